@@ -1,0 +1,67 @@
+"""Every error of this package, in one tree.
+
+A message names the offending value, what would have been valid, and what to do about it. Command-line programs print
+the message of a `BhdError` without a traceback and exit with status 2; any other exception is a bug and keeps its
+traceback.
+"""
+
+import difflib
+from collections.abc import Iterable
+
+
+class BhdError(Exception):
+    """Base class of everything this package raises on purpose."""
+
+
+class ConfigError(BhdError, ValueError):
+    """A configuration value that cannot be honoured."""
+
+
+class ActionError(BhdError, ValueError):
+    """An action with the wrong keys, the wrong order, the wrong type or a non-finite value."""
+
+
+class CommandRefusedError(BhdError):
+    """The cerebellum refused a well-formed command, for example because the emergency stop is latched."""
+
+
+class SimulationError(BhdError):
+    """The physics diverged, or a simulation was used in a way that it cannot serve."""
+
+
+class RenderingError(BhdError):
+    """No image can be rendered on this machine; the message names the remedy."""
+
+
+class DatasetError(BhdError):
+    """Base class of everything that can be wrong with a dataset on disk."""
+
+
+class DatasetExistsError(DatasetError):
+    """The dataset root exists and the caller did not ask to resume."""
+
+
+class DatasetMismatchError(DatasetError):
+    """A dataset that was to be resumed was recorded with another robot, frame rate or feature set."""
+
+
+class DatasetCorruptError(DatasetError):
+    """A file of the dataset cannot be read."""
+
+
+class DatasetWriteError(DatasetError):
+    """An episode could not be written: full disk, missing permission, file-size limit."""
+
+
+def unknown_name(kind: str, value: object, choices: Iterable[str]) -> str:
+    """Return the message for a name that is not among the valid ones, with the nearest valid name if there is one.
+
+    Args:
+        kind: what the name stands for, for example ``"brain"``.
+        value: the name that was given.
+        choices: the valid names.
+    """
+    names = sorted(choices)
+    near = difflib.get_close_matches(str(value), names, n=1, cutoff=0.6)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    return f"Unknown {kind} {value!r}.{hint} Valid: {', '.join(names) if names else '(none)'}."
