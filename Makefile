@@ -1,0 +1,42 @@
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format bench lock clean venv
+
+PYTHON_IN_VENV := .venv/bin/python
+# Two test processes by default; `make test WORKERS=0` runs everything in one, for a debugger.
+WORKERS ?= 2
+PYTEST_ARGS ?=
+BENCH ?=
+LOCK_ARGS ?=
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' Makefile
+
+demo: venv ## record, replay and summarise a small dataset
+	$(PYTHON_IN_VENV) -m bhd_lerobot.runs.demo
+
+test: venv ## run the tests; PYTEST_ARGS='-k name' narrows them down
+	$(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal $(PYTEST_ARGS)
+
+lint: venv ## check style, docstrings and types
+	$(PYTHON_IN_VENV) -m ruff check
+	$(PYTHON_IN_VENV) -m ruff format --check
+	$(PYTHON_IN_VENV) -m mypy
+
+format: venv ## repair what ruff can repair
+	$(PYTHON_IN_VENV) -m ruff check --fix
+	$(PYTHON_IN_VENV) -m ruff format
+
+bench: venv ## run the benchmarks; BENCH='name' picks some
+	$(PYTHON_IN_VENV) -m benchmarks.run $(BENCH)
+
+lock: ## rewrite constraints.txt; LOCK_ARGS=--upgrade takes the newest versions
+	uv=$$(scripts/bootstrap.sh --print-uv) && printf 'hatchling\neditables\n' | "$$uv" pip compile --quiet \
+		--universal --python-version 3.12 --all-extras --no-header --no-annotate --no-emit-index-url \
+		--only-binary :all: $(LOCK_ARGS) --output-file constraints.txt pyproject.toml - >/dev/null
+
+clean: ## remove .venv, .uv and every cache
+	rm -rf .venv .uv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+	find bhd_lerobot tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+
+venv:
+	@scripts/bootstrap.sh

@@ -1,0 +1,31 @@
+"""What every test runs under: no network, no display, no personal caches, the same examples each time.
+
+The environment is set while this file is imported, so before any test module can import LeRobot, torch or matplotlib.
+Child processes inherit it.
+"""
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+from hypothesis import settings
+
+_HF_HOME = Path(tempfile.mkdtemp(prefix="bhd-test-hf-"))
+
+os.environ["HF_HOME"] = str(_HF_HOME)
+os.environ["HF_LEROBOT_HOME"] = str(_HF_HOME / "lerobot")
+os.environ["HF_HUB_OFFLINE"] = "1"
+os.environ["HF_DATASETS_DISABLE_PROGRESS_BARS"] = "1"
+os.environ["WANDB_MODE"] = "disabled"
+os.environ["MPLBACKEND"] = "Agg"
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # One thread for each of torch, BLAS and OpenCV: the workers are the parallelism.
+    os.environ["OMP_NUM_THREADS"] = "1"
+
+settings.register_profile("bhd", derandomize=True, deadline=None, database=None)
+settings.load_profile("bhd")
+
+
+def pytest_unconfigure() -> None:
+    shutil.rmtree(_HF_HOME, ignore_errors=True)

@@ -1,0 +1,245 @@
+"""The rules of the house that no other test would notice: who may import whom, and what a file may not contain.
+
+A new room, or a new arrow between two rooms, is a change to the tables below and so to the design.
+"""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import bhd_lerobot
+
+PACKAGE = "bhd_lerobot"
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / PACKAGE
+
+# room -> what it may import of ours. "control" stands for everything in that room, "bodies.body" for that module only.
+# Each room may import itself and errors.
+EVERYTHING = ("",)
+ARROWS: dict[str, tuple[str, ...]] = {
+    "errors": (),
+    "bodies": (),
+    "sim": ("bodies.body",),
+    "control": ("bodies.body",),
+    "tasks": ("bodies",),
+    "policies": ("bodies", "control.messages"),
+    "data": ("tasks", "bodies", "control.messages"),
+    "robots": ("tasks", "bodies", "sim", "control"),
+    "envs": ("tasks", "bodies", "sim", "control"),
+    "runs": EVERYTHING,
+    "plugin": EVERYTHING,
+}
+
+# third-party package -> the only rooms that may import it, and the rooms that may not.
+ONLY_IN = {"mujoco": ("sim",)}
+NEVER_IN = {
+    "torch": ("bodies", "sim", "control"),
+    "lerobot": ("errors", "bodies", "sim", "control", "tasks"),
+    "mujoco": ("bodies", "control"),
+}
+
+
+def module_name(path: Path, source: Path) -> str:
+    """Return the dotted name of a file, relative to the package: "control.fifo", and "control" for its __init__."""
+    parts = path.relative_to(source).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported_names(path: Path, source: Path) -> Iterator[tuple[int, str]]:
+    """Yield the line and the absolute name of everything a file imports, wherever in the file it does so."""
+    package = path.relative_to(source.parent).parent.parts
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join([*above, *([node.module] if node.module else [])])
+            for alias in node.names:
+                yield node.lineno, f"{module}.{alias.name}"
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            function = ast.unparse(node.func)
+            if function in ("__import__", "import_module", "importlib.import_module"):
+                yield node.lineno, str(node.args[0].value)
+
+
+def within(name: str, allowed: str) -> bool:
+    """Tell whether a dotted name is the allowed module or lies in it."""
+    return allowed in ("", name) or name.startswith(allowed + ".")
+
+
+def wrong_imports(source: Path) -> list[str]:
+    """Return one line of text for every import that breaks a rule in the package whose folder is `source`."""
+    wrong = []
+    for path in sorted(source.rglob("*.py")):
+        importer = module_name(path, source)
+        room = importer.partition(".")[0]
+        if room == "":
+            allowed: tuple[str, ...] = ()
+        elif room in ARROWS:
+            allowed = (room, "errors", "__version__", *ARROWS[room])
+        else:
+            wrong.append(f"{path.relative_to(source.parent)}: {room!r} is not in ARROWS")
+            continue
+        for line, name in imported_names(path, source):
+            where = f"{path.relative_to(source.parent)}:{line}"
+            top, _, rest = name.partition(".")
+            if top == PACKAGE and not any(within(rest, a) for a in allowed):
+                wrong.append(f"{where}: {room or PACKAGE!r} may not import {name}")
+            if room not in ONLY_IN.get(top, (room,)) or room in NEVER_IN.get(top, ()):
+                wrong.append(f"{where}: {room!r} may not import {top}")
+    return wrong
+
+
+def test_every_import_follows_an_arrow() -> None:
+    assert wrong_imports(SOURCE) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "statement"),
+    [
+        ("control/fifo.py", "from bhd_lerobot.sim.world import World"),
+        ("control/fifo.py", "from bhd_lerobot import sim"),
+        ("control/fifo.py", "from ..sim import world"),
+        ("control/fifo.py", "from .. import sim"),
+        ("control/fifo.py", "from bhd_lerobot.bodies.turtlebot3 import BURGER"),
+        ("control/fifo.py", "def f():\n    import torch"),
+        ("control/fifo.py", "import lerobot.robots"),
+        ("control/fifo.py", "import mujoco"),
+        ("control/fifo.py", "import bhd_lerobot"),
+        ("sim/world.py", "from bhd_lerobot.control.messages import Mode"),
+        ("sim/world.py", "from torch import nn"),
+        ("bodies/body.py", "from bhd_lerobot.tasks.task import Task"),
+        ("tasks/avoid.py", "from bhd_lerobot.sim.world import World"),
+        ("tasks/avoid.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import mujoco"),
+        ("policies/brain.py", "from bhd_lerobot.robots.turtlebot3 import TurtleBot3"),
+        ("policies/brain.py", "from bhd_lerobot.tasks.avoid import Avoid"),
+        ("policies/brain.py", "import importlib\nimportlib.import_module('bhd_lerobot.data.recorder')"),
+        ("policies/mlp/modeling_mlp.py", "from ...robots import turtlebot3"),
+        ("data/recorder.py", "from bhd_lerobot.policies.brain import Brain"),
+        ("data/recorder.py", "from bhd_lerobot.runs.record import main"),
+        ("robots/turtlebot3.py", "from bhd_lerobot.data.features import ACTION"),
+        ("robots/turtlebot3.py", "import mujoco.batch"),
+        ("errors.py", "from bhd_lerobot.bodies.body import Body"),
+        ("cellar/wine.py", "x = 1"),
+        ("__init__.py", "from bhd_lerobot.runs.record import main"),
+    ],
+)
+def test_a_planted_wrong_import_is_found(tmp_path: Path, module: str, statement: str) -> None:
+    path = tmp_path / PACKAGE / module
+    path.parent.mkdir(parents=True)
+    path.write_text(statement + "\n")
+    assert len(wrong_imports(tmp_path / PACKAGE)) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "statement"),
+    [
+        ("control/fifo.py", "from bhd_lerobot.bodies.body import Body"),
+        ("control/fifo.py", "from bhd_lerobot.errors import BhdError"),
+        ("control/fifo.py", "from .messages import Mode\nfrom . import messages"),
+        ("control/kinematics.py", "import numpy as np\nimport pinocchio\nimport ruckig"),
+        ("sim/world.py", "import mujoco.batch"),
+        ("robots/turtlebot3.py", "from bhd_lerobot.sim.world import World\nfrom lerobot.robots import Robot"),
+        ("runs/record.py", "from bhd_lerobot.policies.brain import Brain\nfrom bhd_lerobot import __version__"),
+        ("plugin.py", "from bhd_lerobot.robots.turtlebot3 import TurtleBot3"),
+    ],
+)
+def test_a_planted_right_import_is_accepted(tmp_path: Path, module: str, statement: str) -> None:
+    path = tmp_path / PACKAGE / module
+    path.parent.mkdir(parents=True)
+    path.write_text(statement + "\n")
+    assert wrong_imports(tmp_path / PACKAGE) == []
+
+
+def test_the_arrows_form_no_cycle() -> None:
+    free = {"errors"}
+    waiting = {room: {a.partition(".")[0] for a in arrows} for room, arrows in ARROWS.items() if arrows != EVERYTHING}
+    while waiting:
+        ready = {room for room, needs in waiting.items() if needs <= free}
+        assert ready, f"a cycle among {sorted(waiting)}"
+        free |= ready
+        waiting = {room: needs for room, needs in waiting.items() if room not in ready}
+
+
+def test_init_files_are_empty() -> None:
+    filled = [p for p in SOURCE.rglob("__init__.py") if p.parent != SOURCE and p.read_bytes().strip()]
+    assert filled == []
+
+
+def test_the_top_init_holds_a_docstring_and_the_version() -> None:
+    tree = ast.parse((SOURCE / "__init__.py").read_text(encoding="utf-8"))
+    assert ast.get_docstring(tree)
+    assert [ast.unparse(node) for node in tree.body[1:]] == [f"__version__ = {bhd_lerobot.__version__!r}"]
+
+
+def test_the_plugin_module_is_one_import() -> None:
+    tree = ast.parse((ROOT / "lerobot_robot_bhd.py").read_text(encoding="utf-8"))
+    assert [ast.unparse(node) for node in tree.body] == ["import bhd_lerobot.plugin"]
+
+
+@pytest.mark.parametrize(
+    ("rooms", "unwanted"),
+    [
+        (("bodies", "sim", "control"), ("torch", "lerobot")),
+        (("bodies", "control"), ("torch", "lerobot", "mujoco")),
+    ],
+)
+def test_the_real_time_process_stays_light(rooms: tuple[str, ...], unwanted: tuple[str, ...]) -> None:
+    modules = [f"{PACKAGE}.{module_name(p, SOURCE)}" for room in rooms for p in sorted((SOURCE / room).glob("*.py"))]
+    assert len(modules) >= len(rooms)
+    program = (
+        "import importlib, sys\n"
+        f"for name in {modules!r}: importlib.import_module(name)\n"
+        f"print(*sorted(set({unwanted!r}) & set(sys.modules)))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, cwd=ROOT, stdin=subprocess.DEVNULL
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []
+
+
+# Written in two halves, or this file would break its own rule.
+FORBIDDEN = [rf"(?<![\w.~-])/{folder}/\w" for folder in ("ho" + "me", "ro" + "ot", "wo" + "rk", "Us" + "ers")] + [
+    re.escape(host) for host in ("pypi" + ".org", "pythonhosted" + ".org", "npmjs" + ".", "deb.debian" + ".org")
+]
+
+
+def tracked_files() -> list[Path]:
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout, so nothing is tracked")
+    listing = subprocess.run(
+        ["git", "-c", f"safe.directory={ROOT}", "ls-files", "-z"],
+        cwd=ROOT,
+        env={k: v for k, v in os.environ.items() if not k.startswith("GIT_")},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    return [ROOT / name for name in listing.split("\0") if name and (ROOT / name).is_file()]
+
+
+def forbidden_lines(path: Path) -> list[str]:
+    pattern = re.compile("|".join(FORBIDDEN))
+    lines = path.read_bytes().decode("utf-8", errors="replace").splitlines()
+    return [f"{path}:{number}: {line.strip()[:160]}" for number, line in enumerate(lines, 1) if pattern.search(line)]
+
+
+def test_no_tracked_file_names_a_registry_or_a_folder_of_one_machine() -> None:
+    files = tracked_files()
+    assert files
+    assert [line for path in files for line in forbidden_lines(path)] == []
+
+
+@pytest.mark.parametrize("half", ["/ho|me/ann/x", "'/ro|ot/x", "see /wo|rk/main", "https://pypi|.org/simple"])
+def test_a_planted_address_is_found(tmp_path: Path, half: str) -> None:
+    path = tmp_path / "notes.md"
+    path.write_text("fine: a/home/b, network/work/x, https://www.apache.org\n" + half.replace("|", "") + "\n")
+    assert len(forbidden_lines(path)) == 1
