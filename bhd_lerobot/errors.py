@@ -53,6 +53,14 @@ class DatasetWriteError(DatasetError):
     """An episode could not be written: full disk, missing permission, file-size limit."""
 
 
+class DatasetLockedError(DatasetError):
+    """Another process is writing this dataset."""
+
+
+class FrameError(DatasetError, ValueError):
+    """A frame, an image or episode metadata that does not fit the features of the dataset."""
+
+
 def unknown_name(kind: str, value: object, choices: Iterable[str]) -> str:
     """Return the message for a name that is not among the valid ones, with the nearest valid name if there is one.
 

@@ -1,0 +1,173 @@
+"""Every change that the recorder makes on disk, one small step at a time.
+
+All writing goes through `Disk`, so that durability, error messages and the order of steps can be judged in one place,
+and so that a test can stop the process before any single step.
+"""
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from bhd_lerobot.errors import DatasetLockedError, DatasetWriteError
+
+_REMEDIES = {
+    errno.ENOSPC: "Free some space on this disk.",
+    errno.EDQUOT: "Your disk quota is used up; free some space.",
+    errno.EFBIG: "The file-size limit of this process or file system is reached (see `ulimit -f`).",
+    errno.EACCES: "Check the permissions of this path.",
+    errno.EPERM: "Check the permissions of this path.",
+    errno.EROFS: "The file system is mounted read-only; choose another root.",
+    errno.ENOTDIR: "A part of this path is a file, not a folder; choose another root.",
+    errno.EMFILE: "Too many files are open in this process (see `ulimit -n`).",
+}
+
+
+def _before_step(action: str, path: Path) -> None:
+    """Called before every change of the disk. Tests replace it to end the process there."""
+
+
+class Disk:
+    """File-system steps with one policy for flushing and one for errors.
+
+    Args:
+        fsync: flush every file and folder to the device before the step counts as done. Without it an episode
+            survives the death of the process (the kernel holds the pages), but not a power failure.
+    """
+
+    def __init__(self, fsync: bool = False) -> None:
+        """Remember the flushing policy."""
+        self.fsync = fsync
+
+    def make_folder(self, path: Path) -> None:
+        """Create `path` and its parents; an existing folder is fine."""
+        if path.is_dir():
+            return
+        missing = path
+        while not missing.parent.exists():
+            missing = missing.parent
+        _before_step("mkdir", path)
+        path.mkdir(parents=True, exist_ok=True)
+        self._flush_folder(missing.parent)
+
+    def write(self, path: Path, content: bytes | memoryview) -> None:
+        """Write a new file. `path` must be a staging path: a kill leaves it half written."""
+        _before_step("open", path)
+        with open(path, "wb", buffering=0) as file:
+            view = memoryview(content)
+            half = len(view) // 2
+            # Two calls, so that a test can stop between them and leave a torn file, as a real kill can.
+            for part in (view[:half], view[half:]):
+                _before_step("write", path)
+                while part:
+                    part = part[file.write(part) :]
+            if self.fsync:
+                os.fsync(file.fileno())
+
+    def flush(self, path: Path) -> None:
+        """Flush a file that another library wrote, if flushing is on."""
+        if self.fsync:
+            with open(path, "rb") as file:
+                os.fsync(file.fileno())
+
+    def move(self, source: Path, target: Path) -> None:
+        """Rename a file or folder; an existing target file is replaced in one step."""
+        _before_step("rename", target)
+        os.replace(source, target)
+        self._flush_folder(target.parent)
+
+    def link(self, source: Path, target: Path) -> None:
+        """Give a file a second name, or copy it where the file system cannot do that."""
+        _before_step("link", target)
+        try:
+            os.link(source, target)
+        except OSError:
+            # FAT and some network file systems have no hard links. A real failure shows again in the copy.
+            shutil.copy2(source, target)
+            self.flush(target)
+
+    def remove(self, path: Path) -> None:
+        """Remove a file; a missing one is fine."""
+        _before_step("unlink", path)
+        path.unlink(missing_ok=True)
+
+    def remove_tree(self, path: Path) -> None:
+        """Remove a folder and all below it; a missing one is fine."""
+        if not path.exists():
+            return
+        _before_step("rmtree", path)
+        shutil.rmtree(path)
+
+    def _flush_folder(self, path: Path) -> None:
+        if self.fsync:
+            handle = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+
+
+def to_json(content: Mapping[str, Any]) -> bytes:
+    """Return `content` as indented JSON text, the way LeRobot writes its own files."""
+    return json.dumps(content, indent=4, ensure_ascii=False).encode()
+
+
+@contextlib.contextmanager
+def write_errors(action: str, root: Path, consequence: str) -> Iterator[None]:
+    """Turn an operating-system error into a `DatasetWriteError` that says what failed and what is still intact.
+
+    Args:
+        action: what was being done, for example ``"save episode 3"``.
+        root: the dataset.
+        consequence: one sentence on the state of the dataset now.
+    """
+    try:
+        yield
+    except OSError as error:
+        # ffmpeg's errors carry an errno of their own; a missing one still has a readable message.
+        reason = os.strerror(error.errno) if error.errno in errno.errorcode else str(error)
+        where = error.filename2 or error.filename or root
+        remedy = _REMEDIES.get(error.errno or 0, "")
+        text = f"Could not {action} in {root}: {reason} ({where}). {remedy} {consequence}"
+        raise DatasetWriteError(" ".join(text.split())) from error
+
+
+class RootLock:
+    """Exclusive ownership of a dataset root, held until `release` or the end of the process.
+
+    The lock is taken on the folder itself, so no lock file is left behind for an upload to pick up.
+    """
+
+    def __init__(self, root: Path, shown_as: Path | None = None) -> None:
+        """Take the lock.
+
+        Args:
+            root: an existing folder.
+            shown_as: the path to name in an error, if `root` is a temporary one.
+
+        Raises:
+            DatasetLockedError: another recorder or repair works on this root.
+        """
+        self._handle: int | None = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._handle)
+            self._handle = None
+            raise DatasetLockedError(
+                f"{shown_as or root} is being written by another recorder or repair. Wait until it ends, or choose "
+                "another root."
+            ) from None
+
+    def release(self) -> None:
+        """Give the lock back; a second call does nothing."""
+        if self._handle is not None:
+            # Unlocked explicitly: a forked child may still hold a copy of the handle.
+            fcntl.flock(self._handle, fcntl.LOCK_UN)
+            os.close(self._handle)
+            self._handle = None

@@ -1,0 +1,58 @@
+"""Where the files of a dataset lie, in LeRobot's v3.0 layout plus the two names that are ours."""
+
+from pathlib import Path
+
+CODEBASE_VERSION = "v3.0"
+
+INFO = "meta/info.json"
+STATS = "meta/stats.json"
+TASKS = "meta/tasks.parquet"
+IDENTITY = "meta/bhd.json"
+"""What was recorded and by whom; its presence says that a dataset was written by this package."""
+
+STAGING = ".bhd"
+"""Folder inside the root that holds everything unfinished. It is absent from a finalised dataset."""
+
+CHUNK_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA_PATH = f"data/{CHUNK_FILE}.parquet"
+VIDEO_PATH = f"videos/{{video_key}}/{CHUNK_FILE}.mp4"
+EPISODES_PATH = f"meta/episodes/{CHUNK_FILE}.parquet"
+
+CHUNKS_SIZE = 1000
+DATA_FILES_SIZE_IN_MB = 100
+VIDEO_FILES_SIZE_IN_MB = 200
+
+Slot = tuple[int, int]
+"""(chunk index, file index): how LeRobot numbers the files of one kind."""
+
+
+def next_slot(slot: Slot | None, chunks_size: int) -> Slot:
+    """Return the slot after `slot`, or the first one if `slot` is None."""
+    if slot is None:
+        return 0, 0
+    chunk, file = slot
+    return (chunk, file + 1) if file + 1 < chunks_size else (chunk + 1, 0)
+
+
+def data_file(slot: Slot) -> str:
+    """Return the path of a data file, relative to the root."""
+    return DATA_PATH.format(chunk_index=slot[0], file_index=slot[1])
+
+
+def episodes_file(slot: Slot) -> str:
+    """Return the path of an episode-metadata file, relative to the root."""
+    return EPISODES_PATH.format(chunk_index=slot[0], file_index=slot[1])
+
+
+def video_file(key: str, slot: Slot) -> str:
+    """Return the path of a video file of camera feature `key`, relative to the root."""
+    return VIDEO_PATH.format(video_key=key, chunk_index=slot[0], file_index=slot[1])
+
+
+def recorded_files(root: Path) -> set[str]:
+    """Return every data, video and episode-metadata file below `root`, as relative POSIX paths.
+
+    Only names that fit the layout are returned, so notes that somebody put beside them are never touched.
+    """
+    patterns = ("data/chunk-*/file-*.parquet", "meta/episodes/chunk-*/file-*.parquet", "videos/*/chunk-*/file-*.mp4")
+    return {path.relative_to(root).as_posix() for pattern in patterns for path in root.glob(pattern)}
