@@ -4,12 +4,17 @@
 #   scripts/bootstrap.sh             make .venv ready; a few milliseconds when it already is
 #   scripts/bootstrap.sh --print-uv  print the uv to use, installing it into .uv when there is none
 #
-# PYTHON=/path/to/python overrides the search for an interpreter.
+# PYTHON=/path/to/python names the interpreter to create .venv with; `make clean` first to change that of an old one.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 usable='import sys, venv, ensurepip; assert (3, 12) <= sys.version_info[:2] < (3, 14)'
 stamp=.venv/.bhd-stamp
+
+# A company's proxy may sign with a certificate of its own, which the system trusts and uv's own list does not.
+for bundle in /etc/ssl/certs/ca-certificates.crt /etc/pki/tls/certs/ca-bundle.crt /etc/ssl/cert.pem; do
+    if [ -s "$bundle" ]; then export UV_SYSTEM_CERTS="${UV_SYSTEM_CERTS:-true}" UV_NATIVE_TLS="${UV_NATIVE_TLS:-true}"; fi
+done
 
 say() { printf 'bootstrap: %s\n' "$*" >&2; }
 die() {
