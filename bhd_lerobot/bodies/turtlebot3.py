@@ -1,0 +1,85 @@
+"""TurtleBot3 Burger, with the source of every number.
+
+Sources:
+
+[manual]   ROBOTIS e-Manual, TurtleBot3, "Features: specifications": 0.22 m/s, 2.84 rad/s, 138 x 178 x 192 mm, 1 kg.
+[urdf]     ROBOTIS `turtlebot3_description`, `turtlebot3_burger.urdf`: link masses and inertias, positions of wheels,
+           caster, IMU and scanner, hull box, wheel radius 0.033 m, wheel separation 0.160 m. The URDF puts the chassis'
+           centre of mass on the wheel axis, 10 mm above the floor, where the robot would rest on nothing; here it is an
+           estimate, the middle of the hull at battery height. The scanner's inertia in the URDF (1e-3 kg m^2) is a
+           placeholder, ten times that of a solid cylinder of its size; here it is the cylinder's.
+[servo]    ROBOTIS e-Manual, XL430-W250: stall torque 1.4 N m at 11.1 V, the voltage of the robot's battery; 4096 pulses
+           per revolution.
+[lds]      ROBOTIS e-Manual, LDS-01: 0.12 to 3.5 m, 1 degree, 300 rpm. Noise: the manual's accuracy below 0.5 m is
+           +-15 mm; 0.01 m is the standard deviation that ROBOTIS' own simulation uses.
+[nav]      ROBOTIS `turtlebot3_navigation`, `dwa_local_planner_params_burger.yaml`: 2.5 m/s^2, 3.2 rad/s^2.
+
+Estimates of ours: servo gain, reflected rotor inertia (armature), tyre friction, and the deceleration of a stop, which
+is what the tyres can carry (a yaw deceleration of 20 rad/s^2 needs 0.5 N at each tyre, and 3 N are there).
+"""
+
+import math
+from importlib import resources
+
+from bhd_lerobot.bodies.body import Body, CameraSpec, CommandLimits, LidarSpec, WheelDrive
+from bhd_lerobot.errors import ConfigError
+
+WHEEL_RADIUS = 0.033  # [m], [urdf]
+WHEEL_SEPARATION = 0.160  # [m], [urdf]
+MAX_LINEAR = 0.22  # [m/s], [manual]
+MAX_ANGULAR = 2.84  # [rad/s], [manual]
+LIDAR_BEAMS = 360  # [lds]
+
+
+def turtlebot3_burger(
+    *,
+    lidar_noise_std: float = 0.01,
+    command_timeout_s: float = 0.5,
+    camera_width: int = 320,
+    camera_height: int = 240,
+) -> Body:
+    """Return the Burger.
+
+    Args:
+        lidar_noise_std: standard deviation of the range noise [m]; 0 turns it off.
+        command_timeout_s: age at which a command is no longer trusted [s].
+        camera_width: width of the front camera's image [px].
+        camera_height: height of the front camera's image [px].
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+    if not 0 <= lidar_noise_std < math.inf:
+        raise ConfigError(f"lidar_noise_std is {lidar_noise_std}; it must be 0 (off) or a positive number of metres.")
+    if camera_width <= 0 or camera_height <= 0:
+        raise ConfigError(f"The camera image is {camera_width} x {camera_height} px; both must be positive.")
+    return Body(
+        name="turtlebot3_burger",
+        mjcf=resources.files(__package__).joinpath("turtlebot3_burger.xml").read_text(encoding="utf-8"),
+        root="base",
+        limits=CommandLimits(
+            names=("x.vel", "theta.vel"),
+            velocity=(MAX_LINEAR, MAX_ANGULAR),
+            acceleration=(2.5, 3.2),
+            stop_deceleration=(2.5, 20.0),
+            command_timeout_s=command_timeout_s,
+        ),
+        drive=WheelDrive(
+            joints=("wheel_left", "wheel_right"),
+            actuators=("wheel_left", "wheel_right"),
+            wheel_radius=WHEEL_RADIUS,
+            wheel_separation=WHEEL_SEPARATION,
+            # Turning on the spot at the published limit needs this much; driving straight at 0.22 m/s needs less. The
+            # published limits cannot be had both at once: a twist that needs more is scaled down on its arc.
+            max_wheel_speed=MAX_ANGULAR * WHEEL_SEPARATION / 2 / WHEEL_RADIUS,
+            max_torque=1.4,
+            servo_gain=0.3,
+            encoder_ticks=4096,
+        ),
+        lidar=LidarSpec(
+            site="lidar", beams=LIDAR_BEAMS, range_min=0.12, range_max=3.5, rate_hz=5, noise_std=lidar_noise_std
+        ),
+        cameras={"front": CameraSpec("front", camera_width, camera_height)},
+        radius=0.115,  # the rear corners of the hull, and the outer rims of the tyres at 0.095 m
+        height=0.192,
+    )

@@ -1,0 +1,137 @@
+"""Offscreen images of simulations, without a display."""
+
+import os
+import weakref
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.errors import RenderingError, unknown_name
+from bhd_lerobot.sim.world import World
+
+_BACKENDS = ("egl", "osmesa")
+_REMEDY = (
+    "Images need an offscreen OpenGL: install EGL (Debian and Ubuntu: 'apt-get install libegl1 libgl1', works with and "
+    "without a GPU) or OSMesa ('apt-get install libosmesa6'), or turn the cameras off. To choose a backend yourself, "
+    "set MUJOCO_GL to 'egl', 'osmesa' or 'glfw'."
+)
+
+
+def _make_context(width: int, height: int) -> Any:
+    """Return an OpenGL context from the first backend that works.
+
+    MuJoCo chooses its backend once, when it is imported, from MUJOCO_GL, and takes one that needs a display if that is
+    not set. A user's choice is honoured; otherwise EGL and then OSMesa are tried.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    failures = []
+    for backend in (chosen,) if chosen else _BACKENDS:
+        try:
+            return _open(backend, width, height)
+        except Exception as error:  # the GL bindings raise whatever they like: ImportError, AttributeError, GLError
+            failures.append(f"{backend}: {type(error).__name__}: {error}")
+    raise RenderingError(f"No image can be rendered here. Tried {'; '.join(failures)}. {_REMEDY}")
+
+
+def _open(backend: str, width: int, height: int) -> Any:
+    if backend == "egl":
+        # PyOpenGL binds to one platform when it is first imported.
+        os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+        from mujoco.egl import GLContext
+    elif backend == "osmesa":
+        os.environ.setdefault("PYOPENGL_PLATFORM", "osmesa")
+        from mujoco.osmesa import GLContext
+    elif backend == "glfw":
+        from mujoco.glfw import GLContext
+    else:
+        raise RenderingError(unknown_name("MUJOCO_GL backend", backend, (*_BACKENDS, "glfw")))
+    return GLContext(width, height)
+
+
+class Camera:
+    """Renders images of a world's simulations.
+
+    One camera object serves all simulations and all named cameras of one image size. It must be used from the thread
+    that made it, because an OpenGL context belongs to a thread.
+
+    Args:
+        world: the simulations.
+        width: image width [px].
+        height: image height [px].
+
+    Raises:
+        RenderingError: no OpenGL backend works here; the message names the remedy.
+    """
+
+    def __init__(self, world: World, width: int = 320, height: int = 240) -> None:
+        self._world = world
+        self.width, self.height = width, height
+        self._gl = _make_context(width, height)
+        self._gl.make_current()
+        model = world.model
+        model.vis.global_.offwidth = max(width, model.vis.global_.offwidth)
+        model.vis.global_.offheight = max(height, model.vis.global_.offheight)
+        self._scene = mujoco.MjvScene(model, maxgeom=world.model.ngeom + 64)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_HAZE):
+            self._scene.flags[flag] = False
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[:] = [1, 1, 0, 0, 0, 0]  # obstacles and visuals; the hull is for contacts only
+        self._view = mujoco.MjvCamera()
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        # Not at interpreter exit: by then the display connection is gone, and the process frees everything anyway.
+        self._free = weakref.finalize(self, _free, self._gl, self._context)
+        self._free.atexit = False
+        self._flipped = np.empty((height, width, 3), np.uint8)
+        self._model = world.copy_model(0)
+        self._data = mujoco.MjData(world.model)
+
+    def render(self, sim: int, camera: str, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """Return the image that a named camera of one simulation sees now.
+
+        Args:
+            sim: the simulation.
+            camera: a camera of the body, or ``"overview"``.
+            out: where the image goes; a new array if None.
+
+        Returns:
+            The image, shape (height, width, 3), RGB, first row on top.
+
+        Raises:
+            RenderingError: there is no such camera, or the renderer was closed.
+        """
+        if self._context is None:
+            raise RenderingError("The camera was closed; make a new one.")
+        model = self._world.model
+        number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        if number < 0:
+            raise RenderingError(unknown_name("camera", camera, [model.camera(i).name for i in range(model.ncam)]))
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._view.fixedcamid = number
+        self._world.copy_into(sim, self._model, self._data)
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        mujoco.mjv_updateScene(
+            self._model, self._data, self._option, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+        )
+        self._gl.make_current()
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(self._flipped, None, self._rect, self._context)
+        if out is None:
+            return self._flipped[::-1].copy()
+        out[:] = self._flipped[::-1]
+        return out
+
+    def close(self) -> None:
+        """Free the OpenGL context. May be called twice."""
+        self._context = None
+        self._free()
+
+
+def _free(gl: Any, context: mujoco.MjrContext) -> None:
+    gl.make_current()
+    context.free()
+    gl.free()

@@ -1,0 +1,127 @@
+"""The model that a world simulates: a body, a floor, light, and a pool of obstacles that every simulation places anew."""
+
+import math
+
+import mujoco
+
+from bhd_lerobot.bodies.body import Body, Shape
+from bhd_lerobot.errors import ConfigError
+
+# Obstacles that one simulation can have. All simulations of a batch share one model, so the number is fixed; a pool
+# geometry that a simulation does not use is parked far below the floor, where the broad phase drops it at once.
+POOL_SIZE = 64
+PARKED_Z = -100.0
+
+_FLOOR_BIT, _SCENE_BIT = 1, 2
+
+
+def build_model(body: Body, physics_hz: int, pool_size: int = POOL_SIZE) -> mujoco.MjModel:
+    """Compile the model.
+
+    Args:
+        body: the robot.
+        physics_hz: physics steps a second [Hz].
+        pool_size: number of obstacles a simulation can have at the most.
+
+    Raises:
+        ConfigError: the body's MJCF does not compile.
+    """
+    try:
+        spec = mujoco.MjSpec.from_string(body.mjcf)
+    except ValueError as error:
+        raise ConfigError(f"The MJCF of body {body.name!r} does not compile: {error}") from error
+    spec.option.timestep = 1.0 / physics_hz
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # Elliptic cones with a stiffer friction direction: with the defaults a wheel creeps through its contact by several
+    # per cent, which would be an odometry error that no real tyre has.
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    # The mid phase walks a bounding-volume tree that is compiled once; obstacles move between episodes.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+    _add_stage(spec)
+    _add_pool(spec, pool_size)
+    spec.add_sensor(
+        name=body.touch_sensor,
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_XBODY,
+        objname=body.root,
+        reftype=mujoco.mjtObj.mjOBJ_BODY,
+        refname="scene",
+        intprm=[1, 0, 1],  # data: found; reduce: none; num: one slot
+    )
+    return spec.compile()
+
+
+def _add_stage(spec: mujoco.MjSpec) -> None:
+    """Add floor, sky, light and the cameras that look at the scene from outside."""
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.78, 0.86, 0.95],
+        rgb2=[0.95, 0.97, 1.0],
+        width=64,
+        height=384,
+    )
+    spec.add_texture(
+        name="floor",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.80, 0.80, 0.78],
+        rgb2=[0.72, 0.72, 0.70],
+        width=128,
+        height=128,
+    )
+    material = spec.add_material(name="floor", texrepeat=[2, 2], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
+    spec.add_material(name="obstacle", rgba=[0.80, 0.55, 0.30, 1.0], specular=0.1)
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[20, 20, 0.1],
+        material="floor",
+        contype=_FLOOR_BIT,
+        conaffinity=0,
+        # One sliding contact for each wheel needs no torsional or rolling friction.
+        condim=3,
+        friction=[0.9, 0.005, 0.0001],
+    )
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, 6], dir=[-0.3, 0.2, -1], diffuse=[0.7] * 3
+    )
+    spec.visual.headlight.ambient = [0.45] * 3
+    spec.visual.headlight.diffuse = [0.35] * 3
+    # Near and far planes are multiples of the extent; left to MuJoCo it would span to the parked obstacles.
+    spec.stat.extent = 4.0
+    spec.visual.map.znear = 0.002
+    # Shadows and multi-sampling off: with a software renderer a frame costs twenty times as much with them.
+    spec.visual.quality.shadowsize = 0
+    spec.visual.quality.offsamples = 0
+    spec.worldbody.add_camera(name="overview", pos=[0, -3.6, 6.4], xyaxes=[1, 0, 0, 0, 0.87, 0.49], fovy=46)
+
+
+def _add_pool(spec: mujoco.MjSpec, pool_size: int) -> None:
+    """Add the obstacles' pool on one static body, so that one contact sensor sees every touch with the scene."""
+    pool = spec.worldbody.add_body(name="scene")
+    for index in range(pool_size):
+        pool.add_geom(
+            name=f"obstacle_{index:03d}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[0.01, 0.01, 0.01],
+            pos=[0, 0, PARKED_Z],
+            material="obstacle",
+            contype=_SCENE_BIT,
+            conaffinity=0,
+        )
+
+
+def shape_fields(shape: Shape) -> tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...], float]:
+    """Return MuJoCo's type, size (3), position (3), quaternion wxyz (4) and bounding radius of a shape."""
+    half = shape.height / 2
+    position = (shape.x, shape.y, half)
+    if shape.kind == "cylinder":
+        size = (shape.size_x, half, 0.0)
+        return int(mujoco.mjtGeom.mjGEOM_CYLINDER), size, position, (1.0, 0.0, 0.0, 0.0), math.hypot(shape.size_x, half)
+    quaternion = (math.cos(shape.yaw / 2), 0.0, 0.0, math.sin(shape.yaw / 2))
+    size = (shape.size_x, shape.size_y, half)
+    return int(mujoco.mjtGeom.mjGEOM_BOX), size, position, quaternion, math.hypot(*size)

@@ -1,0 +1,323 @@
+"""n simulations of one model, stepped together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco import batch as mujoco_batch
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Body, Shape
+from bhd_lerobot.errors import SimulationError, unknown_name
+from bhd_lerobot.sim.scene import PARKED_Z, POOL_SIZE, build_model, shape_fields
+
+Ids = NDArray[np.intp] | Sequence[int] | None
+
+# Only the obstacles, which are in group 0: a range finder does not see the robot that carries it.
+_SCENE_GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
+_POOL_FIELDS = ("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_rbound")
+_DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{field}")) for field in ("QPOS", "QVEL", "QACC")]
+_WARNING_COUNT = 1  # the last axis of Batch.warning: last info, count
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that decides how simulations go on: restoring it continues bit-exactly.
+
+    Attributes:
+        state: MuJoCo's integration state, shape (k, nstate).
+        fields: the per-simulation model fields, each of shape (k, ...).
+    """
+
+    state: NDArray[np.float64]
+    fields: dict[str, NDArray]
+
+
+class World:
+    """n simulations of one body in its scene.
+
+    Arrays carry the simulation axis first. `qpos`, `qvel`, `ctrl` and `time` are live views of the simulations' states:
+    they change with `step`, and what is written to them is the state at the next step. Results do not depend on the
+    number of threads, nor on how many other simulations there are.
+
+    Args:
+        body: the robot.
+        n: number of simulations.
+        physics_hz: physics steps a second [Hz]; the body's default if None.
+        threads: threads that step the simulations; as many as there are processors, and at most n, if None.
+        pool_size: number of obstacles that one simulation can have at the most.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        n: int = 1,
+        *,
+        physics_hz: int | None = None,
+        threads: int | None = None,
+        pool_size: int = POOL_SIZE,
+    ) -> None:
+        if n < 1:
+            raise SimulationError(f"A world needs at least one simulation, got n = {n}.")
+        self.body = body
+        self.n = n
+        self.physics_hz = physics_hz or body.physics_hz
+        self.pool_size = pool_size
+        self.model = build_model(body, self.physics_hz, pool_size)
+        # One simulation is stepped by the calling thread; more threads would only add hand-overs.
+        self._batch = mujoco_batch.Batch(self.model, n, nthread=1 if n == 1 else threads or 0)
+        self.qpos: NDArray[np.float64] = self._batch.bind("qpos")
+        self.qvel: NDArray[np.float64] = self._batch.bind("qvel")
+        self.ctrl: NDArray[np.float64] = self._batch.bind("ctrl")
+        self.time: NDArray[np.float64] = self._batch.bind("time")
+        self._sensordata: NDArray[np.float64] = self._batch.bind("sensordata")
+        self._root = self.model.body(body.root).id
+        self._pool = slice(
+            self.model.geom("obstacle_000").id if pool_size else 0,
+            (self.model.geom("obstacle_000").id if pool_size else 0) + pool_size,
+        )
+        self._fields: dict[str, NDArray] = {}
+        if pool_size:
+            for name in _POOL_FIELDS:
+                self.model_field(name)
+        self._all = np.arange(n)
+        self.reset()
+
+    # --- state -------------------------------------------------------------------------------------------------------
+
+    def reset(self, ids: Ids = None, poses: NDArray[np.float64] | None = None) -> None:
+        """Put simulations back to the model's initial state, at rest.
+
+        Args:
+            ids: the simulations, all if None.
+            poses: x [m], y [m] and yaw [rad] of the root body in the world frame, shape (len(ids), 3); the origin if
+                None.
+        """
+        ids = self._ids(ids)
+        self._batch.reset(ids, stage=0)
+        if poses is not None:
+            poses = np.asarray(poses, dtype=np.float64)
+            if poses.shape != (len(ids), 3) or not np.isfinite(poses).all():
+                raise SimulationError(
+                    f"Start poses must be {len(ids)} finite rows of x, y, yaw; got shape {poses.shape}."
+                )
+            self.qpos[ids, 0:2] = poses[:, 0:2]
+            self.qpos[ids, 3] = np.cos(poses[:, 2] / 2)
+            self.qpos[ids, 6] = np.sin(poses[:, 2] / 2)
+        self._batch.forward(ids)
+
+    def step(self, k: int = 1, ids: Ids = None) -> None:
+        """Advance simulations by k physics steps.
+
+        Raises:
+            SimulationError: MuJoCo could not step a simulation. That the physics diverged is reported by `check`.
+        """
+        try:
+            self._batch.step(None if ids is None else self._ids(ids), nstep=k)
+        except mujoco_batch.SimulationError as error:
+            raise SimulationError(f"{error}. The simulations named kept the state they had before the step.") from error
+
+    def forward(self, ids: Ids = None) -> None:
+        """Compute everything that derives from the state, without advancing time: sensors for example."""
+        self._batch.forward(None if ids is None else self._ids(ids))
+
+    def check(self) -> None:
+        """Raise if the physics of any simulation diverged since its last reset.
+
+        Raises:
+            SimulationError: names the simulations.
+        """
+        # The engine resets a simulation that diverged, so that its state looks healthy: its warning count tells.
+        diverged = self._batch.warning[:, _DIVERGED, _WARNING_COUNT].any(axis=1)
+        diverged |= ~np.isfinite(self.qpos).all(axis=1)
+        if diverged.any():
+            raise SimulationError(
+                f"The physics of simulation(s) {np.flatnonzero(diverged).tolist()} diverged. "
+                "Lower the time step (a higher physics_hz) or the forces that act on the robot."
+            )
+
+    def snapshot(self, ids: Ids = None) -> Snapshot:
+        """Return a copy of everything that decides how simulations go on."""
+        ids = self._ids(ids)
+        return Snapshot(self._batch.state[ids].copy(), {k: v[ids].copy() for k, v in self._fields.items()})
+
+    def restore(self, snapshot: Snapshot, ids: Ids = None) -> None:
+        """Continue from a snapshot, bit-exactly.
+
+        Args:
+            snapshot: one row for each simulation restored, in their order.
+            ids: the simulations, all if None.
+
+        Raises:
+            SimulationError: the snapshot is of another model or of another number of simulations.
+        """
+        ids = self._ids(ids)
+        expected = (len(ids), self._batch.state.shape[1])
+        if snapshot.state.shape != expected:
+            raise SimulationError(f"The snapshot's state has shape {snapshot.state.shape}; {expected} is needed.")
+        for name, values in snapshot.fields.items():
+            self.model_field(name)[ids] = values
+        self._batch.forward(ids)  # sensors first: the state rows are written last, so that they are exactly the saved
+        self._batch.state[ids] = snapshot.state
+
+    @property
+    def base_pose(self) -> NDArray[np.float64]:
+        """Ground truth: x [m], y [m] and yaw [rad] of the root body in the world frame, shape (n, 3), a copy."""
+        q = self.qpos
+        w, x, y, z = q[:, 3], q[:, 4], q[:, 5], q[:, 6]
+        pose = np.empty((self.n, 3))
+        pose[:, 0:2] = q[:, 0:2]
+        pose[:, 2] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return pose
+
+    # --- sensors -----------------------------------------------------------------------------------------------------
+
+    def sensor(self, name: str) -> NDArray[np.float64]:
+        """Return the live readings of a named sensor, shape (n, dim), as of the last physics step.
+
+        Raises:
+            SimulationError: there is no such sensor; the message lists the valid names.
+        """
+        try:
+            sensor = self.model.sensor(name)
+        except KeyError:
+            names = [self.model.sensor(i).name for i in range(self.model.nsensor)]
+            raise SimulationError(unknown_name("sensor", name, names)) from None
+        view = self._sensordata[:, sensor.adr[0] : sensor.adr[0] + sensor.dim[0]]
+        view.flags.writeable = False
+        return view
+
+    def joint_slice(self, names: Sequence[str]) -> tuple[slice, slice]:
+        """Return where the named one-dimensional joints lie in `qpos` and `qvel`; they must be neighbours, in order."""
+        joints = [self.model.joint(name) for name in names]
+        q, v = int(joints[0].qposadr[0]), int(joints[0].dofadr[0])
+        for offset, joint in enumerate(joints):
+            if joint.qposadr[0] != q + offset or joint.dofadr[0] != v + offset:
+                raise SimulationError(f"Joints {list(names)} are not neighbours in the model of {self.body.name!r}.")
+        return slice(q, q + len(names)), slice(v, v + len(names))
+
+    def rays(
+        self, site: str, directions: NDArray[np.float64], ids: Ids = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+        """Cast rays from a site against the scene.
+
+        Args:
+            site: the site the rays start from; it is fixed to the root body or to a body welded to it.
+            directions: unit vectors in the root body's frame, shape (rays, 3).
+            ids: the simulations, all if None.
+
+        Returns:
+            Distances [m], shape (len(ids), rays), infinity where nothing is hit, and the simulations' ids.
+        """
+        ids = self._ids(ids)
+        q = self.qpos[ids]
+        rotation = _rotation_matrices(q[:, 3:7])
+        offset = self._site_in_root(site)
+        # Sums written out: a matrix product may round differently for different numbers of simulations.
+        origin = q[:, None, 0:3] + (
+            rotation[:, None, :, 0] * offset[0]
+            + rotation[:, None, :, 1] * offset[1]
+            + rotation[:, None, :, 2] * offset[2]
+        )
+        heading = (
+            rotation[:, None, :, 0] * directions[None, :, 0:1]
+            + rotation[:, None, :, 1] * directions[None, :, 1:2]
+            + rotation[:, None, :, 2] * directions[None, :, 2:3]
+        )
+        distance, _ = self._batch.ray(origin, heading, geomgroup=_SCENE_GROUPS, bodyexclude=self._root, ids=ids)
+        return np.where(distance < 0, np.inf, distance), ids
+
+    def _site_in_root(self, site: str) -> NDArray[np.float64]:
+        offset = self.model.site(site).pos.copy()
+        body = int(self.model.site(site).bodyid[0])
+        while body != self._root:
+            if self.model.body_jntnum[body] or body == 0:
+                raise SimulationError(f"Site {site!r} is not fixed to body {self.body.root!r}.")
+            offset += self.model.body_pos[body]
+            body = int(self.model.body_parentid[body])
+        return offset
+
+    # --- scene and randomisation -------------------------------------------------------------------------------------
+
+    def place(self, shapes: Sequence[Sequence[Shape]], ids: Ids = None) -> None:
+        """Give simulations their obstacles, in place of those they had.
+
+        Args:
+            shapes: the obstacles of each simulation.
+            ids: the simulations, all if None.
+
+        Raises:
+            SimulationError: a simulation would have more obstacles than the pool holds.
+        """
+        ids = self._ids(ids)
+        if len(shapes) != len(ids):
+            raise SimulationError(f"{len(shapes)} scenes were given for {len(ids)} simulations.")
+        kind, size, pos, quat, radius = (self._fields[name] for name in _POOL_FIELDS)
+        first = self._pool.start
+        for sim, scene in zip(ids, shapes, strict=True):
+            if len(scene) > self.pool_size:
+                raise SimulationError(
+                    f"The scene has {len(scene)} obstacles; this world holds {self.pool_size}. "
+                    "Make the World with a larger pool_size."
+                )
+            pos[sim, self._pool] = (0.0, 0.0, PARKED_Z)
+            for index, shape in enumerate(scene):
+                geom = first + index
+                kind[sim, geom], size[sim, geom], pos[sim, geom], quat[sim, geom], radius[sim, geom] = shape_fields(
+                    shape
+                )
+
+    def model_field(self, name: str) -> NDArray:
+        """Return a model field with a value for each simulation, live, shape (n, ...), for domain randomisation.
+
+        Args:
+            name: a field of `mujoco.MjModel`, for example ``"geom_friction"``, or ``"opt.gravity"``. After a write to a
+                field from which MuJoCo derives others (masses for example), call `update_constants`.
+
+        Raises:
+            SimulationError: there is no such field.
+        """
+        if name not in self._fields:
+            if name not in mujoco_batch.MODEL_FIELDS:
+                raise SimulationError(unknown_name("model field", name, mujoco_batch.MODEL_FIELDS))
+            self._fields[name] = self._batch.expand(name)
+        return self._fields[name]
+
+    def update_constants(self, ids: Ids = None) -> None:
+        """Recompute what MuJoCo derives from the model fields."""
+        self._batch.set_const(None if ids is None else self._ids(ids))
+
+    def copy_model(self, sim: int) -> mujoco.MjModel:
+        """Return a copy of one simulation's model, with its own values of the per-simulation fields."""
+        return self._batch.get_model(sim)
+
+    def copy_into(self, sim: int, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Copy one simulation's model fields and state; nothing that derives from the state is computed.
+
+        Args:
+            sim: the simulation.
+            model: where the model goes: a result of `copy_model`.
+            data: where the state goes.
+        """
+        self._batch.get_model(sim, model)
+        self._batch.get_data(sim, data)
+
+    def _ids(self, ids: Ids) -> NDArray[np.intp]:
+        return self._all if ids is None else np.asarray(ids, dtype=np.intp)
+
+
+def _rotation_matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation matrices of unit quaternions wxyz: shape (k, 4) gives (k, 3, 3)."""
+    w, x, y, z = quaternions.T
+    matrix = np.empty((len(quaternions), 3, 3))
+    matrix[:, 0, 0] = 1 - 2 * (y * y + z * z)
+    matrix[:, 0, 1] = 2 * (x * y - w * z)
+    matrix[:, 0, 2] = 2 * (x * z + w * y)
+    matrix[:, 1, 0] = 2 * (x * y + w * z)
+    matrix[:, 1, 1] = 1 - 2 * (x * x + z * z)
+    matrix[:, 1, 2] = 2 * (y * z - w * x)
+    matrix[:, 2, 0] = 2 * (x * z - w * y)
+    matrix[:, 2, 1] = 2 * (y * z + w * x)
+    matrix[:, 2, 2] = 1 - 2 * (x * x + y * y)
+    return matrix
