@@ -1,0 +1,111 @@
+"""The bridge between brain and cerebellum, in lockstep with a simulated clock."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Rates
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.messages import NANOSECONDS, CerebellumState, Request, SendResult, Setpoint
+from bhd_lerobot.control.timing import TimingStatistics
+from bhd_lerobot.errors import ConfigError
+
+
+class LockstepBridge:
+    """Runs the cerebellum on simulated time: a command is sent, then exactly one frame of ticks goes by.
+
+    Nothing waits and nothing is late: the same commands give the same states, bit for bit.
+
+    Args:
+        cerebellum: the controller.
+        rates: the rates; `control_hz` is the cerebellum's.
+        advance: moves the plant on by one tick; called after every tick.
+
+    Raises:
+        ConfigError: a frame lasts longer than the command time-out, so that every command would time out.
+    """
+
+    def __init__(self, cerebellum: Cerebellum, rates: Rates, advance: Callable[[], None]) -> None:
+        timeout = cerebellum.body.limits.command_timeout_s
+        if 1.0 / rates.fps > timeout:
+            raise ConfigError(
+                f"At fps = {rates.fps} a command has to last {1.0 / rates.fps:g} s, longer than the command time-out of "
+                f"{timeout:g} s. Raise fps to at least {int(np.ceil(1 / timeout))}."
+            )
+        self.cerebellum = cerebellum
+        self.rates = rates
+        self.timing = TimingStatistics(NANOSECONDS // rates.control_hz)
+        self._advance = advance
+        self._sequence = 0
+        self._tick = 0
+
+    @property
+    def now_ns(self) -> int:
+        """Simulated time since the bridge was made [ns]."""
+        return self._tick * NANOSECONDS // self.rates.control_hz
+
+    def send(self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, due_ns: int | None = None) -> SendResult:
+        """Send one setpoint.
+
+        Args:
+            values: the commands, shape (n, width).
+            mask: the simulations it is for, shape (n,); all if None.
+            due_ns: when it takes effect [ns]; now if None.
+        """
+        self._sequence += 1
+        return self.cerebellum.offer(Setpoint(self._sequence, self.now_ns if due_ns is None else due_ns, values), mask)
+
+    def send_chunk(self, values: NDArray[np.float64]) -> list[SendResult]:
+        """Send several setpoints, one for each coming frame.
+
+        Args:
+            values: the commands, shape (frames, n, width).
+        """
+        frame = self.rates.ticks_per_frame
+        return [
+            self.send(row, due_ns=(self._tick + k * frame) * NANOSECONDS // self.rates.control_hz)
+            for k, row in enumerate(values)
+        ]
+
+    def advance_frame(self) -> None:
+        """Let one frame go by."""
+        self.advance_ticks(self.rates.ticks_per_frame)
+
+    def advance_ticks(self, ticks: int) -> None:
+        """Let some control ticks go by."""
+        for _ in range(ticks):
+            self.cerebellum.tick(self.now_ns)
+            self._tick += 1
+            self._advance()
+        self.timing.add_punctual(ticks)
+
+    def state(self) -> CerebellumState:
+        """Return a copy of the present state."""
+        return self.cerebellum.state(self.now_ns)
+
+    def estop(self, ids: NDArray[np.intp] | None = None) -> None:
+        """Set the emergency-stop word; the next tick latches it."""
+        self.cerebellum.estop_word[slice(None) if ids is None else ids] = 1
+
+    def configure(self, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Leave UNCONFIGURED: odometry starts here."""
+        return self.cerebellum.request(Request.CONFIGURE, ids)
+
+    def activate(self, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Leave INACTIVE: setpoints are accepted from now on."""
+        return self.cerebellum.request(Request.ACTIVATE, ids)
+
+    def deactivate(self, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Ramp to rest and refuse setpoints."""
+        return self.cerebellum.request(Request.DEACTIVATE, ids)
+
+    def reset(self, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Clear an emergency stop, a fault or a deactivation; motion needs `activate` afterwards."""
+        return self.cerebellum.request(Request.RESET, ids)
+
+    def restart(self, ids: NDArray[np.intp]) -> None:
+        """Start a new episode in simulations whose plant was put to a new initial state: configured and active."""
+        self.cerebellum.restart(ids)
+        self.configure(ids)
+        self.activate(ids)

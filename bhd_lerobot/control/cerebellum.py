@@ -1,0 +1,385 @@
+"""The cerebellum: turns commands into safe actuator commands, one tick at a time. It owns the modes."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Body
+from bhd_lerobot.control import safety
+from bhd_lerobot.control.diff_drive import DiffDrive
+from bhd_lerobot.control.fifo import CommandFifo, StateRing
+from bhd_lerobot.control.messages import (
+    NANOSECONDS,
+    CerebellumState,
+    Limit,
+    Mode,
+    Reason,
+    Request,
+    SendResult,
+    Setpoint,
+    Watchdog,
+)
+from bhd_lerobot.control.plant import Plant, PlantReading
+
+MOVING = 0.01  # [rad/s] a joint faster than this moves: the articles' `is_moving`
+_REST = 1e-9  # a ramp has arrived when the command is this close to zero
+
+# Requests and the modes that they apply in; resets lead to INACTIVE only, motion needs a separate activation.
+_TRANSITIONS = {
+    Request.CONFIGURE: ({Mode.UNCONFIGURED}, Mode.INACTIVE),
+    Request.ACTIVATE: ({Mode.INACTIVE}, Mode.HOLD),
+    Request.DEACTIVATE: ({Mode.HOLD, Mode.TRACKING, Mode.STOPPING}, Mode.STOPPING),
+    Request.RESET: ({Mode.ESTOP, Mode.FAULT, Mode.SAFE_OFF}, Mode.INACTIVE),
+}
+
+
+class Cerebellum:
+    """The fixed-rate controller of n simulations, or of one real robot (n = 1).
+
+    `tick` never sleeps, never blocks and never logs: in lockstep it is called by the simulation's clock, in real time
+    by a thread on an absolute grid, and does the same in both. Everything that depends on time comes in as `now_ns`.
+
+    Args:
+        body: the robot: limits and wheels.
+        plant: the joints.
+        control_hz: ticks a second [Hz].
+        fifo: where commands come from; a new one if None.
+        ring: where every tick's state is published, of dtype `state_dtype(n)`; nowhere if None.
+        estop_word: n 64-bit integers that any process may set to something else than 0; new memory if None.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        plant: Plant,
+        control_hz: int,
+        *,
+        fifo: CommandFifo | None = None,
+        ring: StateRing | None = None,
+        estop_word: NDArray[np.int64] | None = None,
+    ) -> None:
+        self.body, self.plant, self.control_hz = body, plant, control_hz
+        self.n = n = plant.n
+        limits = body.limits
+        self.width = width = len(limits.names)
+        self.fifo = CommandFifo(n, width) if fifo is None else fifo
+        self.estop_word = np.zeros(n, np.int64) if estop_word is None else estop_word
+        self._ring = ring
+        self.drive = DiffDrive(body.drive, n)
+        self.mode = np.full(n, Mode.UNCONFIGURED, np.int8)
+        self.refusals = np.zeros((len(Reason), n), np.int64)
+        self.reading = PlantReading(n, 2)
+        self.command = np.zeros((n, width))
+        self.ticks = 0
+
+        self._timeout_ns = round(limits.command_timeout_s * NANOSECONDS)
+        self._velocity = np.asarray(limits.velocity)
+        self._change = np.asarray(limits.acceleration) / control_hz
+        self._stop_change = np.asarray(limits.stop_deceleration) / control_hz
+        self._wheel_limit = body.drive.max_wheel_speed
+        self._per_speed = 1.0 / body.drive.wheel_radius
+        self._per_yaw = body.drive.wheel_separation / 2 / body.drive.wheel_radius
+        self._largest_error = body.drive.max_torque / body.drive.servo_gain
+
+        # The hot path knows no modes: a change of mode writes what every simulation heads for, and how fast.
+        self._target = np.zeros((n, width))
+        self._largest = np.broadcast_to(self._change, (n, width)).copy()
+        self._clipped = np.zeros((n, width))
+        self._before = np.zeros((n, width))
+        self._wheels = np.zeros((n, 2))
+        self._wheel_reference = np.zeros((n, 2))
+        self._last_position = np.zeros((n, 2))
+        self._settled = False
+        self._last_due = np.zeros(n, np.int64)
+        self._sent_sequence = np.full(n, -1, np.int64)
+        self._sent_due = np.full(n, np.iinfo(np.int64).min, np.int64)
+        self._deactivating = np.zeros(n, np.bool_)
+        self._deadline: int | None = None  # when the first command of a moving robot becomes too old [ns]
+        self._stopping = False
+        self._popped, self._popped_mask = np.zeros((n, width)), np.zeros(n, np.bool_)
+        self._estop_latched = np.zeros(n, np.bool_)
+
+        self._limited_velocity = np.zeros((n, width), np.bool_)
+        self._limited_change = np.zeros((n, width), np.bool_)
+        self._limited_wheels = np.zeros(n, np.bool_)
+        self._limited_effort = np.zeros((n, 2), np.bool_)
+        self._limited_finite = np.zeros(n, np.bool_)
+        self._watchdog = np.zeros(n, np.int8)
+
+    # --- one tick ----------------------------------------------------------------------------------------------------
+
+    def tick(self, now_ns: int) -> None:
+        """Run one tick.
+
+        Args:
+            now_ns: the time that the tick is for [ns].
+        """
+        self.plant.read(self.reading)
+        self._supervise(now_ns)
+        self._take_commands(now_ns)
+        if not self._settled:
+            self._filter()
+        # Where nothing changed since the last tick the command stands, and so do the wheel speeds that it means.
+        np.copyto(self._wheels, self._wheel_reference)
+        safety.limit_effort(self._wheels, self.reading.velocity, self._largest_error, self._limited_effort)
+        self.plant.write(self._wheels)
+        self._last_position[:] = self.reading.position
+        self.drive.update_odometry(self.reading.position)
+        self.ticks += 1
+        if self._ring is not None:
+            self._publish(now_ns)
+
+    def _supervise(self, now_ns: int) -> None:
+        """Emergency stop, plant faults and watchdogs: changes of mode that nobody asked for."""
+        if self.estop_word.any():
+            hit = (self.estop_word != 0) & (self.mode != Mode.ESTOP)
+            if hit.any():
+                self._set_mode(hit, Mode.ESTOP)
+                self._estop_latched |= hit
+        # A sum is finite if and only if all its terms are: encoder values are far from the largest float.
+        if not math.isfinite(self.reading.values.sum()) or self.reading.fault.any():
+            self._handle_fault()
+        if self._deadline is not None and now_ns > self._deadline:
+            old = (self.mode == Mode.TRACKING) & (now_ns - self._last_due > self._timeout_ns)
+            if old.any():
+                self._watchdog[old] |= Watchdog.COMMAND_AGE
+                self._set_mode(old, Mode.STOPPING)
+            self._update_deadline()
+        if self._stopping:
+            stopping = self.mode == Mode.STOPPING
+            rest = stopping & (np.abs(self.command) < _REST).all(axis=1)
+            if rest.any():
+                self._set_mode(rest & ~self._deactivating, Mode.HOLD)
+                self._set_mode(rest & self._deactivating, Mode.SAFE_OFF)
+                self._deactivating &= ~rest
+            self._stopping = bool((self.mode == Mode.STOPPING).any())
+
+    def _handle_fault(self) -> None:
+        reading = self.reading
+        bad = ~np.isfinite(reading.values).all(axis=(0, 2))
+        # What is not a number must not spread: it is treated as a joint at rest where the encoder last was.
+        reading.velocity[bad] = 0.0
+        reading.position[bad] = self._last_position[bad]
+        self._set_mode((bad | reading.fault) & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT), Mode.FAULT)
+
+    def _take_commands(self, now_ns: int) -> None:
+        """Take what is due from the queue, in order; the newest that is due wins."""
+        due = self.fifo.next_due()
+        while due is not None and due <= now_ns:
+            self.fifo.pop(self._popped, self._popped_mask)
+            # Modes may have changed since the command was sent.
+            reasons = self._mode_reasons()
+            reasons[(reasons == Reason.ACCEPTED) & (now_ns - due > self._timeout_ns)] = Reason.STALE
+            take = self._popped_mask & (reasons == Reason.ACCEPTED)
+            self._count_refusals(np.where(self._popped_mask, reasons, Reason.ACCEPTED))
+            self._last_due[take] = due
+            starting = take & (self.mode != Mode.TRACKING)
+            if starting.any():
+                self._set_mode(starting, Mode.TRACKING)
+            np.copyto(self._target, self._popped, where=take[:, None])
+            self._settled = False
+            self._update_deadline()
+            due = self.fifo.next_due()
+
+    def _filter(self) -> None:
+        """Safety filter: from the targets to the commands applied in this tick, and the wheel speeds they mean."""
+        target = self._target
+        if not math.isfinite(target.sum()):
+            # Commands are checked when they are sent; a queue in shared memory is written by another process.
+            bad = ~np.isfinite(target).all(axis=1)
+            self._limited_finite |= bad
+            target[bad] = 0.0
+        safety.limit_velocity(target, self._velocity, self._clipped, self._limited_velocity)
+        arrived = safety.limit_change(
+            self._clipped, self.command, self._largest, self.command, self._limited_change
+        )
+        limited = safety.limit_wheel_speed(
+            self.command, self._per_speed, self._per_yaw, self._wheel_limit, self._limited_wheels
+        )
+        # Limited or not, a command that no longer changes stands until something else is asked for.
+        self._settled = arrived and (not limited or bool((self.command == self._before).all()))
+        np.copyto(self._before, self.command)
+        self.drive.wheels_from_twist(self.command, self._wheel_reference)
+
+    # --- commands ----------------------------------------------------------------------------------------------------
+
+    def offer(self, setpoint: Setpoint, mask: NDArray[np.bool_] | None = None) -> SendResult:
+        """Check a setpoint and put it into the queue.
+
+        A setpoint that one simulation refuses still reaches the others. Every refusal is counted in `refusals`.
+
+        Args:
+            setpoint: the command; `values` has shape (n, width).
+            mask: the simulations it is for, shape (n,); all if None.
+        """
+        wanted = np.ones(self.n, np.bool_) if mask is None else mask
+        values = np.asarray(setpoint.values)
+        if values.shape != (self.n, self.width) or values.dtype.kind not in "fiu":
+            reasons = np.where(wanted, Reason.WRONG_WIDTH, Reason.ACCEPTED).astype(np.int8)
+            self._count_refusals(reasons)
+            return SendResult(reasons)
+        reasons = self._mode_reasons()
+        late = (setpoint.sequence <= self._sent_sequence) | (setpoint.due_ns < self._sent_due)
+        reasons[(reasons == Reason.ACCEPTED) & late] = Reason.OUT_OF_ORDER
+        if not np.isfinite(values).all():
+            reasons[~np.isfinite(values).all(axis=1)] = Reason.NON_FINITE
+        reasons[~wanted] = Reason.ACCEPTED
+        accepted = wanted & (reasons == Reason.ACCEPTED)
+        if accepted.any():
+            if self.fifo.push(setpoint.sequence, setpoint.due_ns, values, accepted):
+                self._sent_sequence[accepted] = setpoint.sequence
+                self._sent_due[accepted] = setpoint.due_ns
+            else:
+                reasons[accepted] = Reason.FIFO_FULL
+        self._count_refusals(reasons)
+        return SendResult(reasons)
+
+    def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Ask for a change of mode; it happens before the next tick or is refused with a reason.
+
+        `RESET` also clears the emergency-stop word, because only the cerebellum clears its own latch.
+        """
+        wanted = np.zeros(self.n, np.bool_)
+        wanted[slice(None) if ids is None else ids] = True
+        sources, result = _TRANSITIONS[request]
+        allowed = wanted & np.isin(self.mode, [int(source) for source in sources])
+        reasons = np.where(wanted & ~allowed, Reason.WRONG_MODE, Reason.ACCEPTED).astype(np.int8)
+        reasons[wanted & ~allowed & (self.mode == Mode.ESTOP)] = Reason.ESTOP
+        reasons[wanted & ~allowed & (self.mode == Mode.FAULT)] = Reason.FAULT
+        if request == Request.CONFIGURE:
+            self.plant.read(self.reading)
+            self.drive.reset_odometry(np.flatnonzero(allowed), self.reading.position[allowed])
+        if request == Request.DEACTIVATE:
+            self._deactivating |= allowed
+        if request == Request.RESET:
+            self.estop_word[allowed] = 0
+            self._estop_latched &= ~allowed
+        self._set_mode(allowed, result)
+        self._count_refusals(reasons)
+        return SendResult(reasons)
+
+    def restart(self, ids: NDArray[np.intp]) -> None:
+        """Forget everything about simulations that were put somewhere else: they are unconfigured again."""
+        self.fifo.drop(ids)
+        self.mode[ids] = Mode.UNCONFIGURED
+        self.estop_word[ids] = 0
+        self.command[ids] = 0.0
+        self._target[ids] = 0.0
+        self._settled = False
+        self._largest[ids] = self._change
+        self._sent_sequence[ids] = -1
+        self._sent_due[ids] = np.iinfo(np.int64).min
+        self._last_due[ids] = 0
+        self._deactivating[ids] = False
+        self._estop_latched[ids] = False
+        self.refusals[:, ids] = 0
+        for flags in self._frame_flags():
+            flags[ids] = 0
+        self._update_deadline()
+
+    # --- reports -----------------------------------------------------------------------------------------------------
+
+    def take_flags(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the `Limit` and `Watchdog` flags raised since the last call, each of shape (n,), and clear them."""
+        limits = (
+            self._limited_finite * int(Limit.NON_FINITE)
+            + (self._limited_velocity.any(axis=1) | self._limited_wheels) * int(Limit.VELOCITY)
+            + self._limited_change.any(axis=1) * int(Limit.ACCELERATION)
+            + self._limited_effort.any(axis=1) * int(Limit.EFFORT)
+        )
+        watchdog = self._watchdog.astype(np.int64)
+        for flags in self._frame_flags():
+            flags[:] = 0
+        self._settled = False  # a limit that still holds is reported again in the next frame
+        return limits, watchdog
+
+    def command_age_ns(self, now_ns: int) -> NDArray[np.int64]:
+        """Return how long ago the command in force was due [ns], shape (n,); 0 for a robot that follows none."""
+        return np.where(self.mode == Mode.TRACKING, now_ns - self._last_due, 0)
+
+    def state(self, now_ns: int) -> CerebellumState:
+        """Return a copy of the present state."""
+        velocity = self.reading.velocity.copy()
+        return CerebellumState(
+            stamp_ns=now_ns,
+            joint_positions=self.reading.position.copy(),
+            joint_velocities=velocity,
+            joint_efforts=(self._wheels - velocity) * self.body.drive.servo_gain,
+            command=self.command.copy(),
+            odometry=self.drive.odometry.copy(),
+            twist=self.drive.twist_from_wheels(velocity),
+            mode=self.mode.copy(),
+            is_moving=(np.abs(velocity) > MOVING).any(axis=1),
+            emergency_stop=self._estop_latched.copy(),
+        )
+
+    @staticmethod
+    def state_dtype(n: int) -> np.dtype:
+        """Return the dtype of the states that go to the ring: the fields of `CerebellumState`."""
+        wheels = (np.float64, (n, 2))
+        return np.dtype(
+            [
+                ("stamp_ns", np.int64),
+                ("joint_positions", *wheels),
+                ("joint_velocities", *wheels),
+                ("joint_efforts", *wheels),
+                ("command", *wheels),
+                ("odometry", np.float64, (n, 3)),
+                ("twist", *wheels),
+                ("mode", np.int8, (n,)),
+                ("is_moving", np.bool_, (n,)),
+                ("emergency_stop", np.bool_, (n,)),
+            ],
+            align=True,
+        )
+
+    def _publish(self, now_ns: int) -> None:
+        state = self.state(now_ns)
+        record = np.zeros((), self.state_dtype(self.n))
+        for name in record.dtype.names or ():
+            record[name] = getattr(state, name)
+        ring: Any = self._ring
+        ring.publish(record)
+
+    # --- modes -------------------------------------------------------------------------------------------------------
+
+    def _set_mode(self, mask: NDArray[np.bool_], mode: Mode) -> None:
+        if not mask.any():
+            return
+        self.mode[mask] = mode
+        self._settled = False
+        if mode != Mode.TRACKING:
+            self._target[mask] = 0.0
+        self._largest[mask] = self._stop_change if mode in (Mode.ESTOP, Mode.FAULT) else self._change
+        self._stopping |= mode == Mode.STOPPING
+        self._update_deadline()
+
+    def _mode_reasons(self) -> NDArray[np.int8]:
+        """Return why each mode would refuse a setpoint, shape (n,)."""
+        return _MODE_REASON[self.mode]
+
+    def _count_refusals(self, reasons: NDArray) -> None:
+        if reasons.any():
+            self.refusals[reasons, np.arange(self.n)] += reasons != Reason.ACCEPTED
+
+    def _update_deadline(self) -> None:
+        tracking = self.mode == Mode.TRACKING
+        self._deadline = int(self._last_due[tracking].min()) + self._timeout_ns if tracking.any() else None
+
+    def _frame_flags(self) -> tuple[NDArray, ...]:
+        return (
+            self._limited_velocity,
+            self._limited_change,
+            self._limited_wheels,
+            self._limited_effort,
+            self._limited_finite,
+            self._watchdog,
+        )
+
+
+_MODE_REASON = np.full(len(Mode), Reason.NOT_ACTIVE, np.int8)
+_MODE_REASON[[Mode.HOLD, Mode.TRACKING, Mode.STOPPING]] = Reason.ACCEPTED
+_MODE_REASON[Mode.ESTOP] = Reason.ESTOP
+_MODE_REASON[Mode.FAULT] = Reason.FAULT

@@ -1,0 +1,76 @@
+"""Twist to wheel speeds and back, and odometry, for a base with two driven wheels on one axis."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import WheelDrive
+
+
+class DiffDrive:
+    """Kinematics and odometry of n bases.
+
+    A twist is the forward speed [m/s] and the yaw rate [rad/s]; wheels are left, right.
+
+    Args:
+        drive: the wheels.
+        n: number of simulations.
+    """
+
+    def __init__(self, drive: WheelDrive, n: int) -> None:
+        self.drive = drive
+        self._per_speed = 1.0 / drive.wheel_radius  # [rad/m]
+        self._per_yaw = drive.wheel_separation / 2 / drive.wheel_radius  # [rad/rad]
+        self._count = drive.encoder_ticks / (2 * np.pi)  # [1/rad]
+        self.odometry = np.zeros((n, 3))
+        self._encoder = np.zeros((n, 2))
+
+    def wheels_from_twist(self, twist: NDArray[np.float64], out: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Write the wheel speeds of a twist.
+
+        Args:
+            twist: shape (n, 2).
+            out: wheel speeds [rad/s], shape (n, 2).
+
+        Returns:
+            `out`.
+        """
+        straight = twist[:, 0] * self._per_speed
+        turn = twist[:, 1] * self._per_yaw
+        np.subtract(straight, turn, out=out[:, 0])
+        np.add(straight, turn, out=out[:, 1])
+        return out
+
+    def twist_from_wheels(self, wheels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the twist of bases whose wheels turn at these speeds [rad/s] without slip, shape (n, 2)."""
+        twist = np.empty_like(wheels)
+        twist[:, 0] = (wheels[:, 0] + wheels[:, 1]) * (self.drive.wheel_radius / 2)
+        twist[:, 1] = (wheels[:, 1] - wheels[:, 0]) * (self.drive.wheel_radius / self.drive.wheel_separation)
+        return twist
+
+    def reset_odometry(self, ids: NDArray[np.intp], angles: NDArray[np.float64]) -> None:
+        """Start odometry at the origin.
+
+        Args:
+            ids: the simulations.
+            angles: their wheel angles now [rad], shape (len(ids), 2).
+        """
+        self.odometry[ids] = 0.0
+        self._encoder[ids] = np.floor(angles * self._count)
+
+    def update_odometry(self, angles: NDArray[np.float64]) -> None:
+        """Integrate the motion since the last update, from encoder counts, along the chord of the arc.
+
+        The encoders' resolution and the tyres' slip make it drift, as odometry does.
+
+        Args:
+            angles: wheel angles [rad], shape (n, 2).
+        """
+        counts = np.floor(angles * self._count)
+        moved = (counts - self._encoder) * (self.drive.wheel_radius / self._count)
+        self._encoder = counts
+        distance = (moved[:, 0] + moved[:, 1]) * 0.5
+        turn = (moved[:, 1] - moved[:, 0]) * (1.0 / self.drive.wheel_separation)
+        heading = self.odometry[:, 2] + turn * 0.5
+        self.odometry[:, 0] += distance * np.cos(heading)
+        self.odometry[:, 1] += distance * np.sin(heading)
+        self.odometry[:, 2] += turn

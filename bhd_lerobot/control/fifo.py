@@ -1,0 +1,166 @@
+"""Bounded queues between a brain and a cerebellum: commands one way, states the other.
+
+Both lie in one block of memory that the caller may provide, so that the same code serves two parts of one process and
+two processes that share the block. Each has one writer and one reader. Neither ever waits: a full command queue refuses,
+and the state ring overwrites its oldest entry.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.errors import ConfigError
+
+
+class CommandFifo:
+    """A queue of commands for n simulations, first in, first out.
+
+    One entry holds the commands of all simulations, and a mask of those that it is for.
+
+    Args:
+        n: number of simulations.
+        width: number of values in a command.
+        capacity: number of entries; one that finds the queue full is refused.
+        buffer: memory of at least `nbytes(n, width, capacity)` bytes, zeroed before its first use; new memory if None.
+    """
+
+    def __init__(self, n: int, width: int, capacity: int = 64, buffer: Any = None) -> None:
+        if capacity < 1:
+            raise ConfigError(f"The command queue's capacity is {capacity}; it must be at least 1.")
+        self.n, self.width, self.capacity = n, width, capacity
+        if buffer is None:
+            buffer = bytearray(self.nbytes(n, width, capacity))
+        # The writer alone moves the head and the reader alone the tail. An aligned 64-bit store is atomic on every
+        # platform that CPython supports, and an entry is complete before the head that publishes it moves.
+        header = np.frombuffer(buffer, np.int64, 2)
+        self._head, self._tail = header[0:1], header[1:2]
+        entries = np.frombuffer(buffer, self._dtype(n, width), capacity, offset=16)
+        self._sequence, self._due = entries["sequence"], entries["due_ns"]
+        self._mask, self._values = entries["mask"], entries["values"]
+
+    @staticmethod
+    def _dtype(n: int, width: int) -> np.dtype:
+        return np.dtype(
+            [("sequence", np.int64), ("due_ns", np.int64), ("values", np.float64, (n, width)), ("mask", np.bool_, (n,))],
+            align=True,
+        )
+
+    @classmethod
+    def nbytes(cls, n: int, width: int, capacity: int = 64) -> int:
+        """Return the size of the memory block [bytes]."""
+        return 16 + capacity * cls._dtype(n, width).itemsize
+
+    def __len__(self) -> int:
+        """Return the number of entries that wait."""
+        return int(self._head[0]) - int(self._tail[0])
+
+    def push(self, sequence: int, due_ns: int, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> bool:
+        """Append an entry.
+
+        Args:
+            sequence: its sequence number.
+            due_ns: when it is due [ns].
+            values: the commands, shape (n, width).
+            mask: the simulations it is for, shape (n,).
+
+        Returns:
+            False if the queue was full, and nothing was appended.
+        """
+        head = int(self._head[0])
+        if head - int(self._tail[0]) >= self.capacity:
+            return False
+        slot = head % self.capacity
+        self._sequence[slot], self._due[slot] = sequence, due_ns
+        self._values[slot], self._mask[slot] = values, mask
+        self._head[0] = head + 1
+        return True
+
+    def next_due(self) -> int | None:
+        """Return when the oldest entry is due [ns], or None if nothing waits."""
+        tail = int(self._tail[0])
+        return None if tail == int(self._head[0]) else int(self._due[tail % self.capacity])
+
+    def pop(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> tuple[int, int] | None:
+        """Take the oldest entry.
+
+        Args:
+            values: where the commands go, shape (n, width).
+            mask: where the mask goes, shape (n,).
+
+        Returns:
+            Sequence number and due time [ns], or None if nothing waits.
+        """
+        tail = int(self._tail[0])
+        if tail == int(self._head[0]):
+            return None
+        slot = tail % self.capacity
+        values[:], mask[:] = self._values[slot], self._mask[slot]
+        result = int(self._sequence[slot]), int(self._due[slot])
+        self._tail[0] = tail + 1
+        return result
+
+    def drop(self, ids: NDArray[np.intp]) -> None:
+        """Drop what waits for some simulations. For the reader."""
+        tail = int(self._tail[0])
+        for entry in range(tail, int(self._head[0])):
+            self._mask[entry % self.capacity, ids] = False
+
+
+class StateRing:
+    """The last states that a cerebellum published, for one writer and any number of readers.
+
+    Each slot is guarded by a counter that is odd while the slot is being written; a reader that sees it change reads
+    again, so that it never gets half of one state and half of another.
+
+    Args:
+        dtype: the state's numpy dtype.
+        capacity: number of slots.
+        buffer: memory of at least `nbytes(dtype, capacity)` bytes, zeroed before its first use; new memory if None.
+    """
+
+    def __init__(self, dtype: np.dtype, capacity: int = 16, buffer: Any = None) -> None:
+        if capacity < 2:
+            raise ConfigError(f"The state ring's capacity is {capacity}; it must be at least 2.")
+        self.capacity = capacity
+        if buffer is None:
+            buffer = bytearray(self.nbytes(dtype, capacity))
+        self._count = np.frombuffer(buffer, np.int64, 1)
+        slots = np.frombuffer(buffer, self._slot(dtype), capacity, offset=8)
+        self._guard, self._state = slots["guard"], slots["state"]
+
+    @staticmethod
+    def _slot(dtype: np.dtype) -> np.dtype:
+        return np.dtype([("guard", np.int64), ("state", dtype)], align=True)
+
+    @classmethod
+    def nbytes(cls, dtype: np.dtype, capacity: int = 16) -> int:
+        """Return the size of the memory block [bytes]."""
+        return 8 + capacity * cls._slot(dtype).itemsize
+
+    def __len__(self) -> int:
+        """Return the number of states published so far."""
+        return int(self._count[0])
+
+    def publish(self, state: NDArray) -> None:
+        """Append a state: a structured array of shape () or a record of the ring's dtype."""
+        count = int(self._count[0])
+        slot = count % self.capacity
+        self._guard[slot] += 1
+        self._state[slot] = state
+        self._guard[slot] += 1
+        self._count[0] = count + 1
+
+    def latest(self) -> NDArray | None:
+        """Return a copy of the newest state, or None if there is none yet."""
+        while True:
+            count = int(self._count[0])
+            if count == 0:
+                return None
+            slot = (count - 1) % self.capacity
+            before = int(self._guard[slot])
+            if before % 2:
+                continue
+            state = self._state[slot].copy()
+            if int(self._guard[slot]) == before:
+                return state

@@ -1,0 +1,162 @@
+"""What brain, bridge and cerebellum say to each other.
+
+Times are whole nanoseconds, so that a grid of ticks is exact and an age does not depend on how long a process has been
+running. Arrays carry the simulation axis first; a robot is n = 1.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+NANOSECONDS = 1_000_000_000
+
+
+class Mode(IntEnum):
+    """What the cerebellum is doing.
+
+    `UNCONFIGURED -> INACTIVE -> HOLD <-> TRACKING -> STOPPING -> HOLD | SAFE_OFF`. `ESTOP` and `FAULT` latch.
+    """
+
+    UNCONFIGURED = 0
+    """No plant reading has been taken yet; no command is accepted."""
+    INACTIVE = 1
+    """Configured, at rest, no command is accepted before `activate`."""
+    HOLD = 2
+    """At rest, and ready: the next setpoint starts motion."""
+    TRACKING = 3
+    """Following setpoints."""
+    STOPPING = 4
+    """Ramping to rest, because the command is too old or because the robot is being deactivated."""
+    SAFE_OFF = 5
+    """Deactivated: at rest, no command is accepted before `reset` and `activate`."""
+    ESTOP = 6
+    """Emergency stop, latched."""
+    FAULT = 7
+    """The plant reported something impossible, latched."""
+
+
+class Reason(IntEnum):
+    """Why a command or a request was accepted or refused."""
+
+    ACCEPTED = 0
+    NON_FINITE = 1
+    WRONG_WIDTH = 2
+    OUT_OF_ORDER = 3
+    STALE = 4
+    FIFO_FULL = 5
+    NOT_ACTIVE = 6
+    ESTOP = 7
+    FAULT = 8
+    WRONG_MODE = 9
+
+    @property
+    def explanation(self) -> str:
+        """What it means, and what to do about it."""
+        return _EXPLANATIONS[self]
+
+
+_EXPLANATIONS = {
+    Reason.ACCEPTED: "accepted",
+    Reason.NON_FINITE: "the command holds NaN or an infinity",
+    Reason.WRONG_WIDTH: "the command has another number of values than the robot has command dimensions",
+    Reason.OUT_OF_ORDER: "the command's sequence number or due time is not after that of the command before it",
+    Reason.STALE: "the command was due longer ago than the command time-out",
+    Reason.FIFO_FULL: "the command queue is full; send later or make it longer",
+    Reason.NOT_ACTIVE: "the robot is not active; call activate() first, after a deactivation reset() and activate()",
+    Reason.ESTOP: "the emergency stop is latched; clear its cause, then call reset() and activate()",
+    Reason.FAULT: "a plant fault is latched; clear its cause, then call reset() and activate()",
+    Reason.WRONG_MODE: "the request does not apply in the present mode",
+}
+
+
+class Limit(IntFlag):
+    """What the safety filter changed about a command during a frame."""
+
+    NONE = 0
+    NON_FINITE = 1
+    """The reference was not finite and the robot was stopped."""
+    VELOCITY = 2
+    """Clipped to the velocity limit, of the command or of a wheel."""
+    ACCELERATION = 4
+    """Slowed to the acceleration limit."""
+    EFFORT = 8
+    """Clipped so that the servo does not ask for more than the largest effort."""
+
+
+class Watchdog(IntFlag):
+    """What the watchdogs noticed during a frame."""
+
+    NONE = 0
+    COMMAND_AGE = 1
+    """The command became older than its time-out; the robot ramps to zero."""
+
+
+class Request(IntEnum):
+    """A request to the mode machine."""
+
+    CONFIGURE = 0
+    ACTIVATE = 1
+    DEACTIVATE = 2
+    RESET = 3
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """An action with a due time.
+
+    Attributes:
+        sequence: counts up with every setpoint of one sender.
+        due_ns: when it is to take effect, on the cerebellum's clock [ns].
+        values: the command, shape (n, width), in the units of the action features.
+    """
+
+    sequence: int
+    due_ns: int
+    values: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SendResult:
+    """What became of a setpoint in each simulation.
+
+    Attributes:
+        reasons: a `Reason` for each simulation, shape (n,).
+    """
+
+    reasons: NDArray[np.int8]
+
+    @property
+    def accepted(self) -> NDArray[np.bool_]:
+        """Whether each simulation took it, shape (n,)."""
+        return self.reasons == Reason.ACCEPTED
+
+
+@dataclass(frozen=True)
+class CerebellumState:
+    """What the cerebellum publishes; a copy, not a view.
+
+    Attributes:
+        stamp_ns: time of the tick [ns].
+        joint_positions: wheel angles [rad], shape (n, joints).
+        joint_velocities: wheel speeds [rad/s], shape (n, joints).
+        joint_efforts: effort that the servos are asked for [N m], shape (n, joints).
+        command: the command applied, after all limits, shape (n, width).
+        odometry: x [m], y [m] and yaw [rad] since the last reset, from the encoders, shape (n, 3).
+        twist: measured command-space velocity, shape (n, width).
+        mode: a `Mode` for each simulation, shape (n,).
+        is_moving: whether any joint is faster than 0.01 rad/s, shape (n,).
+        emergency_stop: whether the emergency stop is latched, shape (n,).
+    """
+
+    stamp_ns: int
+    joint_positions: NDArray[np.float64]
+    joint_velocities: NDArray[np.float64]
+    joint_efforts: NDArray[np.float64]
+    command: NDArray[np.float64]
+    odometry: NDArray[np.float64]
+    twist: NDArray[np.float64]
+    mode: NDArray[np.int8]
+    is_moving: NDArray[np.bool_]
+    emergency_stop: NDArray[np.bool_]

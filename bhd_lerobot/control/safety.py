@@ -1,0 +1,94 @@
+"""From what was requested to what is applied, with the reasons. Pure: no clock, no state, no plant."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def limit_velocity(requested: Array, limit: Array, out: Array, changed: Mask) -> None:
+    """Clip commands to the velocity limits.
+
+    Args:
+        requested: shape (n, width).
+        limit: largest magnitudes, shape (width,).
+        out: where the result goes, shape (n, width).
+        changed: set to True where a value was clipped and left alone elsewhere, shape (n, width).
+    """
+    np.maximum(requested, -limit, out=out)
+    np.minimum(out, limit, out=out)
+    np.logical_or(changed, out != requested, out=changed)
+
+
+def limit_change(requested: Array, previous: Array, largest: Array, out: Array, changed: Mask) -> bool:
+    """Keep commands within the largest change from the previous ones, which is the acceleration limit.
+
+    Args:
+        requested: shape (n, width).
+        previous: what was applied a tick ago, shape (n, width).
+        largest: largest change in one tick, shape (n, width).
+        out: where the result goes, shape (n, width); may be `previous`, may not be `requested`.
+        changed: set to True where a value was held back and left alone elsewhere, shape (n, width).
+
+    Returns:
+        Whether every value arrived at what was requested.
+    """
+    step = requested - previous
+    held = np.abs(step) > largest
+    if not held.any():
+        np.copyto(out, requested)
+        return True
+    np.logical_or(changed, held, out=changed)
+    np.maximum(step, -largest, out=step)
+    np.minimum(step, largest, out=step)
+    np.add(previous, step, out=out)
+    np.copyto(out, requested, where=~held)  # previous + (requested - previous) may differ in the last bit
+    return False
+
+
+def limit_wheel_speed(twist: Array, per_speed: float, per_yaw: float, limit: float, changed: Mask) -> bool:
+    """Take away forward speed until no wheel is faster than its limit, in place; the turn is kept.
+
+    Turning has precedence because it is what avoids an obstacle, and because the two limits cannot fight: in one tick
+    the yaw rate changes by so little that the forward speed which it costs stays within its own acceleration limit.
+
+    Args:
+        twist: forward speed [m/s] and yaw rate [rad/s], shape (n, 2).
+        per_speed: wheel speed of a forward speed [rad/m].
+        per_yaw: wheel speed of a yaw rate [rad/rad].
+        limit: largest wheel speed [rad/s].
+        changed: set to True for simulations that were limited and left alone elsewhere, shape (n,).
+
+    Returns:
+        Whether any simulation was limited.
+    """
+    room = np.abs(twist[:, 1])
+    room *= -per_yaw
+    room += limit
+    room *= 1.0 / per_speed
+    np.maximum(room, 0.0, out=room)
+    forward = twist[:, 0]
+    over = np.abs(forward) > room
+    if not over.any():
+        return False
+    np.logical_or(changed, over, out=changed)
+    np.maximum(forward, -room, out=forward)
+    np.minimum(forward, room, out=forward)
+    return True
+
+
+def limit_effort(speeds: Array, measured: Array, largest_error: float, changed: Mask) -> None:
+    """Clip servo speed commands, in place, so that the servo does not ask for more than its largest torque.
+
+    Args:
+        speeds: commanded joint speeds [rad/s], shape (n, joints).
+        measured: measured joint speeds [rad/s], shape (n, joints).
+        largest_error: speed error at which the servo reaches its torque limit [rad/s].
+        changed: set to True where a value was clipped and left alone elsewhere, shape (n, joints).
+    """
+    error = speeds - measured
+    over = np.abs(error) > largest_error
+    if over.any():
+        np.logical_or(changed, over, out=changed)
+        np.copyto(speeds, measured + np.clip(error, -largest_error, largest_error), where=over)

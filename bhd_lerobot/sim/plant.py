@@ -1,0 +1,39 @@
+"""The joints of a world, as the cerebellum sees them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.sim.world import World
+
+
+class SimulatedPlant:
+    """Reads the wheel joints of all simulations and writes their servos' speeds.
+
+    It has the two calls of the cerebellum's plant and needs none of its code.
+
+    Args:
+        world: the simulations.
+    """
+
+    def __init__(self, world: World) -> None:
+        self.n = world.n
+        positions, velocities = world.joint_slice(world.body.drive.joints)
+        self._position, self._velocity = world.qpos[:, positions], world.qvel[:, velocities]
+        first = world.model.actuator(world.body.drive.actuators[0]).id
+        self._ctrl = world.ctrl[:, first : first + len(world.body.drive.actuators)]
+
+    def read(self, out: "JointReading") -> None:
+        """Write the joints' positions [rad] and velocities [rad/s], each of shape (n, joints), into `out`."""
+        out.position[:] = self._position
+        out.velocity[:] = self._velocity
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        """Take the servos' speeds [rad/s], shape (n, joints)."""
+        self._ctrl[:] = ctrl
+
+
+class JointReading:
+    """What `SimulatedPlant.read` fills: any object with these two arrays."""
+
+    position: NDArray[np.float64]
+    velocity: NDArray[np.float64]
