@@ -87,7 +87,6 @@ class Cerebellum:
         self._target = np.zeros((n, width))
         self._largest = np.broadcast_to(self._change, (n, width)).copy()
         self._clipped = np.zeros((n, width))
-        self._before = np.zeros((n, width))
         self._wheels = np.zeros((n, 2))
         self._wheel_reference = np.zeros((n, 2))
         self._last_position = np.zeros((n, 2))
@@ -192,15 +191,15 @@ class Cerebellum:
             self._limited_finite |= bad
             target[bad] = 0.0
         safety.limit_velocity(target, self._velocity, self._clipped, self._limited_velocity)
+        wheels = (self._per_speed, self._per_yaw, self._wheel_limit, self._limited_wheels)
+        safety.limit_wheel_speed(self._clipped, *wheels)
         arrived = safety.limit_change(
             self._clipped, self.command, self._largest, self.command, self._limited_change
         )
-        limited = safety.limit_wheel_speed(
-            self.command, self._per_speed, self._per_yaw, self._wheel_limit, self._limited_wheels
-        )
-        # Limited or not, a command that no longer changes stands until something else is asked for.
-        self._settled = arrived and (not limited or bool((self.command == self._before).all()))
-        np.copyto(self._before, self.command)
+        # Both ends of a change can be within the wheels' limit and the way between them not: the two dimensions
+        # change at different rates.
+        limited = safety.limit_wheel_speed(self.command, *wheels)
+        self._settled = arrived and not limited
         self.drive.wheels_from_twist(self.command, self._wheel_reference)
 
     # --- commands ----------------------------------------------------------------------------------------------------
