@@ -1,0 +1,232 @@
+"""Where a base roams: the `turtlebot3_world` layout and a seeded generator of arenas.
+
+Every arena is closed, all of it that the robot's centre can be in is connected, and the start pose is free.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.errors import ConfigError, unknown_name
+
+ROBOT_RADIUS = 0.115  # [m] the Burger around its wheel axis, as in bodies/turtlebot3.py
+CLEARANCE = 0.06  # [m] what must be free beside the robot for a place to count as reachable
+RESOLUTION = 0.05  # [m] of the grid that reachability is computed on
+START_CLEARANCE = 0.35  # [m] from the robot's centre to the nearest obstacle at the start
+WALL = 0.05  # [m] half the thickness of the outer walls
+
+
+@dataclass(frozen=True)
+class Arena:
+    """Obstacles, extent and start of an episode.
+
+    Attributes:
+        name: which layout it is.
+        shapes: all obstacles, outer walls included.
+        extent: x_min, x_max, y_min, y_max of the inside [m].
+        start: x [m], y [m], yaw [rad] of the robot, world frame.
+    """
+
+    name: str
+    shapes: tuple[Shape, ...]
+    extent: tuple[float, float, float, float]
+    start: tuple[float, float, float]
+
+    def clearance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the distance from points to the nearest obstacle [m], negative inside one.
+
+        Args:
+            points: x and y in the world frame [m], shape (..., 2).
+        """
+        return _clearance(self.shapes, points)
+
+    @cached_property
+    def reachable(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Grid points (rows, columns, 2) [m], and whether the robot's centre can get to each from the start."""
+        points = _grid(self.extent)
+        free = self.clearance(points) > ROBOT_RADIUS + CLEARANCE
+        labels, _ = ndimage.label(free)
+        row, column = _nearest(self.extent, self.start[:2])
+        label = labels[row, column]
+        return points, (labels == label) & (label > 0)
+
+    def cell_of(self, points: NDArray[np.float64], size: float) -> NDArray[np.int64]:
+        """Return the number of the square cell that each point lies in, shape (...,).
+
+        Args:
+            points: x and y in the world frame [m], shape (..., 2).
+            size: edge length of a cell [m].
+        """
+        x_min, x_max, y_min, y_max = self.extent
+        columns = max(1, math.ceil((x_max - x_min) / size - 1e-9))
+        rows = max(1, math.ceil((y_max - y_min) / size - 1e-9))
+        column = np.clip(np.floor((points[..., 0] - x_min) / size), 0, columns - 1).astype(np.int64)
+        row = np.clip(np.floor((points[..., 1] - y_min) / size), 0, rows - 1).astype(np.int64)
+        return row * columns + column
+
+    def free_cells(self, size: float) -> NDArray[np.int64]:
+        """Return the numbers of the cells that the robot's centre can get into, sorted."""
+        points, free = self.reachable
+        return np.unique(self.cell_of(points[free], size))
+
+
+def make_arena(name: str, seed: int) -> Arena:
+    """Return an arena by name.
+
+    Args:
+        name: ``"turtlebot3_world"``, ``"random"`` or ``"empty"``.
+        seed: decides everything about a random arena; without meaning for the others.
+
+    Raises:
+        ConfigError: there is no such arena.
+    """
+    if name == "turtlebot3_world":
+        return turtlebot3_world()
+    if name == "random":
+        return random_arena(seed)
+    if name == "empty":
+        return _closed("empty", 3.0, 3.0, [], (0.0, 0.0, 0.0))
+    raise ConfigError(unknown_name("arena", name, ARENAS))
+
+
+ARENAS = ("turtlebot3_world", "random", "empty")
+
+
+def turtlebot3_world() -> Arena:
+    """Return the layout of ROBOTIS' `turtlebot3_world`.
+
+    Nine cylinders of radius 0.15 m on a 1.1 m grid, a hexagonal wall around them, start at (-2.0, -0.5) facing +x, as in
+    `turtlebot3_gazebo`. The wall is a mesh there; its size here is an estimate.
+    """
+    shapes = [Shape("cylinder", 1.1 * i, 1.1 * j, 0.0, 0.15, 0.15) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    radius = 2.9  # of the corners; two of them on the x axis
+    apothem = radius * math.cos(math.pi / 6)
+    for side in range(6):
+        angle = math.pi / 6 + side * math.pi / 3
+        distance = apothem + WALL
+        shapes.append(
+            Shape("box", distance * math.cos(angle), distance * math.sin(angle), angle, WALL, radius / 2 + WALL)
+        )
+    return Arena("turtlebot3_world", tuple(shapes), (-radius, radius, -apothem, apothem), (-2.0, -0.5, 0.0))
+
+
+def random_arena(seed: int) -> Arena:
+    """Return a random rectangular arena with cylinders, boxes, walls, corridors and dead ends.
+
+    Args:
+        seed: any whole number from 0; equal seeds give equal arenas.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence([0xA2E4A, int(seed)]))
+    for _ in range(1000):
+        half_x, half_y = rng.uniform(1.8, 3.0, size=2)
+        obstacles: list[Shape] = []
+        points = _grid((-half_x, half_x, -half_y, half_y))
+        clearance = _clearance(_outer_walls(half_x, half_y), points)
+        builders = (_cylinders, _boxes, _walls, _corridor, _dead_end)
+        # Each arena has its own mixture: some are forests of posts, some mazes.
+        for builder, count in zip(builders, rng.integers((2, 1, 0, 0, 0), (9, 6, 4, 2, 3)), strict=True):
+            for _ in range(count):
+                group = builder(rng, half_x, half_y)
+                trial = np.minimum(clearance, _clearance(group, points))
+                if _is_connected(trial):
+                    obstacles += group
+                    clearance = trial
+        candidates = points[clearance > START_CLEARANCE]
+        if len(candidates):
+            x, y = candidates[rng.integers(len(candidates))]
+            return _closed("random", half_x, half_y, obstacles, (float(x), float(y), float(rng.uniform(-np.pi, np.pi))))
+    raise ConfigError(f"No arena could be generated from seed {seed}.")  # 1000 failures in a row
+
+
+def _closed(
+    name: str, half_x: float, half_y: float, obstacles: list[Shape], start: tuple[float, float, float]
+) -> Arena:
+    shapes = tuple(_outer_walls(half_x, half_y) + obstacles)
+    return Arena(name, shapes, (-half_x, half_x, -half_y, half_y), start)
+
+
+def _outer_walls(half_x: float, half_y: float) -> list[Shape]:
+    return [
+        Shape("box", half_x + WALL, 0.0, 0.0, WALL, half_y + 2 * WALL),
+        Shape("box", -half_x - WALL, 0.0, 0.0, WALL, half_y + 2 * WALL),
+        Shape("box", 0.0, half_y + WALL, 0.0, half_x + 2 * WALL, WALL),
+        Shape("box", 0.0, -half_y - WALL, 0.0, half_x + 2 * WALL, WALL),
+    ]
+
+
+def _cylinders(rng: np.random.Generator, half_x: float, half_y: float) -> list[Shape]:
+    x, y, radius = rng.uniform((-half_x, -half_y, 0.05), (half_x, half_y, 0.25))
+    return [Shape("cylinder", x, y, 0.0, radius, radius)]
+
+
+def _boxes(rng: np.random.Generator, half_x: float, half_y: float) -> list[Shape]:
+    x, y, yaw, a, b = rng.uniform((-half_x, -half_y, 0.0, 0.08, 0.08), (half_x, half_y, math.pi, 0.35, 0.35))
+    return [Shape("box", x, y, yaw, a, b)]
+
+
+def _walls(rng: np.random.Generator, half_x: float, half_y: float) -> list[Shape]:
+    x, y, length = rng.uniform((-half_x, -half_y, 0.3), (half_x, half_y, 0.9))
+    return [Shape("box", x, y, float(rng.integers(4)) * math.pi / 4, length, 0.03)]
+
+
+def _corridor(rng: np.random.Generator, half_x: float, half_y: float) -> list[Shape]:
+    """Two parallel walls."""
+    x, y, length, width = rng.uniform((-half_x, -half_y, 0.5, 0.55), (half_x, half_y, 1.0, 0.85))
+    yaw = float(rng.integers(2)) * math.pi / 2
+    return [_beside(x, y, yaw, 0.0, side * width / 2, length, 0.03) for side in (-1, 1)]
+
+
+def _dead_end(rng: np.random.Generator, half_x: float, half_y: float) -> list[Shape]:
+    """Two parallel walls, closed at one end."""
+    x, y, length, width = rng.uniform((-half_x, -half_y, 0.35, 0.6), (half_x, half_y, 0.6, 1.0))
+    yaw = float(rng.integers(4)) * math.pi / 2
+    walls = [_beside(x, y, yaw, 0.0, side * width / 2, length, 0.03) for side in (-1, 1)]
+    return [*walls, _beside(x, y, yaw, length, 0.0, 0.03, width / 2 + 0.03)]
+
+
+def _beside(x: float, y: float, yaw: float, ahead: float, left: float, size_x: float, size_y: float) -> Shape:
+    """Return a box at an offset in a frame at (x, y, yaw)."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return Shape("box", x + c * ahead - s * left, y + s * ahead + c * left, yaw, size_x, size_y)
+
+
+def _is_connected(clearance: NDArray[np.float64]) -> bool:
+    free = clearance > ROBOT_RADIUS + CLEARANCE
+    _, count = ndimage.label(free)
+    # Not crowded: at least a third of the floor stays free for the robot's centre.
+    return count == 1 and float(free.mean()) > 1 / 3
+
+
+def _grid(extent: tuple[float, float, float, float]) -> NDArray[np.float64]:
+    x_min, x_max, y_min, y_max = extent
+    x = np.arange(x_min + RESOLUTION / 2, x_max, RESOLUTION)
+    y = np.arange(y_min + RESOLUTION / 2, y_max, RESOLUTION)
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def _nearest(extent: tuple[float, float, float, float], point: tuple[float, float]) -> tuple[int, int]:
+    x_min, _, y_min, _ = extent
+    return int((point[1] - y_min) / RESOLUTION), int((point[0] - x_min) / RESOLUTION)
+
+
+def _clearance(shapes: Iterable[Shape], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    distance = np.full(points.shape[:-1], np.inf)
+    for shape in shapes:
+        np.minimum(distance, _distance(shape, points), out=distance)
+    return distance
+
+
+def _distance(shape: Shape, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    dx, dy = points[..., 0] - shape.x, points[..., 1] - shape.y
+    if shape.kind == "cylinder":
+        return np.hypot(dx, dy) - shape.size_x
+    c, s = math.cos(shape.yaw), math.sin(shape.yaw)
+    ax = np.abs(c * dx + s * dy) - shape.size_x
+    ay = np.abs(c * dy - s * dx) - shape.size_y
+    return np.hypot(np.maximum(ax, 0), np.maximum(ay, 0)) + np.minimum(np.maximum(ax, ay), 0)
