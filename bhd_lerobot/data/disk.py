@@ -62,10 +62,10 @@ class Disk:
             view = memoryview(content)
             half = len(view) // 2
             # Two calls, so that a test can stop between them and leave a torn file, as a real kill can.
-            for part in (view[:half], view[half:]):
+            for end in (half, len(view)):
                 _before_step("write", path)
-                while part:
-                    part = part[file.write(part) :]
+                while file.tell() < end:
+                    file.write(view[file.tell() : end])
             if self.fsync:
                 os.fsync(file.fileno())
 
@@ -130,7 +130,7 @@ def write_errors(action: str, root: Path, consequence: str) -> Iterator[None]:
         yield
     except OSError as error:
         # ffmpeg's errors carry an errno of their own; a missing one still has a readable message.
-        reason = os.strerror(error.errno) if error.errno in errno.errorcode else str(error)
+        reason = os.strerror(error.errno) if error.errno is not None and error.errno in errno.errorcode else str(error)
         where = error.filename2 or error.filename or root
         remedy = _REMEDIES.get(error.errno or 0, "")
         text = f"Could not {action} in {root}: {reason} ({where}). {remedy} {consequence}"

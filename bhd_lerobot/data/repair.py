@@ -1,0 +1,128 @@
+"""Complete or drop what an interrupted recording left behind."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.data import layout, video
+from bhd_lerobot.data.compact import compact, roll_forward
+from bhd_lerobot.data.disk import Disk, RootLock, write_errors
+from bhd_lerobot.data.schema import Schema
+from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots
+from bhd_lerobot.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class RepairReport:
+    """What was mended. It is false if there was nothing to do.
+
+    Attributes:
+        root: the dataset.
+        episodes: episodes it holds now; none of the saved ones is ever lost.
+        frames: frames it holds now.
+        completed: steps that had been decided before the interruption and were completed.
+        dropped: files of unfinished episodes that were removed, relative to the root.
+    """
+
+    root: Path
+    episodes: int
+    frames: int
+    completed: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Whether anything was mended."""
+        return bool(self.completed or self.dropped)
+
+    def __str__(self) -> str:
+        """Return the report for a terminal."""
+        lines = [f"{self.root}: {self.episodes} episodes, {self.frames} frames"]
+        lines += [f"  completed: {item}" for item in self.completed]
+        lines += [f"  dropped: {item}" for item in self.dropped]
+        return "\n".join(lines if self else [*lines, "  nothing to do"])
+
+
+def repair(root: Path | str) -> RepairReport:
+    """Mend a dataset, check every file to the last page, and leave it compact and with statistics.
+
+    Args:
+        root: the dataset.
+
+    Raises:
+        DatasetLockedError: it is being recorded at this moment.
+        DatasetCorruptError: a file of a saved episode is damaged; nothing was dropped then.
+        DatasetError: there is no dataset at `root`.
+        DatasetWriteError: the disk refuses the repaired files.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise DatasetError(f"{root} is not a LeRobot dataset: it does not exist.")
+    lock = RootLock(root)
+    try:
+        disk = Disk()
+        with write_errors("repair the dataset", root, "Its saved episodes are intact."):
+            state, report = settle(root, disk)
+            _check_deeply(state)
+            if state.identity is not None and compact(state, Schema(state.info["features"]), disk, {}):
+                what = f"compaction and statistics of {len(state.without_stats)} episodes"
+                disk.remove_tree(root / layout.STAGING)
+                done = (*report.completed, what)
+                report = RepairReport(root, report.episodes, report.frames, done, report.dropped)
+        return report
+    finally:
+        lock.release()
+
+
+def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[DatasetState, RepairReport]:
+    """Bring the disk to what ``info.json`` says; the caller holds the lock.
+
+    Args:
+        root: the dataset.
+        disk: how to write.
+        keep_staging: leave files of episodes that are still being recorded.
+
+    Returns:
+        The committed state, and what was done.
+
+    Raises:
+        DatasetCorruptError: a file of a saved episode cannot be read; nothing was dropped then.
+    """
+    completed = ["compaction"] if roll_forward(root, disk) else []
+    state = load_state(root)
+    dropped: list[str] = []
+    if state.identity is not None:
+        # Only in our own datasets: another program may know what its files are for.
+        dropped = sorted(layout.recorded_files(root) - state.files())
+        for name in dropped:
+            disk.remove(root / name)
+    if not keep_staging and (root / layout.STAGING).exists():
+        staged = [path for path in (root / layout.STAGING).rglob("*") if path.is_file()]
+        dropped += sorted(path.relative_to(root).as_posix() for path in staged)
+        disk.remove_tree(root / layout.STAGING)
+    # A task of a dropped episode may be in tasks.parquet already. It is not counted, and the next save writes the
+    # file again, so it needs no step of its own.
+    state.tasks = state.tasks[: state.info["total_tasks"]]
+    return state, RepairReport(root, state.num_episodes, state.num_frames, tuple(completed), tuple(dropped))
+
+
+def _check_deeply(state: DatasetState) -> None:
+    for slot in ordered_slots(state.rows, "data"):
+        path = state.root / layout.data_file(slot)
+        try:
+            file = pq.ParquetFile(path, page_checksum_verification=True)
+            for group in range(file.num_row_groups):
+                file.read_row_group(group, use_threads=False)
+        except (OSError, pa.ArrowException) as error:
+            raise corrupt(path, error) from error
+    for key in state.video_keys:
+        for slot, rows in ordered_slots(state.rows, f"videos/{key}").items():
+            path = state.root / layout.video_file(key, slot)
+            wanted = sum(row["length"] for row in rows)
+            try:
+                found = video.count_frames(path)
+            except OSError as error:
+                raise corrupt(path, error) from error
+            if found != wanted:
+                raise corrupt(path, f"it has {found} frames; its episodes have {wanted}")

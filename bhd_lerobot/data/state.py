@@ -1,0 +1,196 @@
+"""What is committed on disk: read from ``info.json`` and the episode metadata, and checked against the files.
+
+An episode exists if and only if ``info.json`` counts it. Files of other episodes are leftovers of an interrupted save.
+"""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.layout import Slot
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError
+
+_REMEDY = "Restore this file from a copy (or from the Hub), or record into a new root; nothing was changed."
+
+Row = dict[str, Any]
+"""One row of ``meta/episodes``, without the statistics."""
+
+
+@dataclass
+class DatasetState:
+    """The committed content of a dataset.
+
+    Attributes:
+        root: the dataset.
+        info: content of ``meta/info.json``.
+        identity: content of ``meta/bhd.json``; None if another program recorded the dataset.
+        tasks: task sentences in the order of their index; may hold more than ``info`` counts after a kill.
+        rows: one per committed episode, in order.
+        without_stats: committed episodes whose statistics are not stored yet.
+        metadata_types: Arrow type of every ``bhd/`` column, empty before the first episode.
+    """
+
+    root: Path
+    info: dict[str, Any]
+    identity: dict[str, Any] | None
+    tasks: list[str] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
+    without_stats: set[int] = field(default_factory=set)
+    metadata_types: dict[str, pa.DataType] = field(default_factory=dict)
+
+    @property
+    def num_episodes(self) -> int:
+        """Committed episodes."""
+        return len(self.rows)
+
+    @property
+    def num_frames(self) -> int:
+        """Committed frames."""
+        return self.rows[-1]["dataset_to_index"] if self.rows else 0
+
+    @property
+    def video_keys(self) -> list[str]:
+        """Camera features."""
+        return [key for key, feature in self.info["features"].items() if feature["dtype"] == "video"]
+
+    def files(self) -> set[str]:
+        """Return all files of committed episodes, relative to the root."""
+        names = {layout.data_file(slot_of(row, "data")) for row in self.rows}
+        names |= {layout.episodes_file(slot_of(row, "meta/episodes")) for row in self.rows}
+        for key in self.video_keys:
+            names |= {layout.video_file(key, slot_of(row, f"videos/{key}")) for row in self.rows}
+        return names
+
+
+def slot_of(row: Row, kind: str) -> Slot:
+    """Return the (chunk, file) numbers of a row for ``data``, ``meta/episodes`` or ``videos/<key>``."""
+    return row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]
+
+
+def slot_columns(kind: str, slot: Slot) -> Row:
+    """Return the columns that `slot_of` reads."""
+    return {f"{kind}/chunk_index": slot[0], f"{kind}/file_index": slot[1]}
+
+
+def ordered_slots(rows: Iterable[Row], kind: str) -> dict[Slot, list[Row]]:
+    """Return the files of one kind in the order of their episodes, each with its rows."""
+    slots: dict[Slot, list[Row]] = {}
+    for row in rows:
+        slots.setdefault(slot_of(row, kind), []).append(row)
+    return slots
+
+
+def corrupt(path: Path, reason: object) -> DatasetCorruptError:
+    """Return the error for a file that cannot be trusted."""
+    return DatasetCorruptError(f"{path} is corrupt: {' '.join(str(reason).split())}. {_REMEDY}")
+
+
+def load_state(root: Path) -> DatasetState:
+    """Read what is committed and check that every file it needs is there and readable.
+
+    Reads file footers, not their pages: a damaged value inside a file is found by `bhd_lerobot.data.repair.repair`.
+
+    Raises:
+        DatasetError: `root` is not a dataset.
+        DatasetCorruptError: a file is missing, unreadable or contradicts the others; the message names it.
+    """
+    if not (root / layout.INFO).is_file():
+        found = "has no meta/info.json" if root.is_dir() else "does not exist"
+        raise DatasetError(f"{root} is not a LeRobot dataset: it {found}.")
+    info = _read_json(root / layout.INFO)
+    for key in ("codebase_version", "features", "fps", "total_episodes", "total_frames", "total_tasks"):
+        if key not in info:
+            raise corrupt(root / layout.INFO, f"it has no {key!r}")
+    if not str(info["codebase_version"]).startswith("v3."):
+        raise DatasetError(f"{root} has dataset format {info['codebase_version']}; this program reads v3.x.")
+    identity = _read_json(root / layout.IDENTITY) if (root / layout.IDENTITY).exists() else None
+    state = DatasetState(root, info, identity)
+    if info["total_episodes"]:
+        state.tasks = _read_tasks(root / layout.TASKS)
+        if len(state.tasks) < info["total_tasks"]:
+            raise corrupt(root / layout.TASKS, f"it has {len(state.tasks)} of {info['total_tasks']} tasks")
+        _read_rows(state)
+        _check_files(state)
+    return state
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise corrupt(path, error) from error
+    if not isinstance(content, dict):
+        raise corrupt(path, "it is not a JSON object")
+    return content
+
+
+def _read_tasks(path: Path) -> list[str]:
+    try:
+        table = pq.read_table(path, use_threads=False)
+        # LeRobot keeps the sentence in the index of a pandas table; the column name differs between its versions.
+        name = next(n for n in table.column_names if n != "task_index")
+        pairs = sorted(zip(table["task_index"].to_pylist(), table[name].to_pylist(), strict=True))
+    except (OSError, pa.ArrowException, KeyError, StopIteration) as error:
+        raise corrupt(path, error) from error
+    return [task for _, task in pairs]
+
+
+def _read_rows(state: DatasetState) -> None:
+    total = state.info["total_episodes"]
+    by_index: dict[int, Row] = {}
+    for path in sorted((state.root / "meta/episodes").glob("chunk-*/file-*.parquet")):
+        try:
+            file = pq.ParquetFile(path)
+            names = file.schema_arrow.names
+            light = [name for name in names if not name.startswith("stats/")]
+            table = file.read(columns=light, use_threads=False)
+        except (OSError, pa.ArrowException) as error:
+            raise corrupt(path, error) from error
+        has_stats = "stats/index/mean" in names
+        for row in table.to_pylist():
+            index = row.get("episode_index")
+            if index is None or index >= total:
+                continue  # a save that was interrupted before it counted
+            if index in by_index:
+                raise corrupt(path, f"episode {index} is in another file as well")
+            by_index[index] = row
+            if not has_stats:
+                state.without_stats.add(index)
+        if not state.metadata_types:
+            fields = {name: file.schema_arrow.field(name).type for name in light if name.startswith("bhd/")}
+            state.metadata_types = {name.removeprefix("bhd/"): kind for name, kind in fields.items()}
+    for index in range(total):
+        if index not in by_index:
+            raise corrupt(state.root / "meta/episodes", f"info.json counts {total} episodes, but {index} is missing")
+    state.rows = [by_index[index] for index in range(total)]
+
+
+def _check_files(state: DatasetState) -> None:
+    start = 0
+    for row in state.rows:
+        if row["dataset_from_index"] != start or row["dataset_to_index"] != start + row["length"]:
+            path = state.root / layout.episodes_file(slot_of(row, "meta/episodes"))
+            raise corrupt(path, f"episode {row['episode_index']} does not start at frame {start}")
+        start += row["length"]
+    if start != state.info["total_frames"]:
+        raise corrupt(state.root / layout.INFO, f"it counts {state.info['total_frames']} frames; episodes have {start}")
+    for slot, rows in ordered_slots(state.rows, "data").items():
+        path = state.root / layout.data_file(slot)
+        wanted = sum(row["length"] for row in rows)
+        try:
+            found = pq.read_metadata(path).num_rows
+        except (OSError, pa.ArrowException) as error:
+            raise corrupt(path, error) from error
+        if found != wanted:
+            raise corrupt(path, f"it has {found} frames; its episodes have {wanted}")
+    for key in state.video_keys:
+        for slot in ordered_slots(state.rows, f"videos/{key}"):
+            path = state.root / layout.video_file(key, slot)
+            if not path.is_file() or path.stat().st_size == 0:
+                raise corrupt(path, "it is missing or empty")
