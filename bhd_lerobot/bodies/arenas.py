@@ -5,7 +5,7 @@ Every arena is closed, all of it that the robot's centre can be in is connected,
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -63,12 +63,16 @@ class Arena:
             points: x and y in the world frame [m], shape (..., 2).
             size: edge length of a cell [m].
         """
-        x_min, x_max, y_min, y_max = self.extent
-        columns = max(1, math.ceil((x_max - x_min) / size - 1e-9))
-        rows = max(1, math.ceil((y_max - y_min) / size - 1e-9))
+        x_min, _, y_min, _ = self.extent
+        columns, rows = self.cells(size)
         column = np.clip(np.floor((points[..., 0] - x_min) / size), 0, columns - 1).astype(np.int64)
         row = np.clip(np.floor((points[..., 1] - y_min) / size), 0, rows - 1).astype(np.int64)
         return row * columns + column
+
+    def cells(self, size: float) -> tuple[int, int]:
+        """Return how many cells of this edge length [m] cover the extent: columns along x, rows along y."""
+        x_min, x_max, y_min, y_max = self.extent
+        return max(1, math.ceil((x_max - x_min) / size - 1e-9)), max(1, math.ceil((y_max - y_min) / size - 1e-9))
 
     def free_cells(self, size: float) -> NDArray[np.int64]:
         """Return the numbers of the cells that the robot's centre can get into, sorted."""
@@ -76,23 +80,26 @@ class Arena:
         return np.unique(self.cell_of(points[free], size))
 
 
-def make_arena(name: str, seed: int) -> Arena:
+def make_arena(name: str, seed: int, random_start: bool = False) -> Arena:
     """Return an arena by name.
 
     Args:
         name: ``"turtlebot3_world"``, ``"random"`` or ``"empty"``.
-        seed: decides everything about a random arena; without meaning for the others.
+        seed: decides everything about a random arena, and the start pose where it is random.
+        random_start: start at a random free pose, not at the layout's own; a random arena always does.
 
     Raises:
         ConfigError: there is no such arena.
     """
-    if name == "turtlebot3_world":
-        return turtlebot3_world()
     if name == "random":
         return random_arena(seed)
-    if name == "empty":
-        return _closed("empty", 3.0, 3.0, [], (0.0, 0.0, 0.0))
-    raise ConfigError(unknown_name("arena", name, ARENAS))
+    if name == "turtlebot3_world":
+        arena = turtlebot3_world()
+    elif name == "empty":
+        arena = _closed("empty", 3.0, 3.0, [], (0.0, 0.0, 0.0))
+    else:
+        raise ConfigError(unknown_name("arena", name, ARENAS))
+    return _with_random_start(arena, seed) if random_start else arena
 
 
 ARENAS = ("turtlebot3_world", "random", "empty")
@@ -137,11 +144,24 @@ def random_arena(seed: int) -> Arena:
                 if _is_connected(trial):
                     obstacles += group
                     clearance = trial
-        candidates = points[clearance > START_CLEARANCE]
-        if len(candidates):
-            x, y = candidates[rng.integers(len(candidates))]
-            return _closed("random", half_x, half_y, obstacles, (float(x), float(y), float(rng.uniform(-np.pi, np.pi))))
+        if (clearance > START_CLEARANCE).any():
+            return _closed("random", half_x, half_y, obstacles, _random_pose(points, clearance, rng))
     raise ConfigError(f"No arena could be generated from seed {seed}.")  # 1000 failures in a row
+
+
+def _with_random_start(arena: Arena, seed: int) -> Arena:
+    rng = np.random.default_rng(np.random.SeedSequence([0x57A27, int(seed)]))
+    points, reachable = arena.reachable
+    clearance = np.where(reachable, arena.clearance(points), -np.inf)
+    return replace(arena, start=_random_pose(points, clearance, rng))
+
+
+def _random_pose(
+    points: NDArray[np.float64], clearance: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[float, float, float]:
+    candidates = points[clearance > START_CLEARANCE]
+    x, y = candidates[rng.integers(len(candidates))]
+    return float(x), float(y), float(rng.uniform(-np.pi, np.pi))
 
 
 def _closed(

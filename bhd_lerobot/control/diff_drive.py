@@ -65,12 +65,27 @@ class DiffDrive:
         Args:
             angles: wheel angles [rad], shape (n, 2).
         """
-        counts = np.floor(angles * self._count)
-        moved = (counts - self._encoder) * (self.drive.wheel_radius / self._count)
-        self._encoder = counts
-        distance = (moved[:, 0] + moved[:, 1]) * 0.5
-        turn = (moved[:, 1] - moved[:, 0]) * (1.0 / self.drive.wheel_separation)
-        heading = self.odometry[:, 2] + turn * 0.5
-        self.odometry[:, 0] += distance * np.cos(heading)
-        self.odometry[:, 1] += distance * np.sin(heading)
-        self.odometry[:, 2] += turn
+        self.odometry = self.odometry_at(angles)
+        self._encoder = np.floor(angles * self._count)
+
+    def odometry_at(self, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the odometry with the motion since the last update added, without updating it.
+
+        Args:
+            angles: wheel angles [rad], shape (n, 2).
+
+        Returns:
+            x [m], y [m] and yaw [rad] since the last reset, shape (n, 3).
+        """
+        moved = np.floor(angles * self._count)
+        moved -= self._encoder
+        moved *= self.drive.wheel_radius / self._count
+        left, right = moved[:, 0], moved[:, 1]
+        odometry = self.odometry.copy()
+        distance = (left + right) * 0.5
+        turn = (right - left) * (1.0 / self.drive.wheel_separation)
+        heading = odometry[:, 2] + turn * 0.5
+        odometry[:, 0] += distance * np.cos(heading)
+        odometry[:, 1] += distance * np.sin(heading)
+        odometry[:, 2] += turn
+        return odometry

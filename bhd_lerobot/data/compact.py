@@ -6,6 +6,7 @@ the marker leaves the old dataset and some rubbish in the staging folder; a kill
 `roll_forward` at the next open.
 """
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data import layout, statistics, video
-from bhd_lerobot.data.disk import Disk, to_json
+from bhd_lerobot.data.disk import Disk
 from bhd_lerobot.data.episode_table import episode_table, read_stats
 from bhd_lerobot.data.layout import Slot
 from bhd_lerobot.data.schema import Schema, as_numpy
@@ -221,7 +222,7 @@ def _build_meta(state: DatasetState, disk: Disk, rows: list[Row], stats: Mapping
         disk.write(new / layout.episodes_file(slot), sink.getvalue())
     total = {key: statistics.aggregate(stat) for key, stat in stats.items()}
     lists = {key: {name: values.tolist() for name, values in stat.items()} for key, stat in total.items()}
-    disk.write(new / layout.STATS, to_json(lists))
+    disk.write(new / layout.STATS, json.dumps(lists).encode())
 
 
 def _link_others(old: Path, new: Path, disk: Disk, *replaced: str) -> None:

@@ -19,6 +19,7 @@ class AvoidConfig:
 
     Attributes:
         arena: ``"random"``, ``"turtlebot3_world"`` or ``"empty"``.
+        random_start: start at a random free pose in the fixed layouts too.
         duration_s: length of an episode [s].
         min_path_m: length of the path that a success needs [m].
         cell_m: edge length of the cells that the score counts [m].
@@ -27,6 +28,7 @@ class AvoidConfig:
     """
 
     arena: str = "random"
+    random_start: bool = False
     duration_s: float = 60.0
     min_path_m: float = 3.0
     cell_m: float = 0.25
@@ -66,9 +68,12 @@ class AvoidTask:
         self.duration_s = config.duration_s
         self.frames = max(1, round(config.duration_s * fps))
         self._window = max(1, round(config.stuck_time_s * fps))
-        self._arenas: list[Arena | None] = [None] * n
-        self._free: list[NDArray[np.int64]] = [np.zeros(0, np.int64)] * n
-        self._visited: list[set[int]] = [set() for _ in range(n)]
+        self._sims = np.arange(n)
+        # Cells by number, a row for each simulation; the rows grow with the largest arena seen.
+        self._free = np.zeros((n, 0), np.bool_)
+        self._visited = np.zeros((n, 0), np.bool_)
+        self._origin = np.zeros((n, 2))
+        self._columns = np.ones(n, np.int64)
         self._pose = np.zeros((n, 2))
         self._path = np.zeros(n)
         self._history = np.zeros((self._window, n))  # path lengths of the last frames, a ring
@@ -76,35 +81,40 @@ class AvoidTask:
 
     def sample(self, seed: int) -> Arena:
         """Return the arena of the episode with this seed."""
-        return make_arena(self.config.arena, seed)
+        return make_arena(self.config.arena, seed, self.config.random_start)
 
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
         """Start episodes: the robot stands at each arena's start."""
         for sim, arena in zip(ids, scenes, strict=True):
-            self._arenas[sim] = arena
-            self._free[sim] = arena.free_cells(self.config.cell_m)
-            self._visited[sim] = set()
+            cells = arena.free_cells(self.config.cell_m)
+            columns, rows = arena.cells(self.config.cell_m)
+            if columns * rows > self._free.shape[1]:
+                grow = ((0, 0), (0, columns * rows - self._free.shape[1]))
+                self._free, self._visited = np.pad(self._free, grow), np.pad(self._visited, grow)
+            self._free[sim] = self._visited[sim] = False
+            self._free[sim, cells] = True
+            self._origin[sim] = arena.extent[0], arena.extent[2]
+            self._columns[sim] = columns
             self._pose[sim] = arena.start[:2]
-            self._count_cell(sim)
+        started = np.zeros(len(self._sims), np.bool_)
+        started[ids] = True
+        self._count_cells(started)
         self._path[ids] = 0.0
         self._history[:, ids] = 0.0
         self._frame[ids] = 0
 
     def judge(self, truth: Truth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""
-        n = len(running)
-        reward, event = np.zeros(n), np.full(n, int(Event.NOTHING))
+        event = np.full(len(running), int(Event.NOTHING))
         position = truth.base_pose_in_world[:, :2]
         self._path += np.where(running, np.hypot(*(position - self._pose).T), 0.0)
         self._pose[running] = position[running]
         slot = self._frame % self._window
-        sims = np.arange(n)
-        recent = self._path - self._history[slot, sims]  # the ring's oldest entry is the path one window ago
-        self._history[slot, sims] = self._path
+        recent = self._path - self._history[slot, self._sims]  # the ring's oldest entry: the path one window ago
+        self._history[slot, self._sims] = self._path
         self._frame[running] += 1
         clean = running & ~truth.touched
-        for sim in np.flatnonzero(clean):
-            reward[sim] = self._count_cell(sim)
+        reward = self._count_cells(clean)
         over = clean & (self._frame >= self.frames)
         far = self._path >= self.config.min_path_m
         event[over & far] = Event.SUCCESS
@@ -116,14 +126,14 @@ class AvoidTask:
 
     def outcome(self, sim: int, event: Event) -> Outcome:
         """Return how an episode ended."""
-        free = max(1, len(self._free[sim]))
+        free, visited = max(1, int(self._free[sim].sum())), int(self._visited[sim].sum())
         return Outcome(
             success=event == Event.SUCCESS,
             event=event,
-            score=len(self._visited[sim]) / free,
+            score=visited / free,
             details={
                 "path_m": float(self._path[sim]),
-                "cells_visited": float(len(self._visited[sim])),
+                "cells_visited": float(visited),
                 "cells_free": float(free),
             },
         )
@@ -132,17 +142,12 @@ class AvoidTask:
         """Return everything that defines the task."""
         return {"type": self.name, **asdict(self.config)}
 
-    def _count_cell(self, sim: int) -> float:
-        """Count the cell that the robot is in, and return what it adds to the score."""
-        arena, visited = self._arenas[sim], self._visited[sim]
-        if arena is None:
-            return 0.0
-        cell = int(arena.cell_of(self._pose[sim], self.config.cell_m))
-        if cell in visited:
-            return 0.0
-        free = self._free[sim]
-        index = int(np.searchsorted(free, cell))
-        if index == len(free) or free[index] != cell:
-            return 0.0
-        visited.add(cell)
-        return 1.0 / len(free)
+    def _count_cells(self, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Count the cells that robots are in, and return what they add to the scores, shape (n,)."""
+        column, row = np.floor((self._pose - self._origin) / self.config.cell_m).astype(np.int64).T
+        cell = np.clip(row * self._columns + column, 0, self._free.shape[1] - 1)
+        # Outside the grid is no free cell: a robot there has left the arena through a wall.
+        inside = (column >= 0) & (column < self._columns) & (row >= 0)
+        new = mask & inside & self._free[self._sims, cell] & ~self._visited[self._sims, cell]
+        self._visited[self._sims[new], cell[new]] = True
+        return np.where(new, 1.0 / np.maximum(self._free.sum(axis=1), 1), 0.0)

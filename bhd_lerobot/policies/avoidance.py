@@ -1,0 +1,84 @@
+"""The rule of the articles: drive until something is near in front, then turn left."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import Observation, find_columns, find_scan
+
+
+@dataclass
+class AvoidanceConfig:
+    """Parameters of the avoidance rule.
+
+    Attributes:
+        front_sector_deg: the front sector reaches this far to either side [deg].
+        safe_distance_m: nearer than this in the front sector, the robot turns [m].
+        forward_speed: speed when the way is free [m/s].
+        turn_speed: yaw rate when it is not, positive to the left [rad/s].
+        range_min_m: a reading below this is not valid [m].
+        range_max_m: a reading above this is not valid [m]; a beam without a return reads exactly this.
+    """
+
+    front_sector_deg: float = 30.0
+    safe_distance_m: float = 0.5
+    forward_speed: float = 0.2
+    turn_speed: float = 0.5
+    range_min_m: float = 0.12
+    range_max_m: float = 3.5
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not math.isfinite(value):
+                raise ConfigError(f"brain.{name} is {value}; it must be finite.")
+        if not 0 < self.front_sector_deg <= 180:
+            raise ConfigError(f"brain.front_sector_deg is {self.front_sector_deg}; it must be in (0, 180].")
+
+
+class AvoidanceBrain:
+    """Front sector ±30°; nothing nearer than 0.5 m: 0.2 m/s ahead; otherwise turn left at 0.5 rad/s; blind: stop.
+
+    Args:
+        config: the parameters; the articles' if None.
+    """
+
+    name = "avoidance"
+
+    def __init__(self, config: AvoidanceConfig | None = None) -> None:
+        self.config = config or AvoidanceConfig()
+        self._scan = slice(0)
+        self._front = np.zeros(0, np.bool_)
+        self._forward = self._turn = 0
+        self._width = 0
+
+    def bind(self, observation_names: Sequence[str], action_names: Sequence[str], fps: int) -> None:
+        """Find the scan and the twist."""
+        self._scan, angles = find_scan(observation_names, self.name)
+        self._front = np.abs(angles) <= math.radians(self.config.front_sector_deg) + 1e-9
+        self._forward, self._turn = find_columns(action_names, ("x.vel", "theta.vel"), self.name, "action")
+        self._width = len(action_names)
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int) -> None:
+        """Nothing to forget: the rule has no memory."""
+
+    def act(self, observation: Observation) -> NDArray[np.float64]:
+        """Return the twist, shape (n, actions)."""
+        config = self.config
+        front = observation.state[:, self._scan][:, self._front]
+        valid = (front >= config.range_min_m) & (front <= config.range_max_m)  # False for NaN
+        nearest = np.where(valid, front, np.inf).min(axis=1)
+        seen = valid.any(axis=1)
+        free = nearest >= config.safe_distance_m
+        action = np.zeros((len(front), self._width))
+        action[:, self._forward] = np.where(seen & free, config.forward_speed, 0.0)
+        action[:, self._turn] = np.where(seen & ~free, config.turn_speed, 0.0)
+        return action
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters."""
+        return {"type": self.name, **asdict(self.config)}

@@ -1,0 +1,102 @@
+"""What a brain is: it looks at an observation a few times a second and says what it wants."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What n robots see at one time.
+
+    Attributes:
+        names: feature names of the columns of `state`.
+        state: the robots' floats, shape (n, len(names)), read-only.
+        images: by camera name, shape (n, height, width, 3), RGB.
+        environment_state: what the task tells the brain, shape (n, k), or None.
+    """
+
+    names: tuple[str, ...]
+    state: NDArray[np.float64]
+    images: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
+    environment_state: NDArray[np.float64] | None = None
+
+
+class Brain(Protocol):
+    """A rule or a network that drives n robots.
+
+    A brain is told once which features it will see and which it must command; it finds its inputs by name and fails at
+    once, with the names it misses, if they are not there.
+    """
+
+    name: str
+
+    def bind(self, observation_names: Sequence[str], action_names: Sequence[str], fps: int) -> None:
+        """Learn the order of the observation's and the action's features, and the frame rate [Hz].
+
+        Raises:
+            ConfigError: a feature that the brain needs is missing.
+        """
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int) -> None:
+        """Start episodes in some of n simulations: forget what was seen there.
+
+        Args:
+            ids: the simulations.
+            seeds: a seed for each of them; all that is random in the brain follows from it.
+            n: number of simulations that `act` will be called for.
+        """
+
+    def act(self, observation: Observation) -> NDArray[np.float64]:
+        """Return the setpoints, shape (n, actions), in the order of the action features."""
+
+    def parameters(self) -> dict[str, Any]:
+        """Return everything that defines the brain, as plain values."""
+
+
+def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: str) -> NDArray[np.intp]:
+    """Return where features lie.
+
+    Args:
+        names: the features there are, in order.
+        wanted: the features to find.
+        who: name of the brain, for the message.
+        what: ``"observation"`` or ``"action"``, for the message.
+
+    Raises:
+        ConfigError: some are missing; the message names them.
+    """
+    index = {name: column for column, name in enumerate(names)}
+    missing = [name for name in wanted if name not in index]
+    if missing:
+        raise ConfigError(
+            f"The brain {who!r} needs the {what} feature(s) {', '.join(missing)}, which this robot does not have. "
+            f"It has: {', '.join(names[:8])}{', …' if len(names) > 8 else ''}."
+        )
+    return np.array([index[name] for name in wanted], np.intp)
+
+
+def find_scan(names: Sequence[str], who: str) -> tuple[slice, NDArray[np.float64]]:
+    """Return where the range finder's beams lie, and their directions.
+
+    Beams are named ``scan_000.pos`` and so on, in order: beam 0 straight ahead, counter-clockwise, evenly spaced.
+
+    Returns:
+        The columns, which are neighbours, and the beams' angles in the robot's frame [rad] in [-pi, pi), shape (beams,).
+
+    Raises:
+        ConfigError: there is no scan.
+    """
+    columns = [column for column, name in enumerate(names) if name.startswith("scan_") and name.endswith(".pos")]
+    if not columns or columns != list(range(columns[0], columns[0] + len(columns))):
+        raise ConfigError(
+            f"The brain {who!r} needs a range scan (scan_000.pos, scan_001.pos, …), which this robot does not have. "
+            "Choose a robot with a lidar, turtlebot3 for example."
+        )
+    angles = 2 * np.pi * np.arange(len(columns)) / len(columns)
+    return slice(columns[0], columns[-1] + 1), (angles + np.pi) % (2 * np.pi) - np.pi
