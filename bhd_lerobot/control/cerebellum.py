@@ -357,7 +357,10 @@ class Cerebellum:
 
     def _mode_reasons(self) -> NDArray[np.int8]:
         """Return why each mode would refuse a setpoint, shape (n,)."""
-        return _MODE_REASON[self.mode]
+        reasons = _MODE_REASON[self.mode]
+        # The word counts from the moment that it is set, the mode from the next tick.
+        reasons[self.estop_word != 0] = Reason.ESTOP
+        return reasons
 
     def _count_refusals(self, reasons: NDArray) -> None:
         if reasons.any():

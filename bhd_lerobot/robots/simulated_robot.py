@@ -1,0 +1,217 @@
+"""The lifecycle that all simulated robots share: LeRobot's `Robot` over a simulation of one."""
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from lerobot.robots.robot import Robot
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.arenas import make_arena
+from bhd_lerobot.control.messages import Mode, Reason
+from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.simulation import TurtleBot3Simulation
+
+
+class SimulatedRobot(Robot):
+    """A simulated robot on a lockstep clock: `send_action` applies an action and advances time by one frame.
+
+    Two things differ from a robot on a table. Time stands still between two calls of `send_action`, so that a slow brain
+    is not a late one. And `send_action` returns at the end of the frame, with what the cerebellum commanded by then.
+    """
+
+    config: TurtleBot3Config
+
+    def __init__(self, config: TurtleBot3Config) -> None:
+        super().__init__(config)
+        self.config = config
+        self._simulation: TurtleBot3Simulation | None = None
+        # lerobot-record asks for its length, with or without cameras.
+        self.cameras: dict[str, Any] = {name: None for name in self.camera_shapes}
+
+    @abstractmethod
+    def make_simulation(self) -> TurtleBot3Simulation:
+        """Return a new simulation of one robot."""
+
+    @property
+    @abstractmethod
+    def observation_names(self) -> tuple[str, ...]:
+        """Names of the observation's floats, in order."""
+
+    @property
+    @abstractmethod
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the action's floats, in order."""
+
+    @property
+    @abstractmethod
+    def camera_shapes(self) -> dict[str, tuple[int, int, int]]:
+        """Image shapes (height, width, 3) by camera name."""
+
+    @cached_property
+    def observation_features(self) -> dict[str, Any]:
+        """LeRobot's description of an observation: floats first, then images."""
+        return {**dict.fromkeys(self.observation_names, float), **self.camera_shapes}
+
+    @cached_property
+    def action_features(self) -> dict[str, Any]:
+        """LeRobot's description of an action."""
+        return dict.fromkeys(self.action_names, float)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the simulation runs."""
+        return self._simulation is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        """A simulated robot needs no calibration."""
+        return True
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Start the simulation, at the configured arena's start.
+
+        Raises:
+            DeviceAlreadyConnectedError: it runs already.
+        """
+        if self.is_connected:
+            raise DeviceAlreadyConnectedError(f"{self} is already connected.")
+        self._simulation = self.make_simulation()
+        self.restart()
+        if self.camera_shapes:
+            try:
+                for name in self.camera_shapes:
+                    self._simulation.render(0, name)
+            except BaseException:
+                self._simulation = None
+                raise
+
+    def restart(self) -> None:
+        """Put the robot back to the start of its arena, at rest."""
+        arena = make_arena(self.config.arena, self.config.seed)
+        self.simulation.reset(np.zeros(1, np.intp), [arena], [self.config.seed])
+
+    def disconnect(self) -> None:
+        """Stop the simulation. May be called at any time, also twice."""
+        if self._simulation is not None:
+            self._simulation.close()
+            self._simulation = None
+
+    def calibrate(self) -> None:
+        """Nothing to calibrate."""
+
+    def configure(self) -> None:
+        """Nothing to configure beyond the configuration."""
+
+    @property
+    def simulation(self) -> TurtleBot3Simulation:
+        """The simulation behind the robot.
+
+        Raises:
+            DeviceNotConnectedError: it does not run.
+        """
+        if self._simulation is None:
+            raise DeviceNotConnectedError(f"{self} is not connected. Call connect() first.")
+        return self._simulation
+
+    def get_observation(self) -> dict[str, Any]:
+        """Return what the robot sees now: floats in SI units, images as (height, width, 3) uint8 RGB.
+
+        Raises:
+            DeviceNotConnectedError: the robot is not connected.
+        """
+        simulation = self.simulation
+        observation: dict[str, Any] = dict(
+            zip(self.observation_names, simulation.observe().state[0].tolist(), strict=True)
+        )
+        for name in self.camera_shapes:
+            observation[name] = simulation.render(0, name)
+        return observation
+
+    def send_action(self, action: Mapping[str, Any]) -> dict[str, float]:
+        """Apply an action for one frame of simulated time.
+
+        Args:
+            action: a number for each action feature. The order of the keys is free, because they are names.
+
+        Returns:
+            The command at the end of the frame: the action after the limits of velocity, acceleration and effort.
+
+        Raises:
+            DeviceNotConnectedError: the robot is not connected.
+            ActionError: a key is missing or unknown, or a value is not a finite number. Nothing happened.
+            CommandRefusedError: the robot does not take commands in its present mode, after an emergency stop for
+                example. Time went on by a frame all the same: a robot that is stopping goes on stopping.
+        """
+        simulation = self.simulation
+        values = self.action_array(action)
+        report = simulation.act(values)
+        reason = Reason(int(report.sent.reasons[0]))
+        if reason != Reason.ACCEPTED:
+            mode = Mode(int(report.mode[0])).name
+            raise CommandRefusedError(f"The {self.name} refused the action: {reason.explanation} (mode {mode}).")
+        return dict(zip(self.action_names, report.applied[0].tolist(), strict=True))
+
+    def action_array(self, action: Mapping[str, Any]) -> NDArray[np.float64]:
+        """Return an action as an array of shape (1, actions), checked.
+
+        Raises:
+            ActionError: a key is missing or unknown, or a value is not a finite number.
+        """
+        if not isinstance(action, Mapping):
+            raise ActionError(
+                f"An action is a dict of feature names to numbers, got {type(action).__name__}. "
+                f"Valid keys: {', '.join(self.action_names)}."
+            )
+        unknown = [key for key in action if key not in self.action_features]
+        if unknown:
+            raise ActionError(unknown_name("action key", unknown[0], self.action_names))
+        missing = [key for key in self.action_names if key not in action]
+        if missing:
+            raise ActionError(
+                f"The action lacks {', '.join(map(repr, missing))}. It needs a number for each of "
+                f"{', '.join(self.action_names)}; to leave a dimension alone, send 0."
+            )
+        values = np.empty((1, len(self.action_names)))
+        for column, name in enumerate(self.action_names):
+            value = action[name]
+            try:
+                values[0, column] = float(value)
+            except (TypeError, ValueError):
+                raise ActionError(f"Action {name!r} is {value!r}, which is not a number.") from None
+            if not math.isfinite(values[0, column]):
+                raise ActionError(f"Action {name!r} is {value!r}; it must be finite.")
+        return values
+
+    def estop(self) -> None:
+        """Latch the emergency stop: from the next tick the robot brakes as hard as it can, and refuses commands.
+
+        This is a software stop, not a certified safety function.
+        """
+        self.simulation.bridge.estop()
+
+    def reset(self) -> None:
+        """Clear an emergency stop, a fault or a deactivation. The robot moves again only after `activate`.
+
+        Raises:
+            CommandRefusedError: there is nothing to clear.
+        """
+        self._request(self.simulation.bridge.reset().reasons[0])
+
+    def activate(self) -> None:
+        """Accept actions again after `reset`.
+
+        Raises:
+            CommandRefusedError: the robot is active already, or a stop is still latched.
+        """
+        self._request(self.simulation.bridge.activate().reasons[0])
+
+    def _request(self, reason: int) -> None:
+        if reason != Reason.ACCEPTED:
+            mode = Mode(int(self.simulation.cerebellum.mode[0])).name
+            raise CommandRefusedError(f"{Reason(int(reason)).explanation} (mode {mode})")
