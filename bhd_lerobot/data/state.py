@@ -132,7 +132,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 def _read_tasks(path: Path) -> list[str]:
     try:
-        table = pq.read_table(path, use_threads=False)
+        table = pq.ParquetFile(path).read(use_threads=False)
         # LeRobot keeps the sentence in the index of a pandas table; the column name differs between its versions.
         name = next(n for n in table.column_names if n != "task_index")
         pairs = sorted(zip(table["task_index"].to_pylist(), table[name].to_pylist(), strict=True))

@@ -1,0 +1,205 @@
+"""Frames per second of recording: LeRobot's own writer, this package, and pyarrow alone, on the same frames.
+
+Run with ``python benchmarks/recording.py``. All of them record the same episodes in one process, in turns; the table
+shows medians. Both datasets are read back through stock LeRobot and compared value by value. With ``--video`` an
+episode has a camera as well, and LeRobot encodes while it records, with the same codec and options.
+"""
+
+import argparse
+import contextlib
+import gc
+import io
+import logging
+import shutil
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.data.schema import Schema
+from bhd_lerobot.data.video import VideoSettings
+
+FPS = 10
+STATE = 362
+CAMERA = "observation.images.front"
+METADATA = {"seed": 1, "outcome": "success", "score": 0.5, "brain": "avoidance"}
+
+
+def features(camera: tuple[int, int] | None) -> dict[str, dict[str, Any]]:
+    """Return the features of a recording of a TurtleBot3 with all its beams."""
+
+    def feature(dtype: str, size: int = 1) -> dict[str, Any]:
+        return {"dtype": dtype, "shape": (size,), "names": None}
+
+    result = {"observation.state": feature("float32", STATE), "action": feature("float32", 2)}
+    result |= {f"control.{name}": feature("float32") for name in ("time", "age", "lateness", "overruns", "limited")}
+    result |= {"control.watchdog": feature("bool"), "control.mode": feature("int64"), "event": feature("int64")}
+    result |= {"next.reward": feature("float32"), "next.success": feature("bool"), "next.done": feature("bool")}
+    if camera:
+        names = ["height", "width", "channels"]
+        result[CAMERA] = {"dtype": "video", "shape": (*camera, 3), "names": names}
+    return result
+
+
+def episodes(count: int, length: int) -> list[dict[str, np.ndarray]]:
+    """Return the columns of seeded episodes: a drifting lidar scan with noise, and a few flags."""
+    rng = np.random.default_rng(0)
+    result = []
+    for _ in range(count):
+        scan = 1.5 + np.cumsum(rng.normal(0, 0.02, (length, STATE)), axis=0) + rng.normal(0, 0.01, (length, STATE))
+        columns = {"observation.state": np.clip(scan, 0.12, 3.5).astype(np.float32)}
+        columns["action"] = rng.uniform(-0.2, 0.2, (length, 2)).astype(np.float32)
+        for key, feature in features(None).items():
+            if key not in columns:
+                values = rng.normal(size=length) if feature["dtype"] == "float32" else rng.random(length) < 0.1
+                columns[key] = values.astype(feature["dtype"])
+        result.append(columns)
+    return result
+
+
+def images(length: int, camera: tuple[int, int]) -> np.ndarray:
+    """Return moving colour gradients, shape (T, H, W, 3)."""
+    y, x = np.mgrid[: camera[0], : camera[1]]
+    frames = [np.stack([x + 3 * t, y + 2 * t, x + y + t], axis=-1) % 256 for t in range(length)]
+    return np.array(frames, dtype=np.uint8)
+
+
+def record_with_lerobot(root: Path, data: list, pictures: np.ndarray | None, settings: VideoSettings) -> None:
+    """Record with LeRobot's own writer."""
+    from lerobot.configs import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    options: dict[str, Any] = {}
+    camera = None
+    if pictures is not None:
+        camera = pictures.shape[1:3]
+        recorded = settings.recorded()
+        encoder = RGBEncoderConfig(**{**recorded, "extra_options": {**recorded["extra_options"], "bf": 0}})
+        options = {"rgb_encoder": encoder, "streaming_encoding": True, "encoder_queue_maxsize": 10_000}
+        options["encoder_threads"] = settings.encoder_threads
+    dataset = LeRobotDataset.create(
+        "bench/lerobot", FPS, features(camera), root=root, robot_type="bench", use_videos=True, **options
+    )
+    for columns in data:
+        for i in range(len(columns["action"])):
+            frame = {key: values[i] if values.ndim == 2 else values[i : i + 1] for key, values in columns.items()}
+            if pictures is not None:
+                frame[CAMERA] = pictures[i]
+            dataset.add_frame({**frame, "task": "avoid"})
+        dataset.save_episode()
+    dataset.finalize()
+
+
+def record_with_ours(
+    root: Path, data: list, pictures: np.ndarray | None, settings: VideoSettings, by_frame: bool
+) -> None:
+    """Record with this package, by frames or by columns."""
+    camera = pictures.shape[1:3] if pictures is not None else None
+    with DatasetRecorder.create(
+        "bench/ours", FPS, features(camera), robot_type="bench", root=root, recording={}, video=settings
+    ) as recorder:
+        for columns in data:
+            episode = recorder.begin_episode()
+            if not by_frame:
+                episode.set_columns(columns)
+            for i in range(len(columns["action"])):
+                if by_frame:
+                    episode.add_frame({key: values[i] for key, values in columns.items()})
+                if pictures is not None:
+                    episode.add_image(CAMERA, pictures[i])
+            recorder.save(episode, task="avoid", metadata=METADATA)
+
+
+def write_with_pyarrow(root: Path, data: list, options: dict[str, Any]) -> None:
+    """Write the same columns with one ``pq.write_table`` per episode, and nothing else."""
+    schema = Schema(features(None))
+    root.mkdir()
+    start = 0
+    for index, columns in enumerate(data):
+        frames = np.arange(len(columns["action"]))
+        full = {**columns, "timestamp": (frames / FPS).astype(np.float32), "frame_index": frames}
+        full |= {"episode_index": np.full(len(frames), index), "index": frames + start, "task_index": frames * 0}
+        pq.write_table(schema.table(full), root / f"{index}.parquet", **options)
+        start += len(frames)
+
+
+def check(root: Path, data: list, pictures: np.ndarray | None) -> None:
+    """Read a dataset with stock LeRobot and compare every value with what was recorded."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("bench/check", root=root, video_backend="pyav")
+    table = dataset.hf_dataset.with_format("arrow")[:]
+    assert len(dataset) == sum(len(columns["action"]) for columns in data)
+    for key in data[0]:
+        column = table[key].combine_chunks()
+        values = column.flatten() if pa.types.is_fixed_size_list(column.type) else column
+        wanted = np.concatenate([columns[key] for columns in data])
+        assert np.array_equal(values.to_numpy(zero_copy_only=False).reshape(wanted.shape), wanted), key
+    assert dataset[0]["observation.state"].numpy().tobytes() == data[0]["observation.state"][0].tobytes()
+    assert set(dataset.meta.stats["observation.state"]) >= {"min", "max", "mean", "std", "count", "q01", "q99"}
+    if pictures is not None:
+        for i in (0, len(dataset) - 1):
+            decoded = dataset[i][CAMERA].permute(1, 2, 0).numpy() * 255
+            difference = np.abs(decoded - pictures[i % len(pictures)]).mean()
+            assert difference < 12, f"frame {i} differs by {difference:.1f} grey levels"
+
+
+def main() -> None:
+    """Run all of them in turns and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--episodes", type=int, default=20)
+    parser.add_argument("--length", type=int, default=300)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--video", action="store_true", help="add a 320 x 240 camera")
+    arguments = parser.parse_args()
+    data = episodes(arguments.episodes, arguments.length)
+    pictures = images(arguments.length, (240, 320)) if arguments.video else None
+    settings = VideoSettings()
+    logging.disable(logging.WARNING)
+
+    plain = {"use_dictionary": False}
+    contestants: dict[str, Callable[[Path], None]] = {
+        "LeRobot add_frame + save_episode + finalize": lambda root: record_with_lerobot(
+            root, data, pictures, settings
+        ),
+        "ours, set_columns": lambda root: record_with_ours(root, data, pictures, settings, by_frame=False),
+        "ours, add_frame": lambda root: record_with_ours(root, data, pictures, settings, by_frame=True),
+    }
+    if pictures is None:
+        contestants["pyarrow, write_table as it comes"] = lambda root: write_with_pyarrow(root, data, {})
+        contestants["pyarrow, write_table without dictionaries"] = lambda root: write_with_pyarrow(root, data, plain)
+    seconds: dict[str, list[float]] = {name: [] for name in contestants}
+    for repeat in range(arguments.repeats + 1):
+        for name, contestant in contestants.items():
+            folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
+            try:
+                gc.collect()
+                # LeRobot shows a progress bar per episode; into memory, so that the terminal costs it no time.
+                with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
+                    begin = time.perf_counter()
+                    contestant(folder / "dataset")
+                    seconds[name].append(time.perf_counter() - begin)
+                    if repeat == 0 and "pyarrow" not in name:
+                        check(folder / "dataset", data, pictures)
+            finally:
+                shutil.rmtree(folder)
+    frames = arguments.episodes * arguments.length
+    rates = {name: frames / statistics.median(times[1:]) for name, times in seconds.items()}  # the first warms up
+    reference, alone = next(iter(rates.values())), rates.get("pyarrow, write_table without dictionaries")
+    shape = f"{arguments.episodes} episodes of {arguments.length} frames, {STATE} floats"
+    print(f"{shape}{', camera 320x240' if pictures is not None else ''}; median of {arguments.repeats}")
+    print(f"{'':44} {'frames/s':>10} {'ms/episode':>11} {'x LeRobot':>10} {'x pyarrow':>10}")
+    for name, rate in rates.items():
+        share = f"{rate / alone:10.2f}" if alone else f"{'-':>10}"
+        print(f"{name:44} {rate:10.0f} {1000 * arguments.length / rate:11.2f} {rate / reference:10.1f} {share}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""Every key of a dataset that this package records, in one place.
+
+The names decide what LeRobot does with a column: `observation*` become a policy's inputs and `action*` its outputs.
+Everything else is carried along and neither learned from nor predicted, which is why the command that was really
+applied is called `control.applied_action`.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+OBSERVATION_STATE = "observation.state"
+OBSERVATION_IMAGES = "observation.images"
+ENVIRONMENT_STATE = "observation.environment_state"
+ACTION = "action"
+
+APPLIED_ACTION = "control.applied_action"
+TIME = "control.time"
+AGE = "control.age"
+COMMAND_AGE = "control.command_age"
+LATENESS = "control.lateness"
+OVERRUNS = "control.overruns"
+LIMITS = "control.limits"
+WATCHDOG = "control.watchdog"
+MODE = "control.mode"
+
+REWARD = "next.reward"
+SUCCESS = "next.success"
+DONE = "next.done"
+EVENT = "event"
+
+PHYSICS_STATE = "simulation.state"
+
+# dtype and meaning of the columns that hold one number a frame
+SCALARS: dict[str, tuple[str, str]] = {
+    TIME: ("float64", "when the observation was measured, since the episode's start [s]"),
+    AGE: ("float32", "age of the oldest reading in the observation when the brain got it [s]"),
+    COMMAND_AGE: ("float32", "age of the command in force at the end of the frame [s]"),
+    LATENESS: ("float32", "largest lateness of a control tick in the frame [s]"),
+    OVERRUNS: ("int64", "control ticks of the frame that ended after the next was due"),
+    LIMITS: ("int64", "what the safety filter changed: 1 not finite, 2 velocity, 4 acceleration, 8 effort; sum"),
+    WATCHDOG: ("int64", "what the watchdogs noticed: 1 command too old; sum"),
+    MODE: (
+        "int64",
+        "cerebellum's mode at the end of the frame: 0 unconfigured, 1 inactive, 2 hold, 3 tracking, 4 stopping, "
+        "5 safe off, 6 emergency stop, 7 fault",
+    ),
+    REWARD: ("float32", "the task's reward for the frame"),
+    SUCCESS: ("bool", "the episode ended in success with this frame"),
+    DONE: ("bool", "the episode ended with this frame"),
+    EVENT: (
+        "int64",
+        "0 nothing, 1 success, 2 collision, 3 stuck, 4 time-out, 5 intervention, 6 emergency stop",
+    ),
+}
+
+
+def dataset_features(
+    observation_names: Sequence[str],
+    action_names: Sequence[str],
+    images: Mapping[str, tuple[int, int, int]],
+    physics_names: Sequence[str],
+    environment_names: Sequence[str] = (),
+) -> dict[str, dict[str, Any]]:
+    """Return the features of a dataset in LeRobot's form.
+
+    Args:
+        observation_names: the robot's floats, in order.
+        action_names: the action's floats, in order.
+        images: image shapes (height, width, 3) by camera name.
+        physics_names: the simulator's generalised positions and velocities, in order.
+        environment_names: what the task tells the brain, in order; no such column if there is nothing.
+    """
+    features: dict[str, dict[str, Any]] = {OBSERVATION_STATE: _vector("float32", observation_names)}
+    if environment_names:
+        features[ENVIRONMENT_STATE] = _vector("float32", environment_names)
+    for name, shape in images.items():
+        features[f"{OBSERVATION_IMAGES}.{name}"] = {
+            "dtype": "video",
+            "shape": shape,
+            "names": ["height", "width", "channels"],
+        }
+    features[ACTION] = _vector("float32", action_names)
+    features[APPLIED_ACTION] = _vector("float32", action_names)
+    for key, (dtype, _) in SCALARS.items():
+        features[key] = {"dtype": dtype, "shape": (1,), "names": None}
+    features[PHYSICS_STATE] = _vector("float64", physics_names)
+    return features
+
+
+def _vector(dtype: str, names: Sequence[str]) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
