@@ -15,8 +15,8 @@ from scipy import ndimage
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.errors import ConfigError, unknown_name
 
-ROBOT_RADIUS = 0.115  # [m] the Burger around its wheel axis, as in bodies/turtlebot3.py
-CLEARANCE = 0.06  # [m] what must be free beside the robot for a place to count as reachable
+ROBOT_RADIUS = 0.124  # [m] the Burger around its wheel axis, as in bodies/turtlebot3.py
+CLEARANCE = 0.051  # [m] what must be free beside the robot for a place to count as reachable
 RESOLUTION = 0.05  # [m] of the grid that reachability is computed on
 START_CLEARANCE = 0.35  # [m] from the robot's centre to the nearest obstacle at the start
 WALL = 0.05  # [m] half the thickness of the outer walls
@@ -108,8 +108,8 @@ ARENAS = ("turtlebot3_world", "random", "empty")
 def turtlebot3_world() -> Arena:
     """Return the layout of ROBOTIS' `turtlebot3_world`.
 
-    Nine cylinders of radius 0.15 m on a 1.1 m grid, a hexagonal wall around them, start at (-2.0, -0.5) facing +x, as in
-    `turtlebot3_gazebo`. The wall is a mesh there; its size here is an estimate.
+    Nine cylinders of radius 0.15 m on a 1.1 m grid, a hexagonal wall around them, start at (-2.0, -0.5) facing +x, as
+    in `turtlebot3_gazebo`. The wall is a mesh there; its size here is an estimate.
     """
     shapes = [Shape("cylinder", 1.1 * i, 1.1 * j, 0.0, 0.15, 0.15) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     radius = 2.9  # of the corners; two of them on the x axis
@@ -199,19 +199,20 @@ def _corridor(rng: np.random.Generator, half_x: float, half_y: float) -> list[Sh
     """Two parallel walls."""
     x, y, length, width = rng.uniform((-half_x, -half_y, 0.5, 0.55), (half_x, half_y, 1.0, 0.85))
     yaw = float(rng.integers(2)) * math.pi / 2
-    return [_beside(x, y, yaw, 0.0, side * width / 2, length, 0.03) for side in (-1, 1)]
+    return [_beside((x, y, yaw), 0.0, side * width / 2, length, 0.03) for side in (-1, 1)]
 
 
 def _dead_end(rng: np.random.Generator, half_x: float, half_y: float) -> list[Shape]:
     """Two parallel walls, closed at one end."""
     x, y, length, width = rng.uniform((-half_x, -half_y, 0.35, 0.6), (half_x, half_y, 0.6, 1.0))
     yaw = float(rng.integers(4)) * math.pi / 2
-    walls = [_beside(x, y, yaw, 0.0, side * width / 2, length, 0.03) for side in (-1, 1)]
-    return [*walls, _beside(x, y, yaw, length, 0.0, 0.03, width / 2 + 0.03)]
+    walls = [_beside((x, y, yaw), 0.0, side * width / 2, length, 0.03) for side in (-1, 1)]
+    return [*walls, _beside((x, y, yaw), length, 0.0, 0.03, width / 2 + 0.03)]
 
 
-def _beside(x: float, y: float, yaw: float, ahead: float, left: float, size_x: float, size_y: float) -> Shape:
-    """Return a box at an offset in a frame at (x, y, yaw)."""
+def _beside(pose: tuple[float, float, float], ahead: float, left: float, size_x: float, size_y: float) -> Shape:
+    """Return a box at an offset in the frame at a pose (x, y, yaw)."""
+    x, y, yaw = pose
     c, s = math.cos(yaw), math.sin(yaw)
     return Shape("box", x + c * ahead - s * left, y + s * ahead + c * left, yaw, size_x, size_y)
 

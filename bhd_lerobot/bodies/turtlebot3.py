@@ -80,6 +80,6 @@ def turtlebot3_burger(
             site="lidar", beams=LIDAR_BEAMS, range_min=0.12, range_max=3.5, rate_hz=5, noise_std=lidar_noise_std
         ),
         cameras={"front": CameraSpec("front", camera_width, camera_height)},
-        radius=0.115,  # the rear corners of the hull, and the outer rims of the tyres at 0.095 m
+        radius=0.124,  # the rear corners of the hull; the outer rims of the tyres are at 0.095 m
         height=0.192,
     )

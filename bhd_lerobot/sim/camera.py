@@ -1,17 +1,19 @@
 """Offscreen images of simulations, without a display."""
 
 import os
+import sys
 import weakref
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import RenderingError, unknown_name
+from bhd_lerobot.sim.engine import mujoco
 from bhd_lerobot.sim.world import World
 
 _BACKENDS = ("egl", "osmesa")
+_CHOICES = (*_BACKENDS, "glfw")
 _REMEDY = (
     "Images need an offscreen OpenGL: install EGL (Debian and Ubuntu: 'apt-get install libegl1 libgl1', works with and "
     "without a GPU) or OSMesa ('apt-get install libosmesa6'), or turn the cameras off. To choose a backend yourself, "
@@ -22,32 +24,39 @@ _REMEDY = (
 def _make_context(width: int, height: int) -> Any:
     """Return an OpenGL context from the first backend that works.
 
-    MuJoCo chooses its backend once, when it is imported, from MUJOCO_GL, and takes one that needs a display if that is
-    not set. A user's choice is honoured; otherwise EGL and then OSMesa are tried.
+    A user's choice in MUJOCO_GL is honoured; otherwise EGL and then OSMesa are tried, which need no display.
     """
-    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if chosen and chosen not in _CHOICES:
+        raise RenderingError(f"{unknown_name('MUJOCO_GL backend', chosen, _CHOICES)} {_REMEDY}")
+    platform = os.environ.get("PYOPENGL_PLATFORM")
     failures = []
     for backend in (chosen,) if chosen else _BACKENDS:
         try:
             return _open(backend, width, height)
         except Exception as error:  # the GL bindings raise whatever they like: ImportError, AttributeError, GLError
             failures.append(f"{backend}: {type(error).__name__}: {error}")
+            _forget_backend(platform)
     raise RenderingError(f"No image can be rendered here. Tried {'; '.join(failures)}. {_REMEDY}")
 
 
 def _open(backend: str, width: int, height: int) -> Any:
     if backend == "egl":
-        # PyOpenGL binds to one platform when it is first imported.
-        os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
         from mujoco.egl import GLContext
     elif backend == "osmesa":
-        os.environ.setdefault("PYOPENGL_PLATFORM", "osmesa")
         from mujoco.osmesa import GLContext
-    elif backend == "glfw":
-        from mujoco.glfw import GLContext
     else:
-        raise RenderingError(unknown_name("MUJOCO_GL backend", backend, (*_BACKENDS, "glfw")))
+        from mujoco.glfw import GLContext
     return GLContext(width, height)
+
+
+def _forget_backend(platform: str | None) -> None:
+    """Undo what a backend that failed left behind: PyOpenGL binds to one platform when it is first imported."""
+    if platform is None:
+        os.environ.pop("PYOPENGL_PLATFORM", None)
+    for name in list(sys.modules):
+        if name.partition(".")[0] == "OpenGL" or name.startswith(("mujoco.egl", "mujoco.osmesa")):
+            del sys.modules[name]
 
 
 class Camera:
@@ -78,9 +87,14 @@ class Camera:
             self._scene.flags[flag] = False
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = [1, 1, 0, 0, 0, 0]  # obstacles and visuals; the hull is for contacts only
+        self._option.sitegroup[:] = 0
         self._view = mujoco.MjvCamera()
         self._rect = mujoco.MjrRect(0, 0, width, height)
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        try:
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150.value)
+        except mujoco.FatalError as error:  # GLFW without a display makes a context that is none
+            self._gl.free()
+            raise RenderingError(f"No image can be rendered here: {error}. {_REMEDY}") from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         # Not at interpreter exit: by then the display connection is gone, and the process frees everything anyway.
         self._free = weakref.finalize(self, _free, self._gl, self._context)

@@ -1,11 +1,10 @@
-"""The model that a world simulates: a body, a floor, light, and a pool of obstacles that every simulation places anew."""
+"""The model that a world simulates: a body, a floor, light, and a pool of obstacles that each simulation places."""
 
 import math
 
-import mujoco
-
 from bhd_lerobot.bodies.body import Body, Shape
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.sim.engine import mujoco
 
 # Obstacles that one simulation can have. All simulations of a batch share one model, so the number is fixed; a pool
 # geometry that a simulation does not use is parked far below the floor, where the broad phase drops it at once.

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
-from mujoco import batch as mujoco_batch
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body, Shape
 from bhd_lerobot.errors import SimulationError, unknown_name
+from bhd_lerobot.sim.engine import mujoco, mujoco_batch
 from bhd_lerobot.sim.scene import PARKED_Z, POOL_SIZE, build_model, shape_fields
 
 Ids = NDArray[np.intp] | Sequence[int] | None
@@ -28,10 +27,12 @@ class Snapshot:
     Attributes:
         state: MuJoCo's integration state, shape (k, nstate).
         fields: the per-simulation model fields, each of shape (k, ...).
+        constants: whether `World.update_constants` was in use: what derives from the fields is then computed again.
     """
 
     state: NDArray[np.float64]
     fields: dict[str, NDArray]
+    constants: bool = False
 
 
 class World:
@@ -78,6 +79,7 @@ class World:
             (self.model.geom("obstacle_000").id if pool_size else 0) + pool_size,
         )
         self._fields: dict[str, NDArray] = {}
+        self._constants = False
         if pool_size:
             for name in _POOL_FIELDS:
                 self.model_field(name)
@@ -140,10 +142,11 @@ class World:
     def snapshot(self, ids: Ids = None) -> Snapshot:
         """Return a copy of everything that decides how simulations go on."""
         ids = self._ids(ids)
-        return Snapshot(self._batch.state[ids].copy(), {k: v[ids].copy() for k, v in self._fields.items()})
+        fields = {name: values[ids].copy() for name, values in self._fields.items()}
+        return Snapshot(self._batch.state[ids].copy(), fields, self._constants)
 
     def restore(self, snapshot: Snapshot, ids: Ids = None) -> None:
-        """Continue from a snapshot, bit-exactly.
+        """Continue from a snapshot, bit-exactly. Sensors read what they read in the restored state.
 
         Args:
             snapshot: one row for each simulation restored, in their order.
@@ -158,7 +161,13 @@ class World:
             raise SimulationError(f"The snapshot's state has shape {snapshot.state.shape}; {expected} is needed.")
         for name, values in snapshot.fields.items():
             self.model_field(name)[ids] = values
-        self._batch.forward(ids)  # sensors first: the state rows are written last, so that they are exactly the saved
+        for name in self._fields.keys() - snapshot.fields.keys():  # fields that were the model's own at that time
+            self._fields[name][ids] = self._model_value(name)
+        if snapshot.constants or self._constants:
+            self.update_constants(ids)
+        self._batch.state[ids] = snapshot.state
+        self._batch.forward(ids)
+        # Computing the sensors moved the solver's warm start, which is part of the state.
         self._batch.state[ids] = snapshot.state
 
     @property
@@ -190,6 +199,10 @@ class World:
 
     def joint_slice(self, names: Sequence[str]) -> tuple[slice, slice]:
         """Return where the named one-dimensional joints lie in `qpos` and `qvel`; they must be neighbours, in order."""
+        valid = [self.model.joint(i).name for i in range(self.model.njnt)]
+        for name in names:
+            if name not in valid:
+                raise SimulationError(unknown_name("joint", name, valid))
         joints = [self.model.joint(name) for name in names]
         q, v = int(joints[0].qposadr[0]), int(joints[0].dofadr[0])
         for offset, joint in enumerate(joints):
@@ -229,11 +242,15 @@ class World:
         return np.where(distance < 0, np.inf, distance), ids
 
     def _site_in_root(self, site: str) -> NDArray[np.float64]:
-        offset = self.model.site(site).pos.copy()
-        body = int(self.model.site(site).bodyid[0])
+        number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, site)
+        if number < 0:
+            names = [self.model.site(i).name for i in range(self.model.nsite)]
+            raise SimulationError(unknown_name("site", site, names))
+        offset = self.model.site_pos[number].copy()
+        body = int(self.model.site_bodyid[number])
         while body != self._root:
-            if self.model.body_jntnum[body] or body == 0:
-                raise SimulationError(f"Site {site!r} is not fixed to body {self.body.root!r}.")
+            if self.model.body_jntnum[body] or body == 0 or self.model.body_quat[body, 0] != 1.0:
+                raise SimulationError(f"Site {site!r} is not fixed to body {self.body.root!r} without a rotation.")
             offset += self.model.body_pos[body]
             body = int(self.model.body_parentid[body])
         return offset
@@ -253,7 +270,7 @@ class World:
         ids = self._ids(ids)
         if len(shapes) != len(ids):
             raise SimulationError(f"{len(shapes)} scenes were given for {len(ids)} simulations.")
-        kind, size, pos, quat, radius = (self._fields[name] for name in _POOL_FIELDS)
+        kind, size, pos, quat, radius = (self.model_field(name) for name in _POOL_FIELDS)
         first = self._pool.start
         for sim, scene in zip(ids, shapes, strict=True):
             if len(scene) > self.pool_size:
@@ -286,6 +303,7 @@ class World:
 
     def update_constants(self, ids: Ids = None) -> None:
         """Recompute what MuJoCo derives from the model fields."""
+        self._constants = True
         self._batch.set_const(None if ids is None else self._ids(ids))
 
     def copy_model(self, sim: int) -> mujoco.MjModel:
@@ -302,6 +320,11 @@ class World:
         """
         self._batch.get_model(sim, model)
         self._batch.get_data(sim, data)
+
+    def _model_value(self, name: str) -> NDArray:
+        """Return the model's own value of a field, which simulations have until they get another."""
+        owner = self.model.opt if name.startswith("opt.") else self.model
+        return np.asarray(getattr(owner, name.removeprefix("opt.")))
 
     def _ids(self, ids: Ids) -> NDArray[np.intp]:
         return self._all if ids is None else np.asarray(ids, dtype=np.intp)
