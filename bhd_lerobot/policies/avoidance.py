@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, find_columns, find_scan
+from bhd_lerobot.policies.config_brain import BrainConfig
 
 
+@BrainConfig.register_subclass("avoidance")
 @dataclass
-class AvoidanceConfig:
+class AvoidanceConfig(BrainConfig):
     """Parameters of the avoidance rule.
 
     Attributes:

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import ARENAS, Arena, make_arena
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import Event, Outcome, Truth
 
 
+@TaskConfig.register_subclass("avoid")
 @dataclass
-class AvoidConfig:
+class AvoidConfig(TaskConfig):
     """What the avoid task asks for.
 
     Attributes:

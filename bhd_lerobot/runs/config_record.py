@@ -1,0 +1,107 @@
+"""Configuration of `bhd-record`."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.robots.config import RobotConfig
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.runs import registry  # noqa: F401  registers the brains and tasks
+from bhd_lerobot.tasks.config_task import TaskConfig
+from bhd_lerobot.tasks.task import SPLITS
+
+
+@dataclass
+class DatasetConfig:
+    """What is recorded and where. The names are those of `lerobot-record`.
+
+    Attributes:
+        repo_id: name of the dataset on the Hub, `user/name`.
+        root: folder of the dataset; LeRobot's default place if nothing.
+        fps: frames a second [Hz].
+        num_episodes: number of episodes that the dataset holds in the end.
+        episode_time_s: longest duration of an episode [s]; the task's if nothing.
+        push_to_hub: upload the dataset when it is complete.
+        private: whether the uploaded dataset is private.
+        tags: tags of the uploaded dataset.
+    """
+
+    repo_id: str
+    root: str | None = None
+    fps: int = 10
+    num_episodes: int = 50
+    episode_time_s: float | None = None
+    push_to_hub: bool = False
+    private: bool = False
+    tags: list[str] = field(default_factory=list)
+
+
+@dataclass
+class RecordConfig:
+    """Record episodes of a simulated robot, driven by a brain, into a LeRobotDataset.
+
+    Attributes:
+        robot: the robot; its `fps` is the dataset's.
+        dataset: what is recorded and where.
+        brain: what drives the robot.
+        task: what it is to achieve, and where.
+        seed: every episode's seed follows from this and its number.
+        split: `train` or `held_out`: which of two sets of seeds, disjoint by construction.
+        n_envs: simulations that run side by side; changes the speed and nothing else.
+        threads: threads that step the physics; all processors if nothing.
+        resume: continue the dataset at `dataset.root`, or start it if there is none.
+        output_dir: run folder, for the resolved configuration and pictures; a new one below `outputs/record` if nothing.
+        preview_video: make an MP4 of the first episode; if nothing, where images can be rendered.
+    """
+
+    robot: RobotConfig
+    dataset: DatasetConfig
+    brain: BrainConfig
+    task: TaskConfig
+    seed: int = 0
+    split: str = "train"
+    n_envs: int = 1
+    threads: int | None = None
+    resume: bool = False
+    output_dir: str | None = None
+    preview_video: bool | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        if self.robot.type not in SIMULATED:
+            raise ConfigError(
+                f"robot.type is {self.robot.type!r}; bhd-record drives simulated robots: {', '.join(SIMULATED)}. "
+                "Record another robot with lerobot-record."
+            )
+        for name, value in (
+            ("dataset.num_episodes", self.dataset.num_episodes),
+            ("n_envs", self.n_envs),
+            ("threads", 1 if self.threads is None else self.threads),
+        ):
+            if value < 1:
+                raise ConfigError(f"{name} is {value}; it must be at least 1.")
+        if self.seed < 0:
+            raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
+        if self.split not in SPLITS:
+            raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
+        robot: Any = self.robot
+        if robot.fps not in (self.dataset.fps, type(robot).fps):
+            raise ConfigError(
+                f"robot.fps is {robot.fps} and dataset.fps is {self.dataset.fps}; leave robot.fps out, "
+                "the robot acts at the dataset's rate."
+            )
+        robot.fps = self.dataset.fps
+        _ = robot.rates
+        if self.dataset.episode_time_s is not None:
+            if not 0 < self.dataset.episode_time_s < float("inf"):
+                raise ConfigError(f"dataset.episode_time_s is {self.dataset.episode_time_s}; it must be positive.")
+            task: Any = self.task
+            task.duration_s = self.dataset.episode_time_s
+
+
+SIMULATED = ("turtlebot3",)

@@ -1,0 +1,204 @@
+"""From a YAML file and command-line overrides to a checked configuration.
+
+LeRobot's own parser stops at the first unknown key with a list of every option there is. Here the message names the key,
+the nearest one that exists, and the valid ones on that level. Both read the same files: `--config_path=FILE` and
+`--a.b=value`, with `type` choosing among registered classes.
+"""
+
+import dataclasses
+import sys
+import types
+import typing
+from collections.abc import Callable, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any, TypeVar
+
+import draccus
+import yaml
+
+from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
+
+T = TypeVar("T")
+
+CONFIG_PATH = "config_path"
+
+
+def parse(config_class: type[T], arguments: Sequence[str]) -> T:
+    """Return the configuration that a command line asks for.
+
+    Args:
+        config_class: a dataclass.
+        arguments: ``--config_path=FILE`` and overrides ``--a.b=value`` or ``--a.b value``; values are YAML.
+
+    Raises:
+        ConfigError: an unknown key, a value of the wrong type, or a file that cannot be read.
+    """
+    overrides = _overrides(arguments)
+    path = overrides.pop(CONFIG_PATH, None)
+    values: dict[str, Any] = _read(Path(str(path))) if path is not None else {}
+    for key, value in overrides.items():
+        _set(values, key.split("."), value, key)
+    _check_keys(config_class, values, "")
+    try:
+        return draccus.decode(config_class, values)
+    except ConfigError:
+        raise
+    except Exception as error:  # draccus raises DecodingError, ValueError, TypeError and what our checks raise in it
+        own = _own_error(error)
+        raise ConfigError(str(own) if own else f"The configuration cannot be used: {error}") from error
+
+
+def encode(config: Any) -> dict[str, Any]:
+    """Return a configuration as plain values, with every default filled in: what `parse` would read back."""
+    return draccus.encode(config)
+
+
+def run(main: Callable[[Any], int | None], config_class: type, arguments: Sequence[str] | None = None) -> int:
+    """Parse a command line and run a program on it; return its exit status.
+
+    An error of this package is printed as a sentence, without a traceback, and gives status 2.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if any(a in ("-h", "--help") for a in arguments):
+        print(describe(config_class))
+        return 0
+    try:
+        return main(parse(config_class, arguments)) or 0
+    except BhdError as error:
+        print(f"error: {error}", file=sys.stderr)
+        for note in getattr(error, "__notes__", ()):
+            print(f"  {note}", file=sys.stderr)
+        return 2
+
+
+def describe(config_class: type, prefix: str = "") -> str:
+    """Return the options of a configuration class, a line each, with their types and defaults."""
+    lines = [] if prefix else [(config_class.__doc__ or "").strip(), "", "Options (also in a file: --config_path=FILE):"]
+    for name, kind, default in _fields(config_class):
+        key = f"{prefix}{name}"
+        if _choices(kind):
+            lines.append(f"  --{key}.type  {{{','.join(sorted(_choices(kind)))}}}")
+            for choice, subclass in sorted(_choices(kind).items()):
+                lines += [f"    {choice}:", *("  " + line for line in describe(subclass, f"{key}.").splitlines())]
+        elif dataclasses.is_dataclass(kind):
+            lines.append(describe(typing.cast(type, kind), f"{key}."))
+        else:
+            shown = "required" if default is dataclasses.MISSING else f"default {default!r}"
+            lines.append(f"  --{key}  {getattr(kind, '__name__', str(kind))}, {shown}")
+    return "\n".join(line for line in lines)
+
+
+def _overrides(arguments: Sequence[str]) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    rest = list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        if not argument.startswith("--"):
+            raise ConfigError(f"Unexpected argument {argument!r}; options are written --key=value.")
+        key, sign, text = argument[2:].partition("=")
+        if not sign:
+            if not rest or rest[0].startswith("--"):
+                raise ConfigError(f"Option --{key} has no value; write --{key}=value.")
+            text = rest.pop(0)
+        if key in result:
+            raise ConfigError(f"Option --{key} was given twice.")
+        try:
+            result[key] = text if key == CONFIG_PATH else yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"The value of --{key}, {text!r}, cannot be read: {error}") from error
+    return result
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"The configuration {str(path)!r} cannot be read: {error.strerror}.") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not a YAML file: {error}") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path} must hold keys and values at its top level, found {type(values).__name__}.")
+    return values
+
+
+def _set(values: dict[str, Any], keys: list[str], value: Any, full: str) -> None:
+    for key in keys[:-1]:
+        values = values.setdefault(key, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"Option --{full} sets a key of {key!r}, which is a plain value.")
+    values[keys[-1]] = value
+
+
+def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None:
+    fields = {name: kind for name, kind, _ in _fields(config_class)}
+    for key, value in values.items():
+        if key not in fields:
+            raise ConfigError(unknown_name("option", f"{prefix}{key}", [f"{prefix}{name}" for name in fields]))
+        kind = fields[key]
+        choices = _choices(kind)
+        if choices and isinstance(value, dict):
+            chosen = value.get("type")
+            if chosen is None:
+                raise ConfigError(f"{prefix}{key}.type is missing. Valid: {', '.join(sorted(choices))}.")
+            if chosen not in choices:
+                raise ConfigError(unknown_name(f"{prefix}{key}.type", chosen, choices))
+            _check_keys(choices[chosen], {k: v for k, v in value.items() if k != "type"}, f"{prefix}{key}.")
+        elif dataclasses.is_dataclass(kind) and isinstance(value, dict):
+            _check_keys(typing.cast(type, kind), value, f"{prefix}{key}.")
+        elif dataclasses.is_dataclass(kind) or choices:
+            raise ConfigError(f"{prefix}{key} is {value!r}; it has keys of its own, such as {prefix}{key}.type.")
+        else:
+            _check_value(f"{prefix}{key}", value, kind)
+    for name, kind, default in _fields(config_class):
+        if default is dataclasses.MISSING and name not in values:
+            choice = f".type, one of {', '.join(sorted(_choices(kind)))}" if _choices(kind) else ""
+            raise ConfigError(f"The option {prefix}{name} is required; set --{prefix}{name}{choice}.")
+
+
+def _check_value(key: str, value: Any, kind: Any) -> None:
+    """Refuse a value of another type. Converting silently would turn fps: 10.5 into 10."""
+    allowed = typing.get_args(kind) if typing.get_origin(kind) in (typing.Union, types.UnionType) else (kind,)
+    for one in allowed:
+        if one is type(None) and value is None:
+            return
+        if one is float and isinstance(value, int | float) and not isinstance(value, bool):
+            return
+        if one is int and isinstance(value, int) and not isinstance(value, bool):
+            return
+        if one in (str, Path) and isinstance(value, str):
+            return
+        if one is bool and isinstance(value, bool):
+            return
+        if not isinstance(one, type) or issubclass(one, Enum) or one not in (float, int, str, Path, bool, type(None)):
+            return
+    names = " or ".join("nothing" if one is type(None) else one.__name__ for one in allowed)
+    raise ConfigError(f"{key} is {value!r}; it must be {names}.")
+
+
+def _fields(config_class: type) -> list[tuple[str, Any, Any]]:
+    """Return name, type and default of each field; the default is MISSING where there is none."""
+    hints = typing.get_type_hints(config_class)
+    result = []
+    for field in dataclasses.fields(config_class):
+        default = field.default
+        if default is dataclasses.MISSING and field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        result.append((field.name, hints[field.name], default))
+    return result
+
+
+def _choices(kind: Any) -> dict[str, type]:
+    """Return the registered classes of a choice type, or nothing if it is none."""
+    if isinstance(kind, type) and issubclass(kind, draccus.ChoiceRegistry):
+        return kind.get_known_choices()
+    return {}
+
+
+def _own_error(error: BaseException | None) -> BhdError | None:
+    while error is not None:
+        if isinstance(error, BhdError):
+            return error
+        error = error.__cause__ or error.__context__
+    return None
+

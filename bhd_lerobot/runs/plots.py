@@ -1,0 +1,137 @@
+"""Pictures of a run: trajectories from above, divergence over time."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.arenas import Arena
+
+PANELS = 100  # panels on one page
+
+_FREE, _WALL, _GOOD, _BAD = "#f4f1ea", "#8a8478", "#1b7f4d", "#c0392b"
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One episode, seen from above.
+
+    Attributes:
+        title: what stands above the panel.
+        arena: the obstacles.
+        xy: positions in the world frame [m], shape (frames, 2).
+        success: whether the episode was one.
+    """
+
+    title: str
+    arena: Arena
+    xy: NDArray[np.float64]
+    success: bool
+
+
+def draw_trajectories(trajectories: Sequence[Trajectory], path: Path, heading: str) -> list[Path]:
+    """Draw every trajectory in a panel of its own; return the files, one for each page of `PANELS` panels."""
+    pages = []
+    count = max(1, math.ceil(len(trajectories) / PANELS))
+    for page in range(count):
+        chosen = trajectories[page * PANELS : (page + 1) * PANELS]
+        columns = min(len(chosen), max(1, math.ceil(math.sqrt(len(chosen) * 1.4))))
+        rows = max(1, math.ceil(len(chosen) / max(columns, 1)))
+        size = 2.1 if len(chosen) > 4 else 4.0
+        # Figure without pyplot: no global state, no display.
+        figure = Figure(figsize=(size * max(columns, 1) + 0.2, size * 1.06 * rows + 0.7), layout="constrained")
+        figure.suptitle(heading if count == 1 else f"{heading} ({page + 1} of {count})", fontsize=11)
+        for axes, trajectory in zip(
+            np.atleast_1d(figure.subplots(rows, max(columns, 1), squeeze=False).ravel()),
+            [*chosen, *[None] * (rows * max(columns, 1) - len(chosen))],
+            strict=True,
+        ):
+            if trajectory is None:
+                axes.set_axis_off()
+            else:
+                _draw_panel(axes, trajectory)
+        file = path if count == 1 else path.with_stem(f"{path.stem}_{page + 1:02d}")
+        figure.savefig(file, dpi=110)
+        pages.append(file)
+    return pages
+
+
+def _draw_panel(axes: Axes, trajectory: Trajectory) -> None:
+    draw_arena(axes, trajectory.arena)
+    color = _GOOD if trajectory.success else _BAD
+    axes.plot(trajectory.xy[:, 0], trajectory.xy[:, 1], color=color, linewidth=1.1)
+    axes.plot(*trajectory.xy[0], marker="o", color=color, markersize=4)
+    if not trajectory.success:
+        axes.plot(*trajectory.xy[-1], marker="x", color=color, markersize=7, markeredgewidth=2)
+    axes.set_title(trajectory.title, fontsize=7.5, color=color)
+
+
+def draw_arena(axes: Axes, arena: Arena) -> None:
+    """Draw the obstacles of an arena from above, to scale."""
+    x_min, x_max, y_min, y_max = arena.extent
+    axes.set_facecolor(_FREE)
+    for shape in arena.shapes:
+        if shape.kind == "cylinder":
+            axes.add_patch(Circle((shape.x, shape.y), shape.size_x, color=_WALL, linewidth=0))
+        else:
+            corner = (shape.x - shape.size_x, shape.y - shape.size_y)
+            axes.add_patch(
+                Rectangle(
+                    corner,
+                    2 * shape.size_x,
+                    2 * shape.size_y,
+                    angle=math.degrees(shape.yaw),
+                    rotation_point="center",
+                    color=_WALL,
+                    linewidth=0,
+                )
+            )
+    axes.set_xlim(x_min - 0.12, x_max + 0.12)
+    axes.set_ylim(y_min - 0.12, y_max + 0.12)
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for side in axes.spines.values():
+        side.set_visible(False)
+
+
+def draw_divergence(
+    arena: Arena, recorded: NDArray, replayed: NDArray, time: NDArray, curves: dict[str, Any], heading: str, path: Path
+) -> None:
+    """Draw a replay beside its recording.
+
+    Args:
+        arena: the obstacles.
+        recorded: recorded positions [m], shape (frames, 2).
+        replayed: replayed positions [m], shape (frames, 2).
+        time: time of the frames [s], shape (frames,).
+        curves: divergence over time by label, each of shape (frames,).
+        heading: what stands above the figure.
+        path: where the picture goes.
+    """
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    figure.suptitle(heading, fontsize=11)
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
+    draw_arena(left, arena)
+    left.plot(recorded[:, 0], recorded[:, 1], color="#2c3e50", linewidth=3, alpha=0.35, label="recorded")
+    left.plot(replayed[:, 0], replayed[:, 1], color=_BAD, linewidth=1.1, label="replayed")
+    left.plot(*recorded[0], marker="o", color="#2c3e50", markersize=5)
+    left.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False, fontsize=9)
+    for label, values in curves.items():
+        right.plot(time, values, label=label, linewidth=1.3)
+    largest = max((float(np.max(values)) for values in curves.values()), default=0.0)
+    if largest == 0.0:
+        right.set_ylim(-0.5, 1.0)
+        right.text(0.5, 0.6, "identical, to the last bit", transform=right.transAxes, ha="center", color=_GOOD)
+    right.set_xlabel("time [s]")
+    right.set_ylabel("difference between replay and recording")
+    right.grid(alpha=0.3)
+    right.legend(frameon=False, fontsize=9)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,282 @@
+"""`bhd-record`: episodes of a simulated robot, driven by a brain, into a LeRobotDataset."""
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from bhd_lerobot.data.features import PHYSICS_STATE, dataset_features
+from bhd_lerobot.data.identity import default_root
+from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.simulation import TurtleBot3Simulation, describe
+from bhd_lerobot.runs.config_record import RecordConfig
+from bhd_lerobot.runs.configuration import encode, run
+from bhd_lerobot.runs.episode import Episode, EpisodeLoop, EpisodeSpec
+from bhd_lerobot.runs.plots import Trajectory, draw_trajectories
+from bhd_lerobot.runs.preview import Preview
+from bhd_lerobot.runs.provenance import episode_metadata
+from bhd_lerobot.runs.registry import make_brain, make_task
+from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
+from bhd_lerobot.tasks.task import episode_seed
+
+
+@dataclass
+class RecordResult:
+    """What a run recorded.
+
+    Attributes:
+        root: the dataset.
+        output_dir: the run folder.
+        episodes: episodes that the dataset holds.
+        recorded: episodes that this run added.
+        successes: how many of them were a success.
+        outcomes: how many ended how.
+        scores: their scores.
+        frames: frames that this run added.
+        simulated_s: simulated time of the episodes that this run added [s].
+        wall_s: time that this took [s], from the first observation to the last save.
+        stopped_by: the signal that ended the run early, or None.
+    """
+
+    root: Path
+    output_dir: Path
+    episodes: int = 0
+    recorded: int = 0
+    successes: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    scores: list[float] = field(default_factory=list)
+    frames: int = 0
+    simulated_s: float = 0.0
+    wall_s: float = 0.0
+    stopped_by: StopRequest | None = None
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated seconds in a second."""
+        return self.simulated_s / self.wall_s if self.wall_s > 0 else 0.0
+
+
+def record(config: RecordConfig, console: Console | None = None) -> RecordResult:
+    """Record what a configuration asks for.
+
+    Args:
+        config: what to record.
+        console: where progress is shown; standard error if None.
+
+    Raises:
+        BhdError: the configuration cannot be honoured, or the dataset cannot be written. Episodes that were saved
+            before are intact.
+    """
+    console = console or Console(stderr=True)
+    root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
+    if isinstance(config.robot, TurtleBot3Config):
+        robot = config.robot
+    else:
+        raise ConfigError(f"bhd-record cannot simulate a {config.robot.type}.")
+    simulation = TurtleBot3Simulation(robot, min(config.n_envs, config.dataset.num_episodes), config.threads)
+    task = make_task(config.task, simulation.n, config.dataset.fps)
+    brain = make_brain(config.brain)
+    preview = _make_preview(config, simulation, console)
+    try:
+        recorder = _open_recorder(config, root, simulation, task.parameters(), brain.parameters())
+    except BaseException:
+        simulation.close()
+        raise
+    with stop_on_signals() as stop, recorder:
+        output_dir = _make_output_dir(config, console)
+        result = RecordResult(root, output_dir, stopped_by=stop)
+        if recorder.repair_report:
+            console.print(f"Mended before resuming: {recorder.repair_report}")
+        loop = EpisodeLoop(simulation, task, brain, recorder.begin_episode)
+        trajectories: list[Trajectory] = []
+        first: Episode | None = None
+        specs = [
+            EpisodeSpec(index, episode_seed(config.seed, index, config.split))  # type: ignore[arg-type]
+            for index in range(recorder.num_episodes, config.dataset.num_episodes)
+        ]
+        with _progress(console) as progress:
+            bar = progress.add_task("recording", total=len(specs), success="", speed="")
+            started = time.perf_counter()
+            for episode in loop.run(specs, stop.__bool__):
+                _save(recorder, episode, config, task.parameters(), brain.parameters(), loop)
+                _count(result, episode, config.dataset.fps)
+                result.wall_s = time.perf_counter() - started
+                trajectories.append(_trajectory(episode))
+                first = first or episode
+                progress.update(
+                    bar,
+                    advance=1,
+                    success=f"{result.successes}/{result.recorded} succeeded",
+                    speed=f"{result.real_time_factor:.0f}x real time",
+                )
+        result.episodes = recorder.num_episodes
+        recorder.finalize()
+        result.wall_s = time.perf_counter() - started if result.recorded else 0.0
+    simulation.close()
+    if trajectories:
+        heading = f"{task.name}, {brain.name}: {result.successes} of {result.recorded} episodes succeeded"
+        draw_trajectories(trajectories, output_dir / "trajectories.png", heading)
+    if first is not None and preview is not None:
+        preview.write(first.arena, first.columns[PHYSICS_STATE], config.dataset.fps, output_dir / "episode.mp4")
+        preview.close()
+    _summary(console, config, result, preview is not None and first is not None)
+    if config.dataset.push_to_hub and not stop:
+        _push(config, root)
+    return result
+
+
+def _open_recorder(
+    config: RecordConfig, root: Path, simulation: TurtleBot3Simulation, task: dict[str, Any], brain: dict[str, Any]
+) -> DatasetRecorder:
+    images = {
+        name: (simulation.config.camera_height, simulation.config.camera_width, 3) for name in simulation.camera_names
+    }
+    nq, nv = simulation.world.qpos.shape[1], simulation.world.qvel.shape[1]
+    physics = [f"qpos_{i}" for i in range(nq)] + [f"qvel_{i}" for i in range(nv)]
+    features = dataset_features(simulation.observation_names, simulation.action_names, images, physics)
+    # What decides the episodes. How many there are, and how many run side by side, does not.
+    recording = {
+        "robot": {key: str(value) if isinstance(value, Path) else value for key, value in describe(simulation.config).items()},
+        "task": task,
+        "brain": brain,
+        "seed": config.seed,
+        "split": config.split,
+    }
+    make = DatasetRecorder.resume if config.resume and root.exists() else DatasetRecorder.create
+    return make(
+        config.dataset.repo_id,
+        config.dataset.fps,
+        features,
+        robot_type=config.robot.type,
+        root=root,
+        recording=recording,
+    )
+
+
+def _save(
+    recorder: DatasetRecorder,
+    episode: Episode,
+    config: RecordConfig,
+    task: dict[str, Any],
+    brain: dict[str, Any],
+    loop: EpisodeLoop,
+) -> None:
+    writer = episode.writer or recorder.begin_episode()
+    try:
+        writer.set_columns(episode.columns)
+        metadata = episode_metadata(
+            episode, split=config.split, task=task, brain=brain, timing=loop.simulation.bridge.timing.summary()
+        )
+        recorder.save(writer, task=loop.task.instruction, metadata=metadata)
+    except BaseException:
+        writer.discard()
+        raise
+
+
+def _count(result: RecordResult, episode: Episode, fps: int) -> None:
+    result.recorded += 1
+    result.successes += episode.outcome.success
+    result.outcomes[episode.outcome.event.cause] += 1
+    result.scores.append(episode.outcome.score)
+    result.frames += episode.frames
+    result.simulated_s += episode.frames / fps
+
+
+def _trajectory(episode: Episode) -> Trajectory:
+    outcome = episode.outcome
+    title = f"{episode.spec.index}: {outcome.event.cause}, score {outcome.score:.2f}"
+    return Trajectory(title, episode.arena, episode.columns[PHYSICS_STATE][:, :2], outcome.success)
+
+
+def _make_preview(config: RecordConfig, simulation: TurtleBot3Simulation, console: Console) -> Preview | None:
+    if config.preview_video is False:
+        return None
+    try:
+        return Preview(simulation.body)
+    except RenderingError as error:
+        if config.preview_video:
+            raise
+        console.print(f"No film of an episode: {error}")
+        return None
+
+
+def _make_output_dir(config: RecordConfig, console: Console) -> Path:
+    if config.output_dir:
+        folder = Path(config.output_dir).expanduser()
+    else:
+        now = datetime.now()
+        name = f"{now:%H-%M-%S}_{config.robot.type}_{config.task.get_choice_name(type(config.task))}"
+        folder = Path("outputs/record") / f"{now:%Y-%m-%d}" / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "config.yaml").write_text(yaml.safe_dump(encode(config), sort_keys=False), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
+    return folder
+
+
+def _progress(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[success]}"),
+        TextColumn("{task.fields[speed]}"),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def _summary(console: Console, config: RecordConfig, result: RecordResult, film: bool) -> None:
+    table = Table(title="Recorded", show_header=False, title_justify="left")
+    table.add_row("dataset", f"{result.root} ({result.episodes} episodes)")
+    table.add_row("this run", f"{result.recorded} episodes, {result.frames} frames, {result.simulated_s:.0f} s simulated")
+    if result.recorded:
+        table.add_row("success", f"{result.successes} of {result.recorded}")
+        table.add_row("outcomes", ", ".join(f"{name} {count}" for name, count in result.outcomes.most_common()))
+        table.add_row("mean score", f"{np.mean(result.scores):.3f}")
+        table.add_row("speed", f"{result.real_time_factor:.0f} x real time, n_envs = {config.n_envs}")
+    files = ["config.yaml", *(["trajectories.png"] if result.recorded else []), *(["episode.mp4"] if film else [])]
+    table.add_row("run folder", f"{result.output_dir}: {', '.join(files)}")
+    console.print(table)
+    if result.stopped_by:
+        console.print(
+            f"Stopped by {result.stopped_by.signal.name if result.stopped_by.signal else ''}. Episodes that were running "
+            "were dropped, all others are saved. Go on with --resume=true: the dropped ones are run again, the same."
+        )
+
+
+def _push(config: RecordConfig, root: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset  # seconds to import, and rarely needed
+
+    dataset = LeRobotDataset(config.dataset.repo_id, root=root, video_backend="pyav")
+    try:
+        dataset.push_to_hub(tags=config.dataset.tags, private=config.dataset.private)
+    except Exception as error:
+        raise BhdError(f"The dataset is complete at {root}, but it was not uploaded: {error}") from error
+
+
+def _main(config: RecordConfig) -> int:
+    result = record(config)
+    return result.stopped_by.exit_status if result.stopped_by else 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `bhd-record`; return the exit status."""
+    return run(_main, RecordConfig, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,51 @@
+"""Ending a run from outside, without losing what it has."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class StopRequest:
+    """Whether, and by which signal, the run was asked to end.
+
+    Attributes:
+        signal: the signal, or None.
+    """
+
+    def __init__(self) -> None:
+        self.signal: signal.Signals | None = None
+
+    def __bool__(self) -> bool:
+        """Whether the run was asked to end."""
+        return self.signal is not None
+
+    @property
+    def exit_status(self) -> int:
+        """The exit status that says which signal ended the run, 0 if none did."""
+        return 0 if self.signal is None else 128 + self.signal
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[StopRequest]:
+    """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request that the run's loop reads between two frames.
+
+    A second one acts as it would without us: the loop might hang. The former handlers come back at the end.
+    """
+    request = StopRequest()
+    former = {}
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        request.signal = signal.Signals(number)
+        for one, handler in former.items():
+            signal.signal(one, handler)
+
+    for one in _SIGNALS:
+        former[one] = signal.signal(one, handle)
+    try:
+        yield request
+    finally:
+        for one, handler in former.items():
+            signal.signal(one, handler)
