@@ -23,15 +23,20 @@ class LockstepBridge:
         advance: moves the plant on by one tick; called after every tick.
 
     Raises:
-        ConfigError: a frame lasts longer than the command time-out, so that every command would time out.
+        ConfigError: a frame lasts longer than the command time-out, so that every command would time out; or the
+            cerebellum was made for another rate.
     """
 
     def __init__(self, cerebellum: Cerebellum, rates: Rates, advance: Callable[[], None]) -> None:
         timeout = cerebellum.body.limits.command_timeout_s
         if 1.0 / rates.fps > timeout:
             raise ConfigError(
-                f"At fps = {rates.fps} a command has to last {1.0 / rates.fps:g} s, longer than the command time-out of "
-                f"{timeout:g} s. Raise fps to at least {int(np.ceil(1 / timeout))}."
+                f"At fps = {rates.fps} a command has to last {1.0 / rates.fps:g} s, longer than the command time-out "
+                f"of {timeout:g} s. Raise fps to at least {int(np.ceil(1 / timeout))}."
+            )
+        if rates.control_hz != cerebellum.control_hz:
+            raise ConfigError(
+                f"control_hz is {rates.control_hz}, but the cerebellum was made for {cerebellum.control_hz} Hz."
             )
         self.cerebellum = cerebellum
         self.rates = rates
@@ -45,7 +50,9 @@ class LockstepBridge:
         """Simulated time since the bridge was made [ns]."""
         return self._tick * NANOSECONDS // self.rates.control_hz
 
-    def send(self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, due_ns: int | None = None) -> SendResult:
+    def send(
+        self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, due_ns: int | None = None
+    ) -> SendResult:
         """Send one setpoint.
 
         Args:

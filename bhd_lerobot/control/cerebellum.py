@@ -1,6 +1,5 @@
 """The cerebellum: turns commands into safe actuator commands, one tick at a time. It owns the modes."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from bhd_lerobot.control.messages import (
     Watchdog,
 )
 from bhd_lerobot.control.plant import Plant, PlantReading
+from bhd_lerobot.errors import ConfigError
 
 MOVING = 0.01  # [rad/s] a joint faster than this moves: the articles' `is_moving`
 _REST = 1e-9  # a ramp has arrived when the command is this close to zero
@@ -48,6 +48,9 @@ class Cerebellum:
         fifo: where commands come from; a new one if None.
         ring: where every tick's state is published, of dtype `state_dtype(n)`; nowhere if None.
         estop_word: n 64-bit integers that any process may set to something else than 0; new memory if None.
+
+    Raises:
+        ConfigError: the wheels cannot turn the base as fast as its velocity limit allows.
     """
 
     def __init__(
@@ -82,6 +85,12 @@ class Cerebellum:
         self._per_speed = 1.0 / body.drive.wheel_radius
         self._per_yaw = body.drive.wheel_separation / 2 / body.drive.wheel_radius
         self._largest_error = body.drive.max_torque / body.drive.servo_gain
+        fastest = self._wheel_limit / self._per_yaw
+        if limits.velocity[1] > fastest * (1 + 1e-9):
+            raise ConfigError(
+                f"The limit of {limits.names[1]} is {limits.velocity[1]}; wheels of {self._wheel_limit:g} rad/s at the "
+                f"most can turn the base at {fastest:g} rad/s."
+            )
 
         # The hot path knows no modes: a change of mode writes what every simulation heads for, and how fast.
         self._target = np.zeros((n, width))
@@ -90,6 +99,9 @@ class Cerebellum:
         self._wheels = np.zeros((n, 2))
         self._wheel_reference = np.zeros((n, 2))
         self._last_position = np.zeros((n, 2))
+        # The sum of 0 * x is 0 if and only if every x is finite; unlike a plain sum it neither overflows nor warns.
+        self._flat_reading, self._flat_target = self.reading.values.reshape(-1), self._target.reshape(-1)
+        self._reading_zeros, self._target_zeros = np.zeros(4 * n), np.zeros(width * n)
         self._settled = False
         self._last_due = np.zeros(n, np.int64)
         self._sent_sequence = np.full(n, -1, np.int64)
@@ -137,8 +149,7 @@ class Cerebellum:
             if hit.any():
                 self._set_mode(hit, Mode.ESTOP)
                 self._estop_latched |= hit
-        # A sum is finite if and only if all its terms are: encoder values are far from the largest float.
-        if not math.isfinite(self.reading.values.sum()) or self.reading.fault.any():
+        if self._flat_reading.dot(self._reading_zeros) != 0.0 or self.reading.fault.any():
             self._handle_fault()
         if self._deadline is not None and now_ns > self._deadline:
             old = (self.mode == Mode.TRACKING) & (now_ns - self._last_due > self._timeout_ns)
@@ -152,7 +163,6 @@ class Cerebellum:
             if rest.any():
                 self._set_mode(rest & ~self._deactivating, Mode.HOLD)
                 self._set_mode(rest & self._deactivating, Mode.SAFE_OFF)
-                self._deactivating &= ~rest
             self._stopping = bool((self.mode == Mode.STOPPING).any())
 
     def _handle_fault(self) -> None:
@@ -185,7 +195,7 @@ class Cerebellum:
     def _filter(self) -> None:
         """Safety filter: from the targets to the commands applied in this tick, and the wheel speeds they mean."""
         target = self._target
-        if not math.isfinite(target.sum()):
+        if self._flat_target.dot(self._target_zeros) != 0.0:
             # Commands are checked when they are sent; a queue in shared memory is written by another process.
             bad = ~np.isfinite(target).all(axis=1)
             self._limited_finite |= bad
@@ -193,9 +203,7 @@ class Cerebellum:
         safety.limit_velocity(target, self._velocity, self._clipped, self._limited_velocity)
         wheels = (self._per_speed, self._per_yaw, self._wheel_limit, self._limited_wheels)
         safety.limit_wheel_speed(self._clipped, *wheels)
-        arrived = safety.limit_change(
-            self._clipped, self.command, self._largest, self.command, self._limited_change
-        )
+        arrived = safety.limit_change(self._clipped, self.command, self._largest, self.command, self._limited_change)
         # Both ends of a change can be within the wheels' limit and the way between them not: the two dimensions
         # change at different rates.
         limited = safety.limit_wheel_speed(self.command, *wheels)
@@ -238,8 +246,13 @@ class Cerebellum:
     def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Ask for a change of mode; it happens before the next tick or is refused with a reason.
 
-        `RESET` also clears the emergency-stop word, because only the cerebellum clears its own latch.
+        `RESET` also clears the emergency-stop word of a latched emergency stop, because only the cerebellum clears its
+        own latch. `ACTIVATE` drops what still waits in the queue: no command from before it can start motion.
         """
+        if request == Request.CONFIGURE:
+            self.plant.read(self.reading)
+            if self._flat_reading.dot(self._reading_zeros) != 0.0:
+                self._handle_fault()
         wanted = np.zeros(self.n, np.bool_)
         wanted[slice(None) if ids is None else ids] = True
         sources, result = _TRANSITIONS[request]
@@ -248,14 +261,18 @@ class Cerebellum:
         reasons[wanted & ~allowed & (self.mode == Mode.ESTOP)] = Reason.ESTOP
         reasons[wanted & ~allowed & (self.mode == Mode.FAULT)] = Reason.FAULT
         if request == Request.CONFIGURE:
-            self.plant.read(self.reading)
             self.drive.reset_odometry(np.flatnonzero(allowed), self.reading.position[allowed])
-        if request == Request.DEACTIVATE:
-            self._deactivating |= allowed
+        if request == Request.ACTIVATE:
+            active = np.flatnonzero(allowed)
+            self.refusals[Reason.NOT_ACTIVE, active] += self.fifo.drop(active)
+            self._sent_due[active] = np.iinfo(np.int64).min
         if request == Request.RESET:
-            self.estop_word[allowed] = 0
+            # A word that was set after another latch has not been seen yet: the next tick will.
+            self.estop_word[allowed & (self.mode == Mode.ESTOP)] = 0
             self._estop_latched &= ~allowed
         self._set_mode(allowed, result)
+        if request == Request.DEACTIVATE:
+            self._deactivating |= allowed
         self._count_refusals(reasons)
         return SendResult(reasons)
 
@@ -266,6 +283,7 @@ class Cerebellum:
         self.estop_word[ids] = 0
         self.command[ids] = 0.0
         self._target[ids] = 0.0
+        self._wheels[ids] = self._wheel_reference[ids] = 0.0
         self._settled = False
         self._largest[ids] = self._change
         self._sent_sequence[ids] = -1
@@ -310,7 +328,7 @@ class Cerebellum:
             odometry=self.drive.odometry.copy(),
             twist=self.drive.twist_from_wheels(velocity),
             mode=self.mode.copy(),
-            is_moving=(np.abs(velocity) > MOVING).any(axis=1),
+            is_moving=np.asarray((np.abs(velocity) > MOVING).any(axis=1)),
             emergency_stop=self._estop_latched.copy(),
         )
 
@@ -351,6 +369,7 @@ class Cerebellum:
         self._settled = False
         if mode != Mode.TRACKING:
             self._target[mask] = 0.0
+        self._deactivating[mask] = False
         self._largest[mask] = self._stop_change if mode in (Mode.ESTOP, Mode.FAULT) else self._change
         self._stopping |= mode == Mode.STOPPING
         self._update_deadline()
@@ -358,6 +377,7 @@ class Cerebellum:
     def _mode_reasons(self) -> NDArray[np.int8]:
         """Return why each mode would refuse a setpoint, shape (n,)."""
         reasons = _MODE_REASON[self.mode]
+        reasons[self._deactivating] = Reason.NOT_ACTIVE
         # The word counts from the moment that it is set, the mode from the next tick.
         reasons[self.estop_word != 0] = Reason.ESTOP
         return reasons

@@ -21,8 +21,8 @@ class DiffDrive:
         self._per_speed = 1.0 / drive.wheel_radius  # [rad/m]
         self._per_yaw = drive.wheel_separation / 2 / drive.wheel_radius  # [rad/rad]
         self._count = drive.encoder_ticks / (2 * np.pi)  # [1/rad]
-        self.odometry = np.zeros((n, 3))
-        self._encoder = np.zeros((n, 2))
+        self.odometry: NDArray[np.float64] = np.zeros((n, 3))
+        self._encoder: NDArray[np.float64] = np.zeros((n, 2))
 
     def wheels_from_twist(self, twist: NDArray[np.float64], out: NDArray[np.float64]) -> NDArray[np.float64]:
         """Write the wheel speeds of a twist.

@@ -1,8 +1,8 @@
 """Bounded queues between a brain and a cerebellum: commands one way, states the other.
 
 Both lie in one block of memory that the caller may provide, so that the same code serves two parts of one process and
-two processes that share the block. Each has one writer and one reader. Neither ever waits: a full command queue refuses,
-and the state ring overwrites its oldest entry.
+two processes that share the block. Each has one writer and one reader. Neither ever waits: a full command queue
+refuses, and the state ring overwrites its oldest entry.
 """
 
 from typing import Any
@@ -14,9 +14,11 @@ from bhd_lerobot.errors import ConfigError
 
 
 class CommandFifo:
-    """A queue of commands for n simulations, first in, first out.
+    """A queue of commands for n simulations.
 
-    One entry holds the commands of all simulations, and a mask of those that it is for.
+    One entry holds the commands of all simulations, and a mask of those that it is for. Entries come out by due time,
+    and those of equal due time in the order in which they went in: the commands of one simulation, whose due times
+    never decrease, come out first in, first out, and none waits for another simulation's that is due later.
 
     Args:
         n: number of simulations.
@@ -38,11 +40,20 @@ class CommandFifo:
         entries = np.frombuffer(buffer, self._dtype(n, width), capacity, offset=16)
         self._sequence, self._due = entries["sequence"], entries["due_ns"]
         self._mask, self._values = entries["mask"], entries["values"]
+        # What the reader found out about the entries up to a head.
+        self._seen_head = -1
+        self._next: int | None = None
+        self._next_due: int | None = None
 
     @staticmethod
     def _dtype(n: int, width: int) -> np.dtype:
         return np.dtype(
-            [("sequence", np.int64), ("due_ns", np.int64), ("values", np.float64, (n, width)), ("mask", np.bool_, (n,))],
+            [
+                ("sequence", np.int64),
+                ("due_ns", np.int64),
+                ("values", np.float64, (n, width)),
+                ("mask", np.bool_, (n,)),
+            ],
             align=True,
         )
 
@@ -52,7 +63,7 @@ class CommandFifo:
         return 16 + capacity * cls._dtype(n, width).itemsize
 
     def __len__(self) -> int:
-        """Return the number of entries that wait."""
+        """Return the number of entries in use: those that wait, and those between them."""
         return int(self._head[0]) - int(self._tail[0])
 
     def push(self, sequence: int, due_ns: int, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> bool:
@@ -77,12 +88,13 @@ class CommandFifo:
         return True
 
     def next_due(self) -> int | None:
-        """Return when the oldest entry is due [ns], or None if nothing waits."""
-        tail = int(self._tail[0])
-        return None if tail == int(self._head[0]) else int(self._due[tail % self.capacity])
+        """Return when the next entry is due [ns], or None if nothing waits."""
+        if int(self._head[0]) != self._seen_head:
+            self._look()
+        return self._next_due
 
     def pop(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> tuple[int, int] | None:
-        """Take the oldest entry.
+        """Take the next entry.
 
         Args:
             values: where the commands go, shape (n, width).
@@ -91,20 +103,37 @@ class CommandFifo:
         Returns:
             Sequence number and due time [ns], or None if nothing waits.
         """
-        tail = int(self._tail[0])
-        if tail == int(self._head[0]):
+        if self.next_due() is None or self._next is None:
             return None
-        slot = tail % self.capacity
+        slot = self._next % self.capacity
         values[:], mask[:] = self._values[slot], self._mask[slot]
         result = int(self._sequence[slot]), int(self._due[slot])
-        self._tail[0] = tail + 1
+        self._mask[slot] = False
+        self._look()
         return result
 
-    def drop(self, ids: NDArray[np.intp]) -> None:
-        """Drop what waits for some simulations. For the reader."""
-        tail = int(self._tail[0])
-        for entry in range(tail, int(self._head[0])):
-            self._mask[entry % self.capacity, ids] = False
+    def drop(self, ids: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Drop what waits for some simulations, and return how many commands of each that were. For the reader."""
+        dropped = np.zeros(len(ids), np.int64)
+        for entry in range(int(self._tail[0]), int(self._head[0])):
+            slot = entry % self.capacity
+            dropped += self._mask[slot, ids]
+            self._mask[slot, ids] = False
+        self._look()
+        return dropped
+
+    def _look(self) -> None:
+        """Find the next entry, and give up the oldest entries that nobody waits for any more."""
+        tail, head = int(self._tail[0]), int(self._head[0])
+        while tail < head and not self._mask[tail % self.capacity].any():
+            tail += 1
+        self._tail[0] = tail
+        self._seen_head = head
+        self._next, self._next_due = None, None
+        for entry in range(tail, head):
+            due = int(self._due[entry % self.capacity])
+            if (self._next_due is None or due < self._next_due) and self._mask[entry % self.capacity].any():
+                self._next, self._next_due = entry, due
 
 
 class StateRing:

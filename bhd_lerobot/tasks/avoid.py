@@ -72,10 +72,10 @@ class AvoidTask:
         self._window = max(1, round(config.stuck_time_s * fps))
         self._sims = np.arange(n)
         # Cells by number, a row for each simulation; the rows grow with the largest arena seen.
-        self._free = np.zeros((n, 0), np.bool_)
-        self._visited = np.zeros((n, 0), np.bool_)
+        self._free: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
+        self._visited: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
         self._origin = np.zeros((n, 2))
-        self._columns = np.ones(n, np.int64)
+        self._columns, self._rows = np.ones(n, np.int64), np.ones(n, np.int64)
         self._pose = np.zeros((n, 2))
         self._path = np.zeros(n)
         self._history = np.zeros((self._window, n))  # path lengths of the last frames, a ring
@@ -96,7 +96,7 @@ class AvoidTask:
             self._free[sim] = self._visited[sim] = False
             self._free[sim, cells] = True
             self._origin[sim] = arena.extent[0], arena.extent[2]
-            self._columns[sim] = columns
+            self._columns[sim], self._rows[sim] = columns, rows
             self._pose[sim] = arena.start[:2]
         started = np.zeros(len(self._sims), np.bool_)
         started[ids] = True
@@ -149,7 +149,7 @@ class AvoidTask:
         column, row = np.floor((self._pose - self._origin) / self.config.cell_m).astype(np.int64).T
         cell = np.clip(row * self._columns + column, 0, self._free.shape[1] - 1)
         # Outside the grid is no free cell: a robot there has left the arena through a wall.
-        inside = (column >= 0) & (column < self._columns) & (row >= 0)
+        inside = (column >= 0) & (column < self._columns) & (row >= 0) & (row < self._rows)
         new = mask & inside & self._free[self._sims, cell] & ~self._visited[self._sims, cell]
         self._visited[self._sims[new], cell[new]] = True
         return np.where(new, 1.0 / np.maximum(self._free.sum(axis=1), 1), 0.0)
