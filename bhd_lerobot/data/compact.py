@@ -7,7 +7,7 @@ the marker leaves the old dataset and some rubbish in the staging folder; a kill
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -151,13 +151,19 @@ def _merge_parquet(sources: list[Path], target: Path, schema: pa.Schema, disk: D
     disk.write(target, b"")
     with pq.ParquetWriter(target, schema, **PARQUET_OPTIONS) as writer:
         for source in sources:
-            try:
-                file = pq.ParquetFile(source, page_checksum_verification=True)
-                for group in range(file.num_row_groups):
-                    writer.write_table(file.read_row_group(group, use_threads=False).select(schema.names).cast(schema))
-            except pa.ArrowException as error:
-                raise corrupt(source, error) from error
+            for table in _row_groups(source):
+                writer.write_table(table.select(schema.names).cast(schema))
     disk.flush(target)
+
+
+def _row_groups(source: Path) -> Iterator[pa.Table]:
+    """Read a file group by group. Arrow reports damaged pages as an OSError; here it cannot mean a full disk."""
+    try:
+        file = pq.ParquetFile(source, page_checksum_verification=True)
+        for group in range(file.num_row_groups):
+            yield file.read_row_group(group, use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise corrupt(source, error) from error
 
 
 def _build_videos(state: DatasetState, disk: Disk, videos: Mapping[str, list[_Group]], rows: list[Row]) -> None:

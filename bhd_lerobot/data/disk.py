@@ -49,8 +49,10 @@ class Disk:
         if path.is_dir():
             return
         missing = path
-        while not missing.parent.exists():
+        while not missing.exists() and not missing.parent.is_dir():
             missing = missing.parent
+        if missing.exists():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(missing))
         _before_step("mkdir", path)
         path.mkdir(parents=True, exist_ok=True)
         self._flush_folder(missing.parent)

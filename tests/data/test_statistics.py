@@ -1,0 +1,82 @@
+"""Statistics against numpy and against LeRobot's choice of pixels."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from bhd_lerobot.data import statistics
+from bhd_lerobot.errors import FrameError
+
+SHAPES = st.tuples(st.integers(1, 60), st.integers(1, 40))
+VALUES = st.floats(-1e6, 1e6, width=32)
+
+
+@given(SHAPES.flatmap(lambda shape: arrays(np.float32, shape, elements=VALUES)), st.booleans())
+def test_columns_against_numpy(values: np.ndarray, double: bool) -> None:
+    values = values.astype(np.float64) if double else values
+    stats = statistics.column_stats({"x": values, "flag": values[:, 0] > 0})
+    exact = values.astype(np.float64)
+    np.testing.assert_array_equal(stats["x"]["min"], exact.min(0))
+    np.testing.assert_array_equal(stats["x"]["max"], exact.max(0))
+    np.testing.assert_allclose(stats["x"]["mean"], exact.mean(0), rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(stats["x"]["std"], exact.std(0), rtol=1e-9, atol=1e-9)
+    for name, share in statistics.QUANTILES.items():
+        np.testing.assert_array_equal(stats["x"][name], np.quantile(exact, share, axis=0, method="inverted_cdf"))
+    assert stats["x"]["count"].tolist() == [len(values)]
+    assert stats["flag"]["mean"] == pytest.approx((exact[:, 0] > 0).mean())
+
+
+def test_values_that_are_not_finite() -> None:
+    values = np.array([[1.0, np.nan], [np.inf, np.nan], [3.0, np.nan]])
+    for name in ("observation.state", "action"):
+        with pytest.raises(FrameError, match="frame 1"):
+            statistics.column_stats({name: values[:, :1]})
+    stats = statistics.column_stats({"control.age": values})["control.age"]
+    assert stats["mean"].tolist() == [2.0, 0.0]
+    assert stats["max"].tolist() == [3.0, 0.0]
+    assert stats["count"].tolist() == [3]
+
+
+@given(st.integers(1, 50_000))
+def test_sampled_frames_are_lerobots(length: int) -> None:
+    from lerobot.datasets.compute_stats import sample_indices
+
+    assert statistics.sampled_frames(length).tolist() == sample_indices(length)
+
+
+@pytest.mark.parametrize("size", [(48, 64), (240, 320), (400, 150)])
+def test_images_against_numpy(size: tuple[int, int]) -> None:
+    from lerobot.datasets.compute_stats import auto_downsample_height_width
+
+    images = np.random.default_rng(0).integers(0, 256, (120, *size, 3)).astype(np.uint8)
+    images[..., 1] //= 3
+    stats = statistics.image_stats(np.stack([statistics.image_histogram(image) for image in images]))
+    chosen = images[statistics.sampled_frames(120)]
+    thinned = np.stack([auto_downsample_height_width(image.transpose(2, 0, 1)) for image in chosen]) / 255.0
+    pixels = thinned.transpose(0, 2, 3, 1).reshape(-1, 3)
+    for name, value in (
+        ("min", pixels.min(0)),
+        ("max", pixels.max(0)),
+        ("mean", pixels.mean(0)),
+        ("std", pixels.std(0)),
+    ):
+        np.testing.assert_allclose(stats[name].ravel(), value, atol=1e-9)
+    for name, share in statistics.QUANTILES.items():
+        wanted = np.quantile(pixels, share, axis=0, method="inverted_cdf")
+        np.testing.assert_allclose(stats[name].ravel(), wanted, atol=1e-9)
+    assert stats["count"].tolist() == [len(chosen)]
+    assert stats["mean"].shape == (3, 1, 1)
+
+
+@given(st.lists(st.integers(1, 30), min_size=1, max_size=5), st.integers(0, 1000))
+def test_aggregation_is_exact_where_it_can_be(lengths: list[int], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    episodes = [rng.normal(rng.normal() * 5, 2, (length, 3)) for length in lengths]
+    stats = [statistics.column_stats({"x": episode})["x"] for episode in episodes]
+    total = statistics.aggregate({name: np.stack([s[name] for s in stats]) for name in statistics.STATISTICS})
+    together = np.concatenate(episodes)
+    for name in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(total[name], getattr(together, name)(axis=0), rtol=1e-9, atol=1e-9)
+    assert total["count"].tolist() == [len(together)]
