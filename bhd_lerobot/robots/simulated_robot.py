@@ -1,6 +1,7 @@
 """The lifecycle that all simulated robots share: LeRobot's `Robot` over a simulation of one."""
 
 import math
+import weakref
 from abc import abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
@@ -18,6 +19,16 @@ from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.simulation import TurtleBot3Simulation
 
 
+# Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator; one that
+# thinks for itself finds its robot here. Weak, so that a forgotten robot is freed.
+_connected: "weakref.WeakSet[SimulatedRobot]" = weakref.WeakSet()
+
+
+def connected_robots() -> list["SimulatedRobot"]:
+    """Return the simulated robots that are connected in this process."""
+    return [robot for robot in _connected if robot.is_connected]
+
+
 class SimulatedRobot(Robot):
     """A simulated robot on a lockstep clock: `send_action` applies an action and advances time by one frame.
 
@@ -31,6 +42,7 @@ class SimulatedRobot(Robot):
         super().__init__(config)
         self.config = config
         self._simulation: TurtleBot3Simulation | None = None
+        self._last_observation: dict[str, Any] | None = None
         # lerobot-record asks for its length, with or without cameras.
         self.cameras: dict[str, Any] = {name: None for name in self.camera_shapes}
 
@@ -90,6 +102,7 @@ class SimulatedRobot(Robot):
             except BaseException:
                 self._simulation = None
                 raise
+        _connected.add(self)
 
     def restart(self) -> None:
         """Put the robot back to the start of its arena, at rest."""
@@ -101,6 +114,8 @@ class SimulatedRobot(Robot):
         if self._simulation is not None:
             self._simulation.close()
             self._simulation = None
+        self._last_observation = None
+        _connected.discard(self)
 
     def calibrate(self) -> None:
         """Nothing to calibrate."""
@@ -131,7 +146,21 @@ class SimulatedRobot(Robot):
         )
         for name in self.camera_shapes:
             observation[name] = simulation.render(0, name)
+        self._last_observation = {
+            name: value.copy() if isinstance(value, np.ndarray) else value for name, value in observation.items()
+        }
         return observation
+
+    @property
+    def last_observation(self) -> dict[str, Any]:
+        """A copy of what `get_observation` returned last; a new observation if it was not called yet.
+
+        Raises:
+            DeviceNotConnectedError: the robot is not connected.
+        """
+        if self._last_observation is None:
+            return self.get_observation()
+        return dict(self._last_observation)
 
     def send_action(self, action: Mapping[str, Any]) -> dict[str, float]:
         """Apply an action for one frame of simulated time.
