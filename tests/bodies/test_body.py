@@ -1,0 +1,74 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.bodies.body import CommandLimits, Rates, Shape
+from bhd_lerobot.errors import BhdError, ConfigError
+
+WHOLE = st.integers(1, 2000)
+
+
+@given(fps=WHOLE, ticks=st.integers(1, 50), steps=st.integers(1, 20))
+def test_rates_that_divide_are_taken_and_multiply_back(fps: int, ticks: int, steps: int) -> None:
+    rates = Rates(fps * ticks * steps, fps * ticks, fps)
+    assert rates.fps * rates.ticks_per_frame * rates.steps_per_tick == rates.physics_hz
+
+
+@given(physics=WHOLE, control=WHOLE, fps=WHOLE)
+def test_the_error_about_a_rate_lists_rates_that_would_do(physics: int, control: int, fps: int) -> None:
+    if physics % control == 0 and control % fps == 0:
+        Rates(physics, control, fps)
+        return
+    with pytest.raises(ConfigError) as caught:
+        Rates(physics, control, fps)
+    message = str(caught.value)
+    valid = [int(rate) for rate in message.rsplit(": ", maxsplit=1)[-1].rstrip(".").split(", ")]
+    if physics % control:
+        assert message.startswith(f"control_hz is {control} ")
+        assert valid == [rate for rate in range(1, physics + 1) if physics % rate == 0]
+    else:
+        assert message.startswith(f"fps is {fps} ")
+        assert valid == [rate for rate in range(1, control + 1) if control % rate == 0]
+
+
+@pytest.mark.parametrize("value", [0, -1, 10.0, True, "10", None, math.nan])
+@pytest.mark.parametrize("name", ["physics_hz", "control_hz", "fps"])
+def test_a_rate_is_a_positive_whole_number(name: str, value: object) -> None:
+    rates = {"physics_hz": 400, "control_hz": 200, "fps": 10, name: value}
+    with pytest.raises(ConfigError, match=rf"{name} is .*positive whole number"):
+        Rates(**rates)  # type: ignore[arg-type]
+
+
+def limits(**changes: object) -> CommandLimits:
+    values = {
+        "names": ("x.vel", "theta.vel"),
+        "velocity": (0.2, 2.0),
+        "acceleration": (1.0, 3.0),
+        "stop_deceleration": (2.0, 20.0),
+        "command_timeout_s": 0.5,
+    }
+    return CommandLimits(**{**values, **changes})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("bad", [(0.2,), (0.2, 2.0, 1.0), (0.2, 0.0), (-0.2, 2.0), (0.2, math.inf), (math.nan, 2.0)])
+@pytest.mark.parametrize("name", ["velocity", "acceleration", "stop_deceleration"])
+def test_limits_are_positive_finite_and_as_many_as_the_names(name: str, bad: tuple[float, ...]) -> None:
+    with pytest.raises(ConfigError, match=name):
+        limits(**{name: bad})
+
+
+@pytest.mark.parametrize("timeout", [0, 0.0, -0.5, math.inf, math.nan])
+def test_the_watchdog_cannot_be_turned_off(timeout: float) -> None:
+    with pytest.raises(ConfigError, match="cannot be turned off"):
+        limits(command_timeout_s=timeout)
+
+
+@pytest.mark.parametrize(
+    "change", [{"kind": "sphere"}, {"size_x": 0.0}, {"size_y": -1.0}, {"height": 0.0}, {"size_x": math.nan}]
+)
+def test_a_shape_is_a_box_or_a_cylinder_of_positive_size(change: dict[str, object]) -> None:
+    values = {"kind": "box", "x": 0.0, "y": 0.0, "yaw": 0.0, "size_x": 0.1, "size_y": 0.1, **change}
+    with pytest.raises(BhdError):
+        Shape(**values)  # type: ignore[arg-type]
