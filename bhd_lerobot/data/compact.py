@@ -152,7 +152,8 @@ def _merge_parquet(sources: list[Path], target: Path, schema: pa.Schema, disk: D
     with pq.ParquetWriter(target, schema, **PARQUET_OPTIONS) as writer:
         for source in sources:
             for table in _row_groups(source):
-                writer.write_table(table.select(schema.names).cast(schema))
+                same = table.schema.equals(schema, check_metadata=True)
+                writer.write_table(table if same else table.select(schema.names).cast(schema))
     disk.flush(target)
 
 

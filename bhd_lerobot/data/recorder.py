@@ -1,8 +1,6 @@
 """Frames in, a LeRobotDataset out; every episode is safe when `save` returns."""
 
 import contextlib
-import shutil
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -13,7 +11,8 @@ import numpy as np
 from bhd_lerobot.data import layout, statistics
 from bhd_lerobot.data.commit import Committer, EpisodeContent
 from bhd_lerobot.data.compact import EpisodeStats, compact
-from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.data.creation import create_root, new_info
+from bhd_lerobot.data.disk import Disk, RootLock, write_errors
 from bhd_lerobot.data.episode import EpisodeWriter
 from bhd_lerobot.data.episode_table import checked_metadata, metadata_types
 from bhd_lerobot.data.identity import FORMAT, as_json, check_identity, default_root
@@ -21,7 +20,7 @@ from bhd_lerobot.data.repair import RepairReport, settle
 from bhd_lerobot.data.schema import Schema
 from bhd_lerobot.data.state import DatasetState
 from bhd_lerobot.data.video import VideoSettings
-from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetExistsError, FrameError
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, FrameError
 
 _INTACT = "Episodes saved before are intact."
 
@@ -98,28 +97,9 @@ class DatasetRecorder:
         schema, settings = _checked(fps, features, video)
         identity = {"format": FORMAT, "recording": as_json(recording or {}), "video": settings.recorded()}
         root = Path(root) if root is not None else default_root(repo_id)
-        exists = DatasetExistsError(f"{root} exists already. Resume it, remove it, or choose another root.")
-        if root.exists() or root.is_symlink():
-            raise exists
         disk = Disk(fsync)
-        info = _new_info(fps, schema, robot_type)
-        with write_errors("create the dataset", root, "Nothing was recorded."):
-            disk.make_folder(root.parent)
-            # Built beside its place and renamed, so that a kill leaves either no dataset or a complete empty one.
-            building = Path(tempfile.mkdtemp(prefix=f".{root.name}-", dir=root.parent))
-            lock = RootLock(building, shown_as=root)
-            try:
-                building.chmod(0o755)
-                disk.make_folder(building / "meta")
-                disk.write(building / layout.INFO, to_json(info))
-                disk.write(building / layout.IDENTITY, to_json(identity))
-                if root.exists():
-                    raise exists
-                disk.move(building, root)
-            except BaseException:
-                lock.release()
-                shutil.rmtree(building, ignore_errors=True)
-                raise
+        info = new_info(fps, schema, robot_type)
+        lock = create_root(root, info, identity, disk)
         state, report = DatasetState(root, info, identity), RepairReport(root, 0, 0)
         return cls(repo_id, state, schema=schema, lock=lock, disk=disk, video=settings, report=report)
 
@@ -327,21 +307,3 @@ def _checked(
     if schema.videos:
         settings.check()
     return schema, settings
-
-
-def _new_info(fps: int, schema: Schema, robot_type: str) -> dict[str, Any]:
-    return {
-        "codebase_version": layout.CODEBASE_VERSION,
-        "fps": fps,
-        "features": {key: {**feature, "shape": list(feature["shape"])} for key, feature in schema.features.items()},
-        "total_episodes": 0,
-        "total_frames": 0,
-        "total_tasks": 0,
-        "chunks_size": layout.CHUNKS_SIZE,
-        "data_files_size_in_mb": layout.DATA_FILES_SIZE_IN_MB,
-        "video_files_size_in_mb": layout.VIDEO_FILES_SIZE_IN_MB,
-        "data_path": layout.DATA_PATH,
-        "video_path": layout.VIDEO_PATH if schema.videos else None,
-        "robot_type": robot_type,
-        "splits": {},
-    }

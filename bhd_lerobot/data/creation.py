@@ -1,0 +1,80 @@
+"""An empty dataset, which appears on disk complete or not at all."""
+
+import contextlib
+import glob
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.data.schema import Schema
+from bhd_lerobot.errors import DatasetExistsError, DatasetLockedError
+
+
+def new_info(fps: int, schema: Schema, robot_type: str) -> dict[str, Any]:
+    """Return the content of ``info.json`` before the first episode."""
+    return {
+        "codebase_version": layout.CODEBASE_VERSION,
+        "fps": fps,
+        "features": {key: {**feature, "shape": list(feature["shape"])} for key, feature in schema.features.items()},
+        "total_episodes": 0,
+        "total_frames": 0,
+        "total_tasks": 0,
+        "chunks_size": layout.CHUNKS_SIZE,
+        "data_files_size_in_mb": layout.DATA_FILES_SIZE_IN_MB,
+        "video_files_size_in_mb": layout.VIDEO_FILES_SIZE_IN_MB,
+        "data_path": layout.DATA_PATH,
+        "video_path": layout.VIDEO_PATH if schema.videos else None,
+        "robot_type": robot_type,
+        "splits": {},
+    }
+
+
+def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any], disk: Disk) -> RootLock:
+    """Create an empty dataset and return the lock on it.
+
+    It is built beside its place and renamed, so that a kill leaves either no dataset or a complete, empty one.
+
+    Args:
+        root: where to put it; must not exist.
+        info: content of ``meta/info.json``.
+        identity: content of ``meta/bhd.json``.
+        disk: how to write.
+
+    Raises:
+        DatasetExistsError: `root` exists.
+        DatasetWriteError: it cannot be written.
+    """
+    exists = DatasetExistsError(f"{root} exists already. Resume it, remove it, or choose another root.")
+    if root.exists() or root.is_symlink():
+        raise exists
+    with write_errors("create the dataset", root, "Nothing was recorded."):
+        disk.make_folder(root.parent)
+        prefix = f".{root.name}.bhd-"
+        _remove_abandoned(root.parent, prefix)
+        building = Path(tempfile.mkdtemp(prefix=prefix, dir=root.parent))
+        lock = RootLock(building, shown_as=root)
+        try:
+            building.chmod(0o755)
+            disk.make_folder(building / "meta")
+            disk.write(building / layout.INFO, to_json(info))
+            disk.write(building / layout.IDENTITY, to_json(identity))
+            if root.exists():
+                raise exists
+            disk.move(building, root)
+        except BaseException:
+            lock.release()
+            shutil.rmtree(building, ignore_errors=True)
+            raise
+    return lock
+
+
+def _remove_abandoned(parent: Path, prefix: str) -> None:
+    """Remove what killed calls left beside the root; folders of living processes are locked."""
+    for folder in parent.glob(f"{glob.escape(prefix)}*"):
+        with contextlib.suppress(OSError, DatasetLockedError):
+            RootLock(folder).release()
+            shutil.rmtree(folder)
