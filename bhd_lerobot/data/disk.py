@@ -155,16 +155,27 @@ class RootLock:
         Raises:
             DatasetLockedError: another recorder or repair works on this root.
         """
-        self._handle: int | None = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        self._root, self._shown_as = root, shown_as or root
+        self._handle: int | None = None
+        self.acquire()
+
+    def acquire(self) -> bool:
+        """Take the lock if it is not held; return whether it was taken now."""
+        if self._handle is not None:
+            return False
+        handle = os.open(self._root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
-            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            os.close(self._handle)
-            self._handle = None
+            os.close(handle)
             raise DatasetLockedError(
-                f"{shown_as or root} is being written by another recorder or repair. Wait until it ends, or choose "
+                f"{self._shown_as} is being written by another recorder or repair. Wait until it ends, or choose "
                 "another root."
             ) from None
+        self._handle = handle
+        # The folder may be renamed while it is locked; a second time it is taken under its final name.
+        self._root = self._shown_as
+        return True
 
     def release(self) -> None:
         """Give the lock back; a second call does nothing."""

@@ -289,6 +289,8 @@ class DatasetRecorder:
                 self._disk.remove_tree(episode.folder)
 
     def _settle_if_in_doubt(self) -> None:
+        # A failed `finalize` gave the lock back, so that `repair` can be used; somebody may have done that.
+        self._in_doubt |= self._lock.acquire()
         if self._in_doubt:
             self._state, _ = settle(self.root, self._disk, keep_staging=True)
             self._in_doubt = False

@@ -204,6 +204,21 @@ def test_only_one_writer_at_a_time(tmp_path: Path) -> None:
     assert not repair(root)
 
 
+def test_a_failed_finalize_gives_the_lock_back_and_can_be_followed_by_more(tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    recorder = support.create(root)
+    for _ in range(3):
+        support.record(recorder)
+    with file_size_limit(1000), pytest.raises(DatasetWriteError):
+        recorder.finalize()
+    assert repair(root)
+    assert support.record(recorder) == 3
+    with pytest.raises(DatasetLockedError):
+        repair(root)
+    recorder.finalize()
+    assert support.verify(root, 4, stats=True) == 4
+
+
 def test_a_dataset_that_does_not_fit_is_not_resumed(tmp_path: Path) -> None:
     root = make(tmp_path / "d", video=True)
     before = snapshot(root)
