@@ -8,7 +8,7 @@ from bhd_lerobot.sim.engine import mujoco
 
 # Obstacles that one simulation can have. All simulations of a batch share one model, so the number is fixed; a pool
 # geometry that a simulation does not use is parked far below the floor, where the broad phase drops it at once.
-POOL_SIZE = 64
+POOL_SIZE = 32
 PARKED_Z = -100.0
 
 _FLOOR_BIT, _SCENE_BIT = 1, 2
@@ -48,7 +48,12 @@ def build_model(body: Body, physics_hz: int, pool_size: int = POOL_SIZE) -> mujo
         refname="scene",
         intprm=[1, 0, 1],  # data: found; reduce: none; num: one slot
     )
-    return spec.compile()
+    model = spec.compile()
+    # The compiler marks geometries that have the orientation of their body, and the engine then leaves theirs out of
+    # account: obstacles would all stand along the axes, whatever orientation a simulation gives them.
+    for index in range(pool_size):
+        model.geom(f"obstacle_{index:03d}").sameframe = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    return model
 
 
 def _add_stage(spec: mujoco.MjSpec) -> None:

@@ -11,7 +11,8 @@ from bhd_lerobot.errors import SimulationError, unknown_name
 from bhd_lerobot.sim.engine import mujoco, mujoco_batch
 from bhd_lerobot.sim.scene import PARKED_Z, POOL_SIZE, build_model, shape_fields
 
-Ids = NDArray[np.intp] | Sequence[int] | None
+# Sorted and without repetition, or a mask of shape (n,); all if None.
+Ids = NDArray[np.intp] | NDArray[np.bool_] | Sequence[int] | None
 
 # Only the obstacles, which are in group 0: a range finder does not see the robot that carries it.
 _SCENE_GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
@@ -327,7 +328,14 @@ class World:
         return np.asarray(getattr(owner, name.removeprefix("opt.")))
 
     def _ids(self, ids: Ids) -> NDArray[np.intp]:
-        return self._all if ids is None else np.asarray(ids, dtype=np.intp)
+        if ids is None:
+            return self._all
+        ids = np.asarray(ids)
+        if ids.dtype == np.bool_:
+            if ids.shape != (self.n,):
+                raise SimulationError(f"A mask of simulations has shape ({self.n},), got {ids.shape}.")
+            return np.flatnonzero(ids)
+        return ids.astype(np.intp, copy=False)
 
 
 def _rotation_matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
