@@ -171,7 +171,7 @@ class Body:
     touch_sensor: str = "touch"
     radius: float = 0.0
     height: float = 0.0
-    physics_hz: int = 400
+    physics_hz: int = 200
     control_hz: int = 200
 
 

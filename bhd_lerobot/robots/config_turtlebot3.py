@@ -39,7 +39,7 @@ class TurtleBot3Config(RobotConfig):
     fps: int = 10
     clock: str = "lockstep"
     control_hz: int = 200
-    physics_hz: int = 400
+    physics_hz: int = 200
     arena: str = "turtlebot3_world"
     seed: int = 0
     beams: int = 360

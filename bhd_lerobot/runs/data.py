@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from bhd_lerobot.data import features as keys
@@ -64,10 +65,11 @@ def info(root: Path, console: Console, as_json: bool = False) -> None:
     for heading in ("key", "type", "shape", "meaning"):
         features.add_column(heading)
     for key, feature in summary.features.items():
-        features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), _meaning(key, feature))
+        # Units stand in square brackets, which rich would take for markup.
+        features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), escape(_meaning(key, feature)))
     console.print(features)
     episodes = Table(title="Episodes", title_justify="left")
-    for heading in ("episode", "frames", "seconds", "outcome", "score", "seed", "overruns", "late p99 [ms]"):
+    for heading in ("episode", "frames", "seconds", "outcome", "score", "seed", "overruns", "late p99 / ms"):
         episodes.add_column(heading, justify="left" if heading == "outcome" else "right")
     for episode in summary.episodes:
         episodes.add_row(*_episode_row(episode, summary.fps))
