@@ -29,6 +29,8 @@ from bhd_lerobot.data.video import VideoSettings
 FPS = 10
 STATE = 362
 CAMERA = "observation.images.front"
+PYARROW = "pyarrow alone, write_table as it comes"
+PYARROW_PLAIN = "pyarrow alone, without dictionaries"
 METADATA = {"seed": 1, "outcome": "success", "score": 0.5, "brain": "avoidance"}
 
 
@@ -166,15 +168,13 @@ def main() -> None:
 
     plain = {"use_dictionary": False}
     contestants: dict[str, Callable[[Path], None]] = {
-        "LeRobot add_frame + save_episode + finalize": lambda root: record_with_lerobot(
-            root, data, pictures, settings
-        ),
+        "LeRobot add_frame + save_episode + finalize": lambda root: record_with_lerobot(root, data, pictures, settings),
         "ours, set_columns": lambda root: record_with_ours(root, data, pictures, settings, by_frame=False),
         "ours, add_frame": lambda root: record_with_ours(root, data, pictures, settings, by_frame=True),
     }
     if pictures is None:
-        contestants["pyarrow, write_table as it comes"] = lambda root: write_with_pyarrow(root, data, {})
-        contestants["pyarrow, write_table without dictionaries"] = lambda root: write_with_pyarrow(root, data, plain)
+        contestants[PYARROW] = lambda root: write_with_pyarrow(root, data, {})
+        contestants[PYARROW_PLAIN] = lambda root: write_with_pyarrow(root, data, plain)
     seconds: dict[str, list[float]] = {name: [] for name in contestants}
     for repeat in range(arguments.repeats + 1):
         for name, contestant in contestants.items():
@@ -192,13 +192,13 @@ def main() -> None:
                 shutil.rmtree(folder)
     frames = arguments.episodes * arguments.length
     rates = {name: frames / statistics.median(times[1:]) for name, times in seconds.items()}  # the first warms up
-    reference, alone = next(iter(rates.values())), rates.get("pyarrow, write_table without dictionaries")
     shape = f"{arguments.episodes} episodes of {arguments.length} frames, {STATE} floats"
     print(f"{shape}{', camera 320x240' if pictures is not None else ''}; median of {arguments.repeats}")
-    print(f"{'':44} {'frames/s':>10} {'ms/episode':>11} {'x LeRobot':>10} {'x pyarrow':>10}")
+    references = {"x LeRobot": next(iter(rates)), "x pyarrow": PYARROW, "x pyarrow plain": PYARROW_PLAIN}
+    print(f"{'':44} {'frames/s':>10} {'ms/episode':>11}" + "".join(f"{title:>17}" for title in references))
     for name, rate in rates.items():
-        share = f"{rate / alone:10.2f}" if alone else f"{'-':>10}"
-        print(f"{name:44} {rate:10.0f} {1000 * arguments.length / rate:11.2f} {rate / reference:10.1f} {share}")
+        shares = [f"{rate / rates[other]:17.2f}" if other in rates else f"{'-':>17}" for other in references.values()]
+        print(f"{name:44} {rate:10.0f} {1000 * arguments.length / rate:11.2f}" + "".join(shares))
 
 
 if __name__ == "__main__":
