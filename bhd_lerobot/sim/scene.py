@@ -28,7 +28,7 @@ def build_model(body: Body, physics_hz: int, pool_size: int = POOL_SIZE) -> mujo
     try:
         spec = mujoco.MjSpec.from_string(body.mjcf)
     except ValueError as error:
-        raise ConfigError(f"The MJCF of body {body.name!r} does not compile: {error}") from error
+        raise ConfigError(f"The MJCF of body {body.name!r} is not valid: {error}") from error
     spec.option.timestep = 1.0 / physics_hz
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # Elliptic cones with a stiffer friction direction: with the defaults a wheel creeps through its contact by several
@@ -48,7 +48,10 @@ def build_model(body: Body, physics_hz: int, pool_size: int = POOL_SIZE) -> mujo
         refname="scene",
         intprm=[1, 0, 1],  # data: found; reduce: none; num: one slot
     )
-    model = spec.compile()
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise ConfigError(f"The MJCF of body {body.name!r} does not compile: {error}") from error
     # The compiler marks geometries that have the orientation of their body, and the engine then leaves theirs out of
     # account: obstacles would all stand along the axes, whatever orientation a simulation gives them.
     for index in range(pool_size):
