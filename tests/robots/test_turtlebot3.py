@@ -1,0 +1,220 @@
+"""The TurtleBot3 as LeRobot sees it: bad actions, stops, noise, options, time."""
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+
+from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError, RenderingError
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+
+GO = {"x.vel": 0.2, "theta.vel": 0.0}
+
+
+def make(tmp_path: Path, **options) -> TurtleBot3:
+    return TurtleBot3(TurtleBot3Config(calibration_dir=tmp_path, **options))
+
+
+@pytest.fixture
+def robot(tmp_path):
+    with make(tmp_path, arena="empty") as robot:
+        yield robot
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ({"x.vel": 0.1}, "lacks 'theta.vel'"),
+        ({"x.velo": 0.1, "theta.vel": 0.0}, "Did you mean 'x.vel'"),
+        ({**GO, "y.vel": 0.0}, "Unknown action key 'y.vel'"),
+        ({"x.vel": math.nan, "theta.vel": 0.0}, "'x.vel' is nan"),
+        ({"x.vel": 0.1, "theta.vel": math.inf}, "'theta.vel' is inf"),
+        ({"x.vel": -math.inf, "theta.vel": 0.0}, "'x.vel' is -inf"),
+        ({"x.vel": "fast", "theta.vel": 0.0}, "not a number"),
+        ({"x.vel": None, "theta.vel": 0.0}, "not a number"),
+        ([0.1, 0.0], "dict"),
+    ],
+)
+def test_a_bad_action_is_refused_and_nothing_happens(robot, action, message):
+    before = robot.simulation.physics_state
+    now = robot.simulation.bridge.now_ns
+    with pytest.raises(ActionError, match=message):
+        robot.send_action(action)
+    assert np.array_equal(robot.simulation.physics_state, before)
+    assert robot.simulation.bridge.now_ns == now
+
+
+def test_keys_are_names_so_their_order_does_not_matter(tmp_path):
+    results = []
+    for keys in (("x.vel", "theta.vel"), ("theta.vel", "x.vel")):
+        with make(tmp_path, arena="empty") as robot:
+            action = {"x.vel": 0.1, "theta.vel": 0.7}
+            results.append([robot.send_action({key: action[key] for key in keys}) for _ in range(5)])
+            assert list(results[-1][0]) == ["x.vel", "theta.vel"]
+    assert results[0] == results[1]
+
+
+def test_far_out_of_range_is_limited_and_the_return_value_says_so(robot):
+    for _ in range(20):
+        applied = robot.send_action({"x.vel": 1e9, "theta.vel": 0.0})
+    assert applied == {"x.vel": 0.22, "theta.vel": 0.0}
+    for _ in range(20):
+        applied = robot.send_action({"x.vel": 0.0, "theta.vel": -1e300})
+    assert applied["theta.vel"] == -2.84
+    measured = robot.get_observation()
+    assert measured["theta.vel"] == pytest.approx(-2.84, abs=0.02)
+
+
+def test_the_returned_action_is_what_the_base_was_commanded(robot):
+    # From rest with 2.5 m/s^2 a tenth of a second is enough for 0.1 m/s, and with 3.2 rad/s^2 for 0.32 rad/s only.
+    applied = robot.send_action({"x.vel": 0.1, "theta.vel": 1.0})
+    assert applied["x.vel"] == pytest.approx(0.1)
+    assert applied["theta.vel"] == pytest.approx(0.32)
+    assert applied == dict(zip(robot.action_names, robot.simulation.cerebellum.command[0], strict=True))
+
+
+def test_one_action_is_one_frame_of_simulated_time(tmp_path):
+    for fps in (5, 10, 50):
+        with make(tmp_path, arena="empty", fps=fps) as robot:
+            for _ in range(fps):
+                robot.send_action(GO)
+            assert robot.simulation.bridge.now_ns == 1_000_000_000
+            assert robot.simulation.world.time[0] == pytest.approx(1.0)
+
+
+def test_calls_before_connect_and_after_disconnect(tmp_path):
+    robot = make(tmp_path)
+    for _ in range(2):
+        for call in (robot.get_observation, lambda: robot.send_action(GO), robot.estop, robot.reset, robot.activate):
+            with pytest.raises(DeviceNotConnectedError):
+                call()
+        robot.disconnect()
+        robot.connect()
+        with pytest.raises(DeviceAlreadyConnectedError):
+            robot.connect()
+        robot.disconnect()
+        robot.disconnect()
+
+
+def test_emergency_stop_is_latched_until_reset_and_activate(robot):
+    for _ in range(10):
+        robot.send_action(GO)
+    robot.estop()
+    for _ in range(3):  # 0.3 s
+        with pytest.raises(CommandRefusedError, match="emergency stop is latched"):
+            robot.send_action(GO)
+    assert abs(robot.get_observation()["x.vel"]) < 1e-3
+    with pytest.raises(CommandRefusedError, match="emergency stop"):
+        robot.activate()
+    robot.reset()
+    with pytest.raises(CommandRefusedError, match="activate"):
+        robot.send_action(GO)
+    robot.activate()
+    assert robot.send_action(GO)["x.vel"] == pytest.approx(0.2)
+    with pytest.raises(CommandRefusedError):
+        robot.reset()  # nothing to clear
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fps": 7}, "valid values of fps: 1, 2, 4, 5"),
+        ({"fps": 0}, "positive whole number"),
+        ({"physics_hz": 300}, "control_hz"),
+        ({"beams": 7}, "must divide 360"),
+        ({"beams": 0}, "must divide 360"),
+        ({"clock": "lockstop"}, "Did you mean 'lockstep'"),
+        ({"arena": "randm"}, "Did you mean 'random'"),
+        ({"lidar_noise_std": -0.1}, "lidar_noise_std"),
+        ({"lidar_noise_std": math.nan}, "lidar_noise_std"),
+        ({"command_timeout_s": 0}, "does not mean 'off'"),
+        ({"camera_width": 0}, "must be positive"),
+        ({"seed": -1}, "seeds start at 0"),
+    ],
+)
+def test_options_that_cannot_be_honoured(options, message):
+    with pytest.raises(ConfigError, match=message):
+        TurtleBot3Config(**options)
+
+
+def test_a_frame_longer_than_the_command_timeout_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="Raise fps to at least 2"):
+        make(tmp_path, fps=1).connect()
+
+
+def test_equal_seeds_give_equal_noise_and_others_do_not(tmp_path):
+    def observe(seed):
+        with make(tmp_path, seed=seed) as robot:
+            return [robot.get_observation(), robot.send_action(GO), robot.send_action(GO), robot.get_observation()]
+
+    assert observe(3) == observe(3)
+    assert observe(3) != observe(4)
+
+
+def test_a_scan_lasts_a_fifth_of_a_second(robot):
+    seen = []
+    for _ in range(7):
+        observation = robot.get_observation()
+        seen.append(tuple(value for name, value in observation.items() if name.startswith("scan_")))
+        robot.send_action(GO)
+    fresh = [a != b for a, b in zip(seen, seen[1:], strict=False)]
+    assert fresh == [False, True] * 3
+
+
+def test_fewer_beams_are_the_same_beams(tmp_path):
+    with make(tmp_path, lidar_noise_std=0.0) as full, make(tmp_path, lidar_noise_std=0.0, beams=36) as few:
+        all_beams, some = full.get_observation(), few.get_observation()
+    for beam in range(36):
+        assert some[f"scan_{beam:03d}.pos"] == pytest.approx(all_beams[f"scan_{beam * 10:03d}.pos"], abs=1e-9)
+
+
+def test_odometry_follows_the_truth_and_drifts(tmp_path):
+    with make(tmp_path, arena="empty", odometry=True) as robot:
+        for k in range(60):
+            robot.send_action({"x.vel": 0.15, "theta.vel": 0.8 if k % 20 < 10 else -0.5})
+        seen = robot.get_observation()
+        truth = robot.simulation.world.base_pose[0]
+    error = math.hypot(seen["x.pos"] - truth[0], seen["y.pos"] - truth[1])
+    assert 0 < error < 0.05
+    assert seen["theta.pos"] == pytest.approx(truth[2], abs=0.15)
+
+
+def test_imu_measures_the_turn(tmp_path):
+    with make(tmp_path, arena="empty", imu=True) as robot:
+        for _ in range(15):
+            robot.send_action({"x.vel": 0.0, "theta.vel": 1.0})
+        seen = robot.get_observation()
+    assert seen["imu_z.vel"] == pytest.approx(1.0, abs=0.02)
+    assert seen["imu_x.vel"] == pytest.approx(0.0, abs=0.02)
+
+
+def test_lerobot_finds_the_robot_and_the_brain_through_its_plugin_mechanism():
+    code = (
+        "from lerobot.utils.import_utils import register_third_party_plugins as r; r();"
+        "from lerobot.robots import RobotConfig, make_robot_from_config as m;"
+        "from lerobot.teleoperators import TeleoperatorConfig, make_teleoperator_from_config as t;"
+        "print(type(m(RobotConfig.get_choice_class('turtlebot3')())).__name__,"
+        " type(t(TeleoperatorConfig.get_choice_class('bhd_brain')())).__name__)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["TurtleBot3", "BhdBrain"]
+
+
+def test_camera_images_where_there_is_opengl(tmp_path):
+    robot = make(tmp_path, camera=True, camera_width=64, camera_height=48)
+    assert robot.observation_features["front"] == (48, 64, 3)
+    try:
+        robot.connect()
+    except RenderingError as error:
+        assert "libegl1" in str(error)
+        assert not robot.is_connected
+        pytest.skip("no OpenGL here")
+    image = robot.get_observation()["front"]
+    robot.disconnect()
+    assert image.shape == (48, 64, 3)
+    assert image.std() > 1
