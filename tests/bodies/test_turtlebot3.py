@@ -119,6 +119,12 @@ def test_a_stop_stays_within_what_the_tyres_can_carry(model: mujoco.MjModel, dat
     assert yaw_inertia * angular / (BODY.drive.wheel_separation / 2) <= friction
 
 
+def test_the_servo_is_slower_than_a_physics_step_and_fast_enough_to_stop(model: mujoco.MjModel) -> None:
+    rotor = model.joint("wheel_left").armature[0] + model.body("wheel_left").inertia[1]
+    time_constant = (model.body_subtreemass[0] * 0.033**2 / 2 + rotor) / BODY.drive.servo_gain
+    assert 2 / BODY.physics_hz <= time_constant <= 0.02
+
+
 def test_the_lidar_is_the_lds_01(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     assert BODY.lidar is not None
     assert (BODY.lidar.beams, BODY.lidar.range_min, BODY.lidar.range_max) == (360, 0.12, 3.5)

@@ -1,0 +1,516 @@
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.arenas import random_arena
+from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.errors import ConfigError, SimulationError
+from bhd_lerobot.sim.lidar import Lidar
+from bhd_lerobot.sim.plant import SimulatedPlant
+from bhd_lerobot.sim.world import World
+
+BODY = turtlebot3_burger()
+RADIUS, SEPARATION = 0.033, 0.160
+PHYSICS_HZ = pytest.mark.parametrize("physics_hz", [200, 400, 1000])
+
+
+def wheel_speeds(speed: float, yaw_rate: float) -> tuple[float, float]:
+    """Of a base that rolls without slip, left and right."""
+    turn = yaw_rate * SEPARATION / 2
+    return (speed - turn) / RADIUS, (speed + turn) / RADIUS
+
+
+def pass_time(world: World, seconds: float) -> None:
+    world.step(round(seconds * world.physics_hz))
+
+
+def drive(world: World, speed: float, yaw_rate: float, seconds: float, start: tuple[float, float] = (0, 0)) -> None:
+    """Take all robots from one twist to another within the body's acceleration limits, and keep it."""
+    limit = np.array(BODY.limits.acceleration) / 200
+    twist = np.array(start, float)
+    for _ in range(round(seconds * 200)):
+        twist += np.clip(np.array([speed, yaw_rate]) - twist, -limit, limit)
+        world.ctrl[:] = wheel_speeds(*twist)
+        world.step(world.physics_hz // 200)
+
+
+def roam(world: World, sims: range, steps: int = 25) -> None:
+    """Drive each simulation by random wheel speeds of its own."""
+    generators = [np.random.default_rng([99, sim]) for sim in sims]
+    for _ in range(steps):
+        for row, generator in enumerate(generators):
+            world.ctrl[row] = generator.uniform(-7, 7, 2)
+        world.step(8)
+
+
+def fill(world: World, sims: range) -> None:
+    arenas = [random_arena(sim) for sim in sims]
+    world.place([arena.shapes for arena in arenas])
+    world.reset(poses=np.array([arena.start for arena in arenas]))
+
+
+def everything(world: World, sim: int) -> bytes:
+    """All of one simulation that anybody can see, as bytes."""
+    snapshot = world.snapshot(np.array([sim]))
+    sensors = [world.sensor(world.model.sensor(k).name)[sim] for k in range(world.model.nsensor)]
+    parts = [snapshot.state, *snapshot.fields.values(), *sensors]
+    return b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+
+
+# --- determinism -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sixty_four() -> list[bytes]:
+    world = World(BODY, 64, threads=2)
+    fill(world, range(64))
+    roam(world, range(64))
+    return [everything(world, sim) for sim in range(64)]
+
+
+def test_simulations_differ(sixty_four: list[bytes]) -> None:
+    assert len(set(sixty_four)) == 64
+
+
+@pytest.mark.parametrize(("n", "threads"), [(1, None), (7, None), (7, 1), (64, 1), (64, 5)])
+def test_the_same_commands_give_the_same_bytes_for_any_number_of_simulations_and_threads(
+    n: int, threads: int | None, sixty_four: list[bytes]
+) -> None:
+    world = World(BODY, n, threads=threads)
+    fill(world, range(n))
+    roam(world, range(n))
+    assert [everything(world, sim) for sim in range(n)] == sixty_four[:n]
+
+
+def test_a_simulation_does_not_depend_on_its_place(sixty_four: list[bytes]) -> None:
+    world = World(BODY, 3)
+    fill(world, range(20, 23))
+    roam(world, range(20, 23))
+    assert [everything(world, sim) for sim in range(3)] == sixty_four[20:23]
+
+
+def test_an_episode_does_not_depend_on_the_one_before(sixty_four: list[bytes]) -> None:
+    world = World(BODY, 4)
+    fill(world, range(40, 44))
+    roam(world, range(40, 44), 7)
+    fill(world, range(4))
+    roam(world, range(4))
+    states = [world.snapshot(np.array([sim])).state.tobytes() for sim in range(4)]
+    assert all(expected.startswith(state) for state, expected in zip(states, sixty_four, strict=False))
+
+
+def test_steps_may_be_split() -> None:
+    at_once, split = World(BODY, 2), World(BODY, 2)
+    for world in (at_once, split):
+        fill(world, range(2))
+        world.ctrl[:] = (5.0, -3.0)
+    at_once.step(30)
+    for k in (1, 4, 25):
+        split.step(k)
+    assert [everything(at_once, sim) for sim in range(2)] == [everything(split, sim) for sim in range(2)]
+
+
+def test_only_the_simulations_named_are_stepped() -> None:
+    world, reference = World(BODY, 5), World(BODY, 5)
+    for each in (world, reference):
+        fill(each, range(5))
+        each.ctrl[:] = 4.0
+    before = [everything(world, sim) for sim in range(5)]
+    world.step(10, np.array([1, 4]))
+    reference.step(10)
+    for sim in range(5):
+        assert everything(world, sim) == (everything(reference, sim) if sim in (1, 4) else before[sim])
+    world.step(10, np.array([], np.intp))
+    world.step(10, np.zeros(5, np.bool_))
+    world.reset([], np.zeros((0, 3)))
+    assert everything(world, 0) == before[0]
+    world.step(10, np.array([True, False, True, True, False]))
+    assert [everything(world, sim) for sim in range(5)] == [everything(reference, sim) for sim in range(5)]
+
+
+def test_reset_of_some_leaves_the_others_alone() -> None:
+    world = World(BODY, 6)
+    fill(world, range(6))
+    roam(world, range(6))
+    before = [everything(world, sim) for sim in range(6)]
+    ids = np.array([0, 3])
+    world.place([random_arena(77).shapes, ()], ids)
+    world.reset(ids, np.array([(0.1, 0.2, 0.3), (-0.1, 0.0, 3.0)]))
+    after = [everything(world, sim) for sim in range(6)]
+    assert [a == b for a, b in zip(after, before, strict=True)] == [False, True, True, False, True, True]
+    np.testing.assert_allclose(world.base_pose[ids], [(0.1, 0.2, 0.3), (-0.1, 0.0, 3.0)], atol=1e-12)
+    assert (world.qvel[ids] == 0).all()
+    assert (world.ctrl[ids] == 0).all()
+    assert (world.time[ids] == 0).all()
+
+
+@pytest.mark.parametrize("poses", [np.zeros((2, 3)), np.zeros(3), np.array([[0.0, math.nan, 0.0]])])
+def test_impossible_start_poses_are_refused(poses: np.ndarray) -> None:
+    with pytest.raises(SimulationError, match="Start poses"):
+        World(BODY).reset(poses=poses)
+
+
+# --- snapshots -------------------------------------------------------------------------------------------------------
+
+
+def test_a_restored_snapshot_goes_on_bit_exactly() -> None:
+    world = World(BODY, 5)
+    fill(world, range(5))
+    roam(world, range(5))
+    snapshot = world.snapshot()
+    roam(world, range(5), 10)
+    expected = [everything(world, sim) for sim in range(5)]
+    world.place([()] * 5)
+    roam(world, range(3, 8), 4)
+    world.restore(snapshot)
+    assert world.snapshot().state.tobytes() == snapshot.state.tobytes()
+    roam(world, range(5), 10)
+    assert [everything(world, sim) for sim in range(5)] == expected
+
+    elsewhere = World(BODY, 5, threads=1)
+    elsewhere.restore(snapshot)
+    roam(elsewhere, range(5), 10)
+    assert [everything(elsewhere, sim) for sim in range(5)] == expected
+
+
+def test_a_snapshot_of_some_can_be_restored_into_others() -> None:
+    world = World(BODY, 4)
+    fill(world, range(4))
+    roam(world, range(4))
+    snapshot = world.snapshot([1, 3])
+    untouched = everything(world, 3)
+    world.restore(snapshot, np.array([0, 2]))
+    assert everything(world, 3) == untouched
+    for _ in range(3):
+        world.ctrl[:] = (6.0, 2.0)
+        world.step(20)
+    assert everything(world, 0) == everything(world, 1)
+    assert everything(world, 2) == everything(world, 3)
+
+
+def test_a_snapshot_holds_randomised_model_fields_and_what_derives_from_them() -> None:
+    world = World(BODY, 3)
+    fill(world, range(3))
+    world.model_field("geom_friction")[:, :, 0] *= np.array([0.2, 0.5, 1.0])[:, None]
+    world.model_field("body_mass")[:] *= np.array([0.7, 1.0, 1.6])[:, None]
+    world.model_field("opt.gravity")[:, 2] = (-9.0, -9.81, -10.0)
+    world.update_constants()
+    roam(world, range(3))
+    snapshot = world.snapshot()
+    roam(world, range(3), 10)
+    expected = [world.snapshot([sim]).state.tobytes() for sim in range(3)]
+    for target in (world, World(BODY, 3)):
+        target.restore(snapshot)
+        roam(target, range(3), 10)
+        assert [target.snapshot([sim]).state.tobytes() for sim in range(3)] == expected
+
+
+def test_a_snapshot_from_before_a_randomisation_undoes_it() -> None:
+    world, reference = World(BODY, 2), World(BODY, 2)
+    for each in (world, reference):
+        fill(each, range(2))
+    snapshot = world.snapshot()
+    world.model_field("geom_friction")[:] = 0.01
+    world.model_field("opt.gravity")[:] = (0.0, 0.0, -1.0)
+    world.model_field("body_mass")[:] *= 3.0
+    world.update_constants()
+    roam(world, range(2), 3)
+    world.restore(snapshot)
+    for each in (world, reference):
+        roam(each, range(2))
+    assert world.snapshot().state.tobytes() == reference.snapshot().state.tobytes()
+
+
+def test_sensors_read_the_restored_state() -> None:
+    world = World(BODY, 2)
+    fill(world, range(2))
+    roam(world, range(2))
+    snapshot = world.snapshot()
+    world.reset()
+    world.restore(snapshot)
+    np.testing.assert_array_equal(world.sensor("encoder_left")[:, 0], world.qpos[:, 7])
+    np.testing.assert_array_equal(world.sensor("speed_right")[:, 0], world.qvel[:, 7])
+
+
+def test_a_snapshot_is_a_copy() -> None:
+    world = World(BODY)
+    snapshot = world.snapshot()
+    before = snapshot.state.tobytes()
+    world.ctrl[:] = 5.0
+    world.step(10)
+    world.model_field("geom_pos")[:] += 1.0
+    assert snapshot.state.tobytes() == before
+    assert not (snapshot.fields["geom_pos"] == world.model_field("geom_pos")).any()
+
+
+def test_a_snapshot_of_other_simulations_does_not_fit() -> None:
+    snapshot = World(BODY, 2).snapshot()
+    with pytest.raises(SimulationError, match="shape"):
+        World(BODY, 3).restore(snapshot)
+
+
+# --- names -----------------------------------------------------------------------------------------------------------
+
+
+def test_unknown_names_are_errors_with_the_near_miss() -> None:
+    world = World(BODY)
+    with pytest.raises(SimulationError, match=r"Did you mean 'imu_gyro'.*Valid: .*touch"):
+        world.sensor("imu_gyr")
+    with pytest.raises(SimulationError, match="Did you mean 'geom_friction'"):
+        world.model_field("geom_frictions")
+    with pytest.raises(SimulationError, match="Did you mean 'wheel_left'"):
+        world.joint_slice(["wheel_lef"])
+    with pytest.raises(SimulationError, match="neighbours"):
+        world.joint_slice(["wheel_right", "wheel_left"])
+
+
+def test_a_body_that_does_not_compile_is_an_error_with_its_name() -> None:
+    with pytest.raises(ConfigError, match=BODY.name):
+        World(dataclasses.replace(BODY, mjcf="<mujoco><body/></mujoco>"))
+
+
+@pytest.mark.parametrize("n", [0, -1])
+def test_a_world_has_simulations(n: int) -> None:
+    with pytest.raises(SimulationError, match="at least one"):
+        World(BODY, n)
+
+
+def test_more_obstacles_than_the_pool_holds_are_refused() -> None:
+    post = Shape("cylinder", 1.0, 0.0, 0.0, 0.1, 0.1)
+    with pytest.raises(SimulationError, match=r"4 obstacles; this world holds 3.*pool_size"):
+        World(BODY, pool_size=3).place([[post] * 4])
+    with pytest.raises(SimulationError, match="1 obstacles; this world holds 0"):
+        World(BODY, pool_size=0).place([[post]])
+    with pytest.raises(SimulationError, match="2 scenes were given for 1"):
+        World(BODY).place([[post], [post]])
+
+
+def test_sensor_readings_are_live_and_cannot_be_written_to() -> None:
+    world = World(BODY)
+    encoder = world.sensor("encoder_left")
+    world.ctrl[:] = 3.0
+    world.step(50)
+    assert encoder[0, 0] > 0.1
+    with pytest.raises(ValueError, match="read-only"):
+        encoder[:] = 0.0
+
+
+def test_the_plant_reads_and_writes_the_wheels_by_name() -> None:
+    world = World(BODY, 3)
+    plant = SimulatedPlant(world)
+    plant.write(np.array([(0.5, 1.0), (1.0, 1.5), (1.5, 2.0)]))
+    pass_time(world, 2.0)
+
+    class Reading:
+        position = np.zeros((3, 2))
+        velocity = np.zeros((3, 2))
+
+    plant.read(Reading)  # type: ignore[arg-type]
+    np.testing.assert_allclose(Reading.velocity, [(0.5, 1.0), (1.0, 1.5), (1.5, 2.0)], rtol=0.02)
+    np.testing.assert_allclose(Reading.position, Reading.velocity * 2.0, rtol=0.03)
+    world.forward()
+    for side, name in enumerate(("left", "right")):
+        np.testing.assert_array_equal(Reading.velocity[:, side], world.sensor(f"speed_{name}")[:, 0])
+        np.testing.assert_array_equal(Reading.position[:, side], world.sensor(f"encoder_{name}")[:, 0])
+
+
+def test_a_body_whose_wheel_actuators_are_apart_is_refused() -> None:
+    between = '<velocity name="extra" joint="wheel_left"/><velocity name="wheel_right"'
+    mjcf = BODY.mjcf.replace('<velocity name="wheel_right"', between)
+    with pytest.raises(SimulationError, match="not neighbours"):
+        SimulatedPlant(World(dataclasses.replace(BODY, mjcf=mjcf)))
+
+
+# --- physics ---------------------------------------------------------------------------------------------------------
+
+
+@PHYSICS_HZ
+@pytest.mark.parametrize("speed", [0.05, 0.22, -0.22])
+def test_driving_straight_covers_speed_times_time(speed: float, physics_hz: int) -> None:
+    world = World(BODY, physics_hz=physics_hz)
+    world.reset(poses=np.array([[0.0, 0.0, 0.5]]))
+    drive(world, speed, 0.0, 4.0)
+    x, y, yaw = world.base_pose[0]
+    ramp = abs(speed) / BODY.limits.acceleration[0]
+    assert x * math.cos(0.5) + y * math.sin(0.5) == pytest.approx(speed * (4.0 - ramp / 2), rel=0.01)
+    assert abs(y * math.cos(0.5) - x * math.sin(0.5)) < 0.002
+    assert yaw == pytest.approx(0.5, abs=0.005)
+
+
+@PHYSICS_HZ
+@pytest.mark.parametrize("rate", [0.5, 2.84, -2.84])
+def test_spinning_turns_rate_times_time_on_the_spot(rate: float, physics_hz: int) -> None:
+    world = World(BODY, physics_hz=physics_hz)
+    drive(world, 0.0, rate, 1.0)
+    turned, before = 0.0, world.base_pose[0, 2]
+    for _ in range(200):
+        pass_time(world, 0.02)
+        yaw = world.base_pose[0, 2]
+        turned += (yaw - before + np.pi) % (2 * np.pi) - np.pi
+        before = yaw
+    assert turned == pytest.approx(rate * 4.0, rel=0.02)
+    assert np.hypot(*world.base_pose[0, :2]) < 0.01
+
+
+def test_a_circle_has_the_radius_speed_over_rate() -> None:
+    world = World(BODY)
+    drive(world, 0.15, 0.6, 0.5)
+    path = []
+    for _ in range(200):
+        pass_time(world, 0.05)
+        path.append(world.base_pose[0, :2])
+    points = np.array(path)
+    matrix = np.column_stack([2 * points, np.ones(len(points))])
+    solution = np.linalg.lstsq(matrix, (points**2).sum(axis=1), rcond=None)[0]
+    radius = math.sqrt(solution[2] + solution[:2] @ solution[:2])
+    assert radius == pytest.approx(0.15 / 0.6, rel=0.02)
+
+
+def test_the_gyro_measures_the_yaw_rate() -> None:
+    world = World(BODY)
+    drive(world, 0.1, 1.5, 1.0)
+    assert world.sensor("imu_gyro")[0, 2] == pytest.approx(1.5, rel=0.03)
+    # At rest the accelerometer feels the floor push against gravity.
+    drive(world, 0.0, 0.0, 1.0, (0.1, 1.5))
+    pass_time(world, 1.0)
+    np.testing.assert_allclose(world.sensor("imu_accelerometer")[0], (0, 0, 9.81), atol=0.1)
+
+
+@pytest.mark.parametrize("speed", [1e3, -1e3, 7.0])
+def test_the_wheel_torque_never_exceeds_its_limit(speed: float) -> None:
+    world = World(BODY)
+    model = world.copy_model(0)
+    data = mujoco.MjData(model)
+    largest = 0.0
+    for k in range(200):
+        world.ctrl[0] = speed if k // 20 % 2 else -speed
+        world.step()
+        world.copy_into(0, model, data)
+        mujoco.mj_forward(model, data)
+        largest = max(largest, np.abs(data.actuator_force).max())
+        assert largest <= BODY.drive.max_torque
+    assert (largest == BODY.drive.max_torque) == (abs(speed) > 100)
+
+
+def test_a_robot_at_rest_stays_at_rest() -> None:
+    world = World(BODY, 2)
+    start = np.array([(0.0, 0.0, 0.0), (1.0, -2.0, 2.0)])
+    world.reset(poses=start)
+    lowest = []
+    for _ in range(10):
+        world.step(world.physics_hz)
+        lowest.append(world.qpos[:, 2].copy())
+    drift = world.base_pose - start
+    assert np.hypot(drift[:, 0], drift[:, 1]).max() < 1e-3
+    assert np.abs(drift[:, 2]).max() < 1e-3
+    assert np.abs(lowest).max() < 1e-3  # neither sinks nor lifts off
+    tilt = np.abs(world.qpos[:, 4:6]).max() * 2
+    assert tilt < math.radians(0.5)
+
+
+@PHYSICS_HZ
+def test_the_robot_keeps_its_feet_on_the_floor_when_it_starts_and_brakes(physics_hz: int) -> None:
+    """A robot that rears up by 0.05 rad sees the floor 3.6 m ahead."""
+    world = World(BODY, physics_hz=physics_hz)
+    largest = 0.0
+    speed = 0.0
+    for target in (0.22, 0.0, -0.22, 0.22, 0.0):
+        for _ in range(100):
+            speed += float(np.clip(target - speed, -2.5 / 200, 2.5 / 200))
+            world.ctrl[0] = wheel_speeds(speed, 0.0)
+            world.step(physics_hz // 200)
+            largest = max(largest, 2 * abs(world.qpos[0, 5]))
+    assert largest < 0.01
+
+
+def test_braking_takes_the_energy_out() -> None:
+    world = World(BODY)
+    drive(world, 0.22, 0.0, 1.0)
+    model = world.copy_model(0)
+    data = mujoco.MjData(model)
+    world.ctrl[0] = 0.0
+
+    def kinetic() -> float:
+        world.copy_into(0, model, data)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_energyVel(model, data)
+        return float(data.energy[1])
+
+    energy = [kinetic()]
+    mass = model.body_subtreemass[model.body("base").id]
+    spinning = sum(model.body(name).inertia[1] + model.joint(name).armature[0] for name in BODY.drive.joints)
+    expected = 0.5 * mass * 0.22**2 + 0.5 * spinning * (0.22 / RADIUS) ** 2
+    assert energy[0] == pytest.approx(expected, rel=0.02)
+    for _ in range(200):
+        world.step()
+        energy.append(kinetic())
+    assert max(energy[1:]) < energy[0]
+    assert (np.diff(energy) < 0.1 * energy[0]).all()  # a little comes back from the pitching
+    assert energy[-1] < 1e-6
+
+
+def test_touch_is_felt_at_a_box_and_not_on_the_floor() -> None:
+    world = World(BODY, 2)
+    world.place([[Shape("box", 0.3, 0.0, 0.0, 0.05, 0.3)], []])
+    world.reset()
+    touch = world.sensor(BODY.touch_sensor)
+    drive(world, 0.2, 0.0, 0.8)
+    assert not touch.any()
+    felt = np.zeros(2, np.bool_)
+    while world.time[0] < 2.0:
+        world.step()
+        # The front of the hull is 0.038 m ahead of the axis, that of the box 0.25 m.
+        if not felt[0] and touch[0, 0]:
+            assert world.base_pose[0, 0] == pytest.approx(0.25 - 0.038, abs=0.003)
+        felt |= touch[:, 0] > 0
+    assert felt.tolist() == [True, False]
+    assert world.base_pose[0, 0] < 0.25 - 0.03  # the box did not let it through
+    assert world.base_pose[1, 0] > 0.35
+
+
+def test_a_low_obstacle_stops_a_wheel() -> None:
+    world = World(BODY)
+    world.place([[Shape("box", 0.3, 0.08, 0.0, 0.05, 0.05, 0.05)]])
+    world.reset()
+    world.ctrl[:] = wheel_speeds(0.2, 0.0)
+    touched = False
+    while world.time[0] < 2.0:
+        world.step()
+        touched |= bool(world.sensor(BODY.touch_sensor)[0, 0] > 0)
+    assert touched
+
+
+@pytest.mark.parametrize("broken", [math.nan, math.inf, 1e20])
+def test_diverged_physics_is_an_error_that_names_the_simulation(broken: float) -> None:
+    world, healthy = World(BODY, 4), World(BODY, 4)
+    for each in (world, healthy):
+        fill(each, range(4))
+        each.ctrl[:] = 3.0
+    world.qvel[2, 0] = broken
+    world.step(5)
+    healthy.step(5)
+    with pytest.raises(SimulationError, match=r"simulation\(s\) \[2\] diverged.*physics_hz"):
+        world.check()
+    assert [everything(world, sim) for sim in (0, 1, 3)] == [everything(healthy, sim) for sim in (0, 1, 3)]
+    world.reset([2])
+    world.check()
+    world.step(5)
+    world.check()
+
+
+def test_images_and_scans_do_not_disturb_the_physics() -> None:
+    world, reference = World(BODY, 2), World(BODY, 2)
+    for each in (world, reference):
+        fill(each, range(2))
+    assert BODY.lidar is not None
+    lidar = Lidar(world, BODY.lidar)
+    for _ in range(5):
+        lidar.scan([np.random.default_rng(sim) for sim in range(2)])
+        for each in (world, reference):
+            each.ctrl[:] = (5.0, 4.0)
+            each.step(10)
+    assert [everything(world, sim) for sim in range(2)] == [everything(reference, sim) for sim in range(2)]
