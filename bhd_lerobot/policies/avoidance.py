@@ -50,6 +50,7 @@ class AvoidanceBrain:
     """
 
     name = "avoidance"
+    uses_images = False
 
     def __init__(self, config: AvoidanceConfig | None = None) -> None:
         self.config = config or AvoidanceConfig()

@@ -35,6 +35,8 @@ class Brain(Protocol):
     """
 
     name: str
+    uses_images: bool
+    """Whether `act` looks at the observation's images. If not, it is not kept waiting for them and may not get any."""
 
     def bind(self, observation_names: Sequence[str], action_names: Sequence[str], fps: int) -> None:
         """Learn the order of the observation's and the action's features, and the frame rate [Hz].

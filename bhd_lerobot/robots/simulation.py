@@ -1,6 +1,7 @@
 """n simulated robots under one cerebellum: what a LeRobot `Robot` and the batched runs are both made of."""
 
 from collections.abc import Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.plant import SimulatedPlant
+from bhd_lerobot.sim.render_thread import Deliver, RenderThread
 from bhd_lerobot.sim.world import Snapshot, World
 
 # Streams of random numbers of one episode: what one draws more of must not shift the others.
@@ -89,6 +91,7 @@ class TurtleBot3Simulation:
         self.camera_names = ("front",) if config.camera else ()
         self.running = np.ones(n, np.bool_)
         self._camera: Camera | None = None
+        self._render_thread: RenderThread | None = None
         self._touch = self.world.sensor(self.body.touch_sensor)[:, 0]
         self._gyro = self.world.sensor("imu_gyro")
         self._touched = np.zeros(n, np.bool_)
@@ -174,8 +177,33 @@ class TurtleBot3Simulation:
             self._camera = Camera(self.world, self.config.camera_width, self.config.camera_height)
         return self._camera.render(sim, camera)
 
+    def start_rendering(self) -> None:
+        """Get ready for `render_later`.
+
+        Raises:
+            RenderingError: no image can be rendered here.
+        """
+        if self._render_thread is None:
+            self._render_thread = RenderThread(self.world, self.config.camera_width, self.config.camera_height)
+
+    def render_later(self, sim: int, camera: str, deliver: Deliver | None = None) -> Future[NDArray[np.uint8]]:
+        """Return what a camera of one robot sees now, as an image to come; the simulation may go on meanwhile.
+
+        Args:
+            sim: the robot.
+            camera: the camera.
+            deliver: called with the image, in the order of the calls, on another thread.
+        """
+        self.start_rendering()
+        if self._render_thread is None:
+            raise AssertionError("Rendering was just started.")
+        return self._render_thread.submit(sim, camera, deliver)
+
     def close(self) -> None:
-        """Free the renderer."""
+        """Free the renderers. May be called twice."""
+        if self._render_thread is not None:
+            self._render_thread.close()
+            self._render_thread = None
         if self._camera is not None:
             self._camera.close()
             self._camera = None

@@ -1,7 +1,9 @@
 """The only observe-think-act-record loop: n episodes side by side, each as if it were alone."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent import futures
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -57,16 +59,6 @@ class Episode:
         return len(self.columns[keys.ACTION])
 
 
-class ImageSink:
-    """Where the images of one episode go; the recorder's `EpisodeWriter` is one."""
-
-    def add_image(self, key: str, image: NDArray[np.uint8]) -> None:
-        """Take the next image of a camera."""
-
-    def discard(self) -> None:
-        """The episode will not be finished."""
-
-
 class EpisodeLoop:
     """Runs episodes on n simulations. A simulation that is done with one takes the next.
 
@@ -110,6 +102,7 @@ class EpisodeLoop:
         self._arenas: list[Arena | None] = [None] * n
         self._initial: list[NDArray[np.float64] | None] = [None] * n
         self._sinks: list[Any] = [None] * n
+        self._pending: list[list[futures.Future[NDArray[np.uint8]]]] = [[] for _ in range(n)]
         self.simulation.stop(np.arange(n))
         self._start(np.arange(n), waiting)
         try:
@@ -127,6 +120,9 @@ class EpisodeLoop:
                 while order and order[0] in done:
                     yield done.pop(order.pop(0))
         finally:
+            for waiting in self._pending:
+                futures.wait(waiting)
+                waiting.clear()
             for sink in [*self._sinks, *(episode.writer for episode in done.values())]:
                 if sink is not None:
                     sink.discard()
@@ -167,16 +163,32 @@ class EpisodeLoop:
         return [(int(sim), Event(int(event[sim]))) for sim in running if event[sim] != Event.NOTHING]
 
     def _images(self) -> dict[str, NDArray[np.uint8]]:
+        """Order the images of the running simulations; return them if the brain looks at them.
+
+        A brain that does not look at images does not wait for them: they are made while the frame goes on.
+        """
+        simulation = self.simulation
         images: dict[str, NDArray[np.uint8]] = {}
-        for camera in self.simulation.camera_names:
-            for sim in np.flatnonzero(self.simulation.running):
-                image = self.simulation.render(int(sim), camera)
-                if camera not in images:
-                    images[camera] = np.zeros((self.simulation.n, *image.shape), np.uint8)
-                images[camera][sim] = image
-                if self._sinks[sim] is not None:
-                    self._sinks[sim].add_image(f"{keys.OBSERVATION_IMAGES}.{camera}", image)
+        for camera in simulation.camera_names:
+            key = f"{keys.OBSERVATION_IMAGES}.{camera}"
+            for sim in np.flatnonzero(simulation.running).tolist():
+                sink = self._sinks[sim]
+                deliver = None if sink is None else partial(sink.add_image, key)
+                self._pending[sim].append(simulation.render_later(sim, camera, deliver))
+            if self.brain.uses_images:
+                height, width = simulation.config.camera_height, simulation.config.camera_width
+                images[camera] = np.zeros((simulation.n, height, width, 3), np.uint8)
+                for sim in np.flatnonzero(simulation.running):
+                    images[camera][sim] = self._pending[sim][-1].result()
+        # What went wrong in the making of an image ends the run now, not at the end of the episode.
+        for waiting in self._pending:
+            while waiting and waiting[0].done():
+                waiting.pop(0).result()
         return images
+
+    def _wait_for_images(self, sim: int) -> None:
+        while self._pending[sim]:
+            self._pending[sim].pop(0).result()
 
     def _store(
         self,
@@ -216,6 +228,7 @@ class EpisodeLoop:
         spec, arena, initial = self._specs[sim], self._arenas[sim], self._initial[sim]
         if spec is None or arena is None or initial is None:
             raise AssertionError(f"Simulation {sim} ended an episode that it never started.")
+        self._wait_for_images(sim)
         length = int(self._length[sim])
         columns = {key: column[sim, :length].copy() for key, column in self._columns.items()}
         outcome = self.task.outcome(sim, event)

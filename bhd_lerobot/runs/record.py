@@ -90,6 +90,8 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     brain = make_brain(config.brain)
     preview = _make_preview(config, simulation, console)
     try:
+        if simulation.camera_names:
+            simulation.start_rendering()  # a machine without OpenGL fails here, before a dataset exists
         recorder = _open_recorder(config, root, simulation, task.parameters(), brain.parameters())
     except BaseException:
         simulation.close()

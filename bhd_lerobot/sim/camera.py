@@ -59,6 +59,23 @@ def _forget_backend(platform: str | None) -> None:
             del sys.modules[name]
 
 
+class Pose:
+    """One simulation's model and state at one time, to be drawn later.
+
+    Args:
+        world: the simulations.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.model = world.copy_model(0)
+        self.data = mujoco.MjData(world.model)
+
+    def take(self, sim: int) -> None:
+        """Take the present pose of a simulation, in place of the one before."""
+        self._world.copy_into(sim, self.model, self.data)
+
+
 class Camera:
     """Renders images of a world's simulations.
 
@@ -100,8 +117,7 @@ class Camera:
         self._free = weakref.finalize(self, _free, self._gl, self._context)
         self._free.atexit = False
         self._flipped = np.empty((height, width, 3), np.uint8)
-        self._model = world.copy_model(0)
-        self._data = mujoco.MjData(world.model)
+        self._own = Pose(world)
 
     def render(self, sim: int, camera: str, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
         """Return the image that a named camera of one simulation sees now.
@@ -117,6 +133,11 @@ class Camera:
         Raises:
             RenderingError: there is no such camera, or the renderer was closed.
         """
+        self._own.take(sim)
+        return self.draw(self._own, camera, out)
+
+    def draw(self, pose: "Pose", camera: str, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """Return the image that a named camera sees in a pose that was taken earlier; otherwise like `render`."""
         if self._context is None:
             raise RenderingError("The camera was closed; make a new one.")
         model = self._world.model
@@ -125,11 +146,10 @@ class Camera:
             raise RenderingError(unknown_name("camera", camera, [model.camera(i).name for i in range(model.ncam)]))
         self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._view.fixedcamid = number
-        self._world.copy_into(sim, self._model, self._data)
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_camlight(self._model, self._data)
+        mujoco.mj_kinematics(pose.model, pose.data)
+        mujoco.mj_camlight(pose.model, pose.data)
         mujoco.mjv_updateScene(
-            self._model, self._data, self._option, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._scene
+            pose.model, pose.data, self._option, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
         self._gl.make_current()
         mujoco.mjr_render(self._rect, self._scene, self._context)

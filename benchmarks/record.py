@@ -1,0 +1,171 @@
+"""Speed of bhd-record, beside what it is made of: `python -m benchmarks.record`.
+
+Without a camera: simulated seconds in a second with everything on (physics, cerebellum, lidar, brain, task, recorder,
+finalising), for 1 and for 64 simulations, beside the bare `Batch.step` with the same number of physics steps and the
+same scans. With a camera: frames a second beside MuJoCo's own renderer, in its fastest settings, feeding the same
+encoder. The two of a pair run in turns in one process; the table shows medians.
+"""
+
+import argparse
+import io
+import os
+import shutil
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+# MuJoCo's renderer takes its backend from here when it is imported; ours looks for one by itself.
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import mujoco
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from bhd_lerobot.data.video import CameraEncoder, VideoSettings
+from bhd_lerobot.errors import RenderingError
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.simulation import TurtleBot3Simulation
+from bhd_lerobot.runs.config_record import RecordConfig
+from bhd_lerobot.runs.configuration import parse
+from bhd_lerobot.runs.record import record
+from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
+
+GOALS = {"n_envs = 1": 60.0, "n_envs = 64": 300.0, "camera": 0.8}
+
+
+def run_record(folder: Path, *options: str) -> tuple[float, float, int]:
+    """Record the avoid task; return simulated seconds, seconds that it took, and frames."""
+    shutil.rmtree(folder, ignore_errors=True)
+    config = parse(
+        RecordConfig,
+        [
+            "--config_path=configs/record/turtlebot3_avoid.yaml",
+            f"--dataset.root={folder / 'dataset'}",
+            f"--output_dir={folder / 'run'}",
+            "--preview_video=false",
+            "--seed=1",
+            *options,
+        ],
+    )
+    result = record(config, Console(file=io.StringIO()))
+    return result.simulated_s, result.wall_s, result.frames
+
+
+def bare_step(n: int, seconds: float) -> float:
+    """Return how long the physics steps and scans of n simulations take for some simulated time [s]."""
+    simulation = TurtleBot3Simulation(TurtleBot3Config(), n)
+    task = AvoidTask(AvoidConfig(), n, 10)
+    simulation.reset(np.arange(n), [task.sample(2 * i) for i in range(n)], range(n))
+    world, lidar = simulation.world, simulation.lidar
+    world.ctrl[:] = 3.0
+    rngs = [np.random.default_rng(i) for i in range(n)]
+    steps = world.physics_hz // 5
+    started = time.perf_counter()
+    for _ in range(round(seconds * 5)):
+        for _ in range(steps):
+            world.step(1)
+        lidar.scan(rngs)
+    return time.perf_counter() - started
+
+
+def bare_renderer(folder: Path, frames: int) -> float:
+    """Return how long MuJoCo's own renderer and our encoder take for some frames [s], the fastest settings on."""
+    simulation = TurtleBot3Simulation(TurtleBot3Config())
+    arena = AvoidTask(AvoidConfig(), 1, 10).sample(0)
+    simulation.reset(np.zeros(1, int), [arena], [0])
+    model = simulation.world.copy_model(0)
+    data = mujoco.MjData(model)
+    simulation.world.copy_into(0, model, data)
+    renderer = mujoco.Renderer(model, 240, 320)
+    for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_HAZE):
+        renderer.scene.flags[flag] = False
+    option = mujoco.MjvOption()
+    option.geomgroup[:] = [1, 1, 0, 0, 0, 0]
+    folder.mkdir(parents=True, exist_ok=True)
+    mujoco.mj_forward(model, data)
+    renderer.update_scene(data, "front", option)
+    renderer.render()
+    encoder = CameraEncoder(folder / "bare.mp4", 10, (240, 320), VideoSettings())
+    started = time.perf_counter()
+    for frame in range(frames):
+        # The view moves as it does in an episode.
+        data.qpos[3], data.qpos[6] = np.cos(frame * 0.01), np.sin(frame * 0.01)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        renderer.update_scene(data, "front", option)
+        encoder.add(renderer.render())
+    encoder.finish()
+    seconds = time.perf_counter() - started
+    renderer.close()
+    return seconds
+
+
+def paired(first: Callable[[], float], second: Callable[[], float], repeats: int) -> tuple[float, float]:
+    """Return the medians of two measurements that are taken in turns."""
+    values = [(first(), second()) for _ in range(repeats)]
+    return statistics.median(v[0] for v in values), statistics.median(v[1] for v in values)
+
+
+def main() -> int:
+    """Print the table; return 1 if a goal was missed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--simulated_s", type=float, default=60.0, help="length of an episode")
+    options = parser.parse_args()
+    folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
+    table = Table(title="bhd-record", title_justify="left")
+    for heading in ("measured", "ours", "peer", "peer is", "ratio", "goal"):
+        table.add_column(heading, justify="left" if heading in ("measured", "peer is") else "right")
+    missed = []
+    try:
+        for n, episodes in ((1, 4), (64, 64)):
+            length = f"--dataset.episode_time_s={options.simulated_s}"
+
+            def ours(n: int = n, episodes: int = episodes, length: str = length) -> float:
+                simulated, wall, _ = run_record(
+                    folder, f"--n_envs={n}", f"--dataset.num_episodes={episodes}", length
+                )
+                return simulated / wall
+
+            def bare(n: int = n) -> float:
+                seconds = 20.0
+                return n * seconds / bare_step(n, seconds)
+
+            mine, peer = paired(ours, bare, options.repeats)
+            key = f"n_envs = {n}"
+            missed += [key] * (mine < GOALS[key])
+            table.add_row(
+                f"{key}: simulated s per s", f"{mine:.0f}", f"{peer:.0f}", "Batch.step and lidar alone",
+                f"{mine / peer:.2f}", f">= {GOALS[key]:.0f} x real time",
+            )
+        try:
+            def camera() -> float:
+                _, wall, frames = run_record(
+                    folder, "--robot.camera=true", "--n_envs=1", "--dataset.num_episodes=1",
+                    f"--dataset.episode_time_s={options.simulated_s}",
+                )
+                return frames / wall
+
+            frames = round(options.simulated_s * 10)
+            mine, peer = paired(camera, lambda: frames / bare_renderer(folder, frames), options.repeats)
+            missed += ["camera"] * (mine / peer < GOALS["camera"])
+            table.add_row(
+                "320x240 camera, 10 fps: frames per s", f"{mine:.0f}", f"{peer:.0f}",
+                "MuJoCo's renderer and the same encoder", f"{mine / peer:.2f}", f"ratio >= {GOALS['camera']}",
+            )
+        except RenderingError as error:
+            print(f"Camera not measured: {error}")
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    Console(width=140).print(table)
+    if missed:
+        print(f"Missed: {', '.join(missed)}")
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
