@@ -1,0 +1,140 @@
+"""A plant with perfect wheels on a virtual clock, and the processes that share memory with a test."""
+
+import mmap
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.fifo import CommandFifo, StateRing
+from bhd_lerobot.control.messages import NANOSECONDS, Request, SendResult, Setpoint
+from bhd_lerobot.control.plant import PlantReading
+
+HZ = 200
+TICK_NS = NANOSECONDS // HZ
+BODY = turtlebot3_burger()
+
+
+class PerfectPlant:
+    """Wheels that turn as they are told, and that a test can break."""
+
+    def __init__(self, n: int = 1) -> None:
+        self.n = n
+        self.position = np.zeros((n, 2))
+        self.velocity = np.zeros((n, 2))
+        self.fault = np.zeros(n, np.bool_)
+        self.lie: dict[int, float] = {}  # simulation -> what its encoders read instead
+        self.written = np.zeros((n, 2))
+
+    def read(self, out: PlantReading) -> None:
+        out.position[:] = self.position
+        out.velocity[:] = self.velocity
+        out.fault[:] = self.fault
+        for sim, value in self.lie.items():
+            out.position[sim, 0] = out.velocity[sim, 1] = value
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        assert np.isfinite(ctrl).all()
+        self.written[:] = ctrl
+        self.velocity[:] = ctrl
+        self.position += ctrl / HZ
+
+
+class Rig:
+    """A cerebellum on a perfect plant, and the clock that moves it."""
+
+    def __init__(self, n: int = 1, active: bool = True, **options: object) -> None:
+        self.plant = PerfectPlant(n)
+        self.cerebellum = Cerebellum(BODY, self.plant, HZ, **options)  # type: ignore[arg-type]
+        self.n = n
+        self.now = 0
+        self.sequence = 0
+        if active:
+            assert self.request(Request.CONFIGURE).accepted.all()
+            assert self.request(Request.ACTIVATE).accepted.all()
+
+    def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
+        return self.cerebellum.request(request, ids)
+
+    def send(
+        self,
+        speed: float,
+        yaw_rate: float = 0.0,
+        *,
+        due: int | None = None,
+        sequence: int | None = None,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> SendResult:
+        self.sequence = self.sequence + 1 if sequence is None else sequence
+        values = np.tile([float(speed), float(yaw_rate)], (self.n, 1))
+        return self.cerebellum.offer(Setpoint(self.sequence, self.now if due is None else due, values), mask)
+
+    def tick(self, ticks: int = 1) -> None:
+        for _ in range(ticks):
+            self.cerebellum.tick(self.now)
+            self.now += TICK_NS
+
+    @property
+    def mode(self) -> int:
+        return int(self.cerebellum.mode[0])
+
+    @property
+    def command(self) -> list[float]:
+        return [float(value) for value in self.cerebellum.command[0]]
+
+    def refused(self, reason: int) -> int:
+        return int(self.cerebellum.refusals[reason, 0])
+
+
+# --- what runs in other processes ------------------------------------------------------------------------------------
+
+FIFO_SHAPE = (3, 2, 8)  # n, width, capacity
+STATE = np.dtype([("number", np.int64), ("copies", np.int64, (500,))])
+
+
+def shared_block(path: Path, size: int = 0) -> mmap.mmap:
+    """Return memory that processes share through a file: a new zeroed block, or what is there if the size is 0."""
+    if size:
+        path.write_bytes(bytes(size))
+    with path.open("r+b") as file:
+        return mmap.mmap(file.fileno(), 0)
+
+
+def start(job: str, path: Path, count: int = 0) -> subprocess.Popen:
+    """Run one of the functions below in a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    return subprocess.Popen([sys.executable, __file__, job, str(path), str(count)], env=environment)
+
+
+def push_commands(path: Path, count: int) -> None:
+    """Push numbered commands as fast as the reader makes room."""
+    fifo = CommandFifo(*FIFO_SHAPE, buffer=shared_block(path))
+    for number in range(count):
+        values = np.full((3, 2), float(number))
+        mask = np.array([True, number % 2 == 0, number % 3 == 0])
+        while not fifo.push(number, number, values, mask):
+            pass
+
+
+def publish_states(path: Path, count: int) -> None:
+    """Publish numbered states as fast as possible."""
+    ring = StateRing(STATE, 2, buffer=shared_block(path))
+    state = np.zeros((), STATE)
+    for number in range(1, count + 1):
+        state["number"] = number
+        state["copies"] = number
+        ring.publish(state)
+
+
+def set_word(path: Path, _: int) -> None:
+    """Set the emergency-stop word of the second of two simulations."""
+    np.frombuffer(shared_block(path), np.int64, 2)[1] = 1
+
+
+if __name__ == "__main__":
+    globals()[sys.argv[1]](Path(sys.argv[2]), int(sys.argv[3]))

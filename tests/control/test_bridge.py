@@ -1,0 +1,254 @@
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.arenas import random_arena
+from bhd_lerobot.bodies.body import Rates
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.control.bridge import LockstepBridge
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.sim.plant import SimulatedPlant
+from bhd_lerobot.sim.world import World
+from tests.control.support import BODY, PerfectPlant
+
+RATES = Rates(200, 200, 10)
+
+
+def perfect(n: int = 1, rates: Rates = RATES, timeout: float = 0.5) -> LockstepBridge:
+    body = dataclasses.replace(BODY, limits=dataclasses.replace(BODY.limits, command_timeout_s=timeout))
+    bridge = LockstepBridge(Cerebellum(body, PerfectPlant(n), rates.control_hz), rates, lambda: None)
+    bridge.restart(np.arange(n))
+    return bridge
+
+
+def simulated(n: int = 1, rates: Rates = RATES, threads: int | None = None) -> tuple[LockstepBridge, World]:
+    world = World(turtlebot3_burger(), n, physics_hz=rates.physics_hz, threads=threads)
+    cerebellum = Cerebellum(world.body, SimulatedPlant(world), rates.control_hz)
+    bridge = LockstepBridge(cerebellum, rates, lambda: world.step(rates.steps_per_tick))
+    bridge.restart(np.arange(n))
+    return bridge, world
+
+
+def twist(*values: float) -> np.ndarray:
+    return np.array([values])
+
+
+# --- time ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rates", [Rates(400, 200, 10), Rates(600, 300, 30), Rates(70, 7, 7)])
+def test_a_frame_is_a_frame_without_drift(rates: Rates) -> None:
+    bridge = perfect(rates=rates)
+    for frame in range(1, 200):
+        bridge.send(twist(0.1, 0.0))
+        bridge.advance_frame()
+        assert bridge.now_ns == frame * rates.ticks_per_frame * 1_000_000_000 // rates.control_hz
+    assert bridge.now_ns * rates.fps // 199 <= 1_000_000_000
+    summary = bridge.timing.summary()
+    assert (summary.ticks, summary.overruns, summary.lateness_max) == (199 * rates.ticks_per_frame, 0, 0)
+
+
+def test_frames_as_long_as_the_time_out_do_not_time_out() -> None:
+    bridge = perfect(rates=Rates(200, 200, 2))
+    for _ in range(5):
+        assert bridge.send(twist(0.1, 0.0)).accepted.all()
+        bridge.advance_frame()
+        assert bridge.state().mode.tolist() == [Mode.TRACKING]
+        assert bridge.cerebellum.take_flags()[1].tolist() == [Watchdog.NONE]
+    bridge.advance_frame()
+    assert bridge.cerebellum.take_flags()[1].tolist() == [Watchdog.COMMAND_AGE]
+
+
+def test_a_frame_longer_than_the_time_out_is_an_error_that_says_how_fast_is_enough() -> None:
+    with pytest.raises(ConfigError, match=r"fps = 4 .*time-out of 0.2 s. Raise fps to at least 5\."):
+        perfect(rates=Rates(200, 200, 4), timeout=0.2)
+    perfect(rates=Rates(200, 200, 5), timeout=0.2)
+
+
+def test_a_cerebellum_of_another_rate_is_an_error() -> None:
+    with pytest.raises(ConfigError, match=r"200.*100"):
+        LockstepBridge(Cerebellum(BODY, PerfectPlant(), 100), RATES, lambda: None)
+
+
+def test_a_chunk_is_one_command_a_frame() -> None:
+    chunked, single = perfect(), perfect()
+    values = np.array([[(0.2, 0.0)], [(0.1, 1.0)], [(-0.1, -1.0)], [(0.0, 0.5)]])
+    assert all(result.accepted.all() for result in chunked.send_chunk(values))
+    for row in values:
+        single.send(row)
+        chunked.advance_frame()
+        single.advance_frame()
+        assert chunked.state().command.tobytes() == single.state().command.tobytes()
+    # Nothing comes after the chunk: its last command grows old.
+    chunked.advance_ticks(200)
+    assert chunked.state().mode.tolist() == [Mode.HOLD]
+
+
+def test_the_life_of_a_robot() -> None:
+    bridge = perfect(2)
+    assert bridge.state().mode.tolist() == [Mode.HOLD] * 2
+    bridge.send(np.tile(twist(0.2, 0.0), (2, 1)))
+    bridge.advance_frame()
+    bridge.estop(np.array([1]))
+    bridge.advance_frame()
+    assert bridge.state().mode.tolist() == [Mode.TRACKING, Mode.ESTOP]
+    assert bridge.deactivate(np.array([0])).accepted.all()
+    bridge.advance_frame()
+    bridge.advance_frame()
+    assert bridge.state().mode.tolist() == [Mode.SAFE_OFF, Mode.ESTOP]
+    assert bridge.activate().reasons.tolist() == [Reason.WRONG_MODE, Reason.ESTOP]
+    assert bridge.reset().accepted.all()
+    assert bridge.activate(np.array([1])).accepted.all()
+    assert bridge.send(np.tile(twist(0.2, 0.0), (2, 1))).reasons.tolist() == [Reason.NOT_ACTIVE, Reason.ACCEPTED]
+
+
+def test_a_command_for_some_leaves_the_others_alone() -> None:
+    bridge = perfect(3)
+    for _ in range(3):
+        result = bridge.send(np.full((3, 2), 0.1), np.array([True, False, True]))
+        assert result.accepted.all()
+        bridge.advance_frame()
+    assert bridge.state().command.tolist() == [[0.1, 0.1], [0, 0], [0.1, 0.1]]
+    assert bridge.state().mode.tolist() == [Mode.TRACKING, Mode.HOLD, Mode.TRACKING]
+
+
+# --- on the simulated robot ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rates", [Rates(200, 200, 10), Rates(400, 200, 10), Rates(1000, 200, 10)], ids=str)
+@pytest.mark.parametrize("command", [(0.22, 0.0), (-0.22, 0.0), (0.0, 2.84), (0.0, -2.84), (0.12, 1.2)])
+def test_an_emergency_stop_brings_the_base_to_rest_within_300_ms(command: tuple[float, float], rates: Rates) -> None:
+    bridge, world = simulated(rates=rates)
+    for _ in range(20):
+        bridge.send(twist(*command))
+        bridge.advance_frame()
+    np.testing.assert_allclose(bridge.state().twist[0], command, rtol=0.01, atol=0.01)
+    np.testing.assert_allclose(np.hypot(*world.qvel[0, :2]), abs(command[0]), rtol=0.03, atol=0.01)
+
+    written = bridge.cerebellum._wheels[0].copy()
+    bridge.estop()
+    bridge.advance_ticks(2)
+    # The safe command is out: no wheel is asked to go on as fast.
+    after = bridge.cerebellum._wheels[0]
+    moving = np.abs(written) > 0.1
+    assert (np.abs(after[moving]) < np.abs(written[moving])).all()
+    assert bridge.state().mode.tolist() == [Mode.ESTOP]
+    bridge.advance_ticks(58)
+    start, yaw = world.base_pose[0, :2].copy(), world.base_pose[0, 2]
+    assert not bridge.state().is_moving.any()
+    assert np.hypot(*world.qvel[0, :2]) < 0.005
+    assert abs(world.qvel[0, 5]) < 0.02
+    for _ in range(20):
+        assert bridge.send(twist(*command)).reasons.tolist() == [Reason.ESTOP]
+        bridge.advance_frame()
+    assert np.hypot(*(world.base_pose[0, :2] - start)) < 1e-3
+    assert abs(world.base_pose[0, 2] - yaw) < 5e-3
+    assert bridge.cerebellum.refusals[Reason.ESTOP, 0] == 20
+
+
+def test_a_twist_that_is_asked_for_is_driven() -> None:
+    bridge, world = simulated(3)
+    commands = np.array([(0.2, 0.0), (0.0, 1.5), (-0.1, -0.8)])
+    for _ in range(20):
+        bridge.send(commands)
+        bridge.advance_frame()
+    np.testing.assert_allclose(bridge.state().twist, commands, atol=0.01)
+    np.testing.assert_allclose(bridge.state().command, commands)
+    np.testing.assert_allclose(world.qvel[:, 5], commands[:, 1], rtol=0.02, atol=1e-3)
+
+
+def test_odometry_follows_the_truth_and_drifts_a_little() -> None:
+    bridge, world = simulated()
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        command = rng.uniform((-0.05, -1.0), (0.2, 1.0))
+        for _ in range(10):
+            bridge.send(command[None])
+            bridge.advance_frame()
+    odometry, truth = bridge.state().odometry[0], world.base_pose[0]
+    error = np.hypot(*(odometry[:2] - truth[:2]))
+    assert 1e-6 < error < 0.1
+    turn = (odometry[2] - truth[2] + np.pi) % (2 * np.pi) - np.pi
+    assert 1e-6 < abs(turn) < 0.15
+
+
+def test_a_robot_that_pushes_a_wall_has_no_limits_broken() -> None:
+    bridge, world = simulated()
+    arena = random_arena(3)
+    world.place([arena.shapes])
+    world.reset(poses=np.array([arena.start]))
+    bridge.restart(np.array([0]))
+    for _ in range(300):
+        bridge.send(twist(0.22, 0.0))
+        bridge.advance_frame()
+        state = bridge.state()
+        assert np.abs(state.joint_efforts).max() <= world.body.drive.max_torque
+        assert np.abs(state.joint_velocities).max() < 10
+    # Nothing but the start had to be held back: a blocked wheel slips, it does not ask for more.
+    assert Limit(int(bridge.cerebellum.take_flags()[0][0])) in (Limit.ACCELERATION, Limit.ACCELERATION | Limit.EFFORT)
+    world.check()
+
+
+def run(n: int, threads: int | None) -> list[bytes]:
+    bridge, world = simulated(n, threads=threads)
+    arenas = [random_arena(sim) for sim in range(n)]
+    world.place([arena.shapes for arena in arenas])
+    world.reset(poses=np.array([arena.start for arena in arenas]))
+    bridge.restart(np.arange(n))
+    generators = [np.random.default_rng([5, sim]) for sim in range(n)]
+    trace: list[list[bytes]] = [[] for _ in range(n)]
+    for frame in range(15):
+        bridge.send(np.array([generator.normal((0.1, 0.0), (0.1, 1.0)) for generator in generators]))
+        if frame == 8 and n > 2:
+            bridge.estop(np.array([2]))
+        bridge.advance_frame()
+        limits, watchdog = bridge.cerebellum.take_flags()
+        state = bridge.state()
+        for sim in range(n):
+            parts = [
+                state.command[sim],
+                state.odometry[sim],
+                world.qpos[sim],
+                world.qvel[sim],
+                limits[sim],
+                watchdog[sim],
+            ]
+            trace[sim].append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
+    return [b"".join(rows) for rows in trace]
+
+
+def test_same_commands_same_bytes_for_any_number_of_simulations_and_threads() -> None:
+    many = run(64, 2)
+    assert run(7, None) == many[:7]
+    assert run(7, 1) == many[:7]
+    assert run(1, None) == many[:1]
+
+
+def drop_all(bridge: LockstepBridge) -> None:
+    bridge.advance_ticks(40)
+
+
+def restart_all(bridge: LockstepBridge) -> None:
+    bridge.advance_ticks(3)
+    bridge.restart(np.arange(1))
+
+
+@pytest.mark.parametrize("meanwhile", [drop_all, restart_all])
+def test_a_restart_starts_from_nothing(meanwhile: Callable[[LockstepBridge], None]) -> None:
+    used, fresh = perfect(), perfect()
+    used.send_chunk(np.full((20, 1, 2), 0.2))
+    meanwhile(used)
+    used.restart(np.array([0]))
+    used.cerebellum.plant.position[:] = fresh.cerebellum.plant.position[:] = 0.0  # type: ignore[attr-defined]
+    used.cerebellum.plant.velocity[:] = fresh.cerebellum.plant.velocity[:] = 0.0  # type: ignore[attr-defined]
+    used.restart(np.array([0]))
+    for bridge in (used, fresh):
+        bridge.send(twist(0.1, 0.3))
+        bridge.advance_ticks(30)
+    for field in dataclasses.fields(used.state()):
+        if field.name != "stamp_ns":
+            assert getattr(used.state(), field.name).tobytes() == getattr(fresh.state(), field.name).tobytes()

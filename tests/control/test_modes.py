@@ -1,0 +1,447 @@
+"""The mode machine, edge by edge, on a virtual clock."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Watchdog
+from tests.control import support
+from tests.control.support import HZ, TICK_NS, Rig
+
+TIMEOUT_TICKS = HZ // 2
+
+
+def in_mode(mode: Mode) -> Rig:
+    """Return a rig that got into a mode by the front door."""
+    rig = Rig(active=False)
+    if mode == Mode.UNCONFIGURED:
+        return rig
+    rig.request(Request.CONFIGURE)
+    if mode == Mode.INACTIVE:
+        return rig
+    rig.request(Request.ACTIVATE)
+    if mode == Mode.HOLD:
+        return rig
+    rig.send(0.2, 0.5)
+    rig.tick(20)
+    if mode == Mode.STOPPING:
+        rig.request(Request.DEACTIVATE)
+    elif mode == Mode.SAFE_OFF:
+        rig.request(Request.DEACTIVATE)
+        rig.tick(100)
+    elif mode == Mode.ESTOP:
+        rig.cerebellum.estop_word[0] = 1
+        rig.tick()
+    elif mode == Mode.FAULT:
+        rig.plant.fault[0] = True
+        rig.tick()
+        rig.plant.fault[0] = False
+    assert rig.mode == mode
+    return rig
+
+
+REQUESTS = {
+    (Mode.UNCONFIGURED, Request.CONFIGURE): Mode.INACTIVE,
+    (Mode.INACTIVE, Request.ACTIVATE): Mode.HOLD,
+    (Mode.HOLD, Request.DEACTIVATE): Mode.STOPPING,
+    (Mode.TRACKING, Request.DEACTIVATE): Mode.STOPPING,
+    (Mode.STOPPING, Request.DEACTIVATE): Mode.STOPPING,
+    (Mode.ESTOP, Request.RESET): Mode.INACTIVE,
+    (Mode.FAULT, Request.RESET): Mode.INACTIVE,
+    (Mode.SAFE_OFF, Request.RESET): Mode.INACTIVE,
+}
+
+
+@pytest.mark.parametrize("request_", list(Request), ids=lambda request: request.name)
+@pytest.mark.parametrize("mode", list(Mode), ids=lambda mode: mode.name)
+def test_every_request_in_every_mode(mode: Mode, request_: Request) -> None:
+    rig = in_mode(mode)
+    before = rig.cerebellum.refusals.sum()
+    result = rig.request(request_)
+    if (mode, request_) in REQUESTS:
+        assert result.accepted.all()
+        assert rig.mode == REQUESTS[mode, request_]
+        assert rig.cerebellum.refusals.sum() == before
+    else:
+        expected = {Mode.ESTOP: Reason.ESTOP, Mode.FAULT: Reason.FAULT}.get(mode, Reason.WRONG_MODE)
+        assert result.reasons.tolist() == [expected]
+        assert rig.mode == mode
+        assert rig.cerebellum.refusals.sum() == before + 1
+
+
+@pytest.mark.parametrize("mode", list(Mode), ids=lambda mode: mode.name)
+def test_a_setpoint_in_every_mode(mode: Mode) -> None:
+    rig = in_mode(mode)
+    before = rig.cerebellum.refusals.copy()
+    result = rig.send(0.1, 0.1)
+    refusal = {
+        Mode.HOLD: None,
+        Mode.TRACKING: None,
+        Mode.ESTOP: Reason.ESTOP,
+        Mode.FAULT: Reason.FAULT,
+    }.get(mode, Reason.NOT_ACTIVE)  # STOPPING is that of a deactivation here
+    rig.tick()
+    if refusal is None:
+        assert result.accepted.all()
+        assert rig.mode == Mode.TRACKING
+        assert (rig.cerebellum.refusals == before).all()
+    else:
+        assert result.reasons.tolist() == [refusal]
+        assert rig.mode != Mode.TRACKING
+        assert rig.refused(refusal) == before[refusal, 0] + 1
+
+
+@pytest.mark.parametrize("mode", list(Mode), ids=lambda mode: mode.name)
+def test_an_emergency_stop_in_every_mode(mode: Mode) -> None:
+    rig = in_mode(mode)
+    rig.cerebellum.estop_word[0] = 1
+    rig.tick()
+    assert rig.mode == Mode.ESTOP
+    assert rig.cerebellum.state(rig.now).emergency_stop.all()
+    rig.tick(1000)
+    assert rig.mode == Mode.ESTOP
+
+
+@pytest.mark.parametrize("mode", list(Mode), ids=lambda mode: mode.name)
+def test_a_plant_fault_in_every_mode(mode: Mode) -> None:
+    rig = in_mode(mode)
+    rig.plant.fault[0] = True
+    rig.tick(3)
+    # An emergency stop is not replaced by a fault; the fault shows after its reset.
+    assert rig.mode == (Mode.ESTOP if mode == Mode.ESTOP else Mode.FAULT)
+    if mode == Mode.ESTOP:
+        assert rig.request(Request.RESET).accepted.all()
+        rig.tick()
+        assert rig.mode == Mode.FAULT
+    rig.request(Request.RESET)
+    rig.tick()
+    assert rig.mode == Mode.FAULT  # the cause is still there
+    rig.plant.fault[0] = False
+    rig.request(Request.RESET)
+    rig.tick()
+    assert rig.mode == Mode.INACTIVE
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_readings_that_are_no_numbers_are_a_fault_and_do_not_spread(value: float) -> None:
+    rig = in_mode(Mode.TRACKING)
+    before = rig.cerebellum.state(rig.now).odometry
+    rig.plant.lie[0] = value
+    rig.tick()
+    assert rig.mode == Mode.FAULT
+    rig.tick(200)
+    state = rig.cerebellum.state(rig.now)
+    for field in (state.joint_positions, state.joint_velocities, state.joint_efforts, state.odometry, state.twist):
+        assert np.isfinite(field).all()
+    assert rig.command == [0, 0]
+    assert np.isfinite(before).all()
+
+
+def test_opposite_infinities_are_a_fault_too() -> None:
+    rig = in_mode(Mode.TRACKING)
+    original = rig.plant.read
+
+    def read(out: object) -> None:
+        original(out)  # type: ignore[arg-type]
+        out.position[0] = np.inf, -np.inf  # type: ignore[attr-defined]
+
+    rig.plant.read = read  # type: ignore[method-assign]
+    rig.tick()
+    assert rig.mode == Mode.FAULT
+
+
+def test_configuring_on_a_broken_plant_is_refused() -> None:
+    rig = Rig(active=False)
+    rig.plant.lie[0] = np.nan
+    assert rig.request(Request.CONFIGURE).reasons.tolist() == [Reason.FAULT]
+    assert rig.mode == Mode.FAULT
+    rig.plant.lie.clear()
+    rig.tick(5)
+    assert np.isfinite(rig.cerebellum.state(rig.now).odometry).all()
+
+
+def test_the_whole_way_around() -> None:
+    rig = Rig(active=False)
+    seen = [rig.mode]
+
+    def note() -> None:
+        if rig.mode != seen[-1]:
+            seen.append(rig.mode)
+
+    def tick(ticks: int) -> None:
+        for _ in range(ticks):
+            rig.tick()
+            note()
+
+    def ask(request: Request) -> None:
+        assert rig.request(request).accepted.all()
+        note()
+
+    tick(3)
+    ask(Request.CONFIGURE)
+    tick(3)
+    ask(Request.ACTIVATE)
+    tick(3)
+    rig.send(0.2)
+    tick(150)
+    rig.send(0.1)
+    tick(5)
+    ask(Request.DEACTIVATE)
+    tick(50)
+    ask(Request.RESET)
+    tick(50)
+    assert seen == [
+        Mode.UNCONFIGURED, Mode.INACTIVE, Mode.HOLD, Mode.TRACKING, Mode.STOPPING, Mode.HOLD,
+        Mode.TRACKING, Mode.STOPPING, Mode.SAFE_OFF, Mode.INACTIVE,
+    ]  # fmt: skip
+
+
+# --- the watchdog ----------------------------------------------------------------------------------------------------
+
+
+def test_a_command_that_grows_old_ramps_to_zero_and_motion_resumes_with_the_next() -> None:
+    rig = Rig()
+    rig.send(0.1, 1.0)
+    rig.tick(TIMEOUT_TICKS + 1)  # the last of these ticks is 0.5 s after the command: not yet older
+    assert rig.mode == Mode.TRACKING
+    assert rig.command == [0.1, 1.0]
+    assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.NONE]
+    assert rig.cerebellum.command_age_ns(rig.now - TICK_NS).tolist() == [500_000_000]
+    rig.tick()
+    assert rig.mode == Mode.STOPPING
+    assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.COMMAND_AGE]
+    commands = []
+    while rig.mode == Mode.STOPPING:
+        commands.append(rig.command)
+        rig.tick()
+    ramp = np.array([[0.1, 1.0], *commands])
+    assert rig.mode == Mode.HOLD
+    assert rig.command == [0, 0]
+    assert (np.diff(ramp, axis=0) <= 0).all()
+    assert (np.diff(ramp, axis=0) >= -np.array([2.5, 3.2]) / HZ - 1e-12).all()
+    # No longer than the normal accelerations take: 1.0 rad/s at 3.2 rad/s^2.
+    assert len(commands) == pytest.approx(HZ / 3.2, abs=2)
+    assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.NONE]
+    rig.tick(1000)
+    assert rig.mode == Mode.HOLD
+    assert rig.send(0.1).accepted.all()
+    rig.tick(30)
+    assert rig.mode == Mode.TRACKING
+    assert rig.command == [0.1, 0.0]
+
+
+def test_a_new_command_while_the_robot_stops_takes_over_without_a_jump() -> None:
+    rig = Rig()
+    rig.send(0.2)
+    rig.tick(TIMEOUT_TICKS + 5)
+    assert rig.mode == Mode.STOPPING
+    before = rig.command[0]
+    assert 0 < before < 0.2
+    rig.send(0.2)
+    rig.tick()
+    assert rig.mode == Mode.TRACKING
+    assert rig.command[0] == pytest.approx(before + 2.5 / HZ)
+
+
+def test_a_command_that_is_late_on_arrival_is_refused_as_stale() -> None:
+    rig = Rig()
+    rig.tick(200)
+    assert rig.send(0.2, due=rig.now - 500_000_001).accepted.all()  # it goes into the queue,
+    rig.tick()
+    assert rig.refused(Reason.STALE) == 1  # and is refused when it comes out of it
+    assert rig.mode == Mode.HOLD
+    assert rig.send(0.2, due=rig.now - 400_000_000).accepted.all()
+    rig.tick()
+    assert rig.mode == Mode.TRACKING
+    rig.tick(25)
+    assert rig.mode == Mode.STOPPING  # 0.5 s after it was due, not after it came
+
+
+def test_a_command_takes_effect_when_it_is_due() -> None:
+    rig = Rig()
+    rig.send(0.1, due=rig.now + 10 * TICK_NS)
+    rig.send(0.2, due=rig.now + 50 * TICK_NS)
+    rig.tick(10)
+    assert rig.mode == Mode.HOLD
+    rig.tick(30)
+    assert rig.command[0] == 0.1
+    rig.tick(11)
+    assert rig.command[0] > 0.1
+
+
+# --- latches ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("twist", [(0.22, 0.0), (0.0, 2.84), (-0.1, -1.5), (0.1, 1.5)])
+def test_an_emergency_stop_ramps_down_from_the_next_tick(twist: tuple[float, float]) -> None:
+    rig = Rig()
+    for _ in range(3):
+        rig.send(*twist)
+        rig.tick(90)
+    assert rig.command == list(twist)
+    rig.cerebellum.estop_word[0] = 1
+    ramp = [np.abs(rig.command)]
+    for _ in range(60):
+        rig.tick()
+        ramp.append(np.abs(rig.command))
+    change = np.diff(ramp, axis=0)
+    assert (change <= 0).all()
+    assert (change[0][np.abs(twist) > np.array(0)] < 0).all()  # within one tick, so within two
+    assert (change >= -np.array([2.5, 20.0]) / HZ - 1e-12).all()
+    slowest = max(abs(twist[0]) / 2.5, abs(twist[1]) / 20.0)
+    assert (ramp[int(np.ceil(slowest * HZ)) + 1] == 0).all()
+
+
+def test_commands_after_an_emergency_stop_are_refused_and_counted() -> None:
+    rig = in_mode(Mode.ESTOP)
+    for count in range(1, 6):
+        assert rig.send(0.1).reasons.tolist() == [Reason.ESTOP]
+        assert rig.refused(Reason.ESTOP) == count
+        rig.tick()
+
+
+def test_a_command_is_refused_from_the_moment_that_the_word_is_set() -> None:
+    rig = in_mode(Mode.TRACKING)
+    rig.cerebellum.estop_word[0] = 7
+    assert rig.send(0.1).reasons.tolist() == [Reason.ESTOP]
+
+
+@pytest.mark.parametrize("mode", [Mode.ESTOP, Mode.FAULT, Mode.SAFE_OFF], ids=lambda mode: mode.name)
+def test_after_a_latch_motion_needs_reset_and_activate(mode: Mode) -> None:
+    rig = in_mode(mode)
+    assert not rig.request(Request.ACTIVATE).accepted.any()
+    assert rig.request(Request.RESET).accepted.all()
+    rig.tick(100)
+    assert rig.mode == Mode.INACTIVE
+    assert not rig.cerebellum.state(rig.now).emergency_stop.any()
+    assert rig.send(0.2).reasons.tolist() == [Reason.NOT_ACTIVE]
+    rig.tick(10)
+    assert rig.command == [0, 0]
+    assert rig.request(Request.ACTIVATE).accepted.all()
+    assert rig.send(0.2).accepted.all()
+    rig.tick(10)
+    assert rig.mode == Mode.TRACKING
+    # And it stops to HOLD, not to SAFE_OFF: the deactivation, if there was one, is over.
+    rig.tick(TIMEOUT_TICKS + 50)
+    assert rig.mode == Mode.HOLD
+
+
+def stop_by_word(rig: Rig) -> None:
+    rig.cerebellum.estop_word[0] = 1
+
+
+def stop_by_fault(rig: Rig) -> None:
+    rig.plant.fault[0] = True
+
+
+def stop_by_deactivation(rig: Rig) -> None:
+    rig.request(Request.DEACTIVATE)
+
+
+@pytest.mark.parametrize("stop", [stop_by_word, stop_by_fault, stop_by_deactivation])
+def test_commands_from_before_a_stop_never_start_motion_after_it(stop: Callable[[Rig], None]) -> None:
+    """The rest of an action chunk waits in the queue when the robot is stopped."""
+    rig = Rig()
+    for k in range(10):
+        assert rig.send(0.2, due=rig.now + k * 20 * TICK_NS).accepted.all()
+    rig.tick(21)
+    stop(rig)
+    rig.tick(50)
+    rig.plant.fault[0] = False
+    assert rig.request(Request.RESET).accepted.all()
+    assert rig.request(Request.ACTIVATE).accepted.all()
+    rig.tick(200)
+    assert rig.mode == Mode.HOLD
+    assert rig.command == [0, 0]
+    assert rig.cerebellum.refusals.sum() == 8  # ten, less the two that were followed
+    assert rig.send(0.1).accepted.all()  # now, although the chunk's last due time was later than that
+    rig.tick(30)
+    assert rig.command[0] == 0.1
+
+
+def test_a_command_right_after_an_activation_need_not_wait_for_the_queue_of_before() -> None:
+    rig = Rig()
+    assert rig.send(0.2, due=rig.now + 1000 * TICK_NS).accepted.all()
+    stop_by_word(rig)
+    rig.tick(2)
+    rig.request(Request.RESET)
+    rig.request(Request.ACTIVATE)
+    assert rig.send(0.1).accepted.all()
+    rig.tick()
+    assert rig.mode == Mode.TRACKING
+
+
+def test_a_deactivation_is_not_undone_by_a_setpoint() -> None:
+    rig = in_mode(Mode.TRACKING)
+    rig.send(0.2, due=rig.now + 2 * TICK_NS)
+    rig.request(Request.DEACTIVATE)
+    assert rig.send(0.2, due=rig.now + 3 * TICK_NS).reasons.tolist() == [Reason.NOT_ACTIVE]
+    rig.tick(100)
+    assert rig.mode == Mode.SAFE_OFF
+    assert rig.command == [0, 0]
+    assert rig.refused(Reason.NOT_ACTIVE) == 2
+
+
+def test_an_emergency_stop_that_nobody_has_seen_yet_survives_the_reset_of_another_latch() -> None:
+    for mode in (Mode.FAULT, Mode.SAFE_OFF):
+        rig = in_mode(mode)
+        rig.cerebellum.estop_word[0] = 1
+        rig.request(Request.RESET)
+        rig.tick()
+        assert rig.mode == Mode.ESTOP
+
+
+def test_only_a_reset_clears_the_latch() -> None:
+    rig = in_mode(Mode.ESTOP)
+    rig.cerebellum.estop_word[0] = 0
+    rig.tick(10)
+    assert rig.mode == Mode.ESTOP
+    rig.cerebellum.estop_word[0] = 1
+    rig.request(Request.RESET)
+    assert rig.cerebellum.estop_word.tolist() == [0]
+    rig.tick()
+    assert rig.mode == Mode.INACTIVE
+
+
+def test_another_process_can_stop_one_of_two_robots(tmp_path: Path) -> None:
+    path = tmp_path / "word"
+    rig = Rig(2, estop_word=np.frombuffer(support.shared_block(path, 16), np.int64, 2))
+    rig.send(0.2)
+    rig.tick(20)
+    assert (rig.cerebellum.mode == Mode.TRACKING).all()
+    assert support.start("set_word", path).wait() == 0
+    rig.send(0.2)
+    rig.tick()
+    assert rig.cerebellum.mode.tolist() == [Mode.TRACKING, Mode.ESTOP]
+    assert rig.cerebellum.refusals[Reason.ESTOP].tolist() == [0, 1]
+    rig.tick(40)
+    assert rig.cerebellum.command[:, 0].tolist() == [0.2, 0]
+
+
+def test_a_restart_forgets_the_episode_before_in_the_simulations_named_only() -> None:
+    rig = Rig(2)
+    rig.send(0.2, 0.5)
+    rig.send(0.1, due=rig.now + 500 * TICK_NS)
+    rig.tick(20)
+    rig.cerebellum.estop_word[:] = 1
+    rig.tick()
+    rig.send(0.2)
+    kept = rig.cerebellum.command[1].tobytes()
+    rig.cerebellum.restart(np.array([0]))
+    state = rig.cerebellum.state(rig.now)
+    assert state.mode.tolist() == [Mode.UNCONFIGURED, Mode.ESTOP]
+    assert state.command[0].tolist() == [0, 0]
+    assert rig.cerebellum.command[1].tobytes() == kept
+    assert rig.cerebellum.refusals.sum(axis=0).tolist() == [0, 1]
+    assert rig.cerebellum.estop_word.tolist() == [0, 1]
+    ids = np.array([0])
+    rig.request(Request.CONFIGURE, ids)
+    rig.request(Request.ACTIVATE, ids)
+    assert rig.cerebellum.state(rig.now).odometry[0].tolist() == [0, 0, 0]
+    assert rig.cerebellum.take_flags()[0].tolist()[0] == Limit.NONE
+    assert rig.send(0.1, sequence=0).reasons.tolist() == [Reason.ACCEPTED, Reason.ESTOP]
+    rig.tick(600)
+    assert rig.cerebellum.mode.tolist() == [Mode.HOLD, Mode.ESTOP]
+    assert rig.cerebellum.refusals[:, 0].sum() == 0
