@@ -1,0 +1,252 @@
+"""The judge, on made-up truth: no simulator, no robot."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.bodies.arenas import make_arena, random_arena
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
+from bhd_lerobot.tasks.task import Event, Truth
+
+FPS = 10
+EMPTY = make_arena("empty", 0)  # 6 m by 6 m, start in the middle
+
+
+class Run:
+    """One or more episodes, and what came of them."""
+
+    def __init__(self, config: AvoidConfig, arenas: Sequence = (EMPTY,)) -> None:
+        self.n = len(arenas)
+        self.task = AvoidTask(config, self.n, FPS)
+        self.task.begin(np.arange(self.n), arenas)
+        self.pose = np.array([arena.start for arena in arenas], float)
+        self.running = np.ones(self.n, np.bool_)
+        self.first = [self.task.outcome(sim, Event.NOTHING).score for sim in range(self.n)]
+        self.rewards = np.zeros(self.n)
+        self.events = np.zeros(self.n, int)
+        self.frames = np.zeros(self.n, int)
+
+    def frame(self, positions: np.ndarray, touched: np.ndarray | bool = False) -> np.ndarray:
+        """Judge a frame; an episode that ended is not running any more."""
+        self.pose[:, :2] = positions
+        reward, event = self.task.judge(
+            Truth(self.pose.copy(), np.broadcast_to(touched, (self.n,)).copy()), self.running.copy()
+        )
+        assert (reward[~self.running] == 0).all()
+        assert (event[~self.running] == Event.NOTHING).all()
+        self.frames += self.running
+        self.rewards += reward
+        self.events = np.where(self.running, event, self.events)
+        self.running &= event == Event.NOTHING
+        return reward
+
+    def outcome(self, sim: int = 0):
+        return self.task.outcome(sim, Event(int(self.events[sim])))
+
+
+def on_circle(frame: int, speed: float) -> np.ndarray:
+    """A position on a circle of radius 1 m around the middle of the arena, at a speed [m/s]."""
+    angle = frame * speed / FPS
+    return np.array([[math.sin(angle), 1 - math.cos(angle)]])
+
+
+def test_success_needs_the_whole_time_and_the_path() -> None:
+    run = Run(AvoidConfig(duration_s=20.0))
+    for frame in range(1, 200):
+        run.frame(on_circle(frame, 0.2))
+        assert run.running[0]
+    run.frame(on_circle(200, 0.2))
+    outcome = run.outcome()
+    assert (run.events[0], outcome.success, outcome.event) == (Event.SUCCESS, True, Event.SUCCESS)
+    assert run.frames[0] == 200
+    assert outcome.details["path_m"] == pytest.approx(4.0, rel=1e-3)  # chords of arcs
+
+
+@pytest.mark.parametrize(("speed", "event"), [(0.152, Event.SUCCESS), (0.148, Event.TIMEOUT)])
+def test_too_short_a_path_is_a_time_out(speed: float, event: Event) -> None:
+    run = Run(AvoidConfig(duration_s=20.0))
+    for frame in range(1, 201):
+        run.frame(on_circle(frame, speed))
+    assert run.events[0] == event
+    assert run.outcome().success == (event == Event.SUCCESS)
+
+
+def test_the_path_is_walked_not_the_way_from_the_start() -> None:
+    run = Run(AvoidConfig(duration_s=20.0))
+    for frame in range(1, 201):
+        run.frame(np.array([[0.02 * (frame % 2), 0.0]]))
+    assert run.events[0] == Event.SUCCESS
+    assert run.outcome().details["path_m"] == pytest.approx(200 * 0.02)
+
+
+@pytest.mark.parametrize("when", [1, 7, 200])
+def test_a_touch_is_a_collision_at_once_even_in_the_last_frame(when: int) -> None:
+    run = Run(AvoidConfig(duration_s=20.0))
+    for frame in range(1, when + 1):
+        run.frame(on_circle(frame, 0.2), frame == when)
+    assert run.events[0] == Event.COLLISION
+    assert run.frames[0] == when
+    assert not run.outcome().success
+
+
+def test_nothing_counts_in_the_frame_of_the_contact_or_after_it() -> None:
+    run = Run(AvoidConfig())
+    run.frame(np.array([[0.4, 0.0]]))
+    score = run.outcome().score
+    reward = run.frame(np.array([[0.8, 0.0]]), True)
+    assert reward[0] == 0
+    assert run.outcome().score == score
+    run.frame(np.array([[1.2, 0.0]]))
+    assert run.outcome().score == score
+
+
+@pytest.mark.parametrize(("step", "stuck_after"), [(0.0, 100), (0.0009, 100), (0.0011, None)])
+def test_less_than_a_tenth_of_a_metre_in_ten_seconds_is_stuck(step: float, stuck_after: int | None) -> None:
+    run = Run(AvoidConfig())
+    for frame in range(1, 251):
+        run.frame(np.array([[step * frame, 0.0]]))
+    assert run.events[0] == (Event.STUCK if stuck_after else Event.NOTHING)
+    assert run.frames[0] == (stuck_after or 250)
+
+
+def test_stuck_is_about_the_last_ten_seconds_wherever_they_begin() -> None:
+    run = Run(AvoidConfig())
+    for frame in range(1, 400):
+        moving = min(frame, 137)  # then it stands
+        run.frame(on_circle(moving, 0.2))
+    # The path of the last 100 frames falls below 0.1 m when all but the last four or five moves are older than that.
+    assert run.events[0] == Event.STUCK
+    assert 137 + 95 <= run.frames[0] <= 137 + 96
+
+
+def test_the_last_frame_is_the_end_and_not_stuck() -> None:
+    run = Run(AvoidConfig(duration_s=10.0))
+    for _ in range(100):
+        run.frame(np.array([[0.0, 0.0]]))
+    assert run.events[0] == Event.TIMEOUT
+
+
+@given(
+    st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.booleans()), min_size=1, max_size=30), st.integers(0, 9)
+)
+def test_the_score_grows_by_the_rewards_and_stays_a_share(steps: list[tuple[float, float, bool]], seed: int) -> None:
+    arena = random_arena(seed)
+    run = Run(AvoidConfig(), [arena])
+    scores = [run.first[0]]
+    for x, y, touched in steps:
+        running = run.running[0]
+        reward = run.frame(np.array([[x, y]]), touched and bool(x > 2.5))
+        scores.append(run.outcome().score)
+        assert reward[0] >= 0
+        assert scores[-1] - scores[-2] == pytest.approx(reward[0], abs=1e-12)
+        if not running:
+            assert scores[-1] == scores[-2]
+    assert run.first[0] + run.rewards[0] == pytest.approx(scores[-1], abs=1e-12)
+    assert min(scores) >= 0
+    assert max(scores) <= 1
+    free = arena.free_cells(0.25)
+    assert run.first[0] == pytest.approx(1 / len(free))  # the start's cell is free and visited
+    cells = {int(arena.cell_of(np.array(arena.start[:2]), 0.25))}
+    for x, y, touched in steps:
+        if touched and x > 2.5:
+            break
+        inside = arena.extent[0] <= x < arena.extent[1] and arena.extent[2] <= y < arena.extent[3]
+        if inside:
+            cells.add(int(arena.cell_of(np.array([x, y]), 0.25)))
+    assert run.outcome().details["cells_visited"] == len(cells & set(free.tolist()))
+    assert run.outcome().details["cells_free"] == len(free)
+
+
+def test_visiting_every_free_cell_scores_one() -> None:
+    arena = random_arena(2)
+    run = Run(AvoidConfig(duration_s=1e4), [arena])
+    points, free = arena.reachable
+    for point in points[free]:
+        run.frame(point[None])
+    assert run.outcome().score == 1.0
+    assert run.first[0] + run.rewards[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("place", [(9.0, 0.0), (-9.0, 0.0), (0.0, 9.0), (0.0, -9.0), (2.99, 3.01), (9.0, 9.0)])
+def test_outside_the_arena_is_no_cell(place: tuple[float, float]) -> None:
+    run = Run(AvoidConfig())
+    run.frame(np.array([place]))
+    assert run.rewards[0] == 0
+    assert run.outcome().details["cells_visited"] == 1
+
+
+def test_episodes_are_independent() -> None:
+    """Three arenas of different size at once, each begun and ended at its own time, and the same three alone."""
+    arenas = [random_arena(4), EMPTY, random_arena(6)]
+    config = AvoidConfig(duration_s=5.0, min_path_m=0.5, stuck_time_s=2.0)
+    together, alone = Run(config, arenas), [Run(config, [arena]) for arena in arenas]
+    rngs = [np.random.default_rng(sim) for sim in range(3)]
+    for frame in range(1, 51):
+        steps = np.array([rng.normal(0, 0.05, 2) for rng in rngs])
+        steps[1] *= 0.001 if frame > 10 else 1.0  # gets stuck
+        touched = np.array([frame == 30, False, False])
+        before = together.pose[:, :2].copy()
+        reward = together.frame(before + steps, touched)
+        for sim, run in enumerate(alone):
+            assert run.frame((before + steps)[sim : sim + 1], touched[sim])[0] == reward[sim]
+    assert together.events.tolist() == [int(run.events[0]) for run in alone]
+    assert together.events.tolist() == [Event.COLLISION, Event.STUCK, Event.SUCCESS]
+    for sim, run in enumerate(alone):
+        assert together.outcome(sim) == run.outcome()
+
+
+def test_a_new_episode_starts_from_nothing() -> None:
+    arenas = [random_arena(1), EMPTY]
+    used, fresh = Run(AvoidConfig(), arenas), Run(AvoidConfig(), [EMPTY, EMPTY])
+    for frame in range(1, 60):
+        used.frame(np.repeat(on_circle(frame, 0.3), 2, axis=0))
+    kept = used.task.outcome(1, Event.NOTHING)
+    used.task.begin(np.array([0]), [EMPTY])
+    assert used.task.outcome(0, Event.NOTHING) == fresh.task.outcome(0, Event.NOTHING)
+    assert used.task.outcome(1, Event.NOTHING) == kept
+    used.pose[0] = EMPTY.start
+    for frame in range(1, 60):
+        positions = np.repeat(on_circle(frame, 0.2), 2, axis=0)
+        assert used.frame(positions)[0] == fresh.frame(positions)[0]
+    assert used.task.outcome(0, Event.NOTHING) == fresh.task.outcome(0, Event.NOTHING)
+
+
+@pytest.mark.parametrize("arena", ["random", "turtlebot3_world", "empty"])
+@pytest.mark.parametrize("random_start", [False, True])
+def test_equal_seeds_give_equal_episodes(arena: str, random_start: bool) -> None:
+    task = AvoidTask(AvoidConfig(arena=arena, random_start=random_start), 1, FPS)
+    for seed in (0, 1, 2**62 + 1):
+        assert task.sample(seed) == task.sample(seed)
+        assert (task.sample(seed) != task.sample(seed + 1)) == (arena == "random" or random_start)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"duration_s": 0.0},
+        {"duration_s": math.inf},
+        {"cell_m": -0.25},
+        {"stuck_time_s": math.nan},
+        {"min_path_m": -1.0},
+        {"stuck_path_m": math.nan},
+    ],
+)
+def test_impossible_values_are_refused_by_name(change: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=f"task.{next(iter(change))}"):
+        AvoidConfig(**change)  # type: ignore[arg-type]
+
+
+def test_an_unknown_arena_is_an_error_with_the_near_miss() -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'random'"):
+        AvoidConfig(arena="randon")
+
+
+def test_parameters_are_plain_values_that_define_the_task() -> None:
+    parameters = AvoidTask(AvoidConfig(arena="empty", duration_s=30.0), 1, FPS).parameters()
+    assert parameters.pop("type") == "avoid"
+    assert AvoidConfig(**parameters) == AvoidConfig(arena="empty", duration_s=30.0)
