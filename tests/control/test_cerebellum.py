@@ -329,8 +329,8 @@ def test_a_limit_that_still_holds_is_reported_in_every_frame() -> None:
         rig.send(1.0)
         rig.tick(20)
         rig.cerebellum.take_flags()
-    for _ in range(3):
-        rig.send(1.0)
+    rig.send(1.0)
+    for _ in range(3):  # also in frames without a new command
         rig.tick(20)
         assert Limit(int(rig.cerebellum.take_flags()[0][0])) == Limit.VELOCITY
     rig.send(0.2)
@@ -347,6 +347,18 @@ def test_turning_has_precedence_over_speed() -> None:
         rig.tick(20)
     assert rig.command[1] == 2.84
     assert rig.command[0] == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("end", [(0.22, 0.0), (-0.22, 0.0), (0.22, -2.84)])
+def test_no_wheel_is_too_fast_on_the_way_between_two_twists_that_are_possible(end: tuple[float, float]) -> None:
+    """Forward speed builds up faster than the turn dies down."""
+    rig = Rig()
+    for twist in itertools.chain([(0.0, 2.84)] * 12, [end] * 20):
+        rig.send(*twist)
+        for _ in range(20):
+            rig.tick()
+            assert np.abs(rig.plant.written).max() <= WHEEL_SPEED * (1 + 1e-9)
+    assert rig.cerebellum.take_flags()[0][0] & Limit.VELOCITY
 
 
 def test_a_blocked_wheel_is_not_asked_for_more_than_its_torque() -> None:

@@ -432,7 +432,9 @@ def test_a_restart_forgets_the_episode_before_in_the_simulations_named_only() ->
     rig.cerebellum.restart(np.array([0]))
     state = rig.cerebellum.state(rig.now)
     assert state.mode.tolist() == [Mode.UNCONFIGURED, Mode.ESTOP]
+    assert state.emergency_stop.tolist() == [False, True]
     assert state.command[0].tolist() == [0, 0]
+    assert state.joint_efforts[0].tolist() == (-state.joint_velocities[0] * support.BODY.drive.servo_gain).tolist()
     assert rig.cerebellum.command[1].tobytes() == kept
     assert rig.cerebellum.refusals.sum(axis=0).tolist() == [0, 1]
     assert rig.cerebellum.estop_word.tolist() == [0, 1]
@@ -445,3 +447,12 @@ def test_a_restart_forgets_the_episode_before_in_the_simulations_named_only() ->
     rig.tick(600)
     assert rig.cerebellum.mode.tolist() == [Mode.HOLD, Mode.ESTOP]
     assert rig.cerebellum.refusals[:, 0].sum() == 0
+
+
+def test_a_robot_that_was_restarted_does_not_move_before_it_is_configured() -> None:
+    rig = in_mode(Mode.TRACKING)
+    rig.cerebellum.restart(np.array([0]))
+    rig.tick(50)
+    assert rig.mode == Mode.UNCONFIGURED
+    assert rig.command == [0, 0]
+    assert rig.plant.written.tolist() == [[0, 0]]
