@@ -217,6 +217,16 @@ def test_simulations_are_independent_byte_for_byte(history: list[tuple[int, tupl
             assert (rig.cerebellum.refusals[:, 0] == together.cerebellum.refusals[:, k]).all()
 
 
+def test_one_robot_s_command_does_not_keep_another_s_young() -> None:
+    rig = Rig(2)
+    rig.send(0.1)
+    for _ in range(10):
+        rig.tick(20)
+        rig.send(0.1, mask=np.array([False, True]))
+    assert rig.cerebellum.mode.tolist() == [Mode.HOLD, Mode.TRACKING]
+    assert rig.cerebellum.command[:, 0].tolist() == [0, 0.1]
+
+
 def test_a_history_gives_the_same_bytes_twice() -> None:
     def run() -> bytes:
         rig = Rig(5)
