@@ -126,9 +126,7 @@ def main() -> int:
             length = f"--dataset.episode_time_s={options.simulated_s}"
 
             def ours(n: int = n, episodes: int = episodes, length: str = length) -> float:
-                simulated, wall, _ = run_record(
-                    folder, f"--n_envs={n}", f"--dataset.num_episodes={episodes}", length
-                )
+                simulated, wall, _ = run_record(folder, f"--n_envs={n}", f"--dataset.num_episodes={episodes}", length)
                 return simulated / wall
 
             def bare(n: int = n) -> float:
@@ -139,13 +137,21 @@ def main() -> int:
             key = f"n_envs = {n}"
             missed += [key] * (mine < GOALS[key])
             table.add_row(
-                f"{key}: simulated s per s", f"{mine:.0f}", f"{peer:.0f}", "Batch.step and lidar alone",
-                f"{mine / peer:.2f}", f">= {GOALS[key]:.0f} x real time",
+                f"{key}: simulated s per s",
+                f"{mine:.0f}",
+                f"{peer:.0f}",
+                "Batch.step and lidar alone",
+                f"{mine / peer:.2f}",
+                f">= {GOALS[key]:.0f} x real time",
             )
         try:
+
             def camera() -> float:
                 _, wall, frames = run_record(
-                    folder, "--robot.camera=true", "--n_envs=1", "--dataset.num_episodes=1",
+                    folder,
+                    "--robot.camera=true",
+                    "--n_envs=1",
+                    "--dataset.num_episodes=1",
                     f"--dataset.episode_time_s={options.simulated_s}",
                 )
                 return frames / wall
@@ -154,8 +160,12 @@ def main() -> int:
             mine, peer = paired(camera, lambda: frames / bare_renderer(folder, frames), options.repeats)
             missed += ["camera"] * (mine / peer < GOALS["camera"])
             table.add_row(
-                "320x240 camera, 10 fps: frames per s", f"{mine:.0f}", f"{peer:.0f}",
-                "MuJoCo's renderer and the same encoder", f"{mine / peer:.2f}", f"ratio >= {GOALS['camera']}",
+                "320x240 camera, 10 fps: frames per s",
+                f"{mine:.0f}",
+                f"{peer:.0f}",
+                "MuJoCo's renderer and the same encoder",
+                f"{mine / peer:.2f}",
+                f"ratio >= {GOALS['camera']}",
             )
         except RenderingError as error:
             print(f"Camera not measured: {error}")

@@ -55,7 +55,7 @@ class AvoidanceBrain:
     def __init__(self, config: AvoidanceConfig | None = None) -> None:
         self.config = config or AvoidanceConfig()
         self._scan = slice(0)
-        self._front = np.zeros(0, np.bool_)
+        self._front: NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._forward = self._turn = 0
         self._width = 0
 

@@ -21,9 +21,7 @@ class ConformanceError(BhdError, AssertionError):
     """A robot that breaks LeRobot's contract."""
 
 
-def check_robot(
-    make_robot: Callable[[], Robot], action: Mapping[str, float] | None = None, *, frames: int = 3
-) -> None:
+def check_robot(make_robot: Callable[[], Robot], action: Mapping[str, float] | None = None, *, frames: int = 3) -> None:
     """Check a robot against LeRobot's contract.
 
     Args:

@@ -18,7 +18,6 @@ from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.simulation import TurtleBot3Simulation
 
-
 # Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator; one that
 # thinks for itself finds its robot here. Weak, so that a forgotten robot is freed.
 _connected: "weakref.WeakSet[SimulatedRobot]" = weakref.WeakSet()
@@ -32,8 +31,8 @@ def connected_robots() -> list["SimulatedRobot"]:
 class SimulatedRobot(Robot):
     """A simulated robot on a lockstep clock: `send_action` applies an action and advances time by one frame.
 
-    Two things differ from a robot on a table. Time stands still between two calls of `send_action`, so that a slow brain
-    is not a late one. And `send_action` returns at the end of the frame, with what the cerebellum commanded by then.
+    Two things differ from a robot on a table. Time stands still between two calls of `send_action`, so that a slow
+    brain is not a late one. And `send_action` returns at the end of the frame, with what the cerebellum commanded by then.
     """
 
     config: TurtleBot3Config
@@ -44,7 +43,7 @@ class SimulatedRobot(Robot):
         self._simulation: TurtleBot3Simulation | None = None
         self._last_observation: dict[str, Any] | None = None
         # lerobot-record asks for its length, with or without cameras.
-        self.cameras: dict[str, Any] = {name: None for name in self.camera_shapes}
+        self.cameras: dict[str, Any] = dict.fromkeys(self.camera_shapes)
 
     @abstractmethod
     def make_simulation(self) -> TurtleBot3Simulation:

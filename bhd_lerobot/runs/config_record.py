@@ -7,6 +7,7 @@ from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.runs import registry  # noqa: F401  registers the brains and tasks
 from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import SPLITS
@@ -51,7 +52,7 @@ class RecordConfig:
         n_envs: simulations that run side by side; changes the speed and nothing else.
         threads: threads that step the physics; all processors if nothing.
         resume: continue the dataset at `dataset.root`, or start it if there is none.
-        output_dir: run folder, for the resolved configuration and pictures; a new one below `outputs/record` if nothing.
+        output_dir: run folder, for the resolved configuration and pictures; a new one in `outputs/record` if nothing.
         preview_video: make an MP4 of the first episode; if nothing, where images can be rendered.
     """
 
@@ -73,9 +74,9 @@ class RecordConfig:
         Raises:
             ConfigError: names the value and the valid ones.
         """
-        if self.robot.type not in SIMULATED:
+        if not isinstance(self.robot, TurtleBot3Config):
             raise ConfigError(
-                f"robot.type is {self.robot.type!r}; bhd-record drives simulated robots: {', '.join(SIMULATED)}. "
+                f"robot.type is {self.robot.type!r}; bhd-record drives simulated robots: turtlebot3. "
                 "Record another robot with lerobot-record."
             )
         for name, value in (
@@ -89,7 +90,7 @@ class RecordConfig:
             raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
-        robot: Any = self.robot
+        robot = self.robot
         if robot.fps not in (self.dataset.fps, type(robot).fps):
             raise ConfigError(
                 f"robot.fps is {robot.fps} and dataset.fps is {self.dataset.fps}; leave robot.fps out, "
@@ -102,6 +103,3 @@ class RecordConfig:
                 raise ConfigError(f"dataset.episode_time_s is {self.dataset.episode_time_s}; it must be positive.")
             task: Any = self.task
             task.duration_s = self.dataset.episode_time_s
-
-
-SIMULATED = ("turtlebot3",)

@@ -1,30 +1,28 @@
 """From a YAML file and command-line overrides to a checked configuration.
 
-LeRobot's own parser stops at the first unknown key with a list of every option there is. Here the message names the key,
-the nearest one that exists, and the valid ones on that level. Both read the same files: `--config_path=FILE` and
+LeRobot's own parser stops at the first unknown key with a list of every option there is. Here the message names the
+key, the nearest one that exists, and the valid ones on that level. Both read the same files: `--config_path=FILE` and
 `--a.b=value`, with `type` choosing among registered classes.
 """
 
 import dataclasses
+import re
 import sys
 import types
 import typing
 from collections.abc import Callable, Sequence
-from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import draccus
 import yaml
 
 from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
 
-T = TypeVar("T")
-
 CONFIG_PATH = "config_path"
 
 
-def parse(config_class: type[T], arguments: Sequence[str]) -> T:
+def parse[T](config_class: type[T], arguments: Sequence[str]) -> T:
     """Return the configuration that a command line asks for.
 
     Args:
@@ -74,7 +72,9 @@ def run(main: Callable[[Any], int | None], config_class: type, arguments: Sequen
 
 def describe(config_class: type, prefix: str = "") -> str:
     """Return the options of a configuration class, a line each, with their types and defaults."""
-    lines = [] if prefix else [(config_class.__doc__ or "").strip(), "", "Options (also in a file: --config_path=FILE):"]
+    lines = (
+        [] if prefix else [(config_class.__doc__ or "").strip(), "", "Options (also in a file: --config_path=FILE):"]
+    )
     for name, kind, default in _fields(config_class):
         key = f"{prefix}{name}"
         if _choices(kind):
@@ -149,31 +149,38 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None
         elif dataclasses.is_dataclass(kind) or choices:
             raise ConfigError(f"{prefix}{key} is {value!r}; it has keys of its own, such as {prefix}{key}.type.")
         else:
-            _check_value(f"{prefix}{key}", value, kind)
+            values[key] = _checked_value(f"{prefix}{key}", value, kind)
     for name, kind, default in _fields(config_class):
         if default is dataclasses.MISSING and name not in values:
+            if dataclasses.is_dataclass(kind) and not _choices(kind):
+                _check_keys(typing.cast(type, kind), {}, f"{prefix}{name}.")  # names what is missing in it
             choice = f".type, one of {', '.join(sorted(_choices(kind)))}" if _choices(kind) else ""
             raise ConfigError(f"The option {prefix}{name} is required; set --{prefix}{name}{choice}.")
 
 
-def _check_value(key: str, value: Any, kind: Any) -> None:
-    """Refuse a value of another type. Converting silently would turn fps: 10.5 into 10."""
+def _checked_value(key: str, value: Any, kind: Any) -> Any:
+    """Return the value, or refuse one of another type: converting silently would turn fps: 10.5 into 10."""
     allowed = typing.get_args(kind) if typing.get_origin(kind) in (typing.Union, types.UnionType) else (kind,)
+    if float in allowed and isinstance(value, str) and _EXPONENT.fullmatch(value):
+        return float(value)  # YAML takes 1e-6 for text: it wants a point in it
     for one in allowed:
-        if one is type(None) and value is None:
-            return
-        if one is float and isinstance(value, int | float) and not isinstance(value, bool):
-            return
-        if one is int and isinstance(value, int) and not isinstance(value, bool):
-            return
-        if one in (str, Path) and isinstance(value, str):
-            return
-        if one is bool and isinstance(value, bool):
-            return
-        if not isinstance(one, type) or issubclass(one, Enum) or one not in (float, int, str, Path, bool, type(None)):
-            return
+        if one not in _PLAIN:
+            return value  # enumerations and lists: the decoder checks them
+        if isinstance(value, _PLAIN[one]) and (one is bool or not isinstance(value, bool)):
+            return value
     names = " or ".join("nothing" if one is type(None) else one.__name__ for one in allowed)
     raise ConfigError(f"{key} is {value!r}; it must be {names}.")
+
+
+_EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
+_PLAIN: dict[Any, tuple[type, ...]] = {
+    float: (int, float),
+    int: (int,),
+    str: (str,),
+    Path: (str,),
+    bool: (bool,),
+    type(None): (type(None),),
+}
 
 
 def _fields(config_class: type) -> list[tuple[str, Any, Any]]:
@@ -201,4 +208,3 @@ def _own_error(error: BaseException | None) -> BhdError | None:
             return error
         error = error.__cause__ or error.__context__
     return None
-

@@ -113,9 +113,7 @@ def _plain(summary: DatasetSummary) -> dict[str, Any]:
         "tasks": list(summary.tasks),
         "recording": summary.recording,
         "features": summary.features,
-        "episodes": [
-            {"index": e.index, "frames": e.frames, "task": e.task, **e.metadata} for e in summary.episodes
-        ],
+        "episodes": [{"index": e.index, "frames": e.frames, "task": e.task, **e.metadata} for e in summary.episodes],
     }
 
 

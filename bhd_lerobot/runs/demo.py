@@ -8,18 +8,18 @@ from pathlib import Path
 from rich.console import Console
 
 from bhd_lerobot.runs import data, record, replay
-from bhd_lerobot.runs.configuration import parse
 from bhd_lerobot.runs.config_record import RecordConfig
+from bhd_lerobot.runs.configuration import parse
 
 _RECORD = (
     "--robot.type=turtlebot3",
     "--brain.type=gap_follower",
     "--task.type=avoid",
     "--dataset.repo_id=bhd/demo",
-    "--dataset.num_episodes=12",
-    "--n_envs=12",
     "--seed=1",
 )
+EPISODES = 12
+SECONDS = 60
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,8 +28,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     folder = Path(arguments[0] if arguments else f"outputs/demo/{datetime.now():%Y-%m-%d_%H-%M-%S}")
     root = folder / "dataset"
     console = Console()
-    console.rule("1. Record 12 episodes of a simulated TurtleBot3 that roams random arenas")
-    config = parse(RecordConfig, [*_RECORD, f"--dataset.root={root}", f"--output_dir={folder}"])
+    console.rule(f"1. Record {EPISODES} episodes of a simulated TurtleBot3 that roams random arenas")
+    config = parse(
+        RecordConfig,
+        [
+            *_RECORD,
+            f"--dataset.num_episodes={EPISODES}",
+            f"--n_envs={EPISODES}",
+            f"--dataset.episode_time_s={SECONDS}",
+            f"--dataset.root={root}",
+            f"--output_dir={folder}",
+        ],
+    )
     record.record(config, console)
     console.rule("2. Replay the first: the recorded actions again, and each recorded state again")
     replay.replay(parse(replay.ReplayConfig, [f"--dataset.root={root}", f"--output_dir={folder}"]), console)

@@ -13,7 +13,7 @@ from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.policies.brain import Brain, Observation
-from bhd_lerobot.robots.simulation import Frame, FrameReport, TurtleBot3Simulation
+from bhd_lerobot.robots.simulation import TurtleBot3Simulation
 from bhd_lerobot.tasks.task import Event, Outcome, Task, Truth
 
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.
@@ -120,9 +120,9 @@ class EpisodeLoop:
                 while order and order[0] in done:
                     yield done.pop(order.pop(0))
         finally:
-            for waiting in self._pending:
-                futures.wait(waiting)
-                waiting.clear()
+            for pending in self._pending:
+                futures.wait(pending)
+                pending.clear()
             for sink in [*self._sinks, *(episode.writer for episode in done.values())]:
                 if sink is not None:
                     sink.discard()
@@ -157,7 +157,23 @@ class EpisodeLoop:
         running = np.flatnonzero(simulation.running)
         truth = Truth(simulation.world.base_pose, report.touched)
         reward, event = self.task.judge(truth, simulation.running)
-        self._store(running, frame, state, action, physics, report, reward, event)
+        self._store(
+            running,
+            {
+                keys.OBSERVATION_STATE: state,
+                keys.ACTION: action,
+                keys.APPLIED_ACTION: report.applied,
+                keys.TIME: frame.time_ns / NANOSECONDS,
+                keys.AGE: frame.age_ns / NANOSECONDS,
+                keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,
+                keys.LIMITS: report.limits,
+                keys.WATCHDOG: report.watchdog,
+                keys.MODE: report.mode,
+                keys.REWARD: reward,
+                keys.EVENT: event,
+                keys.PHYSICS_STATE: physics,
+            },
+        )
         self._length[running] += 1
         self.frames += len(running)
         return [(int(sim), Event(int(event[sim]))) for sim in running if event[sim] != Event.NOTHING]
@@ -190,35 +206,12 @@ class EpisodeLoop:
         while self._pending[sim]:
             self._pending[sim].pop(0).result()
 
-    def _store(
-        self,
-        running: NDArray[np.intp],
-        frame: Frame,
-        state: NDArray[np.float32],
-        action: NDArray[np.float32],
-        physics: NDArray[np.float64],
-        report: FrameReport,
-        reward: NDArray[np.float64],
-        event: NDArray[np.int64],
-    ) -> None:
-        values: Mapping[str, NDArray] = {
-            keys.OBSERVATION_STATE: state,
-            keys.ACTION: action,
-            keys.APPLIED_ACTION: report.applied,
-            keys.TIME: frame.time_ns / NANOSECONDS,
-            keys.AGE: frame.age_ns / NANOSECONDS,
-            keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,
-            keys.LIMITS: report.limits,
-            keys.WATCHDOG: report.watchdog,
-            keys.MODE: report.mode,
-            keys.REWARD: reward,
-            keys.EVENT: event,
-            keys.PHYSICS_STATE: physics,
-        }
+    def _store(self, running: NDArray[np.intp], values: Mapping[str, NDArray]) -> None:
+        """Write one frame of the running simulations into their columns."""
         if not self._columns:
             for key, value in values.items():
-                dtype = keys.SCALARS[key][0] if key in keys.SCALARS else np.float32
-                dtype = np.float64 if key == keys.PHYSICS_STATE else dtype
+                dtype = keys.SCALARS[key][0] if key in keys.SCALARS else "float32"
+                dtype = "float64" if key == keys.PHYSICS_STATE else dtype
                 self._columns[key] = np.zeros((self.simulation.n, self._frames, *value.shape[1:]), dtype)
         rows = self._length[running]
         for key, value in values.items():

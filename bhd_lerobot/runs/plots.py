@@ -103,7 +103,14 @@ def draw_arena(axes: Axes, arena: Arena) -> None:
 
 
 def draw_divergence(
-    arena: Arena, recorded: NDArray, replayed: NDArray, time: NDArray, curves: dict[str, Any], heading: str, path: Path
+    *,
+    arena: Arena,
+    recorded: NDArray,
+    replayed: NDArray,
+    time: NDArray,
+    curves: dict[str, Any],
+    heading: str,
+    path: Path,
 ) -> None:
     """Draw a replay beside its recording.
 

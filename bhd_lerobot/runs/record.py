@@ -81,10 +81,9 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     """
     console = console or Console(stderr=True)
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
-    if isinstance(config.robot, TurtleBot3Config):
-        robot = config.robot
-    else:
-        raise ConfigError(f"bhd-record cannot simulate a {config.robot.type}.")
+    robot = config.robot
+    if not isinstance(robot, TurtleBot3Config):
+        raise AssertionError("RecordConfig refuses other robots.")
     simulation = TurtleBot3Simulation(robot, min(config.n_envs, config.dataset.num_episodes), config.threads)
     task = make_task(config.task, simulation.n, config.dataset.fps)
     brain = make_brain(config.brain)
@@ -112,7 +111,14 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
             bar = progress.add_task("recording", total=len(specs), success="", speed="")
             started = time.perf_counter()
             for episode in loop.run(specs, stop.__bool__):
-                _save(recorder, episode, config, task.parameters(), brain.parameters(), loop)
+                metadata = episode_metadata(
+                    episode,
+                    split=config.split,
+                    task=task.parameters(),
+                    brain=brain.parameters(),
+                    timing=simulation.bridge.timing.summary(),
+                )
+                _save(recorder, episode, task.instruction, metadata)
                 _count(result, episode, config.dataset.fps)
                 result.wall_s = time.perf_counter() - started
                 trajectories.append(_trajectory(episode))
@@ -142,15 +148,17 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
 def _open_recorder(
     config: RecordConfig, root: Path, simulation: TurtleBot3Simulation, task: dict[str, Any], brain: dict[str, Any]
 ) -> DatasetRecorder:
-    images = {
-        name: (simulation.config.camera_height, simulation.config.camera_width, 3) for name in simulation.camera_names
-    }
+    images = dict.fromkeys(
+        simulation.camera_names, (simulation.config.camera_height, simulation.config.camera_width, 3)
+    )
     nq, nv = simulation.world.qpos.shape[1], simulation.world.qvel.shape[1]
     physics = [f"qpos_{i}" for i in range(nq)] + [f"qvel_{i}" for i in range(nv)]
     features = dataset_features(simulation.observation_names, simulation.action_names, images, physics)
     # What decides the episodes. How many there are, and how many run side by side, does not.
     recording = {
-        "robot": {key: str(value) if isinstance(value, Path) else value for key, value in describe(simulation.config).items()},
+        "robot": {
+            key: str(value) if isinstance(value, Path) else value for key, value in describe(simulation.config).items()
+        },
         "task": task,
         "brain": brain,
         "seed": config.seed,
@@ -167,21 +175,11 @@ def _open_recorder(
     )
 
 
-def _save(
-    recorder: DatasetRecorder,
-    episode: Episode,
-    config: RecordConfig,
-    task: dict[str, Any],
-    brain: dict[str, Any],
-    loop: EpisodeLoop,
-) -> None:
+def _save(recorder: DatasetRecorder, episode: Episode, instruction: str, metadata: dict[str, Any]) -> None:
     writer = episode.writer or recorder.begin_episode()
     try:
         writer.set_columns(episode.columns)
-        metadata = episode_metadata(
-            episode, split=config.split, task=task, brain=brain, timing=loop.simulation.bridge.timing.summary()
-        )
-        recorder.save(writer, task=loop.task.instruction, metadata=metadata)
+        recorder.save(writer, task=instruction, metadata=metadata)
     except BaseException:
         writer.discard()
         raise
@@ -244,7 +242,9 @@ def _progress(console: Console) -> Progress:
 def _summary(console: Console, config: RecordConfig, result: RecordResult, film: bool) -> None:
     table = Table(title="Recorded", show_header=False, title_justify="left")
     table.add_row("dataset", f"{result.root} ({result.episodes} episodes)")
-    table.add_row("this run", f"{result.recorded} episodes, {result.frames} frames, {result.simulated_s:.0f} s simulated")
+    table.add_row(
+        "this run", f"{result.recorded} episodes, {result.frames} frames, {result.simulated_s:.0f} s simulated"
+    )
     if result.recorded:
         table.add_row("success", f"{result.successes} of {result.recorded}")
         table.add_row("outcomes", ", ".join(f"{name} {count}" for name, count in result.outcomes.most_common()))
@@ -255,8 +255,8 @@ def _summary(console: Console, config: RecordConfig, result: RecordResult, film:
     console.print(table)
     if result.stopped_by:
         console.print(
-            f"Stopped by {result.stopped_by.signal.name if result.stopped_by.signal else ''}. Episodes that were running "
-            "were dropped, all others are saved. Go on with --resume=true: the dropped ones are run again, the same."
+            f"Stopped by {result.stopped_by.name}. Episodes that were running were dropped, all others are saved. "
+            "Go on with --resume=true: the dropped ones are run again, the same."
         )
 
 

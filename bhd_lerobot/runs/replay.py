@@ -138,7 +138,9 @@ class Replay:
     def changed_versions(self) -> dict[str, tuple[str, str]]:
         """Return what has another version than at the recording: name to recorded and present version."""
         recorded = json.loads(self.metadata["versions"])
-        return {name: (recorded.get(name, "none"), now) for name, now in versions().items() if recorded.get(name) != now}
+        return {
+            name: (recorded.get(name, "none"), now) for name, now in versions().items() if recorded.get(name) != now
+        }
 
     def open_loop(self) -> Divergence:
         """Replay the recorded actions from the recorded initial state."""
@@ -238,7 +240,10 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
         table.add_row(
             mode,
             str(len(result.state)),
-            *(f"{values.max():.3g}" for values in (result.position_m, result.yaw_rad, result.state, result.observation)),
+            *(
+                f"{values.max():.3g}"
+                for values in (result.position_m, result.yaw_rad, result.state, result.observation)
+            ),
             "identical" if result.identical else "",
         )
         if result.not_compared:
@@ -251,7 +256,15 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
         time = np.arange(len(result.state)) / episode.fps
         heading = f"Episode {config.dataset.episode}, replay mode {mode}"
         path = folder / f"episode_{config.dataset.episode:06d}_{mode}.png"
-        draw_divergence(episode.arena, result.recorded_xy, result.replayed_xy, time, curves, heading, path)
+        draw_divergence(
+            arena=episode.arena,
+            recorded=result.recorded_xy,
+            replayed=result.replayed_xy,
+            time=time,
+            curves=curves,
+            heading=heading,
+            path=path,
+        )
     console.print(table)
     console.print(f"Plots: {folder}")
     return results

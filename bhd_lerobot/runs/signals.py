@@ -4,6 +4,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -23,6 +24,11 @@ class StopRequest:
         return self.signal is not None
 
     @property
+    def name(self) -> str:
+        """The signal's name, empty if there was none."""
+        return self.signal.name if self.signal else ""
+
+    @property
     def exit_status(self) -> int:
         """The exit status that says which signal ended the run, 0 if none did."""
         return 0 if self.signal is None else 128 + self.signal
@@ -35,7 +41,7 @@ def stop_on_signals() -> Iterator[StopRequest]:
     A second one acts as it would without us: the loop might hang. The former handlers come back at the end.
     """
     request = StopRequest()
-    former = {}
+    former: dict[signal.Signals, Any] = {}
 
     def handle(number: int, frame: FrameType | None) -> None:
         request.signal = signal.Signals(number)

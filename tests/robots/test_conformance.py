@@ -273,7 +273,7 @@ class NoCameras(GoodRobot):
         del self.cameras
 
 
-BROKEN = [cls for cls in GoodRobot.__subclasses__()]
+BROKEN = list(GoodRobot.__subclasses__())
 
 
 @pytest.fixture

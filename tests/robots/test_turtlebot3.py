@@ -1,5 +1,6 @@
 """The TurtleBot3 as LeRobot sees it: bad actions, stops, noise, options, time."""
 
+import itertools
 import math
 import subprocess
 import sys
@@ -162,7 +163,7 @@ def test_a_scan_lasts_a_fifth_of_a_second(robot):
         observation = robot.get_observation()
         seen.append(tuple(value for name, value in observation.items() if name.startswith("scan_")))
         robot.send_action(GO)
-    fresh = [a != b for a, b in zip(seen, seen[1:], strict=False)]
+    fresh = [a != b for a, b in itertools.pairwise(seen)]
     assert fresh == [False, True] * 3
 
 
@@ -210,10 +211,8 @@ def test_camera_images_where_there_is_opengl(tmp_path):
     assert robot.observation_features["front"] == (48, 64, 3)
     try:
         robot.connect()
-    except RenderingError as error:
-        assert "libegl1" in str(error)
-        assert not robot.is_connected
-        pytest.skip("no OpenGL here")
+    except RenderingError:
+        pytest.skip("no OpenGL here; the message is tested in tests/sim")
     image = robot.get_observation()["front"]
     robot.disconnect()
     assert image.shape == (48, 64, 3)

@@ -19,7 +19,6 @@ from bhd_lerobot.runs import record as record_module
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import encode, parse
 from bhd_lerobot.runs.episode import EpisodeLoop
-
 from tests.runs.support import data_columns, episode_rows, options, run_record
 
 

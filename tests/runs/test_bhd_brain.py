@@ -1,0 +1,103 @@
+"""Brains as teleoperators, alone and under the stock command lines."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.avoidance import AvoidanceConfig
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+from bhd_lerobot.runs.bhd_brain import BhdBrain
+from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
+
+
+@pytest.fixture
+def robot(tmp_path):
+    with TurtleBot3(TurtleBot3Config(calibration_dir=tmp_path, id="one", arena="empty")) as robot:
+        yield robot
+
+
+@pytest.fixture
+def teleop(tmp_path):
+    with BhdBrain(BhdBrainConfig(calibration_dir=tmp_path)) as teleop:
+        yield teleop
+
+
+def test_it_drives_the_robot_that_is_connected(robot, teleop):
+    assert list(teleop.action_features) == list(robot.action_features)
+    robot.get_observation()
+    assert teleop.get_action() == {"x.vel": 0.2, "theta.vel": 0.0}
+    for _ in range(300):
+        robot.get_observation()
+        action = teleop.get_action()
+        if action["x.vel"] == 0:
+            break
+        robot.send_action(action)
+    assert action == {"x.vel": 0.0, "theta.vel": 0.5}  # something is ahead now
+
+
+def test_it_sees_the_last_observation_and_asks_for_none_of_its_own(robot, teleop, monkeypatch):
+    robot.get_observation()
+    monkeypatch.setattr(robot.simulation, "observe", lambda: pytest.fail("observed again"))
+    teleop.get_action()
+
+
+def test_it_needs_exactly_one_robot(tmp_path, teleop):
+    with pytest.raises(ConfigError, match="connected are: none"):
+        teleop.get_action()
+    configs = [TurtleBot3Config(calibration_dir=tmp_path, id=name, arena="empty") for name in ("one", "two")]
+    with TurtleBot3(configs[0]), TurtleBot3(configs[1]):
+        with pytest.raises(ConfigError, match=r"teleop\.robot_id"):
+            teleop.get_action()
+        teleop.config.robot_id = "two"
+        assert teleop.get_action()["x.vel"] == 0.2
+        teleop.config.robot_id = "tow"
+        with pytest.raises(ConfigError, match="Did you mean 'two'"):
+            teleop.get_action()
+
+
+def test_its_lifecycle(tmp_path):
+    teleop = BhdBrain(BhdBrainConfig(calibration_dir=tmp_path, brain=AvoidanceConfig(forward_speed=0.1)))
+    with pytest.raises(DeviceNotConnectedError):
+        teleop.get_action()
+    teleop.connect()
+    with pytest.raises(DeviceAlreadyConnectedError):
+        teleop.connect()
+    teleop.disconnect()
+    teleop.disconnect()
+    assert not teleop.is_connected
+
+
+def test_stock_record_and_replay_work(tmp_path):
+    """`lerobot-record` and `lerobot-replay`, in one process because importing LeRobot takes seconds."""
+    root = tmp_path / "stock"
+    code = f"""
+import sys
+from lerobot.scripts import lerobot_record, lerobot_replay
+common = ["--robot.type=turtlebot3", "--play_sounds=false", "--dataset.root={root}"]
+sys.argv = ["lerobot-record", *common, "--dataset.repo_id=test/stock", "--teleop.type=bhd_brain",
+            "--dataset.single_task=Roam.", "--dataset.fps=10", "--dataset.num_episodes=1",
+            "--dataset.episode_time_s=1", "--dataset.reset_time_s=0", "--dataset.push_to_hub=false"]
+lerobot_record.main()
+from lerobot.datasets import LeRobotDataset
+dataset = LeRobotDataset("test/stock", root="{root}")
+name = dataset.repo_id
+assert dataset.meta.robot_type == "turtlebot3", dataset.meta.robot_type
+assert dataset[0]["observation.state"].shape == (362,)
+print("FRAMES", dataset.num_frames, dataset[3]["action"].tolist())
+sys.argv = ["lerobot-replay", *common, "--dataset.repo_id=test/stock", "--dataset.episode=0"]
+lerobot_replay.main()
+print("REPLAYED")
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert result.returncode == 0, result.stderr[-3000:]
+    line = next(line for line in result.stdout.splitlines() if line.startswith("FRAMES"))
+    frames = int(line.split()[1])
+    assert 5 <= frames <= 11
+    assert np.allclose(json.loads(line.split(" ", 2)[2]), [0.2, 0.0])
+    assert "REPLAYED" in result.stdout

@@ -1,0 +1,92 @@
+"""Configuration files and command lines: precedence, types, near misses, round trip."""
+
+import pytest
+
+from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.runs.config_record import RecordConfig
+from bhd_lerobot.runs.configuration import describe, encode, parse, run
+
+REQUIRED = ["--robot.type=turtlebot3", "--dataset.repo_id=a/b", "--brain.type=avoidance", "--task.type=avoid"]
+
+
+def test_the_command_line_wins_over_the_file_and_the_file_over_the_defaults(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("robot: {type: turtlebot3, beams: 36}\nseed: 3\nn_envs: 4\ndataset: {repo_id: a/b, fps: 20}\n")
+    config = parse(
+        RecordConfig, [f"--config_path={path}", "--seed=7", "--brain.type=avoidance", "--task.type", "avoid"]
+    )
+    assert (config.seed, config.n_envs, config.robot.beams, config.dataset.fps) == (7, 4, 36, 20)
+    assert config.robot.fps == 20  # the robot acts at the dataset's rate
+    assert config.dataset.num_episodes == 50
+
+
+def test_what_is_encoded_is_parsed_back(tmp_path):
+    import yaml
+
+    config = parse(RecordConfig, [*REQUIRED, "--brain.safe_distance_m=0.4", "--dataset.tags=[x, y]"])
+    path = tmp_path / "c.yaml"
+    path.write_text(yaml.safe_dump(encode(config)))
+    assert parse(RecordConfig, [f"--config_path={path}"]) == config
+
+
+@pytest.mark.parametrize("text", ["1e-2", "0.01", "1.0e-2"])
+def test_numbers_may_have_an_exponent(text):
+    config = parse(RecordConfig, [*REQUIRED, f"--robot.lidar_noise_std={text}"])
+    assert config.robot.lidar_noise_std == 0.01
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--sed=1"], "Did you mean 'seed'"),
+        (["--robot.beens=36"], "Did you mean 'robot.beams'"),
+        (["--brain.safe_distance=0.4"], "Did you mean 'brain.safe_distance_m'"),
+        (["--seed"], "has no value"),
+        (["seed=1"], "written --key=value"),
+        (["--seed=1", "--seed=2"], "given twice"),
+        (["--seed=1.5"], "must be int"),
+        (["--seed=true"], "must be int"),
+        (["--resume=1"], "must be bool"),
+        (["--dataset.tags=x"], "tags"),
+        (["--dataset.fps.x=1"], "fps"),
+        (["--seed=[1"], "cannot be read"),
+        (["--config_path=missing.yaml"], "'missing.yaml' cannot be read: No such file"),
+    ],
+)
+def test_mistakes_are_named(options, message):
+    with pytest.raises(ConfigError, match=message):
+        parse(RecordConfig, [*REQUIRED, *options])
+
+
+@pytest.mark.parametrize("left_out", range(4))
+def test_required_options_are_asked_for(left_out):
+    options = [option for index, option in enumerate(REQUIRED) if index != left_out]
+    with pytest.raises(ConfigError, match=REQUIRED[left_out][2:].split("=")[0].removesuffix(".type")):
+        parse(RecordConfig, options)
+
+
+@pytest.mark.parametrize("text", ["- a\n- b\n", "a: [", "\x00"])
+def test_files_that_are_no_configuration(tmp_path, text):
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"c\.yaml"):
+        parse(RecordConfig, [f"--config_path={path}"])
+
+
+def test_errors_of_ours_are_sentences_and_others_keep_their_traceback(capsys):
+    def fail(config):
+        raise BhdError("a sentence")
+
+    def bug(config):
+        raise RuntimeError("a bug")
+
+    assert run(fail, RecordConfig, REQUIRED) == 2
+    assert capsys.readouterr().err == "error: a sentence\n"
+    with pytest.raises(RuntimeError):
+        run(bug, RecordConfig, REQUIRED)
+
+
+def test_help_lists_every_option():
+    text = describe(RecordConfig)
+    for option in ("--robot.beams", "--dataset.episode_time_s", "--brain.safe_distance_m", "--task.arena", "--resume"):
+        assert option in text

@@ -1,0 +1,34 @@
+"""Pictures: every trajectory gets a panel, whatever their number."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bhd_lerobot.bodies.arenas import make_arena
+from bhd_lerobot.runs import plots
+
+
+@pytest.mark.parametrize(("count", "pages"), [(1, 1), (2, 1), (7, 1), (9, 3)])
+def test_every_trajectory_has_a_panel(tmp_path, monkeypatch, count, pages):
+    monkeypatch.setattr(plots, "PANELS", 4 if count == 9 else 100)
+    drawn = []
+    original = plots._draw_panel
+    monkeypatch.setattr(plots, "_draw_panel", lambda axes, t: (drawn.append(t.title), original(axes, t)))
+    arena = make_arena("turtlebot3_world", 0)
+    xy = np.array([[-2.0, -0.5], [-1.6, -0.5]])
+    trajectories = [plots.Trajectory(str(i), arena, xy, i % 2 == 0) for i in range(count)]
+    files = plots.draw_trajectories(trajectories, tmp_path / "t.png", "heading")
+    assert len(files) == pages
+    assert drawn == [str(i) for i in range(count)]
+    for file in files:
+        assert min(Image.open(file).size) > 200
+
+
+def test_a_divergence_of_zero_is_drawn_as_such(tmp_path):
+    arena = make_arena("empty", 0)
+    xy = np.zeros((5, 2))
+    path = tmp_path / "d.png"
+    curves = {"position [m]": np.zeros(5)}
+    time = np.arange(5) / 10
+    plots.draw_divergence(arena=arena, recorded=xy, replayed=xy, time=time, curves=curves, heading="same", path=path)
+    assert np.asarray(Image.open(path)).std() > 1
