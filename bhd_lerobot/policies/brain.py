@@ -89,7 +89,8 @@ def find_scan(names: Sequence[str], who: str) -> tuple[slice, NDArray[np.float64
     Beams are named ``scan_000.pos`` and so on, in order: beam 0 straight ahead, counter-clockwise, evenly spaced.
 
     Returns:
-        The columns, which are neighbours, and the beams' angles in the robot's frame [rad], in [-pi, pi), shape (beams,)
+        The columns, which are neighbours, and the beams' angles in the robot's frame [rad], in [-pi, pi),
+        shape (beams,)
 
     Raises:
         ConfigError: there is no scan.

@@ -32,7 +32,8 @@ class SimulatedRobot(Robot):
     """A simulated robot on a lockstep clock: `send_action` applies an action and advances time by one frame.
 
     Two things differ from a robot on a table. Time stands still between two calls of `send_action`, so that a slow
-    brain is not a late one. And `send_action` returns at the end of the frame, with what the cerebellum commanded by then.
+    brain is not a late one. And `send_action` returns at the end of the frame, with what the cerebellum commanded by
+    then.
     """
 
     config: TurtleBot3Config

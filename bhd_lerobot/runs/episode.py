@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.robots.simulation import TurtleBot3Simulation
@@ -43,6 +44,7 @@ class Episode:
         initial_state: the simulator's complete state at its start, shape (nstate,).
         columns: the dataset's columns by key, each of shape (frames, ...), images left out.
         outcome: how it ended.
+        timing: how punctual its control ticks were.
         writer: what was given for the episode's images at its start, or None.
     """
 
@@ -51,6 +53,7 @@ class Episode:
     initial_state: NDArray[np.float64]
     columns: dict[str, NDArray]
     outcome: Outcome
+    timing: TimingSummary
     writer: Any
 
     @property
@@ -231,5 +234,8 @@ class EpisodeLoop:
         # A simulated clock is never late.
         columns[keys.LATENESS] = np.zeros(length, np.float32)
         columns[keys.OVERRUNS] = np.zeros(length, np.int64)
+        rates = self.simulation.rates
+        timing = TimingStatistics(NANOSECONDS // rates.control_hz)
+        timing.add_punctual(length * rates.ticks_per_frame)
         sink, self._sinks[sim] = self._sinks[sim], None
-        return Episode(spec, arena, initial, columns, outcome, sink)
+        return Episode(spec, arena, initial, columns, outcome, timing.summary(), sink)

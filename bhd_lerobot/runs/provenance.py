@@ -8,7 +8,6 @@ from typing import Any
 from bhd_lerobot import __version__
 from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.bodies.body import Shape
-from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.runs.episode import Episode
 
@@ -18,9 +17,7 @@ def versions() -> dict[str, str]:
     return {"bhd_lerobot": __version__, **{name: metadata.version(name) for name in ("lerobot", "mujoco", "numpy")}}
 
 
-def episode_metadata(
-    episode: Episode, *, split: str, task: dict[str, Any], brain: dict[str, Any], timing: TimingSummary
-) -> dict[str, Any]:
+def episode_metadata(episode: Episode, *, split: str, task: dict[str, Any], brain: dict[str, Any]) -> dict[str, Any]:
     """Return the metadata columns of an episode: plain values, structures as JSON."""
     outcome = episode.outcome
     return {
@@ -36,7 +33,7 @@ def episode_metadata(
         "brain": _json(brain),
         "scene": scene_to_json(episode.arena),
         "initial_state": episode.initial_state.tolist(),
-        "timing": _json(asdict(timing)),
+        "timing": _json(asdict(episode.timing)),
         "versions": _json(versions()),
     }
 

@@ -116,7 +116,6 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
                     split=config.split,
                     task=task.parameters(),
                     brain=brain.parameters(),
-                    timing=simulation.bridge.timing.summary(),
                 )
                 _save(recorder, episode, task.instruction, metadata)
                 _count(result, episode, config.dataset.fps)
