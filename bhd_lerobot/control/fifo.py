@@ -125,15 +125,17 @@ class CommandFifo:
     def _look(self) -> None:
         """Find the next entry, and give up the oldest entries that nobody waits for any more."""
         tail, head = int(self._tail[0]), int(self._head[0])
-        while tail < head and not self._mask[tail % self.capacity].any():
-            tail += 1
-        self._tail[0] = tail
         self._seen_head = head
         self._next, self._next_due = None, None
         for entry in range(tail, head):
-            due = int(self._due[entry % self.capacity])
-            if (self._next_due is None or due < self._next_due) and self._mask[entry % self.capacity].any():
-                self._next, self._next_due = entry, due
+            slot = entry % self.capacity
+            if self._mask[slot].any():
+                due = int(self._due[slot])
+                if self._next_due is None or due < self._next_due:
+                    self._next, self._next_due = entry, due
+            elif self._next is None:
+                tail = entry + 1
+        self._tail[0] = tail
 
 
 class StateRing:

@@ -168,8 +168,6 @@ class World:
             self.update_constants(ids)
         self._batch.state[ids] = snapshot.state
         self._batch.forward(ids)
-        # Computing the sensors moved the solver's warm start, which is part of the state.
-        self._batch.state[ids] = snapshot.state
 
     @property
     def base_pose(self) -> NDArray[np.float64]:

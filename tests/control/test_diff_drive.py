@@ -58,6 +58,17 @@ def test_a_spin_on_the_spot_counts_all_its_turns(rate: float) -> None:
     assert math.hypot(x, y) <= 2 * COUNT_M * math.sqrt(2)
 
 
+@pytest.mark.parametrize("turn", [0.2, -0.4])
+def test_a_coarse_step_goes_along_the_chord_of_its_arc(turn: float) -> None:
+    drive = DiffDrive(DRIVE, 1)
+    radius = 0.5
+    wheels = np.array([radius - SEPARATION / 2, radius + SEPARATION / 2]) * abs(turn) / RADIUS
+    drive.update_odometry(wheels[None] if turn > 0 else wheels[None, ::-1])
+    x, y, yaw = drive.odometry[0]
+    assert yaw == pytest.approx(turn, abs=2 * COUNT_RAD)
+    assert math.atan2(y, x) == pytest.approx(turn / 2, abs=2 * COUNT_RAD)
+
+
 @pytest.mark.parametrize(("speed", "rate"), [(0.1, 0.5), (0.2, -1.0), (-0.1, 0.7)])
 def test_a_circle_closes(speed: float, rate: float) -> None:
     period = 2 * math.pi / abs(rate)

@@ -216,6 +216,16 @@ def test_a_new_episode_starts_from_nothing() -> None:
     assert used.task.outcome(0, Event.NOTHING) == fresh.task.outcome(0, Event.NOTHING)
 
 
+def test_a_long_path_in_the_episode_before_does_not_make_a_robot_stuck() -> None:
+    run = Run(AvoidConfig())
+    for frame in range(1, 300):
+        run.frame(on_circle(frame, 0.3))
+    run.task.begin(np.array([0]), [EMPTY])
+    for frame in range(1, 150):
+        run.frame(on_circle(frame, 0.1))
+    assert run.events[0] == Event.NOTHING
+
+
 @pytest.mark.parametrize("arena", ["random", "turtlebot3_world", "empty"])
 @pytest.mark.parametrize("random_start", [False, True])
 def test_equal_seeds_give_equal_episodes(arena: str, random_start: bool) -> None:
