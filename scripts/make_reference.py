@@ -1,0 +1,239 @@
+"""Write docs/reference.md: every configuration option and every dataset column, from the code that defines them.
+
+python scripts/make_reference.py          write the file
+python scripts/make_reference.py --check  exit with 1 if the file is not what would be written
+"""
+
+import ast
+import dataclasses
+import inspect
+import re
+import sys
+import textwrap
+import typing
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import draccus
+
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
+from bhd_lerobot.data import features as keys
+from bhd_lerobot.data.schema import DEFAULT_FEATURES
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.simulation import observation_names
+from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
+from bhd_lerobot.runs.config_record import RecordConfig
+from bhd_lerobot.runs.replay import ReplayConfig
+from bhd_lerobot.tasks.task import Event
+
+FILE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
+
+# What LeRobot's own base classes add to ours; their docstrings do not describe it.
+_INHERITED = {
+    "id": "name of this robot or teleoperator; LeRobot's own field",
+    "calibration_dir": "where LeRobot keeps calibration files; nothing here is calibrated",
+}
+
+_INTRODUCTION = """\
+# Reference
+
+Written by `python scripts/make_reference.py` from the code; do not edit it by hand. A test fails when it is out of
+date.
+
+Options are written `--key=value` on the command line, or as nested keys in a YAML file that `--config_path=FILE` names;
+the command line wins. `type` chooses among several classes. *Required* means that there is no default. "Nothing" is
+written `null`.
+"""
+
+
+def reference() -> str:
+    """Return the whole document."""
+    parts = [
+        _INTRODUCTION,
+        "## `bhd-record`\n",
+        *_options(RecordConfig, ""),
+        "## `bhd-replay`\n",
+        *_options(ReplayConfig, ""),
+        "## Teleoperator `bhd_brain`\n",
+        "For the stock commands: `--teleop.type=bhd_brain`. The brain is chosen by `--teleop.brain.type`; its options "
+        "are those of `brain.*` above.\n",
+        *_options(BhdBrainConfig, "teleop.", choices=False),
+        "## Dataset columns\n",
+        _columns(),
+        "### Modes\n\nIn `control.mode`.\n",
+        _members(Mode),
+        "### Limits\n\nIn `control.limits`: the sum of what applied during the frame.\n",
+        _members(Limit),
+        "### Watchdogs\n\nIn `control.watchdog`: the sum of what applied during the frame.\n",
+        _members(Watchdog),
+        "### Events\n\nIn `event`, and by name in the episode's `bhd/outcome`.\n",
+        _members(Event),
+        "### Reasons of refusal\n\nIn `SendResult.reasons`, and in the message of a `CommandRefusedError`.\n",
+        _table(("value", "name", "meaning"), ((r.value, f"`{r.name}`", r.explanation) for r in Reason)),
+    ]
+    return "\n".join(parts)
+
+
+# --- options ---------------------------------------------------------------------------------------------------------
+
+
+def _options(config_class: type, prefix: str, choices: bool = True) -> Iterator[str]:
+    """Yield the table of a class's plain options, and then those of the classes inside it."""
+    described, hints = _descriptions(config_class), typing.get_type_hints(config_class)
+    rows, inner = [], []
+    for field in dataclasses.fields(config_class):
+        key, kind, meaning = f"{prefix}{field.name}", hints[field.name], described.get(field.name)
+        if meaning is None:
+            raise SystemExit(f"{config_class.__qualname__}: the docstring does not describe {field.name!r}.")
+        if _choices(kind):
+            default = _default(field)
+            shown = f"`{_choice_name(kind, type(default))}`" if dataclasses.is_dataclass(default) else "*required*"
+            rows.append((f"`{key}.type`", _kinds(kind), shown, meaning))
+            if choices:
+                inner += [(f"`{key}.type={name}`", one, f"{key}.") for name, one in _choices(kind).items()]
+        elif dataclasses.is_dataclass(kind):
+            inner.append((f"`{key}`", typing.cast(type, kind), f"{key}."))
+        else:
+            default = _default(field)
+            shown = "*required*" if default is dataclasses.MISSING else f"`{_plain(default)}`"
+            rows.append((f"`{key}`", _type_name(kind), shown, meaning))
+    yield _summary(config_class) + "\n"
+    if rows:
+        yield _table(("option", "type", "default", "meaning"), rows)
+    for title, one, inner_prefix in inner:
+        yield f"### {title}\n"
+        yield from _options(one, inner_prefix)
+
+
+def _descriptions(config_class: type) -> dict[str, str]:
+    """Return the attribute descriptions of a class's docstring, and of its bases in this package."""
+    result = dict(_INHERITED)
+    for one in reversed(config_class.__mro__):
+        section = re.search(r"^Attributes:\n((?:[ ]+.*\n?|\n)*)", inspect.cleandoc(one.__doc__ or ""), re.MULTILINE)
+        if one.__module__.startswith("bhd_lerobot.") and section:
+            name = ""
+            for line in textwrap.dedent(section[1]).splitlines():
+                start = re.match(r"(\w+): (.*)", line)
+                if start:
+                    name = start[1]
+                    result[name] = start[2]
+                elif line.strip():
+                    result[name] += f" {line.strip()}"
+    return {name: text.replace("``", "`") for name, text in result.items()}
+
+
+def _summary(config_class: type) -> str:
+    return inspect.cleandoc(config_class.__doc__ or "").partition("\n\n")[0].replace("``", "`")
+
+
+def _choices(kind: Any) -> dict[str, type]:
+    """Return the classes of ours that are registered under a choice type, or nothing if it is none."""
+    if isinstance(kind, type) and issubclass(kind, draccus.ChoiceRegistry):
+        known = kind.get_known_choices().items()
+        return {name: one for name, one in sorted(known) if one.__module__.startswith("bhd_lerobot.")}
+    return {}
+
+
+def _choice_name(kind: Any, chosen: type) -> str:
+    return next(name for name, one in _choices(kind).items() if one is chosen)
+
+
+def _kinds(kind: Any) -> str:
+    return ", ".join(f"`{name}`" for name in _choices(kind))
+
+
+def _default(field: dataclasses.Field) -> Any:
+    return field.default_factory() if field.default_factory is not dataclasses.MISSING else field.default
+
+
+def _plain(value: Any) -> str:
+    names = {None: "null", True: "true", False: "false"}
+    return names[value] if value is None or isinstance(value, bool) else str(value)
+
+
+def _type_name(kind: Any) -> str:
+    arguments = typing.get_args(kind)
+    if arguments and typing.get_origin(kind) is not list:
+        return " or ".join("nothing" if one is type(None) else _type_name(one) for one in arguments)
+    if arguments:
+        return f"list of {_type_name(arguments[0])}"
+    return {"str": "text", "Path": "path", "bool": "yes or no", "int": "whole number", "float": "number"}.get(
+        kind.__name__, kind.__name__
+    )
+
+
+# --- columns ---------------------------------------------------------------------------------------------------------
+
+_VECTORS = {
+    keys.OBSERVATION_STATE: "the robot's floats in the order of its observation features; named in `meta/info.json`",
+    f"{keys.OBSERVATION_IMAGES}.front": "the front camera, RGB; only with `robot.camera=true`",
+    keys.ACTION: "what the brain asked for over the coming frame",
+    keys.APPLIED_ACTION: "what the cerebellum commanded at the end of the frame, after all limits",
+    keys.PHYSICS_STATE: "the simulator's generalised positions, then velocities, when the observation was measured",
+}
+
+_DEFAULTS = {
+    "timestamp": "frame_index / fps [s]",
+    "frame_index": "number of the frame in its episode, from 0",
+    "episode_index": "number of the episode in the dataset, from 0",
+    "index": "number of the frame in the dataset, from 0",
+    "task_index": "number of the instruction in `meta/tasks.parquet`",
+}
+
+
+def _columns() -> str:
+    config = TurtleBot3Config(camera=True)
+    image = (config.camera_height, config.camera_width, 3)
+    # The state of a free body (7 positions, 6 velocities) and of two wheels.
+    features = keys.dataset_features(
+        observation_names(config), ("x.vel", "theta.vel"), {"front": image}, [str(i) for i in range(17)]
+    )
+    rows = []
+    for key, feature in {**features, **DEFAULT_FEATURES}.items():
+        meaning = keys.SCALARS[key][1] if key in keys.SCALARS else {**_VECTORS, **_DEFAULTS}[key]
+        shape = " × ".join(str(size) for size in feature["shape"])
+        rows.append((f"`{key}`", feature["dtype"], shape, meaning))
+    return (
+        "As `bhd-record` writes them for a TurtleBot3 with its defaults and a camera. [dataset.md](dataset.md) says "
+        "more about each.\n\n" + _table(("key", "type", "size", "meaning"), rows)
+    )
+
+
+def _members(kind: type[Enum]) -> str:
+    """Return a table of an enumeration's members, with the docstrings that stand below them."""
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    notes: dict[str, str] = {}
+    name = ""
+    for node in typing.cast(ast.ClassDef, tree).body:
+        if isinstance(node, ast.Assign):
+            name = ast.unparse(node.targets[0])
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and name:
+            notes[name] = " ".join(str(node.value.value).split())
+    members = kind.__members__.items()
+    return _table(("value", "name", "meaning"), ((m.value, f"`{n}`", notes.get(n, "")) for n, m in members))
+
+
+def _table(headings: tuple[str, ...], rows: Any) -> str:
+    lines = [headings, tuple("---" for _ in headings), *rows]
+    return "".join("| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |\n" for line in lines)
+
+
+def main(arguments: list[str]) -> int:
+    """Write the file, or compare it; return the exit status."""
+    text = reference()
+    if arguments == ["--check"]:
+        same = FILE.exists() and FILE.read_text(encoding="utf-8") == text
+        if not same:
+            print(f"{FILE} is out of date; run: python scripts/make_reference.py", file=sys.stderr)
+        return int(not same)
+    if arguments:
+        print(f"Unknown argument {arguments[0]!r}. Valid: --check.", file=sys.stderr)
+        return 2
+    FILE.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
