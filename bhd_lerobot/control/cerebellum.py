@@ -6,13 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body
-from bhd_lerobot.control import safety
-from bhd_lerobot.control.diff_drive import DiffDrive
+from bhd_lerobot.control.controller import BaseController
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.control.messages import (
     NANOSECONDS,
     CerebellumState,
-    Limit,
     Mode,
     Reason,
     Request,
@@ -21,10 +19,8 @@ from bhd_lerobot.control.messages import (
     Watchdog,
 )
 from bhd_lerobot.control.plant import Plant, PlantReading
-from bhd_lerobot.errors import ConfigError
 
 MOVING = 0.01  # [rad/s] a joint faster than this moves: the articles' `is_moving`
-_REST = 1e-9  # a ramp has arrived when the command is this close to zero
 
 # Requests and the modes that they apply in; resets lead to INACTIVE only, motion needs a separate activation.
 _TRANSITIONS = {
@@ -42,15 +38,16 @@ class Cerebellum:
     by a thread on an absolute grid, and does the same in both. Everything that depends on time comes in as `now_ns`.
 
     Args:
-        body: the robot: limits and wheels.
+        body: the robot.
         plant: the joints.
         control_hz: ticks a second [Hz].
         fifo: where commands come from; a new one if None.
         ring: where every tick's state is published, of dtype `state_dtype(n)`; nowhere if None.
         estop_word: n 64-bit integers that any process may set to something else than 0; new memory if None.
+        controller: what turns commands into actuator commands; that of a wheeled base if None.
 
     Raises:
-        ConfigError: the wheels cannot turn the base as fast as its velocity limit allows.
+        ConfigError: the body cannot do what its limits allow.
     """
 
     def __init__(
@@ -62,47 +59,27 @@ class Cerebellum:
         fifo: CommandFifo | None = None,
         ring: StateRing | None = None,
         estop_word: NDArray[np.int64] | None = None,
+        controller: BaseController | None = None,
     ) -> None:
         self.body, self.plant, self.control_hz = body, plant, control_hz
         self.n = n = plant.n
-        limits = body.limits
-        self.width = width = len(limits.names)
+        self.controller = BaseController(body, n, control_hz) if controller is None else controller
+        self.width = width = self.controller.width
+        self.command = self.controller.command
         self.fifo = CommandFifo(n, width) if fifo is None else fifo
         self.estop_word = np.zeros(n, np.int64) if estop_word is None else estop_word
         self._ring = ring
-        self.drive = DiffDrive(body.drive, n)
         self.mode = np.full(n, Mode.UNCONFIGURED, np.int8)
         self.refusals = np.zeros((len(Reason), n), np.int64)
-        self.reading = PlantReading(n, 2)
-        self.command = np.zeros((n, width))
+        self.reading = PlantReading(n, self.controller.joints)
         self.ticks = 0
 
-        self._timeout_ns = round(limits.command_timeout_s * NANOSECONDS)
-        self._velocity = np.asarray(limits.velocity)
-        self._change = np.asarray(limits.acceleration) / control_hz
-        self._stop_change = np.asarray(limits.stop_deceleration) / control_hz
-        self._wheel_limit = body.drive.max_wheel_speed
-        self._per_speed = 1.0 / body.drive.wheel_radius
-        self._per_yaw = body.drive.wheel_separation / 2 / body.drive.wheel_radius
-        self._largest_error = body.drive.max_torque / body.drive.servo_gain
-        fastest = self._wheel_limit / self._per_yaw
-        if limits.velocity[1] > fastest * (1 + 1e-9):
-            raise ConfigError(
-                f"The limit of {limits.names[1]} is {limits.velocity[1]}; wheels of {self._wheel_limit:g} rad/s at the "
-                f"most can turn the base at {fastest:g} rad/s."
-            )
-
-        # The hot path knows no modes: a change of mode writes what every simulation heads for, and how fast.
-        self._target = np.zeros((n, width))
-        self._largest = np.broadcast_to(self._change, (n, width)).copy()
-        self._clipped = np.zeros((n, width))
-        self._wheels = np.zeros((n, 2))
-        self._wheel_reference = np.zeros((n, 2))
-        self._last_position = np.zeros((n, 2))
+        self._timeout_ns = round(body.limits.command_timeout_s * NANOSECONDS)
+        self._last_position = np.zeros_like(self.reading.position)
         # The sum of 0 * x is 0 if and only if every x is finite; unlike a plain sum it neither overflows nor warns.
-        self._flat_reading, self._flat_target = self.reading.values.reshape(-1), self._target.reshape(-1)
-        self._reading_zeros, self._target_zeros = np.zeros(4 * n), np.zeros(width * n)
-        self._settled = False
+        self._flat_reading = self.reading.values.reshape(-1)
+        self._zeros = np.zeros_like(self._flat_reading)
+        self._configured = np.zeros(n, np.bool_)
         self._last_due = np.zeros(n, np.int64)
         self._sent_sequence = np.full(n, -1, np.int64)
         self._sent_due = np.full(n, np.iinfo(np.int64).min, np.int64)
@@ -112,11 +89,6 @@ class Cerebellum:
         self._popped, self._popped_mask = np.zeros((n, width)), np.zeros(n, np.bool_)
         self._estop_latched = np.zeros(n, np.bool_)
 
-        self._limited_velocity = np.zeros((n, width), np.bool_)
-        self._limited_change = np.zeros((n, width), np.bool_)
-        self._limited_wheels = np.zeros(n, np.bool_)
-        self._limited_effort = np.zeros((n, 2), np.bool_)
-        self._limited_finite = np.zeros(n, np.bool_)
         self._watchdog = np.zeros(n, np.int8)
 
     # --- one tick ----------------------------------------------------------------------------------------------------
@@ -130,14 +102,9 @@ class Cerebellum:
         self.plant.read(self.reading)
         self._supervise(now_ns)
         self._take_commands(now_ns)
-        if not self._settled:
-            self._filter()
-        # Where nothing changed since the last tick the command stands, and so do the wheel speeds that it means.
-        np.copyto(self._wheels, self._wheel_reference)
-        safety.limit_effort(self._wheels, self.reading.velocity, self._largest_error, self._limited_effort)
-        self.plant.write(self._wheels)
+        self.controller.run(self.reading)
+        self.plant.write(self.controller.actuators)
         self._last_position[:] = self.reading.position
-        self.drive.update_odometry(self.reading.position)
         self.ticks += 1
         if self._ring is not None:
             self._publish(now_ns)
@@ -149,7 +116,7 @@ class Cerebellum:
             if hit.any():
                 self._set_mode(hit, Mode.ESTOP)
                 self._estop_latched |= hit
-        if self._flat_reading.dot(self._reading_zeros) != 0.0 or self.reading.fault.any():
+        if self._flat_reading.dot(self._zeros) != 0.0 or self.reading.fault.any():
             self._handle_fault()
         if self._deadline is not None and now_ns > self._deadline:
             old = (self.mode == Mode.TRACKING) & (now_ns - self._last_due > self._timeout_ns)
@@ -159,7 +126,7 @@ class Cerebellum:
             self._update_deadline()
         if self._stopping:
             stopping = self.mode == Mode.STOPPING
-            rest = stopping & (np.abs(self.command) < _REST).all(axis=1)
+            rest = stopping & self.controller.at_rest()
             if rest.any():
                 self._set_mode(rest & ~self._deactivating, Mode.HOLD)
                 self._set_mode(rest & self._deactivating, Mode.SAFE_OFF)
@@ -187,28 +154,9 @@ class Cerebellum:
             starting = take & (self.mode != Mode.TRACKING)
             if starting.any():
                 self._set_mode(starting, Mode.TRACKING)
-            np.copyto(self._target, self._popped, where=take[:, None])
-            self._settled = False
+            self.controller.head_for(self._popped, take)
             self._update_deadline()
             due = self.fifo.next_due()
-
-    def _filter(self) -> None:
-        """Safety filter: from the targets to the commands applied in this tick, and the wheel speeds they mean."""
-        target = self._target
-        if self._flat_target.dot(self._target_zeros) != 0.0:
-            # Commands are checked when they are sent; a queue in shared memory is written by another process.
-            bad = ~np.isfinite(target).all(axis=1)
-            self._limited_finite |= bad
-            target[bad] = 0.0
-        safety.limit_velocity(target, self._velocity, self._clipped, self._limited_velocity)
-        wheels = (self._per_speed, self._per_yaw, self._wheel_limit, self._limited_wheels)
-        safety.limit_wheel_speed(self._clipped, *wheels)
-        arrived = safety.limit_change(self._clipped, self.command, self._largest, self.command, self._limited_change)
-        # Both ends of a change can be within the wheels' limit and the way between them not: the two dimensions
-        # change at different rates.
-        limited = safety.limit_wheel_speed(self.command, *wheels)
-        self._settled = arrived and not limited
-        self.drive.wheels_from_twist(self.command, self._wheel_reference)
 
     # --- commands ----------------------------------------------------------------------------------------------------
 
@@ -251,7 +199,7 @@ class Cerebellum:
         """
         if request == Request.CONFIGURE:
             self.plant.read(self.reading)
-            if self._flat_reading.dot(self._reading_zeros) != 0.0:
+            if self._flat_reading.dot(self._zeros) != 0.0:
                 self._handle_fault()
         wanted = np.zeros(self.n, np.bool_)
         wanted[slice(None) if ids is None else ids] = True
@@ -260,8 +208,13 @@ class Cerebellum:
         reasons = np.where(wanted & ~allowed, Reason.WRONG_MODE, Reason.ACCEPTED).astype(np.int8)
         reasons[wanted & ~allowed & (self.mode == Mode.ESTOP)] = Reason.ESTOP
         reasons[wanted & ~allowed & (self.mode == Mode.FAULT)] = Reason.FAULT
+        if request == Request.RESET:
+            # A stop that is not over yet must not become a gentler one.
+            moving = allowed & ~self.controller.at_rest()
+            reasons[moving] = Reason.NOT_AT_REST
+            allowed &= ~moving
         if request == Request.CONFIGURE:
-            self.drive.reset_odometry(np.flatnonzero(allowed), self.reading.position[allowed])
+            self._configure(allowed)
         if request == Request.ACTIVATE:
             active = np.flatnonzero(allowed)
             self.refusals[Reason.NOT_ACTIVE, active] += self.fifo.drop(active)
@@ -270,6 +223,7 @@ class Cerebellum:
             # A word that was set after another latch has not been seen yet: the next tick will.
             self.estop_word[allowed & (self.mode == Mode.ESTOP)] = 0
             self._estop_latched &= ~allowed
+            self._configure(allowed & ~self._configured)
         self._set_mode(allowed, result)
         if request == Request.DEACTIVATE:
             self._deactivating |= allowed
@@ -281,36 +235,24 @@ class Cerebellum:
         self.fifo.drop(ids)
         self.mode[ids] = Mode.UNCONFIGURED
         self.estop_word[ids] = 0
-        self.command[ids] = 0.0
-        self._target[ids] = 0.0
-        self._wheels[ids] = self._wheel_reference[ids] = 0.0
-        self._settled = False
-        self._largest[ids] = self._change
+        self.controller.restart(ids)
+        self._configured[ids] = False
         self._sent_sequence[ids] = -1
         self._sent_due[ids] = np.iinfo(np.int64).min
         self._last_due[ids] = 0
         self._deactivating[ids] = False
         self._estop_latched[ids] = False
         self.refusals[:, ids] = 0
-        for flags in self._frame_flags():
-            flags[ids] = 0
+        self._watchdog[ids] = 0
         self._update_deadline()
 
     # --- reports -----------------------------------------------------------------------------------------------------
 
     def take_flags(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the `Limit` and `Watchdog` flags raised since the last call, each of shape (n,), and clear them."""
-        limits = (
-            self._limited_finite * int(Limit.NON_FINITE)
-            + (self._limited_velocity.any(axis=1) | self._limited_wheels) * int(Limit.VELOCITY)
-            + self._limited_change.any(axis=1) * int(Limit.ACCELERATION)
-            + self._limited_effort.any(axis=1) * int(Limit.EFFORT)
-        )
         watchdog = self._watchdog.astype(np.int64)
-        for flags in self._frame_flags():
-            flags[:] = 0
-        self._settled = False  # a limit that still holds is reported again in the next frame
-        return limits, watchdog
+        self._watchdog[:] = 0
+        return self.controller.take_limits(), watchdog
 
     def command_age_ns(self, now_ns: int) -> NDArray[np.int64]:
         """Return how long ago the command in force was due [ns], shape (n,); 0 for a robot that follows none."""
@@ -323,10 +265,10 @@ class Cerebellum:
             stamp_ns=now_ns,
             joint_positions=self.reading.position.copy(),
             joint_velocities=velocity,
-            joint_efforts=(self._wheels - velocity) * self.body.drive.servo_gain,
+            joint_efforts=self.controller.efforts(self.reading),
             command=self.command.copy(),
-            odometry=self.drive.odometry.copy(),
-            twist=self.drive.twist_from_wheels(velocity),
+            odometry=self.controller.drive.odometry.copy(),
+            twist=self.controller.drive.twist_from_wheels(velocity),
             mode=self.mode.copy(),
             is_moving=np.asarray((np.abs(velocity) > MOVING).any(axis=1)),
             emergency_stop=self._estop_latched.copy(),
@@ -366,11 +308,9 @@ class Cerebellum:
         if not mask.any():
             return
         self.mode[mask] = mode
-        self._settled = False
         if mode != Mode.TRACKING:
-            self._target[mask] = 0.0
+            self.controller.stop(mask, hard=mode in (Mode.ESTOP, Mode.FAULT))
         self._deactivating[mask] = False
-        self._largest[mask] = self._stop_change if mode in (Mode.ESTOP, Mode.FAULT) else self._change
         self._stopping |= mode == Mode.STOPPING
         self._update_deadline()
 
@@ -390,15 +330,9 @@ class Cerebellum:
         tracking = self.mode == Mode.TRACKING
         self._deadline = int(self._last_due[tracking].min()) + self._timeout_ns if tracking.any() else None
 
-    def _frame_flags(self) -> tuple[NDArray, ...]:
-        return (
-            self._limited_velocity,
-            self._limited_change,
-            self._limited_wheels,
-            self._limited_effort,
-            self._limited_finite,
-            self._watchdog,
-        )
+    def _configure(self, mask: NDArray[np.bool_]) -> None:
+        self.controller.configure(np.flatnonzero(mask), self.reading)
+        self._configured |= mask
 
 
 _MODE_REASON = np.full(len(Mode), Reason.NOT_ACTIVE, np.int8)

@@ -50,6 +50,7 @@ class Reason(IntEnum):
     ESTOP = 7
     FAULT = 8
     WRONG_MODE = 9
+    NOT_AT_REST = 10
 
     @property
     def explanation(self) -> str:
@@ -68,6 +69,7 @@ _EXPLANATIONS = {
     Reason.ESTOP: "the emergency stop is latched; clear its cause, then call reset() and activate()",
     Reason.FAULT: "a plant fault is latched; clear its cause, then call reset() and activate()",
     Reason.WRONG_MODE: "the request does not apply in the present mode",
+    Reason.NOT_AT_REST: "the robot is still stopping; ask again when it is at rest",
 }
 
 

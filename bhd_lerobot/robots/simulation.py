@@ -136,10 +136,10 @@ class TurtleBot3Simulation:
     def observe(self) -> Frame:
         """Return what the robots see now."""
         self.plant.read(self._reading)
-        twist = self.cerebellum.drive.twist_from_wheels(self._reading.velocity)
+        twist = self.cerebellum.controller.drive.twist_from_wheels(self._reading.velocity)
         parts = [twist, self.lidar.ranges]
         if self.config.odometry:
-            parts.append(self.cerebellum.drive.odometry_at(self._reading.position))
+            parts.append(self.cerebellum.controller.drive.odometry_at(self._reading.position))
         if self.config.imu:
             parts.append(self._gyro)
         now = (self._tick - self._start_tick) * NANOSECONDS // self.rates.control_hz

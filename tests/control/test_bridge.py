@@ -129,11 +129,11 @@ def test_an_emergency_stop_brings_the_base_to_rest_within_300_ms(command: tuple[
     np.testing.assert_allclose(bridge.state().twist[0], command, rtol=0.01, atol=0.01)
     np.testing.assert_allclose(np.hypot(*world.qvel[0, :2]), abs(command[0]), rtol=0.03, atol=0.01)
 
-    written = bridge.cerebellum._wheels[0].copy()
+    written = bridge.cerebellum.controller.actuators[0].copy()
     bridge.estop()
     bridge.advance_ticks(2)
     # The safe command is out: no wheel is asked to go on as fast.
-    after = bridge.cerebellum._wheels[0]
+    after = bridge.cerebellum.controller.actuators[0]
     moving = np.abs(written) > 0.1
     assert (np.abs(after[moving]) < np.abs(written[moving])).all()
     assert bridge.state().mode.tolist() == [Mode.ESTOP]

@@ -33,10 +33,10 @@ def in_mode(mode: Mode) -> Rig:
         rig.tick(100)
     elif mode == Mode.ESTOP:
         rig.cerebellum.estop_word[0] = 1
-        rig.tick()
+        rig.tick(60)  # to rest
     elif mode == Mode.FAULT:
         rig.plant.fault[0] = True
-        rig.tick()
+        rig.tick(60)
         rig.plant.fault[0] = False
     assert rig.mode == mode
     return rig
@@ -108,7 +108,7 @@ def test_an_emergency_stop_in_every_mode(mode: Mode) -> None:
 def test_a_plant_fault_in_every_mode(mode: Mode) -> None:
     rig = in_mode(mode)
     rig.plant.fault[0] = True
-    rig.tick(3)
+    rig.tick(60)
     # An emergency stop is not replaced by a fault; the fault shows after its reset.
     assert rig.mode == (Mode.ESTOP if mode == Mode.ESTOP else Mode.FAULT)
     if mode == Mode.ESTOP:
@@ -391,6 +391,31 @@ def test_an_emergency_stop_that_nobody_has_seen_yet_survives_the_reset_of_anothe
         rig.request(Request.RESET)
         rig.tick()
         assert rig.mode == Mode.ESTOP
+
+
+def test_a_reset_waits_until_the_stop_is_over() -> None:
+    rig = in_mode(Mode.TRACKING)
+    rig.cerebellum.estop_word[0] = 1
+    rig.tick(3)
+    assert rig.command[0] > 0
+    assert rig.request(Request.RESET).reasons.tolist() == [Reason.NOT_AT_REST]
+    assert rig.mode == Mode.ESTOP
+    before = rig.command[0]
+    rig.tick()
+    assert before - rig.command[0] == pytest.approx(2.5 / HZ)  # it goes on stopping as hard as before
+    rig.tick(60)
+    assert rig.request(Request.RESET).accepted.all()
+
+
+def test_a_stop_before_the_configuration_leaves_odometry_at_zero() -> None:
+    rig = Rig(active=False)
+    rig.plant.position[:] = 12.5
+    rig.cerebellum.estop_word[0] = 1
+    rig.tick()
+    assert rig.request(Request.RESET).accepted.all()
+    assert rig.request(Request.ACTIVATE).accepted.all()
+    rig.tick()
+    assert rig.cerebellum.state(rig.now).odometry[0].tolist() == [0, 0, 0]
 
 
 def test_only_a_reset_clears_the_latch() -> None:
