@@ -22,7 +22,9 @@ class DiffDrive:
         self._per_yaw = drive.wheel_separation / 2 / drive.wheel_radius  # [rad/rad]
         self._count = drive.encoder_ticks / (2 * np.pi)  # [1/rad]
         self.odometry: NDArray[np.float64] = np.zeros((n, 3))
+        self._metres = drive.wheel_radius / self._count  # [m] that a wheel rolls in one encoder count
         self._encoder: NDArray[np.float64] = np.zeros((n, 2))
+        self._counts, self._moved, self._work = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((4, n))
 
     def wheels_from_twist(self, twist: NDArray[np.float64], out: NDArray[np.float64]) -> NDArray[np.float64]:
         """Write the wheel speeds of a twist.
@@ -65,8 +67,8 @@ class DiffDrive:
         Args:
             angles: wheel angles [rad], shape (n, 2).
         """
-        self.odometry = self.odometry_at(angles)
-        self._encoder = np.floor(angles * self._count)
+        self._integrate(angles, self.odometry)
+        self._encoder, self._counts = self._counts, self._encoder
 
     def odometry_at(self, angles: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the odometry with the motion since the last update added, without updating it.
@@ -77,15 +79,28 @@ class DiffDrive:
         Returns:
             x [m], y [m] and yaw [rad] since the last reset, shape (n, 3).
         """
-        moved = np.floor(angles * self._count)
-        moved -= self._encoder
-        moved *= self.drive.wheel_radius / self._count
-        left, right = moved[:, 0], moved[:, 1]
         odometry = self.odometry.copy()
-        distance = (left + right) * 0.5
-        turn = (right - left) * (1.0 / self.drive.wheel_separation)
-        heading = odometry[:, 2] + turn * 0.5
-        odometry[:, 0] += distance * np.cos(heading)
-        odometry[:, 1] += distance * np.sin(heading)
-        odometry[:, 2] += turn
+        self._integrate(angles, odometry)
         return odometry
+
+    def _integrate(self, angles: NDArray[np.float64], odometry: NDArray[np.float64]) -> None:
+        """Add the motion since the last update to `odometry`. Runs every tick: nothing is allocated."""
+        counts, moved, (distance, turn, heading, part) = self._counts, self._moved, self._work
+        np.multiply(angles, self._count, out=counts)
+        np.floor(counts, out=counts)
+        np.subtract(counts, self._encoder, out=moved)
+        left, right = moved.T
+        np.add(left, right, out=distance)
+        distance *= self._metres / 2
+        np.subtract(right, left, out=turn)
+        turn *= self._metres / self.drive.wheel_separation
+        x, y, yaw = odometry.T
+        np.multiply(turn, 0.5, out=heading)
+        heading += yaw
+        np.cos(heading, out=part)
+        part *= distance
+        x += part
+        np.sin(heading, out=part)
+        part *= distance
+        y += part
+        yaw += turn

@@ -230,9 +230,11 @@ class TurtleBot3Simulation:
     # --- inside a tick -----------------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
-        self.world.step(self.rates.steps_per_tick, self._active)
+        for _ in range(self.rates.steps_per_tick):
+            # One by one: a touch may last a single step, and the sensor tells of the last one only.
+            self.world.step(1, self._active)
+            np.logical_or(self._touched, self._touch, out=self._touched)
         self._tick += 1
-        np.logical_or(self._touched, self._touch, out=self._touched)
         if self._tick >= self._next_scan:
             due = self.running & (self._tick - self._scanned_tick >= self._scan_ticks)
             self._scan(np.flatnonzero(due))
