@@ -14,6 +14,9 @@ Sources:
            +-15 mm; 0.01 m is the standard deviation that ROBOTIS' own simulation uses.
 [nav]      ROBOTIS `turtlebot3_navigation`, `dwa_local_planner_params_burger.yaml`: 2.5 m/s^2, 3.2 rad/s^2.
 
+[camera]   Raspberry Pi, Camera Module 2: 62.2 x 48.8 degrees. The Burger is sold without one; where it sits and its
+           tilt are ours.
+
 Estimates of ours: servo gain, reflected rotor inertia (armature), tyre friction, and the deceleration of a stop, which
 is what the tyres can carry (a yaw deceleration of 20 rad/s^2 needs 0.5 N at each tyre, and 3 N are there).
 """
@@ -75,7 +78,8 @@ def turtlebot3_burger(
             wheel_radius=WHEEL_RADIUS,
             wheel_separation=WHEEL_SEPARATION,
             # Turning on the spot at the published limit needs this much; driving straight at 0.22 m/s needs less. The
-            # published limits cannot be had both at once: a twist that needs more is scaled down on its arc.
+            # published limits cannot be had both at once: where a twist needs more, the cerebellum keeps the turn and
+            # takes forward speed away.
             max_wheel_speed=MAX_ANGULAR * WHEEL_SEPARATION / 2 / WHEEL_RADIUS,
             max_torque=1.4,
             servo_gain=SERVO_GAIN,

@@ -206,7 +206,7 @@ class Cerebellum:
         sources, result = _TRANSITIONS[request]
         allowed = wanted & np.isin(self.mode, [int(source) for source in sources])
         reasons = np.where(wanted & ~allowed, Reason.WRONG_MODE, Reason.ACCEPTED).astype(np.int8)
-        reasons[wanted & ~allowed & (self.mode == Mode.ESTOP)] = Reason.ESTOP
+        reasons[wanted & ~allowed & ((self.mode == Mode.ESTOP) | (self.estop_word != 0))] = Reason.ESTOP
         reasons[wanted & ~allowed & (self.mode == Mode.FAULT)] = Reason.FAULT
         if request == Request.RESET:
             # A stop that is not over yet must not become a gentler one.

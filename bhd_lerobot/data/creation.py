@@ -48,7 +48,7 @@ def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any]
         DatasetExistsError: `root` exists.
         DatasetWriteError: it cannot be written.
     """
-    exists = DatasetExistsError(f"{root} exists already. Resume it, remove it, or choose another root.")
+    exists = DatasetExistsError(f"{root} exists already. Resume it (--resume=true), remove it, or choose another root.")
     if root.exists() or root.is_symlink():
         raise exists
     with write_errors("create the dataset", root, "Nothing was recorded."):

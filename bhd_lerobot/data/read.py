@@ -31,7 +31,7 @@ def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
         )
     path = root / layout.data_file(slot_of(state.rows[index], "data"))
     try:
-        table = pq.read_table(path, filters=[("episode_index", "=", index)])
+        table = pq.read_table(path, filters=[("episode_index", "=", index)], page_checksum_verification=True)
     except (OSError, pa.ArrowInvalid) as error:
         raise corrupt(path, error) from error
     return {

@@ -88,7 +88,7 @@ def ordered_slots(rows: Iterable[Row], kind: str) -> dict[Slot, list[Row]]:
 
 def corrupt(path: Path, reason: object) -> DatasetCorruptError:
     """Return the error for a file that cannot be trusted."""
-    return DatasetCorruptError(f"{path} is corrupt: {' '.join(str(reason).split())}. {_REMEDY}")
+    return DatasetCorruptError(f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}. {_REMEDY}")
 
 
 def load_state(root: Path) -> DatasetState:

@@ -46,6 +46,10 @@ class SimulatedRobot(Robot):
         # lerobot-record asks for its length, with or without cameras.
         self.cameras: dict[str, Any] = dict.fromkeys(self.camera_shapes)
 
+    def __str__(self) -> str:
+        """Return the robot's name, and its id if it has one."""
+        return self.name if self.id is None else f"{self.name} {self.id!r}"
+
     @abstractmethod
     def make_simulation(self) -> TurtleBot3Simulation:
         """Return a new simulation of one robot."""

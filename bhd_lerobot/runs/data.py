@@ -95,10 +95,21 @@ def _episode_row(episode: EpisodeSummary, fps: int) -> list[str]:
 def _meaning(key: str, feature: dict[str, Any]) -> str:
     if key in keys.SCALARS:
         return keys.SCALARS[key][1]
+    if key in _LEROBOT_COLUMNS:
+        return _LEROBOT_COLUMNS[key]
     names = feature.get("names") or []
     if isinstance(names, list) and len(names) > 6:
         return f"{', '.join(map(str, names[:3]))}, … {names[-1]}"
     return ", ".join(map(str, names)) if isinstance(names, list) else ""
+
+
+_LEROBOT_COLUMNS = {
+    "timestamp": "frame_index / fps [s]",
+    "frame_index": "number of the frame in its episode",
+    "episode_index": "number of the episode in the dataset",
+    "index": "number of the frame in the dataset",
+    "task_index": "number of the instruction",
+}
 
 
 def _plain(summary: DatasetSummary) -> dict[str, Any]:
@@ -113,7 +124,9 @@ def _plain(summary: DatasetSummary) -> dict[str, Any]:
         "tasks": list(summary.tasks),
         "recording": summary.recording,
         "features": summary.features,
-        "episodes": [{"index": e.index, "frames": e.frames, "task": e.task, **e.metadata} for e in summary.episodes],
+        "episodes": [
+            {"index": e.index, "frames": e.frames, "task": e.task, "metadata": e.metadata} for e in summary.episodes
+        ],
     }
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from bhd_lerobot.errors import BhdError
 from bhd_lerobot.runs import data, record, replay
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import parse
@@ -22,10 +23,7 @@ EPISODES = 12
 SECONDS = 60
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the demo; return the exit status."""
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    folder = Path(arguments[0] if arguments else f"outputs/demo/{datetime.now():%Y-%m-%d_%H-%M-%S}")
+def _demo(folder: Path) -> None:
     root = folder / "dataset"
     console = Console()
     console.rule(f"1. Record {EPISODES} episodes of a simulated TurtleBot3 that roams random arenas")
@@ -59,6 +57,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in ("trajectories.png", "episode.mp4", "episode_000000_open_loop.png", "config.yaml"):
         if (folder / name).exists():
             console.print(f"{name:<16} {folder / name}", soft_wrap=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the demo; return the exit status."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    folder = Path(arguments[0] if arguments else f"outputs/demo/{datetime.now():%Y-%m-%d_%H-%M-%S}")
+    try:
+        _demo(folder)
+    except BhdError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     return 0
 
 

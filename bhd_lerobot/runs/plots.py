@@ -42,15 +42,14 @@ def draw_trajectories(trajectories: Sequence[Trajectory], path: Path, heading: s
     count = max(1, math.ceil(len(trajectories) / PANELS))
     for page in range(count):
         chosen = trajectories[page * PANELS : (page + 1) * PANELS]
-        columns = min(len(chosen), max(1, math.ceil(math.sqrt(len(chosen) * 1.4))))
-        rows = max(1, math.ceil(len(chosen) / max(columns, 1)))
+        columns, rows = _grid(len(chosen))
         size = 2.1 if len(chosen) > 4 else 4.0
         # Figure without pyplot: no global state, no display.
-        figure = Figure(figsize=(size * max(columns, 1) + 0.2, size * 1.06 * rows + 0.7), layout="constrained")
+        figure = Figure(figsize=(size * columns + 0.2, size * 1.06 * rows + 0.7), layout="constrained")
         figure.suptitle(heading if count == 1 else f"{heading} ({page + 1} of {count})", fontsize=11)
         for axes, trajectory in zip(
-            np.atleast_1d(figure.subplots(rows, max(columns, 1), squeeze=False).ravel()),
-            [*chosen, *[None] * (rows * max(columns, 1) - len(chosen))],
+            np.atleast_1d(figure.subplots(rows, columns, squeeze=False).ravel()),
+            [*chosen, *[None] * (rows * columns - len(chosen))],
             strict=True,
         ):
             if trajectory is None:
@@ -61,6 +60,14 @@ def draw_trajectories(trajectories: Sequence[Trajectory], path: Path, heading: s
         figure.savefig(file, dpi=110)
         pages.append(file)
     return pages
+
+
+def _grid(count: int) -> tuple[int, int]:
+    """Return columns and rows for some panels: a little wider than high, with few empty places."""
+    wide = math.sqrt(max(count, 1) * 1.4)
+    candidates = range(max(1, int(wide) - 1), int(wide) + 3)
+    columns = min(candidates, key=lambda c: (-(-count // c) * c - count + abs(c - wide), c))
+    return min(columns, max(count, 1)), max(1, -(-count // columns))
 
 
 def _draw_panel(axes: Axes, trajectory: Trajectory) -> None:

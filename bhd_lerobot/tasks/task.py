@@ -25,8 +25,6 @@ class Event(IntEnum):
     TIMEOUT = 4
     INTERVENTION = 5
     ESTOP = 6
-    ABORTED = 7
-    """The episode was ended from outside, by a signal for example."""
 
     @property
     def cause(self) -> str:

@@ -30,9 +30,9 @@ def test_info_as_json_holds_everything(recorded, capsys):
     summary = json.loads(capsys.readouterr().out)
     assert [episode["index"] for episode in summary["episodes"]] == [0, 1, 2]
     for episode in summary["episodes"]:
-        assert json.loads(episode["timing"])["overruns"] == 0
-        assert len(episode["initial_state"]) > 20
-        assert set(json.loads(episode["versions"])) == {"bhd_lerobot", "lerobot", "mujoco", "numpy"}
+        assert json.loads(episode["metadata"]["timing"])["overruns"] == 0
+        assert len(episode["metadata"]["initial_state"]) > 20
+        assert set(json.loads(episode["metadata"]["versions"])) == {"bhd_lerobot", "lerobot", "mujoco", "numpy"}
     assert summary["recording"]["brain"]["type"] == "avoidance"
 
 
