@@ -202,7 +202,7 @@ def main() -> int:
                 f"ratio >= {GOALS['camera']}",
             )
             mine, peer = images(300)
-            missed += ["image"] * (mine / peer < GOALS["image"])
+            missed += ["image"] * bool(mine / peer < GOALS["image"])
             table.add_row(
                 "one 320x240 image: images per s",
                 f"{mine:.0f}",
