@@ -86,13 +86,15 @@ class Camera:
         world: the simulations.
         width: image width [px].
         height: image height [px].
+        alone: nothing else uses OpenGL on this thread, so that the context need not be bound again for every image.
 
     Raises:
         RenderingError: no OpenGL backend works here; the message names the remedy.
     """
 
-    def __init__(self, world: World, width: int = 320, height: int = 240) -> None:
+    def __init__(self, world: World, width: int = 320, height: int = 240, *, alone: bool = False) -> None:
         self._world = world
+        self._must_bind = not alone
         self.width, self.height = width, height
         self._gl = _make_context(width, height)
         self._gl.make_current()
@@ -151,12 +153,14 @@ class Camera:
         mujoco.mjv_updateScene(
             pose.model, pose.data, self._option, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._scene
         )
-        self._gl.make_current()
+        if self._must_bind:
+            self._gl.make_current()
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._flipped, None, self._rect, self._context)
+        image = self._flipped[::-1]
         if out is None:
-            return self._flipped[::-1].copy()
-        out[:] = self._flipped[::-1]
+            return image.copy()
+        out[:] = image
         return out
 
     def close(self) -> None:

@@ -37,7 +37,7 @@ class RenderThread:
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="render")
         try:
             # The OpenGL context belongs to the thread that makes it.
-            self._camera: Camera = self._executor.submit(Camera, world, width, height).result()
+            self._camera: Camera = self._executor.submit(Camera, world, width, height, alone=True).result()
         except BaseException:
             self._executor.shutdown()
             raise

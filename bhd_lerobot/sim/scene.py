@@ -10,6 +10,7 @@ from bhd_lerobot.sim.engine import mujoco
 # geometry that a simulation does not use is parked far below the floor, where the broad phase drops it at once.
 POOL_SIZE = 32
 PARKED_Z = -100.0
+PARKED_GROUP = 5  # neither the range finder nor the camera looks at this group
 
 _FLOOR_BIT, _SCENE_BIT = 1, 2
 
@@ -118,6 +119,7 @@ def _add_pool(spec: mujoco.MjSpec, pool_size: int) -> None:
             pos=[0, 0, PARKED_Z],
             material="obstacle",
             contype=_SCENE_BIT,
+            group=PARKED_GROUP,
             conaffinity=0,
         )
 

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Body, Shape
 from bhd_lerobot.errors import SimulationError, unknown_name
 from bhd_lerobot.sim.engine import mujoco, mujoco_batch
-from bhd_lerobot.sim.scene import PARKED_Z, POOL_SIZE, build_model, shape_fields
+from bhd_lerobot.sim.scene import PARKED_GROUP, PARKED_Z, POOL_SIZE, build_model, shape_fields
 
 # Sorted and without repetition, or a mask of shape (n,); all if None.
 Ids = NDArray[np.intp] | NDArray[np.bool_] | Sequence[int] | None
 
 # Only the obstacles, which are in group 0: a range finder does not see the robot that carries it.
 _SCENE_GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
-_POOL_FIELDS = ("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_rbound")
+_POOL_FIELDS = ("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_group")
 _DIVERGED = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{field}")) for field in ("QPOS", "QVEL", "QACC")]
 _WARNING_COUNT = 1  # the last axis of Batch.warning: last info, count
 
@@ -269,7 +269,7 @@ class World:
         ids = self._ids(ids)
         if len(shapes) != len(ids):
             raise SimulationError(f"{len(shapes)} scenes were given for {len(ids)} simulations.")
-        kind, size, pos, quat, radius = (self.model_field(name) for name in _POOL_FIELDS)
+        kind, size, pos, quat, radius, group = (self.model_field(name) for name in _POOL_FIELDS)
         first = self._pool.start
         for sim, scene in zip(ids, shapes, strict=True):
             if len(scene) > self.pool_size:
@@ -278,8 +278,10 @@ class World:
                     "Make the World with a larger pool_size."
                 )
             pos[sim, self._pool] = (0.0, 0.0, PARKED_Z)
+            group[sim, self._pool] = PARKED_GROUP
             for index, shape in enumerate(scene):
                 geom = first + index
+                group[sim, geom] = 0
                 kind[sim, geom], size[sim, geom], pos[sim, geom], quat[sim, geom], radius[sim, geom] = shape_fields(
                     shape
                 )
