@@ -1,4 +1,15 @@
-"""Follow the gap that leads to most new ground."""
+"""Follow the gap that leads to most new ground.
+
+Three published ideas together:
+
+- Candidates are short paths with the robot's true outline, an arc and then a straight line, and their free lengths
+  come from a table: C. Schlegel, IROS 1998; see clearance.py.
+- A candidate is judged as in VFH+ (I. Ulrich and J. Borenstein, "VFH+: reliable obstacle avoidance for fast mobile
+  robots", ICRA 1998) and the dynamic window (D. Fox, W. Burgard and S. Thrun, 1997): the gap's depth, the price of
+  turning, and loyalty to what was chosen before.
+- In place of VFH+'s goal stands new ground: a grid, filled by dead reckoning, remembers where the robot has been, and
+  what a candidate leads to counts as far as it is new, as in frontier-based exploration (B. Yamauchi, 1997).
+"""
 
 import math
 from collections.abc import Sequence
@@ -10,229 +21,271 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, find_columns, find_scan
+from bhd_lerobot.policies.clearance import HALF_TRACK, LONGEST, QUANTUM, SPACING, ClearanceTable, Level, make_paths
+from bhd_lerobot.policies.config_brain import BrainConfig
+
+MIN_BEAMS = 36  # with fewer, a post of 0.1 m can stand unseen within a turning circle
+_SECTORS = 120  # more beams than this are merged
+_CELL = 0.125  # [m] edge length of the memory's cells
+_SIDE = 128  # cells along an edge of the memory, a power of two; it wraps around after 16 m
+_MARK = 0.2  # [m] around the robot that counts as visited
+_STEP = 0.2  # [m] between two places of a path where the memory is asked
+_SPOT = 0.3  # [rad/s] a turn on the spot that is slower than this is a correction, and is driven while moving
+_CAREFUL = 0.6  # share of the speed where there is less room than usual
+_WEDGED = 4  # less free than this, in quanta, is no room to turn
+_BACK_ROOM = 0.08  # [m] behind the robot, needed for backing off
+_AROUND = np.arange(8) * math.pi / 4
+_MARK_X = np.append(np.cos(_AROUND), 0.0) * (_MARK / _CELL)
+_MARK_Y = np.append(np.sin(_AROUND), 0.0) * (_MARK / _CELL)
+_NEVER = -(2**30)
 
 Array = NDArray[np.float64]
 
-HULL = (-0.102, 0.038, 0.070)
-WHEELS = (-0.033, 0.033, 0.089)
-LIDAR_X = -0.032
-HALF_TRACK = 0.08
-QUANTUM = 0.02
-BIN = 0.02
-MEMORY = 128
 
-
+@BrainConfig.register_subclass("gap_follower")
 @dataclass
-class GapFollowerConfig:
+class GapFollowerConfig(BrainConfig):
+    """Parameters of the gap follower.
+
+    Attributes:
+        forward_speed: speed when driving straight [m/s].
+        rim_speed: highest speed of a wheel's rim, 6.885 rad/s at 0.033 m [m/s]; turning costs forward speed.
+        turn_speed: highest yaw rate [rad/s].
+        settle_s: a heading error is corrected in about this time [s].
+        margin_m: room that a path leaves beside the robot, where there is any [m].
+        stop_m: a path must be free for this much more than its turn, so that the robot can turn around in time [m].
+        horizon_m: paths are judged up to this length [m].
+        discount: weight of what lies 0.2 m further on, as a share.
+        memory_s: what was visited longer ago is new again [s].
+        turn_weight: price of half a turn on the spot; the new ground of a path counts from 0 to 1.
+        clear_weight: reward for a path that is free up to the horizon.
+        commit_weight: price of leaving the heading chosen before.
+        range_min_m: a reading below this is not valid [m].
+        range_max_m: a reading above this is not valid [m]; a beam without a return reads exactly this.
+    """
+
     forward_speed: float = 0.22
-    wheel_speed: float = 0.2272
-    max_turn: float = 2.0
-    families: tuple = ((0.25, 180), (0.0, 180), (0.8, 90), (2.4, 60))
-    wide_m: float = 0.2
-    narrow: float = 1.0
-    need_m: float = 9.0
-    headings: int = 48
-    margin_m: float = 0.05
-    tight_margin_m: float = 0.02
-    horizon_m: float = 3.4
-    step_m: float = 0.2
-    stop_m: float = 0.1
-    cell_m: float = 0.125
-    mark_m: float = 0.2
-    memory_s: float = 120.0
-    discount: float = 0.9
-    turn_weight: float = 0.3
-    commit_weight: float = 0.5
-    clear_weight: float = 0.3
+    rim_speed: float = 0.2272
+    turn_speed: float = 2.0
     settle_s: float = 0.35
-    hold: float = 1.01
-    old: float = 0.2
+    margin_m: float = 0.05
+    stop_m: float = 0.35
+    horizon_m: float = 3.4
+    discount: float = 0.9
+    memory_s: float = 120.0
+    turn_weight: float = 1.0
+    clear_weight: float = 0.3
+    commit_weight: float = 0.15
     range_min_m: float = 0.12
     range_max_m: float = 3.5
 
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not 0 <= value < math.inf:
+                raise ConfigError(f"brain.{name} is {value}; it must be 0 or positive, and finite.")
+        for name in ("forward_speed", "rim_speed", "turn_speed", "settle_s", "memory_s", "range_max_m"):
+            if getattr(self, name) == 0:
+                raise ConfigError(f"brain.{name} is 0; it must be positive.")
+        if self.forward_speed > self.rim_speed:
+            raise ConfigError(
+                f"brain.forward_speed is {self.forward_speed}; the wheels reach brain.rim_speed, {self.rim_speed}."
+            )
+        if not _STEP <= self.horizon_m <= LONGEST:
+            raise ConfigError(f"brain.horizon_m is {self.horizon_m}; it must be in [{_STEP}, {LONGEST}].")
+        if not 0 < self.discount <= 1:
+            raise ConfigError(f"brain.discount is {self.discount}; it must be in (0, 1].")
+        if self.stop_m > 1:
+            raise ConfigError(f"brain.stop_m is {self.stop_m}; it must be at most 1.")
+        if self.range_min_m >= self.range_max_m:
+            raise ConfigError(
+                f"brain.range_min_m is {self.range_min_m}; it must be below brain.range_max_m, {self.range_max_m}."
+            )
+
 
 class GapFollowerBrain:
+    """Drive the free path that leads to most new ground for the least turning; blind: stop.
+
+    It needs the scan and the measured twist. Where no path leaves the margin, it asks for less room, drives slower, and
+    at last turns on the spot or backs off.
+
+    Args:
+        config: the parameters.
+    """
+
     name = "gap_follower"
+    uses_images = False
 
     def __init__(self, config: GapFollowerConfig | None = None) -> None:
-        self.config = config or GapFollowerConfig()
+        self.config = config = config or GapFollowerConfig()
+        self._paths = paths = make_paths(config.forward_speed, config.rim_speed)
+        # Room asked for, and how far beyond its turn a path must be free [m]: what is usual; then enough to turn away
+        # from what is close already; then what remains.
+        self._levels = (
+            Level(config.margin_m, 0.005),
+            Level(config.margin_m, 0.03),
+            Level(0.02, 0.02),
+            Level(0.0, 0.01),
+        )
+        beyond = np.array([config.stop_m, 0.1, 0.1, 0.1])
+        self._enough = np.ceil((paths.turn + beyond[:, None]) / QUANTUM).astype(np.int64)
+        # What a path's turn takes away from its length, as a share of half a turn on the spot.
+        lost = paths.turn - np.abs(paths.heading) * paths.radius
+        self._price = config.turn_weight * lost / (HALF_TRACK * math.pi)
+        length = _STEP * np.arange(1, int(config.horizon_m / _STEP + 1e-9) + 1, dtype=np.float64)
+        x, y = paths.points(length)
+        self._path_x, self._path_y = (x / _CELL).astype(np.float32), (y / _CELL).astype(np.float32)  # (points, K)
+        self._reach = np.ceil(length / QUANTUM - 1e-9).astype(np.uint8)[:, None]
+        # Whole numbers, so that their sums are exact. Turning on the spot leads nowhere.
+        moved = np.hypot(np.diff(x, axis=0, prepend=0.0), np.diff(y, axis=0, prepend=0.0)) > _STEP / 2
+        weight = np.round(1000 * config.discount ** np.arange(len(length))).astype(np.int16)
+        self._weight, self._all = weight[:, None] * moved, float(weight.sum())
+        self.reset(np.zeros(0, np.intp), [], 0)
 
     def bind(self, observation_names: Sequence[str], action_names: Sequence[str], fps: int) -> None:
-        c = self.config
+        """Find the scan and the twist, and prepare the look-up table for this number of beams."""
+        config = self.config
         self._scan, angles = find_scan(observation_names, self.name)
-        self._twist = find_columns(observation_names, ("x.vel", "theta.vel"), self.name, "observation")
+        self._measured = find_columns(observation_names, ("x.vel", "theta.vel"), self.name, "observation")
         self._forward, self._turn = find_columns(action_names, ("x.vel", "theta.vel"), self.name, "action")
-        self._width = len(action_names)
-        self._dt = 1.0 / fps
+        self._width, self._dt = len(action_names), 1.0 / fps
         beams = len(angles)
-        self._group = next(g for g in range(max(1, beams // 120), beams + 1) if beams % g == 0)
-        self._sectors = beams // self._group
-        # sector s holds beams s*g .. s*g+g-1; its middle:
-        mid = 2 * np.pi * (np.arange(self._sectors) * self._group + (self._group - 1) / 2) / beams
+        if beams < MIN_BEAMS:
+            raise ConfigError(f"The brain {self.name!r} needs at least {MIN_BEAMS} beams; this robot has {beams}.")
+        # An odd number of beams in a sector, so that the first is centred straight ahead.
+        self._group = next((g for g in range(beams // _SECTORS, 1, -1) if g % 2 and beams % g == 0), 1)
         spread = math.pi * max(self._group - 1, 0.5) / beams
-        k = np.arange(c.headings)
-        h = 2 * np.pi * k / c.headings
-        h = np.where(h > np.pi, h - 2 * np.pi, h)
-        fam = [(r, h[np.abs(h) <= math.radians(lim) + 1e-9]) for r, lim in c.families]
-        self._heading = np.concatenate([x for _, x in fam])
-        self._radius = np.concatenate([np.full(len(x), r) for r, x in fam])
-        self._turncost = np.abs(self._heading) * self._rate(self._radius)
-        self._lost = (self._turncost - np.abs(self._heading) * self._radius) / (HALF_TRACK * np.pi)
-        self._comfort = self._table(mid, spread, c.margin_m)
-        self._wide = self._table(mid, spread, c.wide_m)
-        self._tight = self._table(mid, spread, c.tight_margin_m)
-        # sample points
-        turn = self._turncost
-        cost = np.arange(1, int(c.horizon_m / c.step_m) + 1) * c.step_m
-        self._cost = cost
-        phi = np.minimum(cost[None] / self._rate(self._radius)[:, None], np.abs(self._heading)[:, None])
-        straight = np.maximum(cost[None] - turn[:, None], 0.0)
-        r = self._radius[:, None]
-        sign = np.sign(self._heading)[:, None]
-        self._px = r * np.sin(phi) + straight * np.cos(phi)
-        self._py = sign * (r * (1 - np.cos(phi)) + straight * np.sin(phi))
-        self._need = np.ceil((cost + 0.0) / QUANTUM).astype(np.uint8)
-        self._weight = np.round(1000 * c.discount ** np.arange(len(cost))).astype(np.int32)
-        # a point that coincides with the one before it (turning on the spot) brings nothing
-        moved = np.hypot(np.diff(self._px, axis=1, prepend=0), np.diff(self._py, axis=1, prepend=0)) > c.step_m / 2
-        self._weights = (self._weight[None] * moved).astype(np.int32)
-
-    def _rate(self, r):
-        c = self.config
-        return np.maximum(r, (r + HALF_TRACK) * c.forward_speed / c.wheel_speed)
-
-    def _table(self, mid: Array, spread: float, margin: float) -> NDArray[np.uint8]:
-        c = self.config
-        bins = int(math.ceil((c.range_max_m) / BIN)) + 1
-        r = (np.arange(bins) + 0.5) * BIN
-        x = LIDAR_X + r[None] * np.cos(mid)[:, None]
-        y = r[None] * np.sin(mid)[:, None]
-        m = np.broadcast_to(margin + r[None] * math.sin(spread), x.shape)
-        m = np.minimum(m, np.maximum(_distance(x, y) - 0.005, 0.0))
-        out = np.empty((len(mid), bins, len(self._heading)), np.uint8)
-        for i, (h, radius) in enumerate(zip(self._heading, self._radius, strict=True)):
-            s = math.copysign(1.0, h)
-            clear = np.full(x.shape, 255 * QUANTUM)
-            steps = max(1, math.ceil(abs(h) / math.radians(7.5)), math.ceil(abs(h) * radius / 0.05))
-            for phi in np.linspace(abs(h), 0.0, steps + 1):
-                qx, qy = x - radius * math.sin(phi), y - s * radius * (1 - math.cos(phi))
-                co, si = math.cos(phi), s * math.sin(phi)
-                qx, qy = co * qx + si * qy, co * qy - si * qx
-                cost = phi * self._rate(radius)
-                if phi == abs(h):
-                    for _, front, half in (HULL, WHEELS):
-                        hit = (np.abs(qy) < half + m) & (qx > front)
-                        clear = np.where(hit, np.minimum(clear, cost + np.maximum(qx - front - m, 0.0)), clear)
-                clear = np.where(_distance(qx, qy) < m, cost, clear)
-            out[:, :, i] = np.floor(np.minimum(clear / QUANTUM, 255))
-        return out
+        self._table = ClearanceTable(self._paths, beams // self._group, spread, self._levels, config.range_max_m)
+        self._memory_frames = max(1, round(min(config.memory_s * fps, 2**29)))
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int) -> None:
-        if not hasattr(self, "_pose") or len(self._pose) != n:
-            self._pose = np.zeros((n, 3))
-            self._memory = np.zeros((n, MEMORY * MEMORY), np.int32)
+        """Forget where the robots have been; the seeds are not used, the rule draws nothing."""
+        if n != getattr(self, "_n", -1):
+            self._n = n
+            self._x, self._y, self._yaw = np.zeros((3, n))  # dead reckoning [cells], [cells], [rad]
+            self._last: Array = np.zeros((2, n))  # twist at the last frame
+            self._visited = np.full((n, _SIDE * _SIDE), _NEVER, np.int32)  # frame of the last visit
+            self._offset = np.arange(n, dtype=np.int32) * (_SIDE * _SIDE)
+            self._goal: Array = np.zeros(n)  # heading chosen before [rad]
             self._frame = np.zeros(n, np.int32)
-            self._goal = np.full(n, np.nan)
-            self._last = np.zeros((n, 2))
-        self._pose[ids] = 0
-        self._memory[ids] = 0
-        self._frame[ids] = 0
-        self._goal[ids] = np.nan
-        self._last[ids] = 0
+        for memory in (self._x, self._y, self._yaw, self._goal, self._frame):
+            memory[ids] = 0
+        self._last[:, ids], self._visited[ids] = 0.0, _NEVER
 
-    def act(self, observation: Observation) -> NDArray[np.float64]:
-        c = self.config
-        n = len(observation.state)
-        self._update(observation.state[:, self._twist])
-        scan = observation.state[:, self._scan]
-        valid = (scan >= c.range_min_m) & (scan <= c.range_max_m)
-        near = np.where(valid, scan, np.inf).reshape(n, self._sectors, self._group).min(axis=2)
-        blind = np.isinf(near)
-        if blind.any():
-            near = np.where(blind, np.minimum(np.roll(near, 1, axis=1), np.roll(near, -1, axis=1)), near)
-        blind = np.isinf(near).any(axis=1)
-        near[np.isinf(near)] = c.range_min_m
-        index = (near / BIN).astype(np.intp) + np.arange(self._sectors) * self._comfort.shape[1]
-        clear = self._comfort.reshape(-1, len(self._heading))[index].min(axis=1)
-        go = int(c.stop_m / QUANTUM)
-        turncost = np.minimum(self._turncost, c.need_m)
-        enough = np.ceil((turncost + c.stop_m) / QUANTUM).astype(np.int32)
-        ok = clear >= enough
-        self._dbg = clear
-        lost = ~ok.any(axis=1)
-        if lost.any():
-            clear[lost] = self._tight.reshape(-1, len(self._heading))[index[lost]].min(axis=1)
-            ok[lost] = clear[lost] >= enough
-        # gains
-        pose = self._pose
-        co, si = np.cos(pose[:, 2])[:, None, None], np.sin(pose[:, 2])[:, None, None]
-        cell = self._cell(
-            pose[:, 0, None, None] + co * self._px - si * self._py,
-            pose[:, 1, None, None] + si * self._px + co * self._py,
-        )
-        stamp = self._memory[np.arange(n)[:, None, None], cell]
-        age = self._frame[:, None, None] - stamp
-        horizon = int(c.memory_s / self._dt)
-        value = np.where(stamp == 0, 100, np.minimum(age * int(100 * c.old) // horizon, 100)).astype(np.int32)
-        value = value * self._weights
-        value *= clear[:, :, None] >= self._need
-        if c.narrow < 1:
-            wide = self._wide.reshape(-1, len(self._heading))[index].min(axis=1)
-            value *= np.where(wide[:, :, None] >= self._need, 10, int(10 * c.narrow))
-            value //= 10
-        gain = value.sum(axis=2) / (100.0 * self._weight.sum())
-        score = gain - c.turn_weight * self._lost + c.clear_weight * np.minimum(clear * QUANTUM / c.horizon_m, 1.0)
-        goal = np.where(np.isnan(self._goal), pose[:, 2], self._goal)
-        off = np.abs(_wrap(pose[:, 2, None] + self._heading - goal[:, None]))
-        score -= c.commit_weight * np.minimum(off / 0.5, 1.0)
-        score = np.where(ok, score, -10 + clear * 0.01)
-        best = score.argmax(axis=1)
-        moving = ok[np.arange(n), best]
-        h, radius = self._heading[best], self._radius[best]
-        toward = _wrap(goal - pose[:, 2])
-        h = np.where(np.abs(_wrap(toward - h)) <= c.hold * 2 * np.pi / c.headings, toward, h)
-        self._goal = np.where(moving, _wrap(pose[:, 2] + h), self._goal)
-        turn = np.minimum(np.abs(h) / c.settle_s, np.where(radius > 0, c.wheel_speed / (radius + HALF_TRACK), c.max_turn))
-        forward = np.minimum(c.forward_speed, c.wheel_speed - HALF_TRACK * turn)
-        forward = np.where((radius > 0) | (turn < 0.3), forward, 0.0)
-        forward = np.where(moving, np.maximum(forward, 0), 0.0)
+    def act(self, observation: Observation) -> Array:
+        """Return the twist, shape (n, actions)."""
+        config, paths, n = self.config, self._paths, len(observation.state)
+        if n != self._n:
+            raise ConfigError(f"The brain {self.name!r} was reset for {self._n} robots and sees {n}.")
+        self._remember(observation.state[:, self._measured])
+        ranges, blind = self._ranges(observation.state[:, self._scan])
+        clear, free, level = self._room(ranges)
+        toward = _wrap(self._goal - self._yaw)  # the heading chosen before, seen from the robot
+        turn_off = np.abs(paths.heading - toward[:, None])
+        turn_off = np.minimum(turn_off, 2 * math.pi - turn_off)
+        score = self._new_ground(clear) - self._price
+        score += config.clear_weight * np.minimum(clear * (QUANTUM / config.horizon_m), 1.0)
+        score -= config.commit_weight * np.minimum(turn_off * 2.0, 1.0)
+        # Where no path is free: on the spot, as far as there is room, and not back and forth.
+        spot = 0.01 * clear - 3 * turn_off - 100.0 * (paths.radius > 0)
+        best = np.where(free, score, spot - 1000.0).argmax(axis=1)
+        sims = np.arange(n)
+        moving, heading, radius = free[sims, best], paths.heading[best], paths.radius[best]
+        # The heading chosen before lies between the headings that there are: keep it while its neighbour is best.
+        heading = np.where(np.abs(_wrap(toward - heading)) <= 1.01 * SPACING, toward, heading)
+        largest = np.where(radius > 0, config.rim_speed / (radius + HALF_TRACK), config.turn_speed)
+        turn = np.minimum(np.abs(heading) / config.settle_s, np.minimum(largest, config.turn_speed))
+        forward = np.clip(config.rim_speed - HALF_TRACK * turn, 0.0, config.forward_speed)
+        forward *= np.where(level > 0, _CAREFUL, 1.0)
+        forward = np.where(moving & ((radius > 0) | (turn < _SPOT)), forward, 0.0)
+        # Wedged, not even room to turn: back off, and then turn away from where it came to.
+        wedged = ~moving & (clear[sims, best] <= _WEDGED) & (self._table.behind(ranges) > _BACK_ROOM)
+        heading = np.where(wedged, math.pi, heading)
+        forward = np.where(wedged, -_CAREFUL * config.forward_speed, forward)
+        turn = np.where(wedged, 0.0, turn)
+        self._goal = np.where(blind, self._goal, self._yaw + heading)
         action = np.zeros((n, self._width))
         action[:, self._forward] = np.where(blind, 0.0, forward)
-        action[:, self._turn] = np.where(blind, 0.0, np.copysign(turn, h))
-        self._stuck = ~moving
+        action[:, self._turn] = np.where(blind, 0.0, np.copysign(turn, heading))
         return action
 
-    def _update(self, twist: Array) -> None:
-        twist = np.where(np.isfinite(twist), twist, 0.0)
-        mean = (twist + self._last) / 2
-        self._last = twist
-        first = self._frame == 0
-        mean[first] = 0
-        yaw = self._pose[:, 2] + mean[:, 1] * self._dt / 2
-        self._pose[:, 0] += mean[:, 0] * self._dt * np.cos(yaw)
-        self._pose[:, 1] += mean[:, 0] * self._dt * np.sin(yaw)
-        self._pose[:, 2] += mean[:, 1] * self._dt
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters."""
+        return {"type": self.name, **asdict(self.config)}
+
+    def _room(self, ranges: Array) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.intp]]:
+        """Return how far each path is free, whether that is enough, and which level of room that is for.
+
+        Returns:
+            Free lengths in `QUANTUM`, shape (n, K), whether they are enough, shape (n, K), and levels, shape (n,).
+        """
+        rows = self._table.rows(ranges)
+        clear = self._table.clear(rows, 0)
+        free = clear >= self._enough[0]
+        level = np.zeros(len(ranges), np.intp)
+        for tighter in range(1, len(self._levels)):
+            lost = np.flatnonzero(~free.any(axis=1))
+            if len(lost):
+                level[lost] = tighter
+                clear[lost] = self._table.clear(rows[lost], tighter)
+                free[lost] = clear[lost] >= self._enough[tighter]
+        return clear, free, level
+
+    def _ranges(self, scan: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the nearest valid range of each sector, shape (n, sectors), and who is blind, shape (n,).
+
+        A sector without a valid reading takes over its nearer neighbour's; if neither has one, the robot is blind.
+        """
+        # False for NaN; the limits' own values may have come through single precision.
+        valid = (scan >= self.config.range_min_m - 1e-6) & (scan <= self.config.range_max_m + 1e-6)
+        seen = np.where(valid, scan, np.inf)
+        if self._group > 1:
+            seen = np.roll(seen, self._group // 2, axis=1).reshape(len(scan), -1, self._group).min(axis=2)
+        missing: NDArray[np.bool_] = np.isinf(seen)
+        blind: NDArray[np.bool_] = np.zeros(len(scan), np.bool_)
+        if not missing.any():
+            return seen, blind
+        seen = np.where(missing, np.minimum(np.roll(seen, 1, axis=1), np.roll(seen, -1, axis=1)), seen)
+        missing = np.isinf(seen)
+        missing.any(axis=1, out=blind)
+        return np.where(missing, self.config.range_min_m, seen), blind
+
+    def _remember(self, twist: Array) -> None:
+        """Move on by what the wheels did since the last frame, and mark the place as visited."""
+        now: Array = np.array(np.where(np.isfinite(twist), twist, 0.0).T)
+        speed, rate = np.where(self._frame > 0, (now + self._last) * (self._dt / 2), 0.0)
+        self._last = now
+        halfway = self._yaw + rate / 2
+        self._x += speed * np.cos(halfway) / _CELL
+        self._y += speed * np.sin(halfway) / _CELL
+        self._yaw += rate
         self._frame += 1
-        a = np.arange(8) * np.pi / 4
-        ox = np.append(self.config.mark_m * np.cos(a), 0.0)
-        oy = np.append(self.config.mark_m * np.sin(a), 0.0)
-        cell = self._cell(self._pose[:, 0, None] + ox, self._pose[:, 1, None] + oy)
-        self._memory[np.arange(len(cell))[:, None], cell] = self._frame[:, None]
+        x, y = ((p % _SIDE + _SIDE)[:, None] for p in (self._x, self._y))
+        cell = _cell(x, y, _MARK_X, _MARK_Y)
+        self._visited.ravel()[cell + self._offset[:, None]] = self._frame[:, None]
 
-    def _cell(self, x: Array, y: Array) -> NDArray[np.intp]:
-        column = np.floor(x * (1 / self.config.cell_m)).astype(np.intp) & (MEMORY - 1)
-        row = np.floor(y * (1 / self.config.cell_m)).astype(np.intp) & (MEMORY - 1)
-        return row * MEMORY + column
-
-
-def _distance(x: Array, y: Array) -> Array:
-    d = np.full(x.shape, np.inf)
-    for rear, front, half in (HULL, WHEELS):
-        dx = np.maximum(np.maximum(rear - x, x - front), 0)
-        dy = np.maximum(np.abs(y) - half, 0)
-        d = np.minimum(d, np.hypot(dx, dy))
-    return d
+    def _new_ground(self, clear: NDArray[np.uint8]) -> Array:
+        """Return how much new ground each path leads to, from 0 to 1, shape (n, K)."""
+        cos, sin = (f(self._yaw).astype(np.float32)[:, None, None] for f in (np.cos, np.sin))
+        x, y = ((p % _SIDE + _SIDE).astype(np.float32)[:, None, None] for p in (self._x, self._y))
+        cell = _cell(x, y, cos * self._path_x - sin * self._path_y, sin * self._path_x + cos * self._path_y)
+        cell += self._offset[:, None, None]
+        new = self._visited.ravel().take(cell) < (self._frame - self._memory_frames)[:, None, None]
+        new &= clear[:, None, :] >= self._reach
+        return (new * self._weight).sum(axis=1, dtype=np.int16) / self._all
 
 
-def _wrap(a: Array) -> Array:
-    return (a + np.pi) % (2 * np.pi) - np.pi
+def _cell(x: NDArray[Any], y: NDArray[Any], dx: NDArray[Any], dy: NDArray[Any]) -> NDArray[np.int32]:
+    """Return the memory's cells at places (x, y) + (dx, dy), all in cells; x and y from _SIDE to 2 _SIDE."""
+    # Positive, so that cutting off the fraction rounds down.
+    row = (dy + y).astype(np.int32)
+    row &= _SIDE - 1
+    row *= _SIDE
+    column = (dx + x).astype(np.int32)
+    column &= _SIDE - 1
+    row += column
+    return row
+
+
+def _wrap(angle: Array) -> Array:
+    """Return angles in [-pi, pi) [rad]."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -1,0 +1,131 @@
+"""The two rules beside each other on the same random arenas: failures, score, time: `python -m benchmarks.brains`.
+
+The goal: gap_follower fails no more often than avoidance, at most a third as often where that one fails in more than
+5 %, and has at least 1.5 times its mean score. Exits with 1 if it is missed.
+"""
+
+import argparse
+import math
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from bhd_lerobot.policies.avoidance import AvoidanceBrain
+from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.policies.gap_follower import GapFollowerBrain
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.simulation import TurtleBot3Simulation
+from bhd_lerobot.runs.episode import EpisodeLoop, EpisodeSpec
+from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
+from bhd_lerobot.tasks.task import Event, Outcome, episode_seed
+
+GOAL_RATIO = 1.5
+SIDE_BY_SIDE = 50
+CALLS = 200
+
+
+@dataclass
+class Result:
+    """What a brain achieved.
+
+    Attributes:
+        outcomes: of the episodes, in order.
+        act_ms: median time of a call for 1 and for 64 robots [ms].
+    """
+
+    outcomes: list[Outcome]
+    act_ms: dict[int, float]
+
+    @property
+    def scores(self) -> np.ndarray:
+        """The score of each episode."""
+        return np.array([outcome.score for outcome in self.outcomes])
+
+    @property
+    def failures(self) -> int:
+        """Number of episodes without success."""
+        return sum(not outcome.success for outcome in self.outcomes)
+
+
+def main() -> int:
+    """Run both brains, print the table, return 0 if the goal is met."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--split", choices=("held_out", "train"), default="held_out")
+    args = parser.parse_args()
+    seeds = [episode_seed(args.seed, episode, args.split) for episode in range(args.episodes)]
+    brains: tuple[Brain, ...] = (AvoidanceBrain(), GapFollowerBrain())
+    old, new = results = [measure(brain, seeds) for brain in brains]
+    print(f"{args.episodes} {args.split} random arenas, seed {args.seed}, 60 s each\n")
+    print(f"{'':14}{'failures':>9}{'by cause':>24}{'share, 95 %':>22}{'score, 95 %':>28}{'act, n=1':>11}{'n=64':>10}")
+    for brain, result in zip(brains, results, strict=True):
+        print(row(brain.name, result))
+    ratio = new.scores.mean() / old.scores.mean()
+    low, high = bootstrap_ratio(old.scores, new.scores)
+    print(f"\nscore ratio {ratio:.3f}, 95 % {low:.3f} to {high:.3f} (paired bootstrap); goal: {GOAL_RATIO}")
+    allowed = old.failures // 3 if old.failures > 0.05 * args.episodes else old.failures
+    print(f"failures {new.failures}; allowed: {allowed}")
+    met = ratio >= GOAL_RATIO and new.failures <= allowed
+    print("goal met" if met else "GOAL MISSED")
+    return 0 if met else 1
+
+
+def measure(brain: Brain, seeds: list[int]) -> Result:
+    """Run a brain on the arenas of these seeds."""
+    config = TurtleBot3Config()
+    n = min(SIDE_BY_SIDE, len(seeds))
+    simulation = TurtleBot3Simulation(config, n)
+    loop = EpisodeLoop(simulation, AvoidTask(AvoidConfig(), n, config.fps), brain)
+    specs = [EpisodeSpec(index, seed) for index, seed in enumerate(seeds)]
+    outcomes = [episode.outcome for episode in loop.run(specs)]
+    state = simulation.observe().state
+    return Result(outcomes, {n: act_ms(brain, simulation.observation_names, state, n) for n in (1, 64)})
+
+
+def act_ms(brain: Brain, names: tuple[str, ...], state: np.ndarray, n: int) -> float:
+    """Return the median time of a call for n robots [ms]."""
+    brain.reset(np.arange(n), [0] * n, n)
+    observation = Observation(names, np.resize(state, (n, state.shape[1])))
+    times = []
+    for _ in range(CALLS):
+        started = time.perf_counter()
+        brain.act(observation)
+        times.append(time.perf_counter() - started)
+    return float(np.median(times)) * 1e3
+
+
+def row(name: str, result: Result) -> str:
+    """Return a brain's line of the table."""
+    count = len(result.outcomes)
+    causes = Counter(outcome.event.cause for outcome in result.outcomes if outcome.event != Event.SUCCESS)
+    by_cause = ", ".join(f"{cause} {number}" for cause, number in sorted(causes.items())) or "none"
+    low, high = wilson(result.failures, count)
+    share = f"{result.failures / count:.1%} ({low:.1%} to {high:.1%})"
+    mean, error = result.scores.mean(), 1.96 * result.scores.std(ddof=1) / math.sqrt(count)
+    score = f"{mean:.4f} ({mean - error:.4f} to {mean + error:.4f})"
+    times = f"{result.act_ms[1]:>8.3f} ms{result.act_ms[64]:>7.2f} ms"
+    return f"{name:14}{result.failures:>9}{by_cause:>24}{share:>22}{score:>28}{times}"
+
+
+def wilson(failures: int, count: int, z: float = 1.96) -> tuple[float, float]:
+    """Return the Wilson 95 % interval of a share."""
+    share = failures / count
+    middle = share + z * z / (2 * count)
+    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
+    scale = 1 + z * z / count
+    return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
+
+
+def bootstrap_ratio(old: np.ndarray, new: np.ndarray) -> tuple[float, float]:
+    """Return the 95 % interval of the ratio of two means over the same arenas."""
+    pick = np.random.default_rng(0).integers(0, len(old), (10_000, len(old)))
+    low, high = np.percentile(new[pick].mean(axis=1) / old[pick].mean(axis=1), (2.5, 97.5))
+    return float(low), float(high)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

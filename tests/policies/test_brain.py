@@ -1,0 +1,89 @@
+"""Brains find their inputs by name, or say at once what is missing."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.avoidance import AvoidanceBrain
+from bhd_lerobot.policies.brain import Brain, Observation, find_columns, find_scan
+from bhd_lerobot.policies.gap_follower import GapFollowerBrain
+
+ACTIONS = ("x.vel", "theta.vel")
+BRAINS = (AvoidanceBrain, GapFollowerBrain)
+
+
+def scan_names(beams: int) -> tuple[str, ...]:
+    return tuple(f"scan_{beam:03d}.pos" for beam in range(beams))
+
+
+def test_columns_are_found_wherever_they_lie() -> None:
+    names = ("c", "a", "b")
+    assert find_columns(names, ("a", "b", "c"), "rule", "observation").tolist() == [1, 2, 0]
+    assert find_columns(names, (), "rule", "observation").tolist() == []
+
+
+def test_missing_columns_are_all_named() -> None:
+    with pytest.raises(ConfigError, match=r"'rule' needs the action feature\(s\) y, z.*It has: a, b\."):
+        find_columns(("a", "b"), ("y", "a", "z"), "rule", "action")
+
+
+def test_a_long_list_of_features_is_cut_in_the_message() -> None:
+    with pytest.raises(ConfigError, match=r"scan_007\.pos, …"):
+        find_columns(scan_names(360), ("x.vel",), "rule", "observation")
+
+
+@pytest.mark.parametrize("beams", [1, 3, 36, 90, 360])
+def test_beams_go_once_around_counter_clockwise_from_straight_ahead(beams: int) -> None:
+    columns, angles = find_scan(("x.vel", *scan_names(beams), "theta.vel"), "rule")
+    assert (columns.start, columns.stop) == (1, 1 + beams)
+    assert angles[0] == 0
+    assert ((angles >= -np.pi) & (angles < np.pi)).all()
+    assert_allclose(np.unwrap(angles), 2 * np.pi * np.arange(beams) / beams, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [(), ("x.vel", "theta.vel"), ("scan_000.pos", "x.vel", "scan_001.pos"), ("scan_000.vel",)],
+)
+def test_no_scan_or_a_torn_one_is_refused(names: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError, match="'rule' needs a range scan"):
+        find_scan(names, "rule")
+
+
+@pytest.mark.parametrize("brain_type", BRAINS)
+def test_order_of_features_does_not_matter(brain_type: type[AvoidanceBrain] | type[GapFollowerBrain]) -> None:
+    rng = np.random.default_rng(0)
+    scan, twist = rng.uniform(0.2, 3.4, (4, 90)), rng.uniform(-0.1, 0.1, (4, 2))
+    front = (*ACTIONS, *scan_names(90))
+    back = ("imu_z.vel", *scan_names(90), "theta.vel", "gripper.pos", "x.vel")
+    blank = np.full((4, 1), np.nan)
+    one, other = brain_type(), brain_type()
+    one.bind(front, ACTIONS, 10)
+    other.bind(back, ("theta.vel", "gripper.pos", "x.vel"), 10)
+    for brain in (one, other):
+        brain.reset(np.arange(4), [0] * 4, 4)
+    a = one.act(Observation(front, np.hstack([twist, scan])))
+    b = other.act(Observation(back, np.hstack([blank, scan, twist[:, 1:], blank, twist[:, :1]])))
+    assert np.array_equal(a, b[:, [2, 0]])
+    assert (b[:, 1] == 0).all()
+
+
+@pytest.mark.parametrize("brain_type", BRAINS)
+def test_a_brain_refuses_a_robot_without_its_features(
+    brain_type: type[AvoidanceBrain] | type[GapFollowerBrain],
+) -> None:
+    brain: Brain = brain_type()
+    with pytest.raises(ConfigError, match=f"{brain.name!r} needs a range scan"):
+        brain.bind(ACTIONS, ACTIONS, 10)
+    with pytest.raises(ConfigError, match=f"{brain.name!r} needs the action feature.*theta.vel"):
+        brain.bind((*ACTIONS, *scan_names(360)), ("x.vel",), 10)
+
+
+@pytest.mark.parametrize("brain_type", BRAINS)
+def test_parameters_are_plain_and_complete(brain_type: type[AvoidanceBrain] | type[GapFollowerBrain]) -> None:
+    brain = brain_type()
+    parameters = brain.parameters()
+    assert parameters.pop("type") == brain.name
+    assert all(isinstance(value, int | float | str | bool) for value in parameters.values())
+    assert type(brain.config)(**parameters) == brain.config
