@@ -13,6 +13,9 @@ from bhd_lerobot.policies.brain import Observation, find_columns, find_scan
 from bhd_lerobot.policies.config_brain import BrainConfig
 
 
+_ROUNDING = 1e-6  # [m]
+
+
 @BrainConfig.register_subclass("avoidance")
 @dataclass
 class AvoidanceConfig(BrainConfig):
@@ -73,7 +76,8 @@ class AvoidanceBrain:
         """Return the twist, shape (n, actions)."""
         config = self.config
         front = observation.state[:, self._scan][:, self._front]
-        valid = (front >= config.range_min_m) & (front <= config.range_max_m)  # False for NaN
+        # A reading at a limit is valid, also after it was rounded to single precision. False for NaN.
+        valid = (front >= config.range_min_m - _ROUNDING) & (front <= config.range_max_m + _ROUNDING)
         nearest = np.where(valid, front, np.inf).min(axis=1)
         seen = valid.any(axis=1)
         free = nearest >= config.safe_distance_m

@@ -6,12 +6,16 @@ from typing import Any
 from bhd_lerobot.policies.avoidance import AvoidanceBrain, AvoidanceConfig
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import Task
 
 # Importing this module registers every configuration that it names.
-_BRAINS: dict[type, Callable[[Any], Brain]] = {AvoidanceConfig: AvoidanceBrain}
+_BRAINS: dict[type, Callable[[Any], Brain]] = {
+    AvoidanceConfig: AvoidanceBrain,
+    GapFollowerConfig: GapFollowerBrain,
+}
 _TASKS: dict[type, Callable[[Any, int, int], Task]] = {AvoidConfig: AvoidTask}
 
 

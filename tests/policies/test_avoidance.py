@@ -121,3 +121,12 @@ def test_parameters_are_used() -> None:
 def test_impossible_parameters_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=f"brain.{name} is {value}"):
         AvoidanceConfig(**{name: value})
+
+
+def test_readings_at_the_limits_are_valid_in_single_precision_too() -> None:
+    brain = AvoidanceBrain()
+    names = ["x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36))]
+    brain.bind(names, ["x.vel", "theta.vel"], 10)
+    for reading, expected in ((0.12, [0.0, 0.5]), (3.5, [0.2, 0.0])):
+        state = np.full((1, 38), reading, np.float32).astype(np.float64)
+        assert brain.act(Observation(tuple(names), state)).tolist() == [expected]
