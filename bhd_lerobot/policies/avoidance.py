@@ -12,7 +12,6 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, find_columns, find_scan
 from bhd_lerobot.policies.config_brain import BrainConfig
 
-
 _ROUNDING = 1e-6  # [m]
 
 
