@@ -74,8 +74,8 @@ class AvoidTask:
         # Cells by number, a row for each simulation; the rows grow with the largest arena seen.
         self._free: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
         self._visited: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
-        self._origin = np.zeros((n, 2))
-        self._columns, self._rows = np.ones(n, np.int64), np.ones(n, np.int64)
+        self._origin, self._end = np.zeros((n, 2)), np.zeros((n, 2))
+        self._columns = np.ones(n, np.int64)
         self._pose = np.zeros((n, 2))
         self._path = np.zeros(n)
         self._history = np.zeros((self._window, n))  # path lengths of the last frames, a ring
@@ -95,8 +95,8 @@ class AvoidTask:
                 self._free, self._visited = np.pad(self._free, grow), np.pad(self._visited, grow)
             self._free[sim] = self._visited[sim] = False
             self._free[sim, cells] = True
-            self._origin[sim] = arena.extent[0], arena.extent[2]
-            self._columns[sim], self._rows[sim] = columns, rows
+            self._origin[sim], self._end[sim] = arena.extent[0::2], arena.extent[1::2]
+            self._columns[sim] = columns
             self._pose[sim] = arena.start[:2]
         started = np.zeros(len(self._sims), np.bool_)
         started[ids] = True
@@ -148,8 +148,8 @@ class AvoidTask:
         """Count the cells that robots are in, and return what they add to the scores, shape (n,)."""
         column, row = np.floor((self._pose - self._origin) / self.config.cell_m).astype(np.int64).T
         cell = np.clip(row * self._columns + column, 0, self._free.shape[1] - 1)
-        # Outside the grid is no free cell: a robot there has left the arena through a wall.
-        inside = (column >= 0) & (column < self._columns) & (row >= 0) & (row < self._rows)
+        # Outside the arena is no free cell, also where the last row of cells sticks out of it.
+        inside = ((self._pose >= self._origin) & (self._pose < self._end)).all(axis=1)
         new = mask & inside & self._free[self._sims, cell] & ~self._visited[self._sims, cell]
         self._visited[self._sims[new], cell[new]] = True
         return np.where(new, 1.0 / np.maximum(self._free.sum(axis=1), 1), 0.0)
