@@ -4,6 +4,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -87,51 +88,18 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     simulation = TurtleBot3Simulation(robot, min(config.n_envs, config.dataset.num_episodes), config.threads)
     task = make_task(config.task, simulation.n, config.dataset.fps)
     brain = make_brain(config.brain)
-    preview = _make_preview(config, simulation, console)
-    try:
+    # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
+    with closing(simulation), stop_on_signals() as stop:
+        preview = _make_preview(config, simulation, console)
         if simulation.camera_names:
             simulation.start_rendering()  # a machine without OpenGL fails here, before a dataset exists
-        recorder = _open_recorder(config, root, simulation, task.parameters(), brain.parameters())
-    except BaseException:
-        simulation.close()
-        raise
-    with stop_on_signals() as stop, recorder:
-        output_dir = _make_output_dir(config, console)
+        output_dir = _make_output_dir(config)
         result = RecordResult(root, output_dir, stopped_by=stop)
-        if recorder.repair_report:
-            console.print(f"Mended before resuming: {recorder.repair_report}")
-        loop = EpisodeLoop(simulation, task, brain, recorder.begin_episode)
-        trajectories: list[Trajectory] = []
-        first: Episode | None = None
-        specs = [
-            EpisodeSpec(index, episode_seed(config.seed, index, config.split))  # type: ignore[arg-type]
-            for index in range(recorder.num_episodes, config.dataset.num_episodes)
-        ]
-        with _progress(console) as progress:
-            bar = progress.add_task("recording", total=len(specs), success="", speed="")
-            started = time.perf_counter()
-            for episode in loop.run(specs, stop.__bool__):
-                metadata = episode_metadata(
-                    episode,
-                    split=config.split,
-                    task=task.parameters(),
-                    brain=brain.parameters(),
-                )
-                _save(recorder, episode, task.instruction, metadata)
-                _count(result, episode, config.dataset.fps)
-                result.wall_s = time.perf_counter() - started
-                trajectories.append(_trajectory(episode))
-                first = first or episode
-                progress.update(
-                    bar,
-                    advance=1,
-                    success=f"{result.successes}/{result.recorded} succeeded",
-                    speed=f"{result.real_time_factor:.0f}x real time",
-                )
-        result.episodes = recorder.num_episodes
-        recorder.finalize()
-        result.wall_s = time.perf_counter() - started if result.recorded else 0.0
-    simulation.close()
+        with _open_recorder(config, root, simulation, task.parameters(), brain.parameters()) as recorder:
+            if recorder.repair_report:
+                console.print(f"Mended before resuming: {recorder.repair_report}")
+            loop = EpisodeLoop(simulation, task, brain, recorder.begin_episode)
+            trajectories, first = _run(config, recorder, loop, result, console)
     if trajectories:
         heading = f"{task.name}, {brain.name}: {result.successes} of {result.recorded} episodes succeeded"
         draw_trajectories(trajectories, output_dir / "trajectories.png", heading)
@@ -142,6 +110,39 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     if config.dataset.push_to_hub and not stop:
         _push(config, root)
     return result
+
+
+def _run(
+    config: RecordConfig, recorder: DatasetRecorder, loop: EpisodeLoop, result: RecordResult, console: Console
+) -> tuple[list[Trajectory], Episode | None]:
+    """Run and save the episodes that the dataset lacks; return their trajectories, and the first of them."""
+    task, brain = loop.task, loop.brain
+    trajectories: list[Trajectory] = []
+    first: Episode | None = None
+    specs = [
+        EpisodeSpec(index, episode_seed(config.seed, index, config.split))  # type: ignore[arg-type]
+        for index in range(recorder.num_episodes, config.dataset.num_episodes)
+    ]
+    with _progress(console) as progress:
+        bar = progress.add_task("recording", total=len(specs), success="", speed="")
+        started = time.perf_counter()
+        for episode in loop.run(specs, lambda: bool(result.stopped_by)):
+            metadata = episode_metadata(episode, split=config.split, task=task.parameters(), brain=brain.parameters())
+            _save(recorder, episode, task.instruction, metadata)
+            _count(result, episode, config.dataset.fps)
+            result.wall_s = time.perf_counter() - started
+            trajectories.append(_trajectory(episode))
+            first = first or episode
+            progress.update(
+                bar,
+                advance=1,
+                success=f"{result.successes}/{result.recorded} succeeded",
+                speed=f"{result.real_time_factor:.0f}x real time",
+            )
+    result.episodes = recorder.num_episodes
+    recorder.finalize()
+    result.wall_s = time.perf_counter() - started if result.recorded else 0.0
+    return trajectories, first
 
 
 def _open_recorder(
@@ -211,7 +212,7 @@ def _make_preview(config: RecordConfig, simulation: TurtleBot3Simulation, consol
         return None
 
 
-def _make_output_dir(config: RecordConfig, console: Console) -> Path:
+def _make_output_dir(config: RecordConfig) -> Path:
     if config.output_dir:
         folder = Path(config.output_dir).expanduser()
     else:
