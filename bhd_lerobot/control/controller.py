@@ -1,7 +1,5 @@
 """What stands between a command and the actuators, for one kind of robot; the modes are the cerebellum's."""
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,47 +13,18 @@ from bhd_lerobot.errors import ConfigError
 _REST = 1e-9  # a ramp has arrived when the command is this close to zero
 
 
-class Controller(Protocol):
-    """Turns the commands of n robots into actuator commands, within all limits; called once a tick.
+class BaseController:
+    """Twist commands to wheel speeds, for bases with two driven wheels.
+
+    A command is the forward speed [m/s] and the yaw rate [rad/s]; an actuator command is a wheel speed [rad/s].
+
+    The cerebellum says where to head for and calls `run` once a tick; it never touches the filter in between.
 
     Attributes:
         width: number of values in a command.
         joints: number of joints and of actuators.
         command: what is applied now, after all limits, shape (n, width).
         actuators: what goes to the plant, shape (n, joints).
-    """
-
-    width: int
-    joints: int
-    command: NDArray[np.float64]
-    actuators: NDArray[np.float64]
-
-    def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
-        """Head for new commands, shape (n, width), in the robots of the mask, shape (n,)."""
-
-    def stop(self, mask: NDArray[np.bool_], *, hard: bool) -> None:
-        """Head for rest; `hard`: as fast as the robot can."""
-
-    def run(self, reading: PlantReading) -> None:
-        """Advance by one tick: `command` and `actuators` are those of this tick."""
-
-    def at_rest(self) -> NDArray[np.bool_]:
-        """Return whether each robot is commanded to be at rest, shape (n,)."""
-
-    def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
-        """Take the present reading for where robots start."""
-
-    def restart(self, ids: NDArray[np.intp]) -> None:
-        """Forget everything about robots that were put somewhere else."""
-
-    def take_limits(self) -> NDArray[np.int64]:
-        """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
-
-
-class BaseController:
-    """Twist commands to wheel speeds, for bases with two driven wheels.
-
-    A command is the forward speed [m/s] and the yaw rate [rad/s]; an actuator command is a wheel speed [rad/s].
 
     Args:
         body: limits and wheels.
