@@ -117,7 +117,7 @@ if [ "$runs" = no ]; then
 fi
 say "installing what constraints.txt lists (with PyTorch, several GB; the first time takes minutes)"
 VIRTUAL_ENV="$PWD/.venv" "$uv" pip install --quiet --constraint constraints.txt --build-constraint constraints.txt \
-    --editable '.[test,dev]' </dev/null || die "uv could not install the packages; its message is above." \
+    --editable '.[test,dev,bench]' </dev/null || die "uv could not install the packages; its message is above." \
     "Is the package index reachable, and is there 8 GB of free disk space?"
 fingerprint >"$stamp"
 say "ready after $((SECONDS - started)) s"

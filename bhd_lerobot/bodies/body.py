@@ -142,7 +142,103 @@ class CameraSpec:
     height: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class PositionLimits(CommandLimits):
+    """Limits of a position command, one value for each command dimension.
+
+    `velocity` is the largest speed of the commanded position, `acceleration` its largest acceleration.
+
+    Attributes:
+        lower: smallest position [rad, or m for a gripper].
+        upper: largest position [rad or m].
+        jerk: largest change of the acceleration in normal motion [rad/s^3 or m/s^3].
+        stop_jerk: largest change of the acceleration when the robot has to stop at once [rad/s^3 or m/s^3].
+        effort: largest torque or force of the servo [N m or N].
+    """
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    jerk: tuple[float, ...]
+    stop_jerk: tuple[float, ...]
+    effort: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("jerk", "stop_jerk", "effort"):
+            values = getattr(self, name)
+            if len(values) != len(self.names) or not all(0 < v < float("inf") for v in values):
+                raise ConfigError(f"{name} is {values}; it needs {len(self.names)} positive finite numbers.")
+        if len(self.lower) != len(self.names) or len(self.upper) != len(self.names):
+            raise ConfigError(f"lower and upper need {len(self.names)} numbers each.")
+        if not all(-float("inf") < low < high < float("inf") for low, high in zip(self.lower, self.upper, strict=True)):
+            raise ConfigError(f"lower is {self.lower} and upper is {self.upper}; each range must be finite.")
+
+
 @dataclass(frozen=True)
+class Capsule:
+    """All points within `radius` of a segment that is fixed to a link of an arm.
+
+    Attributes:
+        name: its name.
+        frame: the Denavit-Hartenberg frame that it is fixed to: 0 is the base, i the frame behind joint i.
+        start: one end of the segment in that frame [m].
+        end: the other end [m].
+        radius: [m].
+    """
+
+    name: str
+    frame: int
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+
+
+@dataclass(frozen=True)
+class ArmChain:
+    """The geometry of a serial arm, in the standard Denavit-Hartenberg convention.
+
+    The transform from frame i - 1 to frame i is Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i).
+
+    Attributes:
+        joints: joint names, from the base to the flange.
+        a: link lengths [m].
+        d: link offsets [m].
+        alpha: link twists [rad].
+        tool: the tool centre point in the flange frame, the last of the chain [m]. The tool frame is parallel to the
+            flange frame: its z axis points out of the gripper, its y axis from the left to the right finger.
+        capsules: what the collision checks take the arm for.
+        disjoint: pairs of capsule names whose distance is checked; pairs that cannot meet are left out.
+        min_distance: smallest permitted distance between two capsules, and between a capsule and the table [m].
+        min_manipulability: below this product of the Jacobian's singular values a posture counts as singular [m^3].
+    """
+
+    joints: tuple[str, ...]
+    a: tuple[float, ...]
+    d: tuple[float, ...]
+    alpha: tuple[float, ...]
+    tool: tuple[float, float, float]
+    capsules: tuple[Capsule, ...]
+    disjoint: tuple[tuple[str, str], ...]
+    min_distance: float
+    min_manipulability: float
+
+
+@dataclass(frozen=True)
+class GripperSpec:
+    """A parallel gripper with two fingers that move as one.
+
+    Attributes:
+        joints: joint names, left then right; each moves by half the opening.
+        actuator: name of the actuator; its command is the opening [m].
+        max_opening: largest opening [m].
+    """
+
+    joints: tuple[str, str]
+    actuator: str
+    max_opening: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Body:
     """A robot's hardware.
 
@@ -151,12 +247,7 @@ class Body:
         mjcf: MJCF document of the robot alone, without floor or scene.
         root: name of the root body, which carries a free joint if the robot moves.
         limits: limits of the commands it takes.
-        drive: the wheels.
-        lidar: the range finder, or None.
         cameras: the cameras, by name.
-        touch_sensor: name of the contact sensor that counts touches with the scene.
-        radius: radius of the vertical cylinder around the root body's origin that holds the whole robot [m].
-        height: height of the robot [m].
         physics_hz: default physics rate [Hz].
         control_hz: default control rate [Hz].
     """
@@ -165,14 +256,59 @@ class Body:
     mjcf: str
     root: str
     limits: CommandLimits
+    cameras: dict[str, CameraSpec] = field(default_factory=dict)
+    physics_hz: int = 200
+    control_hz: int = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class MobileBase(Body):
+    """A base on two driven wheels.
+
+    Attributes:
+        drive: the wheels.
+        lidar: the range finder, or None.
+        touch_sensor: name of the contact sensor that counts touches with the scene.
+        radius: radius of the vertical cylinder around the root body's origin that holds the whole robot [m].
+        height: height of the robot [m].
+    """
+
     drive: WheelDrive
     lidar: LidarSpec | None
-    cameras: dict[str, CameraSpec] = field(default_factory=dict)
     touch_sensor: str = "touch"
     radius: float = 0.0
     height: float = 0.0
-    physics_hz: int = 200
-    control_hz: int = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arm(Body):
+    """An arm with a gripper, mounted on a table.
+
+    The base frame is frame 0 of the chain; the table's top is its plane z = 0. A command is the position of each joint
+    [rad] in the chain's order, and then the gripper's opening [m].
+
+    Attributes:
+        limits: limits of the commands, the gripper's last.
+        chain: the geometry.
+        gripper: the gripper.
+        servo_stiffness: torque per position error of each joint's servo [N m/rad]; force per opening error of the
+            gripper's, last [N/m].
+        servo_damping: torque per speed error of each joint's servo [N m s/rad], and of the gripper's [N s/m].
+        actuators: actuator names, the gripper's last.
+        actuation: ``"position"``: servos take positions and compensate gravity; ``"torque"``: they take torques.
+        home: the posture that it starts in [rad], and the gripper's opening [m].
+        payload: largest mass in the gripper [kg].
+    """
+
+    limits: PositionLimits
+    chain: ArmChain
+    gripper: GripperSpec
+    servo_stiffness: tuple[float, ...]
+    servo_damping: tuple[float, ...]
+    actuators: tuple[str, ...]
+    actuation: Literal["position", "torque"]
+    home: tuple[float, ...]
+    payload: float
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ is what the tyres can carry (a yaw deceleration of 20 rad/s^2 needs 0.5 N at eac
 import math
 from importlib import resources
 
-from bhd_lerobot.bodies.body import Body, CameraSpec, CommandLimits, LidarSpec, WheelDrive
+from bhd_lerobot.bodies.body import CameraSpec, CommandLimits, LidarSpec, MobileBase, WheelDrive
 from bhd_lerobot.errors import ConfigError
 
 WHEEL_RADIUS = 0.033  # [m], [urdf]
@@ -45,7 +45,7 @@ def turtlebot3_burger(
     command_timeout_s: float = 0.5,
     camera_width: int = 320,
     camera_height: int = 240,
-) -> Body:
+) -> MobileBase:
     """Return the Burger.
 
     Args:
@@ -61,7 +61,7 @@ def turtlebot3_burger(
         raise ConfigError(f"lidar_noise_std is {lidar_noise_std}; it must be 0 (off) or a positive number of metres.")
     if camera_width <= 0 or camera_height <= 0:
         raise ConfigError(f"The camera image is {camera_width} x {camera_height} px; both must be positive.")
-    return Body(
+    return MobileBase(
         name="turtlebot3_burger",
         mjcf=resources.files(__package__).joinpath("turtlebot3_burger.xml").read_text(encoding="utf-8"),
         root="base",

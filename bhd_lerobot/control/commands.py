@@ -1,0 +1,145 @@
+"""Goals: what a brain may ask an arm for beyond the next setpoint, and what it hears back.
+
+A goal is accepted or refused, gives feedback while it runs, and ends in exactly one result.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Motion = Literal["joint", "line"]
+MOTIONS: tuple[Motion, ...] = ("joint", "line")
+
+
+class GoalPhase(IntEnum):
+    """What the bridge is doing about goals; one for each simulation."""
+
+    IDLE = 0
+    """No goal."""
+    CONVERTING = 1
+    """A goal was accepted and is being turned into a trajectory."""
+    EXECUTING = 2
+    """The trajectory is being followed."""
+    ERROR = 3
+    """The last goal failed; the arm has stopped or is stopping, and the next goal is accepted."""
+
+
+class ResultCode(IntEnum):
+    """How a goal ended, or why it was refused."""
+
+    SUCCEEDED = 0
+    CANCELLED = 1
+    PREEMPTED = 2
+    TIMEOUT = 3
+    PATH_TOLERANCE = 4
+    GOAL_TOLERANCE = 5
+    UNREACHABLE = 6
+    JOINT_LIMIT = 7
+    SELF_COLLISION = 8
+    TABLE_COLLISION = 9
+    SINGULAR = 10
+    NON_FINITE = 11
+    NOT_NORMALISED = 12
+    BAD_TARGET = 13
+    BAD_VELOCITY = 14
+    BAD_ACCELERATION = 15
+    BAD_TIMEOUT = 16
+    DUPLICATE_ID = 17
+    UNKNOWN_ID = 18
+    QUEUE_FULL = 19
+    NOT_ACTIVE = 20
+    ESTOP = 21
+    FAULT = 22
+    PLANNING_FAILED = 23
+    REPLACED_BY_SETPOINT = 24
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A pose of the tool frame in the base frame.
+
+    Attributes:
+        position: x, y, z [m].
+        quaternion: orientation, a unit quaternion w, x, y, z.
+    """
+
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+
+    def matrix(self) -> NDArray[np.float64]:
+        """Return the homogeneous transform, shape (4, 4); the quaternion is normalised first."""
+        w, x, y, z = np.asarray(self.quaternion, np.float64) / np.linalg.norm(self.quaternion)
+        matrix = np.eye(4)
+        matrix[0, :3] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+        matrix[1, :3] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+        matrix[2, :3] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        matrix[:3, 3] = self.position
+        return matrix
+
+
+@dataclass(frozen=True)
+class BrainCommand:
+    """A goal: move the tool to a pose or the joints to a posture, the gripper to an opening, or both at once.
+
+    Attributes:
+        task_id: the sender's name for it; no two goals of one episode may have the same.
+        target_pose: where the tool is to go; None for a goal that moves joints or the gripper only.
+        joint_target: where the joints are to go [rad], one value for each; excludes `target_pose`.
+        gripper: where the gripper is to open or close to [m of opening]; left as it is if None.
+        motion: ``"joint"``: every joint on the shortest way, all arrive together; ``"line"``: the tool on a straight
+            line, its orientation turning evenly.
+        max_velocity: of the fastest joint [rad/s], or of the tool on a line [m/s]; the arm's own limit if None.
+        max_acceleration: of the fastest joint [rad/s^2], or of the tool on a line [m/s^2]; the arm's own if None.
+        timeout_s: the goal fails if it takes longer than this from the start of its motion [s].
+        preempt: end the present goal and drop those that wait, and start from the commanded state at once; otherwise
+            wait for them.
+    """
+
+    task_id: str
+    target_pose: Pose | None = None
+    joint_target: tuple[float, ...] | None = None
+    gripper: float | None = None
+    motion: Motion = "joint"
+    max_velocity: float | None = None
+    max_acceleration: float | None = None
+    timeout_s: float = 20.0
+    preempt: bool = False
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """How far a goal is.
+
+    Attributes:
+        task_id: the goal's.
+        phase: what is being done about it.
+        progress: share of the planned duration that has passed, 0 to 1.
+        remaining_s: planned time that is left [s].
+        position_error: largest distance of a joint from its reference [rad].
+    """
+
+    task_id: str
+    phase: GoalPhase
+    progress: float
+    remaining_s: float
+    position_error: float
+
+
+@dataclass(frozen=True)
+class CommandResult:
+    """How a goal ended; every goal ends in exactly one.
+
+    Attributes:
+        task_id: the goal's.
+        success: whether the target was reached.
+        code: how it ended.
+        message: what happened, in words, with the offending value where there is one.
+    """
+
+    task_id: str
+    success: bool
+    code: ResultCode
+    message: str
