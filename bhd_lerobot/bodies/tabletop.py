@@ -1,0 +1,119 @@
+"""What can lie on the table before an arm, and how one episode's world differs from the next."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+from bhd_lerobot.errors import ConfigError, unknown_name
+
+MAX_OBJECTS = 5  # all simulations of a batch share one model, so the number of bodies is fixed
+
+# The colours that objects have and that an instruction may name: red, green and blue from 0 to 1.
+COLOURS: dict[str, tuple[float, float, float]] = {
+    "red": (0.80, 0.13, 0.12),
+    "green": (0.13, 0.58, 0.22),
+    "blue": (0.12, 0.30, 0.75),
+    "yellow": (0.93, 0.78, 0.12),
+    "orange": (0.92, 0.48, 0.10),
+    "purple": (0.48, 0.20, 0.62),
+    "white": (0.92, 0.92, 0.90),
+    "black": (0.10, 0.10, 0.11),
+}
+KINDS: tuple[Literal["cup", "box"], ...] = ("cup", "box")
+
+
+@dataclass(frozen=True)
+class TableObject:
+    """One object that stands on the table.
+
+    Attributes:
+        kind: ``"cup"``, an upright cylinder, or ``"box"``.
+        colour: a name from `COLOURS`.
+        size_x: radius of a cup, or half the length of a box [m].
+        size_y: half the width of a box [m]; the radius again for a cup.
+        height: [m].
+        x: centre in the base frame [m].
+        y: centre in the base frame [m].
+        yaw: rotation about the vertical axis [rad].
+        mass: [kg].
+        friction: sliding friction against table and fingers.
+        shade: what is added to each of red, green and blue of the colour.
+    """
+
+    kind: Literal["cup", "box"]
+    colour: str
+    size_x: float
+    size_y: float
+    height: float
+    x: float
+    y: float
+    yaw: float = 0.0
+    mass: float = 0.2
+    friction: float = 0.9
+    shade: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ConfigError(unknown_name("kind of object", self.kind, KINDS))
+        if self.colour not in COLOURS:
+            raise ConfigError(unknown_name("colour", self.colour, COLOURS))
+        for name in ("size_x", "size_y", "height", "mass", "friction"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"{name} of a {self.colour} {self.kind} is {getattr(self, name)}; it must be > 0.")
+
+    @property
+    def name(self) -> str:
+        """What an instruction calls it, for example ``"red cup"``."""
+        return f"{self.colour} {self.kind}"
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How one episode's world differs from the nominal one; the defaults are no difference.
+
+    Attributes:
+        light: factor on the lights' brightness.
+        light_direction: what is added to the direction of the main light, x and y.
+        camera_shift: what is added to the scene camera's position [m].
+        sensor_noise: standard deviation of the noise on observed joint positions [rad], on speeds ten times that
+            [rad/s].
+        latency_ticks: control ticks by which what the cerebellum commands reaches the servos late.
+        finger_friction: factor on the fingers' friction.
+    """
+
+    light: float = 1.0
+    light_direction: tuple[float, float] = (0.0, 0.0)
+    camera_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sensor_noise: float = 0.0
+    latency_ticks: int = 0
+    finger_friction: float = 1.0
+
+
+@dataclass(frozen=True)
+class TableScene:
+    """Objects on the table, the arm's start, and what the episode's task is about.
+
+    Attributes:
+        name: which kind of scene it is.
+        objects: at most `MAX_OBJECTS`.
+        posture: joint angles [rad] and gripper opening [m] at the start.
+        target_object: number of the object that the task is about, or None.
+        target_pose: tool pose in the base frame that the task asks for: x, y, z [m] and a quaternion w, x, y, z; or
+            None. It is drawn, and touches nothing.
+        instruction: what a person would ask for.
+        variation: how this world differs from the nominal one.
+    """
+
+    name: str
+    objects: tuple[TableObject, ...]
+    posture: tuple[float, ...]
+    target_object: int | None = None
+    target_pose: tuple[float, ...] | None = None
+    instruction: str = ""
+    variation: Variation = field(default_factory=Variation)
+
+    def __post_init__(self) -> None:
+        if len(self.objects) > MAX_OBJECTS:
+            raise ConfigError(f"The scene has {len(self.objects)} objects; a table holds at most {MAX_OBJECTS}.")
+        if self.target_object is not None and not 0 <= self.target_object < len(self.objects):
+            raise ConfigError(f"target_object is {self.target_object}; the scene has {len(self.objects)} objects.")
