@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, CerebellumState, Request, SendResult, Setpoint
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError
@@ -74,6 +75,34 @@ class LockstepBridge:
             self.send(row, due_ns=(self._tick + k * frame) * NANOSECONDS // self.rates.control_hz)
             for k, row in enumerate(values)
         ]
+
+    # --- goals -------------------------------------------------------------------------------------------------------
+
+    def submit(self, command: BrainCommand, sim: int = 0) -> CommandResult | None:
+        """Send a goal to one simulation.
+
+        Args:
+            command: the goal.
+            sim: the simulation.
+
+        Returns:
+            None if it was accepted: its one result comes later, by `take_results`. Otherwise the refusal.
+        """
+        return self.cerebellum.submit(sim, command)
+
+    def cancel(self, task_id: str, sim: int = 0) -> ResultCode:
+        """Cancel a goal: the arm decelerates and holds. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""
+        return self.cerebellum.cancel(sim, task_id)
+
+    def take_results(self, sim: int = 0) -> list[CommandResult]:
+        """Return the results of one simulation's goals that were not taken yet, in the order in which they came."""
+        return self.cerebellum.controller.take_results(sim)
+
+    def feedback(self, sim: int = 0) -> Feedback | None:
+        """Return how far the goal is that one simulation follows, or None."""
+        return self.cerebellum.controller.feedback(sim)
+
+    # --- time --------------------------------------------------------------------------------------------------------
 
     def advance_frame(self) -> None:
         """Let one frame go by."""

@@ -5,8 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Body
-from bhd_lerobot.control.controller import BaseController
+from bhd_lerobot.bodies.body import Body, MobileBase
+from bhd_lerobot.control.base_controller import BaseController
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
+from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.control.messages import (
     NANOSECONDS,
@@ -44,10 +46,10 @@ class Cerebellum:
         fifo: where commands come from; a new one if None.
         ring: where every tick's state is published, of dtype `state_dtype(n)`; nowhere if None.
         estop_word: n 64-bit integers that any process may set to something else than 0; new memory if None.
-        controller: what turns commands into actuator commands; that of a wheeled base if None.
+        controller: what turns commands into actuator commands; may be left out for a `MobileBase`.
 
     Raises:
-        ConfigError: the body cannot do what its limits allow.
+        ConfigError: the body cannot do what its limits allow, or it needs a controller and none was given.
     """
 
     def __init__(
@@ -59,11 +61,15 @@ class Cerebellum:
         fifo: CommandFifo | None = None,
         ring: StateRing | None = None,
         estop_word: NDArray[np.int64] | None = None,
-        controller: BaseController | None = None,
+        controller: Controller | None = None,
     ) -> None:
         self.body, self.plant, self.control_hz = body, plant, control_hz
         self.n = n = plant.n
-        self.controller = BaseController(body, n, control_hz) if controller is None else controller
+        if controller is None:
+            if not isinstance(body, MobileBase):
+                raise ConfigError(f"The body {body.name!r} is not a wheeled base; give its controller.")
+            controller = BaseController(body, n, control_hz)
+        self.controller: Controller = controller
         self.width = width = self.controller.width
         self.command = self.controller.command
         self.fifo = CommandFifo(n, width) if fifo is None else fifo
@@ -88,7 +94,7 @@ class Cerebellum:
         self._stopping = False
         self._popped, self._popped_mask = np.zeros((n, width)), np.zeros(n, np.bool_)
         self._estop_latched = np.zeros(n, np.bool_)
-
+        self._by_goal = np.zeros(n, np.bool_)  # moves because of a goal, not because of setpoints
         self._watchdog = np.zeros(n, np.int8)
 
     # --- one tick ----------------------------------------------------------------------------------------------------
@@ -103,6 +109,7 @@ class Cerebellum:
         self._supervise(now_ns)
         self._take_commands(now_ns)
         self.controller.run(self.reading)
+        self._follow_goals()
         self.plant.write(self.controller.actuators)
         self._last_position[:] = self.reading.position
         self.ticks += 1
@@ -119,7 +126,7 @@ class Cerebellum:
         if self._flat_reading.dot(self._zeros) != 0.0 or self.reading.fault.any():
             self._handle_fault()
         if self._deadline is not None and now_ns > self._deadline:
-            old = (self.mode == Mode.TRACKING) & (now_ns - self._last_due > self._timeout_ns)
+            old = (self.mode == Mode.TRACKING) & ~self._by_goal & (now_ns - self._last_due > self._timeout_ns)
             if old.any():
                 self._watchdog[old] |= Watchdog.COMMAND_AGE
                 self._set_mode(old, Mode.STOPPING)
@@ -154,11 +161,39 @@ class Cerebellum:
             starting = take & (self.mode != Mode.TRACKING)
             if starting.any():
                 self._set_mode(starting, Mode.TRACKING)
+            self._by_goal &= ~take
             self.controller.head_for(self._popped, take)
             self._update_deadline()
             due = self.fifo.next_due()
 
+    def _follow_goals(self) -> None:
+        """Keep the modes in step with the goals: TRACKING while one is followed, HOLD when all are done."""
+        busy = self.controller.busy
+        if not (busy.any() or self._by_goal.any()):
+            return
+        starting = busy & (self.mode == Mode.HOLD)
+        starting |= self.controller.following & (self.mode == Mode.STOPPING) & ~self._deactivating
+        if starting.any():
+            self._by_goal |= starting
+            self._set_mode(starting, Mode.TRACKING)
+        done = self._by_goal & ~busy
+        if done.any():
+            self._by_goal &= ~done
+            self._set_mode(done & (self.mode == Mode.TRACKING), Mode.HOLD)
+
     # --- commands ----------------------------------------------------------------------------------------------------
+
+    def submit(self, sim: int, command: BrainCommand) -> CommandResult | None:
+        """Take a goal for one simulation; it is planned and started with the next tick, or waits for its turn.
+
+        Returns:
+            None if it was accepted, otherwise the refusal, which is then the goal's one result.
+        """
+        return self.controller.submit(sim, command, _GOAL_REFUSAL.get(int(self._mode_reasons()[sim])))
+
+    def cancel(self, sim: int, task_id: str) -> ResultCode:
+        """Cancel a goal: the arm decelerates and holds. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""
+        return self.controller.cancel(sim, task_id)
 
     def offer(self, setpoint: Setpoint, mask: NDArray[np.bool_] | None = None) -> SendResult:
         """Check a setpoint and put it into the queue.
@@ -242,6 +277,7 @@ class Cerebellum:
         self._last_due[ids] = 0
         self._deactivating[ids] = False
         self._estop_latched[ids] = False
+        self._by_goal[ids] = False
         self.refusals[:, ids] = 0
         self._watchdog[ids] = 0
         self._update_deadline()
@@ -256,7 +292,7 @@ class Cerebellum:
 
     def command_age_ns(self, now_ns: int) -> NDArray[np.int64]:
         """Return how long ago the command in force was due [ns], shape (n,); 0 for a robot that follows none."""
-        return np.where(self.mode == Mode.TRACKING, now_ns - self._last_due, 0)
+        return np.where((self.mode == Mode.TRACKING) & ~self._by_goal, now_ns - self._last_due, 0)
 
     def state(self, now_ns: int) -> CerebellumState:
         """Return a copy of the present state."""
@@ -267,26 +303,26 @@ class Cerebellum:
             joint_velocities=velocity,
             joint_efforts=self.controller.efforts(self.reading),
             command=self.command.copy(),
-            odometry=self.controller.drive.odometry.copy(),
-            twist=self.controller.drive.twist_from_wheels(velocity),
+            odometry=self.controller.odometry(),
+            measured=self.controller.measured(self.reading),
             mode=self.mode.copy(),
             is_moving=np.asarray((np.abs(velocity) > MOVING).any(axis=1)),
             emergency_stop=self._estop_latched.copy(),
         )
 
     @staticmethod
-    def state_dtype(n: int) -> np.dtype:
+    def state_dtype(n: int, joints: int = 2, width: int = 2, odometry: int = 3) -> np.dtype:
         """Return the dtype of the states that go to the ring: the fields of `CerebellumState`."""
-        wheels = (np.float64, (n, 2))
+        per_joint, per_command = (np.float64, (n, joints)), (np.float64, (n, width))
         return np.dtype(
             [
                 ("stamp_ns", np.int64),
-                ("joint_positions", *wheels),
-                ("joint_velocities", *wheels),
-                ("joint_efforts", *wheels),
-                ("command", *wheels),
-                ("odometry", np.float64, (n, 3)),
-                ("twist", *wheels),
+                ("joint_positions", *per_joint),
+                ("joint_velocities", *per_joint),
+                ("joint_efforts", *per_joint),
+                ("command", *per_command),
+                ("measured", *per_command),
+                ("odometry", np.float64, (n, odometry)),
                 ("mode", np.int8, (n,)),
                 ("is_moving", np.bool_, (n,)),
                 ("emergency_stop", np.bool_, (n,)),
@@ -296,7 +332,8 @@ class Cerebellum:
 
     def _publish(self, now_ns: int) -> None:
         state = self.state(now_ns)
-        record = np.zeros((), self.state_dtype(self.n))
+        odometry = state.odometry.shape[1]
+        record = np.zeros((), self.state_dtype(self.n, self.controller.joints, self.width, odometry))
         for name in record.dtype.names or ():
             record[name] = getattr(state, name)
         ring: Any = self._ring
@@ -309,7 +346,7 @@ class Cerebellum:
             return
         self.mode[mask] = mode
         if mode != Mode.TRACKING:
-            self.controller.stop(mask, hard=mode in (Mode.ESTOP, Mode.FAULT))
+            self.controller.stop(mask, mode)
         self._deactivating[mask] = False
         self._stopping |= mode == Mode.STOPPING
         self._update_deadline()
@@ -327,7 +364,7 @@ class Cerebellum:
             self.refusals[reasons, np.arange(self.n)] += reasons != Reason.ACCEPTED
 
     def _update_deadline(self) -> None:
-        tracking = self.mode == Mode.TRACKING
+        tracking = (self.mode == Mode.TRACKING) & ~self._by_goal
         self._deadline = int(self._last_due[tracking].min()) + self._timeout_ns if tracking.any() else None
 
     def _configure(self, mask: NDArray[np.bool_]) -> None:
@@ -339,3 +376,8 @@ _MODE_REASON = np.full(len(Mode), Reason.NOT_ACTIVE, np.int8)
 _MODE_REASON[[Mode.HOLD, Mode.TRACKING, Mode.STOPPING]] = Reason.ACCEPTED
 _MODE_REASON[Mode.ESTOP] = Reason.ESTOP
 _MODE_REASON[Mode.FAULT] = Reason.FAULT
+_GOAL_REFUSAL = {
+    int(Reason.NOT_ACTIVE): ResultCode.NOT_ACTIVE,
+    int(Reason.ESTOP): ResultCode.ESTOP,
+    int(Reason.FAULT): ResultCode.FAULT,
+}

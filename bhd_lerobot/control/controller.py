@@ -1,150 +1,113 @@
 """What stands between a command and the actuators, for one kind of robot; the modes are the cerebellum's."""
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Body
-from bhd_lerobot.control import safety
-from bhd_lerobot.control.diff_drive import DiffDrive
-from bhd_lerobot.control.messages import Limit
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
+from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.errors import ConfigError
-
-_REST = 1e-9  # a ramp has arrived when the command is this close to zero
 
 
-class BaseController:
-    """Twist commands to wheel speeds, for bases with two driven wheels.
+class Controller(ABC):
+    """Turns commands into actuator commands that respect every limit, for n robots.
 
-    A command is the forward speed [m/s] and the yaw rate [rad/s]; an actuator command is a wheel speed [rad/s].
-
-    The cerebellum says where to head for and calls `run` once a tick; it never touches the filter in between.
+    The cerebellum says where to head for and when to stop, and calls `run` once a tick. The arrays are the controller's
+    own, live, and nobody else's to write.
 
     Attributes:
         width: number of values in a command.
         joints: number of joints and of actuators.
         command: what is applied now, after all limits, shape (n, width).
         actuators: what goes to the plant, shape (n, joints).
-
-    Args:
-        body: limits and wheels.
-        n: number of bases.
-        control_hz: ticks a second [Hz].
-
-    Raises:
-        ConfigError: the wheels cannot turn the base as fast as its velocity limit allows.
+        following: whether the robot follows a goal, shape (n,).
+        busy: whether it follows one, or brakes after one, shape (n,): it moves without setpoints, and their age says
+            nothing about it.
     """
 
-    joints = 2
+    width: int
+    joints: int
+    command: NDArray[np.float64]
+    actuators: NDArray[np.float64]
+    following: NDArray[np.bool_]
+    busy: NDArray[np.bool_]
 
-    def __init__(self, body: Body, n: int, control_hz: int) -> None:
-        limits, drive = body.limits, body.drive
-        self.width = width = len(limits.names)
-        self.drive = DiffDrive(drive, n)
-        self.command = np.zeros((n, width))
-        self.actuators = np.zeros((n, self.joints))
-        self._servo_gain = drive.servo_gain
-        self._velocity = np.asarray(limits.velocity)
-        self._change = np.asarray(limits.acceleration) / control_hz
-        self._stop_change = np.asarray(limits.stop_deceleration) / control_hz
-        self._largest_error = drive.max_torque / drive.servo_gain
-        per_yaw = drive.wheel_separation / 2 / drive.wheel_radius
-        fastest = drive.max_wheel_speed / per_yaw
-        if limits.velocity[1] > fastest * (1 + 1e-9):
-            raise ConfigError(
-                f"The limit of {limits.names[1]} is {limits.velocity[1]}; wheels of {drive.max_wheel_speed:g} rad/s at "
-                f"the most can turn the base at {fastest:g} rad/s."
-            )
-        self._target = np.zeros((n, width))
-        self._largest = np.broadcast_to(self._change, (n, width)).copy()
-        self._clipped = np.zeros((n, width))
-        self._reference = np.zeros((n, self.joints))
-        self._settled = False
-        # The sum of 0 * x is 0 if and only if every x is finite; unlike a plain sum it neither overflows nor warns.
-        self._flat_target, self._zeros = self._target.reshape(-1), np.zeros(n * width)
-        self._limited_velocity = np.zeros((n, width), np.bool_)
-        self._limited_change = np.zeros((n, width), np.bool_)
-        self._limited_wheels = np.zeros(n, np.bool_)
-        self._limited_effort = np.zeros((n, self.joints), np.bool_)
-        self._limited_finite = np.zeros(n, np.bool_)
-        self._wheels = (1.0 / drive.wheel_radius, per_yaw, drive.max_wheel_speed, self._limited_wheels)
-
+    @abstractmethod
     def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
-        """Head for new twists, with the normal accelerations."""
-        np.copyto(self._target, values, where=mask[:, None])
-        np.copyto(self._largest, self._change, where=mask[:, None])
-        self._settled = False
+        """Head for new setpoints, in normal motion.
 
-    def stop(self, mask: NDArray[np.bool_], *, hard: bool) -> None:
-        """Head for rest, with the normal decelerations or with those of an emergency stop."""
-        self._target[mask] = 0.0
-        self._largest[mask] = self._stop_change if hard else self._change
-        self._settled = False
+        Args:
+            values: the setpoints, shape (n, width).
+            mask: the robots that they are for, shape (n,).
+        """
 
+    @abstractmethod
+    def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
+        """Head for rest: as in normal motion, or as hard as possible if the cause is `ESTOP` or `FAULT`.
+
+        May be called again while the stop goes on, and must not make it a gentler one.
+
+        Args:
+            mask: the robots, shape (n,).
+            cause: the mode that they are now in.
+        """
+
+    @abstractmethod
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
-        if not self._settled:
-            self._filter()
-        # Where nothing changed since the last tick the command stands, and so do the wheel speeds that it means.
-        np.copyto(self.actuators, self._reference)
-        safety.limit_effort(self.actuators, reading.velocity, self._largest_error, self._limited_effort)
-        self.drive.update_odometry(reading.position)
 
-    def _filter(self) -> None:
-        """From the targets to the commands applied in this tick, and the wheel speeds that they mean."""
-        if self._flat_target.dot(self._zeros) != 0.0:
-            # Commands are checked when they are sent; a queue in shared memory is written by another process.
-            bad = ~np.isfinite(self._target).all(axis=1)
-            self._limited_finite |= bad
-            self._target[bad] = 0.0
-        safety.limit_velocity(self._target, self._velocity, self._clipped, self._limited_velocity)
-        safety.limit_wheel_speed(self._clipped, *self._wheels)
-        arrived = safety.limit_change(self._clipped, self.command, self._largest, self.command, self._limited_change)
-        # Both ends of a change can be within the wheels' limit and the way between them not: the two dimensions
-        # change at different rates.
-        limited = safety.limit_wheel_speed(self.command, *self._wheels)
-        self._settled = arrived and not limited
-        self.drive.wheels_from_twist(self.command, self._reference)
-
+    @abstractmethod
     def at_rest(self) -> NDArray[np.bool_]:
-        """Return whether each base is commanded to be at rest, shape (n,)."""
-        return np.asarray((np.abs(self.command) < _REST).all(axis=1))
+        """Return whether each robot is commanded to be at rest, shape (n,)."""
 
+    @abstractmethod
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
-        """Start odometry here."""
-        self.drive.reset_odometry(ids, reading.position[ids])
+        """Take the joints as they are for the start."""
 
+    @abstractmethod
     def restart(self, ids: NDArray[np.intp]) -> None:
-        """Forget everything about bases that were put somewhere else."""
-        for array in (self.command, self._target, self.actuators, self._reference):
-            array[ids] = 0.0
-        self._largest[ids] = self._change
-        for flags in self._flags():
-            flags[ids] = False
-        self._settled = False
+        """Forget everything about robots that were put somewhere else."""
 
+    @abstractmethod
     def take_limits(self) -> NDArray[np.int64]:
         """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
-        limits = (
-            self._limited_finite * int(Limit.NON_FINITE)
-            + (self._limited_velocity.any(axis=1) | self._limited_wheels) * int(Limit.VELOCITY)
-            + self._limited_change.any(axis=1) * int(Limit.ACCELERATION)
-            + self._limited_effort.any(axis=1) * int(Limit.EFFORT)
-        )
-        for flags in self._flags():
-            flags[:] = False
-        self._settled = False  # a limit that still holds is reported again in the next frame
-        return limits
 
+    @abstractmethod
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return the torques that the servos are asked for [N m], shape (n, joints)."""
-        return (self.actuators - reading.velocity) * self._servo_gain
+        """Return what the servos are asked for [N m; N for a gripper], shape (n, joints)."""
 
-    def _flags(self) -> tuple[NDArray[np.bool_], ...]:
-        return (
-            self._limited_velocity,
-            self._limited_change,
-            self._limited_wheels,
-            self._limited_effort,
-            self._limited_finite,
-        )
+    def odometry(self) -> NDArray[np.float64]:
+        """Return x [m], y [m] and yaw [rad] since the start, shape (n, 3); shape (n, 0) for what does not drive."""
+        return np.zeros((len(self.busy), 0))
+
+    def measured(self, reading: PlantReading) -> NDArray[np.float64]:
+        """Return where the robots really are in the space of the commands, shape (n, width)."""
+        return reading.position.copy()
+
+    # --- goals: robots that take none refuse them ----------------------------------------------------------------------
+
+    def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
+        """Take a goal.
+
+        Args:
+            sim: the robot.
+            command: the goal.
+            blocked: why the robot takes no goals now, or None.
+
+        Returns:
+            None if it was accepted, otherwise the refusal.
+        """
+        return CommandResult(command.task_id, False, ResultCode.BAD_TARGET, "This robot takes setpoints, not goals.")
+
+    def cancel(self, sim: int, task_id: str) -> ResultCode:
+        """Cancel a goal; return `SUCCEEDED`, or `UNKNOWN_ID` if there is none of this name."""
+        return ResultCode.UNKNOWN_ID
+
+    def take_results(self, sim: int) -> list[CommandResult]:
+        """Return the results of one robot that nobody has taken yet."""
+        return []
+
+    def feedback(self, sim: int) -> Feedback | None:
+        """Return how far the goal is that one robot follows, or None."""
+        return None

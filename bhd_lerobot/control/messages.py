@@ -141,12 +141,13 @@ class CerebellumState:
 
     Attributes:
         stamp_ns: time of the tick [ns].
-        joint_positions: wheel angles [rad], shape (n, joints).
-        joint_velocities: wheel speeds [rad/s], shape (n, joints).
-        joint_efforts: effort that the servos are asked for [N m], shape (n, joints).
+        joint_positions: joint or wheel angles [rad], a gripper's opening [m], shape (n, joints).
+        joint_velocities: their speeds [rad/s, m/s], shape (n, joints).
+        joint_efforts: effort that the servos are asked for [N m, N], shape (n, joints).
         command: the command applied, after all limits, shape (n, width).
-        odometry: x [m], y [m] and yaw [rad] since the last reset, from the encoders, shape (n, 3).
-        twist: measured command-space velocity, shape (n, width).
+        measured: where the robot really is in the space of the commands, shape (n, width).
+        odometry: x [m], y [m] and yaw [rad] since the last reset, from the encoders, shape (n, 3); shape (n, 0) for a
+            robot that does not drive.
         mode: a `Mode` for each simulation, shape (n,).
         is_moving: whether any joint is faster than 0.01 rad/s, shape (n,).
         emergency_stop: whether the emergency stop is latched, shape (n,).
@@ -157,8 +158,8 @@ class CerebellumState:
     joint_velocities: NDArray[np.float64]
     joint_efforts: NDArray[np.float64]
     command: NDArray[np.float64]
+    measured: NDArray[np.float64]
     odometry: NDArray[np.float64]
-    twist: NDArray[np.float64]
     mode: NDArray[np.int8]
     is_moving: NDArray[np.bool_]
     emergency_stop: NDArray[np.bool_]

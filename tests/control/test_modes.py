@@ -133,7 +133,7 @@ def test_readings_that_are_no_numbers_are_a_fault_and_do_not_spread(value: float
     assert rig.mode == Mode.FAULT
     rig.tick(200)
     state = rig.cerebellum.state(rig.now)
-    for field in (state.joint_positions, state.joint_velocities, state.joint_efforts, state.odometry, state.twist):
+    for field in (state.joint_positions, state.joint_velocities, state.joint_efforts, state.odometry, state.measured):
         assert np.isfinite(field).all()
     assert rig.command == [0, 0]
     assert np.isfinite(before).all()
