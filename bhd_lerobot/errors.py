@@ -21,6 +21,10 @@ class ActionError(BhdError, ValueError):
     """An action with the wrong keys, the wrong order, the wrong type or a non-finite value."""
 
 
+class InstructionError(BhdError, ValueError):
+    """An instruction that is not understood or fits no single object, or a plan that cannot be carried out."""
+
+
 class CommandRefusedError(BhdError):
     """The cerebellum refused a well-formed command, for example because the emergency stop is latched."""
 
