@@ -5,6 +5,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm, MobileBase
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.world import World
 
@@ -17,9 +18,11 @@ class JointReading(Protocol):
 
 
 class SimulatedPlant:
-    """Reads the wheel joints of all simulations and writes their servos' speeds.
+    """Reads the joints of all simulations and writes their servos' commands.
 
-    It has the two calls of the cerebellum's plant and needs none of its code.
+    It has the two calls of the cerebellum's plant and needs none of its code. A base's joints are its wheels, and their
+    servos take speeds [rad/s]. An arm's are those of its chain [rad], whose servos take angles [rad] or torques [N m],
+    and its gripper, whose position, speed and command are those of the opening, the sum of its two fingers [m].
 
     Args:
         world: the simulations.
@@ -27,18 +30,35 @@ class SimulatedPlant:
 
     def __init__(self, world: World) -> None:
         self.n = world.n
-        positions, velocities = world.joint_slice(world.body.drive.joints)
+        body = world.body
+        self._fingers: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        if isinstance(body, Arm):
+            joints, names = body.chain.joints, body.actuators
+            positions, velocities = world.joint_slice(body.gripper.joints)
+            self._fingers = world.qpos[:, positions], world.qvel[:, velocities]
+        elif isinstance(body, MobileBase):
+            joints, names = body.drive.joints, body.drive.actuators
+        else:
+            raise SimulationError(f"Body {body.name!r} is a {type(body).__name__}, which has no plant.")
+        positions, velocities = world.joint_slice(joints)
         self._position, self._velocity = world.qpos[:, positions], world.qvel[:, velocities]
-        actuators = [world.model.actuator(name).id for name in world.body.drive.actuators]
+        actuators = [world.model.actuator(name).id for name in names]
         if actuators != list(range(actuators[0], actuators[0] + len(actuators))):
-            raise SimulationError(f"Actuators {list(world.body.drive.actuators)} are not neighbours in the model.")
+            raise SimulationError(f"Actuators {list(names)} are not neighbours in the model.")
         self._ctrl = world.ctrl[:, actuators[0] : actuators[-1] + 1]
 
     def read(self, out: JointReading) -> None:
-        """Write the joints' positions [rad] and velocities [rad/s], each of shape (n, joints), into `out`."""
-        out.position[:] = self._position
-        out.velocity[:] = self._velocity
+        """Write the joints' positions and velocities, each of shape (n, joints), into `out`."""
+        if self._fingers is None:
+            out.position[:] = self._position
+            out.velocity[:] = self._velocity
+            return
+        position, velocity = self._fingers
+        out.position[:, :-1] = self._position
+        out.velocity[:, :-1] = self._velocity
+        np.add(position[:, 0], position[:, 1], out=out.position[:, -1])
+        np.add(velocity[:, 0], velocity[:, 1], out=out.velocity[:, -1])
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
-        """Take the servos' speeds [rad/s], shape (n, joints)."""
+        """Take the servos' commands, shape (n, joints)."""
         self._ctrl[:] = ctrl

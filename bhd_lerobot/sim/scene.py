@@ -1,10 +1,11 @@
-"""The model that a world simulates: a body, a floor, light, and a pool of obstacles that each simulation places."""
+"""The model that a world simulates: a base among a pool of obstacles that each simulation places, or an arm on a table."""
 
 import math
 
-from bhd_lerobot.bodies.body import Body, Shape
+from bhd_lerobot.bodies.body import Arm, Body, MobileBase, Shape
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.engine import mujoco
+from bhd_lerobot.sim.table_stage import add_table_stage
 
 # Obstacles that one simulation can have. All simulations of a batch share one model, so the number is fixed; a pool
 # geometry that a simulation does not use is parked far below the floor, where the broad phase drops it at once.
@@ -13,6 +14,7 @@ PARKED_Z = -100.0
 PARKED_GROUP = 5  # neither the range finder nor the camera looks at this group
 
 _FLOOR_BIT, _SCENE_BIT = 1, 2
+_PLACED = ("obstacle_", "object_")  # how the names of geometries begin that simulations place themselves
 
 
 def build_model(body: Body, physics_hz: int, pool_size: int = POOL_SIZE) -> mujoco.MjModel:
@@ -21,10 +23,10 @@ def build_model(body: Body, physics_hz: int, pool_size: int = POOL_SIZE) -> mujo
     Args:
         body: the robot.
         physics_hz: physics steps a second [Hz].
-        pool_size: number of obstacles a simulation can have at the most.
+        pool_size: number of obstacles a simulation of a base can have at the most.
 
     Raises:
-        ConfigError: the body's MJCF does not compile.
+        ConfigError: the body's MJCF does not compile, or there is no stage for this kind of body.
     """
     try:
         spec = mujoco.MjSpec.from_string(body.mjcf)
@@ -32,6 +34,26 @@ def build_model(body: Body, physics_hz: int, pool_size: int = POOL_SIZE) -> mujo
         raise ConfigError(f"The MJCF of body {body.name!r} is not valid: {error}") from error
     spec.option.timestep = 1.0 / physics_hz
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    if isinstance(body, Arm):
+        add_table_stage(spec, body)
+    elif isinstance(body, MobileBase):
+        _add_arena_stage(spec, body, pool_size)
+    else:
+        raise ConfigError(f"Body {body.name!r} is a {type(body).__name__}; there are stages for Arm and MobileBase.")
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise ConfigError(f"The MJCF of body {body.name!r} does not compile: {error}") from error
+    # The compiler marks geometries that have the orientation of their body, and the engine then leaves theirs out of
+    # account: obstacles would all stand along the axes, whatever orientation a simulation gives them.
+    for index in range(model.ngeom):
+        if model.geom(index).name.startswith(_PLACED):
+            model.geom_sameframe[index] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    return model
+
+
+def _add_arena_stage(spec: mujoco.MjSpec, body: MobileBase, pool_size: int) -> None:
+    """Add what stands around a base, and the sensor of its touches."""
     # Elliptic cones with a stiffer friction direction: with the defaults a wheel creeps through its contact by several
     # per cent, which would be an odometry error that no real tyre has.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -49,15 +71,6 @@ def build_model(body: Body, physics_hz: int, pool_size: int = POOL_SIZE) -> mujo
         refname="scene",
         intprm=[1, 0, 1],  # data: found; reduce: none; num: one slot
     )
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise ConfigError(f"The MJCF of body {body.name!r} does not compile: {error}") from error
-    # The compiler marks geometries that have the orientation of their body, and the engine then leaves theirs out of
-    # account: obstacles would all stand along the axes, whatever orientation a simulation gives them.
-    for index in range(pool_size):
-        model.geom(f"obstacle_{index:03d}").sameframe = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-    return model
 
 
 def _add_stage(spec: mujoco.MjSpec) -> None:

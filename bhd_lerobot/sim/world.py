@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Body, Shape
+from bhd_lerobot.bodies.body import Arm, Body, MobileBase, Shape
 from bhd_lerobot.errors import SimulationError, unknown_name
 from bhd_lerobot.sim.engine import mujoco, mujoco_batch
 from bhd_lerobot.sim.scene import PARKED_GROUP, PARKED_Z, POOL_SIZE, build_model, shape_fields
@@ -48,7 +48,8 @@ class World:
         n: number of simulations.
         physics_hz: physics steps a second [Hz]; the body's default if None.
         threads: threads that step the simulations; as many as there are processors, and at most n, if None.
-        pool_size: number of obstacles that one simulation can have at the most.
+        pool_size: number of obstacles that one simulation of a base can have at the most; an arm has a table instead,
+            which `Tabletop` lays.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class World:
         self.body = body
         self.n = n
         self.physics_hz = physics_hz or body.physics_hz
-        self.pool_size = pool_size
+        self.pool_size = pool_size = pool_size if isinstance(body, MobileBase) else 0
         self.model = build_model(body, self.physics_hz, pool_size)
         # One simulation is stepped by the calling thread; more threads would only add hand-overs.
         self._batch = mujoco_batch.Batch(self.model, n, nthread=1 if n == 1 else threads or 0)
@@ -90,14 +91,22 @@ class World:
     # --- state -------------------------------------------------------------------------------------------------------
 
     def reset(self, ids: Ids = None, poses: NDArray[np.float64] | None = None) -> None:
-        """Put simulations back to the model's initial state, at rest.
+        """Put simulations back to the model's initial state, at rest: an arm at home, with nothing on its table.
 
         Args:
             ids: the simulations, all if None.
-            poses: x [m], y [m] and yaw [rad] of the root body in the world frame, shape (len(ids), 3); the origin if
-                None.
+            poses: x [m], y [m] and yaw [rad] of a base's root body in the world frame, shape (len(ids), 3); the origin
+                if None.
+
+        Raises:
+            SimulationError: the poses do not fit, or the body is an arm and there are poses.
         """
         ids = self._ids(ids)
+        if isinstance(self.body, Arm):
+            if poses is not None:
+                self._need_base("Start poses")
+            self._reset_arm(ids)
+            return
         self._batch.reset(ids, stage=0)
         if poses is not None:
             poses = np.asarray(poses, dtype=np.float64)
@@ -108,6 +117,33 @@ class World:
             self.qpos[ids, 0:2] = poses[:, 0:2]
             self.qpos[ids, 3] = np.cos(poses[:, 2] / 2)
             self.qpos[ids, 6] = np.sin(poses[:, 2] / 2)
+        self._batch.forward(ids)
+
+    def _reset_arm(self, ids: NDArray[np.intp]) -> None:
+        if "body_gravcomp" in self._fields:  # what is taken off the table is without weight, or it would fall for ever
+            self._fields["body_gravcomp"][ids] = self._model_value("body_gravcomp")
+        self._batch.reset(ids, keyframe=0, stage=0)
+        self.hold(ids)
+
+    def hold(self, ids: Ids = None) -> None:
+        """Command an arm's servos to hold its present posture, and compute what derives from the state.
+
+        A servo for torque is commanded the torque that the posture needs without a payload.
+
+        Raises:
+            SimulationError: the body is no arm.
+        """
+        ids = self._ids(ids)
+        if not isinstance(self.body, Arm):
+            raise SimulationError(f"hold() is for arms; {self.body.name!r} is a {type(self.body).__name__}.")
+        joints = len(self.body.chain.joints)
+        fingers = self.joint_slice(self.body.gripper.joints)[0]
+        self.ctrl[ids, :joints] = self.qpos[ids, :joints] if self.body.actuation == "position" else 0.0
+        self.ctrl[ids, joints] = self.qpos[ids, fingers.start] + self.qpos[ids, fingers.start + 1]
+        if self.body.actuation == "torque":
+            bias = self._batch.bind("qfrc_bias")
+            self._batch.forward(ids)
+            self.ctrl[ids, :joints] = bias[ids, :joints]
         self._batch.forward(ids)
 
     def step(self, k: int = 1, ids: Ids = None) -> None:
@@ -171,7 +207,12 @@ class World:
 
     @property
     def base_pose(self) -> NDArray[np.float64]:
-        """Ground truth: x [m], y [m] and yaw [rad] of the root body in the world frame, shape (n, 3), a copy."""
+        """Ground truth: x [m], y [m] and yaw [rad] of a base's root body in the world frame, shape (n, 3), a copy.
+
+        Raises:
+            SimulationError: the body is no base.
+        """
+        self._need_base("A base pose")
         q = self.qpos
         w, x, y, z = q[:, 3], q[:, 4], q[:, 5], q[:, 6]
         pose = np.empty((self.n, 3))
@@ -192,9 +233,29 @@ class World:
         except KeyError:
             names = [self.model.sensor(i).name for i in range(self.model.nsensor)]
             raise SimulationError(unknown_name("sensor", name, names)) from None
-        view = self._sensordata[:, sensor.adr[0] : sensor.adr[0] + sensor.dim[0]]
+        return self.sensors(sensor.adr[0], sensor.adr[0] + sensor.dim[0])
+
+    def sensors(self, start: int, stop: int) -> NDArray[np.float64]:
+        """Return the live readings of neighbouring sensors by their addresses, shape (n, stop - start)."""
+        view = self._sensordata[:, start:stop]
         view.flags.writeable = False
         return view
+
+    def site(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the live position [m] and orientation of a named site, as of the last physics step.
+
+        Returns:
+            Positions in the world frame, shape (n, 3), and quaternions w, x, y, z, shape (n, 4); read-only. They are
+            computed from now on: they are valid after the next `step`, `forward`, `reset` or `restore`.
+
+        Raises:
+            SimulationError: there is no such site; the message lists the valid names.
+        """
+        number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, name)
+        if number < 0:
+            names = [self.model.site(i).name for i in range(self.model.nsite)]
+            raise SimulationError(unknown_name("site", name, names))
+        return self._batch.bind("site_xpos")[:, number], self._batch.bind("site_xquat")[:, number]
 
     def joint_slice(self, names: Sequence[str]) -> tuple[slice, slice]:
         """Return where the named one-dimensional joints lie in `qpos` and `qvel`; they must be neighbours, in order."""
@@ -221,7 +282,11 @@ class World:
 
         Returns:
             Distances [m], shape (len(ids), rays), infinity where nothing is hit, and the simulations' ids.
+
+        Raises:
+            SimulationError: the body is no base, or there is no such site.
         """
+        self._need_base("A ray from the root body")
         ids = self._ids(ids)
         q = self.qpos[ids]
         rotation = _rotation_matrices(q[:, 3:7])
@@ -264,8 +329,9 @@ class World:
             ids: the simulations, all if None.
 
         Raises:
-            SimulationError: a simulation would have more obstacles than the pool holds.
+            SimulationError: a simulation would have more obstacles than the pool holds, or the body is no base.
         """
+        self._need_base("An obstacle")
         ids = self._ids(ids)
         if len(shapes) != len(ids):
             raise SimulationError(f"{len(shapes)} scenes were given for {len(ids)} simulations.")
@@ -326,6 +392,14 @@ class World:
         """Return the model's own value of a field, which simulations have until they get another."""
         owner = self.model.opt if name.startswith("opt.") else self.model
         return np.asarray(getattr(owner, name.removeprefix("opt.")))
+
+    def _need_base(self, what: str) -> None:
+        if not isinstance(self.body, MobileBase):
+            raise SimulationError(f"{what} is for mobile bases; {self.body.name!r} is a {type(self.body).__name__}.")
+
+    def selected(self, ids: Ids) -> NDArray[np.intp]:
+        """Return the numbers of the simulations that `ids` names."""
+        return self._ids(ids)
 
     def _ids(self, ids: Ids) -> NDArray[np.intp]:
         if ids is None:

@@ -1,0 +1,259 @@
+"""What stands around an arm: table, room, lights, cameras, and the objects that each simulation makes its own.
+
+World frame and base frame are one; the table's top is the plane z = 0.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
+from bhd_lerobot.sim.engine import mujoco
+
+TABLE_BIT, ARM_BIT, OBJECT_BIT = 1, 2, 4  # contact bits; those of the arm are in its MJCF
+HANDLE_PARTS = 3
+PADS = ("pad_left", "pad_right")
+# Absent objects float, without weight, far below the floor and far from each other: the broad phase drops them at once.
+PARKED = tuple((3.0 * number, 0.0, -100.0) for number in range(MAX_OBJECTS))
+FLOOR = -0.75  # [m]
+_TABLE = (-0.35, 1.05, 0.70)  # edges behind and before the base, half the width [m]
+
+
+def add_table_stage(spec: mujoco.MjSpec, arm: Arm) -> None:
+    """Add everything around an arm, and the arm's actuators, to the specification of its body."""
+    _add_servos(spec, arm)
+    _add_options(spec)
+    _add_room(spec)
+    _add_table(spec)
+    _add_lights(spec)
+    for name, position, target, fovy in (
+        ("scene", (1.18, -0.62, 0.72), (0.42, 0.02, 0.08), 45.0),
+        ("overview", (1.75, -1.35, 1.05), (0.22, 0.0, 0.18), 40.0),
+    ):
+        spec.worldbody.add_camera(name=name, pos=position, xyaxes=_towards(position, target), fovy=fovy)
+    for number in range(MAX_OBJECTS):
+        _add_object(spec, number)
+    _add_target(spec)
+    _add_touch_sensors(spec, arm)
+    _add_start(spec, arm)
+
+
+def _add_servos(spec: mujoco.MjSpec, arm: Arm) -> None:
+    """Add one actuator for each joint and the gripper's, with the arm's gains and limits."""
+    positions = arm.actuation == "position"
+    rows = zip(arm.actuators, arm.servo_stiffness, arm.servo_damping, arm.limits.effort, strict=True)
+    for number, (name, stiffness, damping, effort) in enumerate(rows):
+        gripper = number == len(arm.chain.joints)
+        actuator = spec.add_actuator(
+            name=name,
+            target="opening" if gripper else arm.chain.joints[number],
+            trntype=mujoco.mjtTrn.mjTRN_TENDON if gripper else mujoco.mjtTrn.mjTRN_JOINT,
+            forcerange=[-effort, effort],
+        )
+        if gripper or positions:
+            actuator.set_to_position(kp=stiffness, kv=damping)
+        else:
+            actuator.set_to_motor()
+    # The robot's own controller carries its own weight, with torque that counts against the limits.
+    for body in spec.bodies:
+        if positions and body.name not in ("world", arm.root):
+            body.gravcomp = 1.0
+            for joint in body.joints:
+                joint.actgravcomp = True
+
+
+def _add_options(spec: mujoco.MjSpec) -> None:
+    """Choose solver settings: what is gripped must not creep, and a step should cost little."""
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+
+
+def _add_room(spec: mujoco.MjSpec) -> None:
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.86, 0.88, 0.90],
+        rgb2=[0.62, 0.66, 0.70],
+        width=64,
+        height=384,
+    )
+    spec.add_texture(
+        name="floor",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.46, 0.48, 0.50],
+        rgb2=[0.42, 0.44, 0.46],
+        width=128,
+        height=128,
+    )
+    floor = spec.add_material(name="floor", texrepeat=[2, 2], texuniform=True, specular=0.1)
+    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[20, 20, 0.1],
+        pos=[0, 0, FLOOR],
+        material="floor",
+        contype=0,
+        conaffinity=0,
+    )
+
+
+def _add_table(spec: mujoco.MjSpec) -> None:
+    """Add a table to look at, and a plane to touch: it has no edges, and contacts with it are cheap and exact."""
+    spec.add_material(name="table", rgba=[0.70, 0.56, 0.40, 1.0], specular=0.15, shininess=0.3)
+    spec.add_material(name="leg", rgba=[0.25, 0.26, 0.28, 1.0], specular=0.3)
+    table = spec.worldbody.add_body(name="table")
+    # The larger friction of the two that touch counts: with so little here it is the object's.
+    table.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 1],
+        contype=TABLE_BIT,
+        conaffinity=0,
+        condim=3,
+        friction=[0.01, 0.001, 0.0001],
+        group=3,
+    )
+    back, front, half = _TABLE
+    middle, length = (back + front) / 2, (front - back) / 2
+    _visual(table, "box", (middle, 0, -0.02), (length, half, 0.02), material="table")
+    _visual(table, "box", (0, 0, 0.0005), (0.11, 0.11, 0.0015), material="leg")  # the mounting plate
+    for x in (back + 0.06, front - 0.06):
+        for y in (-half + 0.06, half - 0.06):
+            _visual(table, "box", (x, y, (FLOOR - 0.04) / 2), (0.03, 0.03, -(FLOOR + 0.04) / 2), material="leg")
+
+
+def _add_lights(spec: mujoco.MjSpec) -> None:
+    """Add a main light and a fill; nearly all brightness is theirs, so that a factor on them is one on the image's."""
+    directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    spec.worldbody.add_light(
+        name="main", type=directional, pos=[0.5, -1, 3], dir=[-0.35, 0.45, -1.0], diffuse=[0.55] * 3, ambient=[0.18] * 3
+    )
+    spec.worldbody.add_light(
+        name="fill", type=directional, pos=[1, 1, 2], dir=[-0.6, -0.7, -0.6], diffuse=[0.28] * 3, ambient=[0.10] * 3
+    )
+    spec.visual.headlight.ambient = [0.06] * 3
+    spec.visual.headlight.diffuse = [0.10] * 3
+    spec.visual.headlight.specular = [0.0] * 3
+    # Near and far planes are multiples of the extent; left to MuJoCo it would span to the parked objects.
+    spec.stat.extent = 2.0
+    spec.stat.center = [0.3, 0.0, 0.2]
+    spec.visual.map.znear = 0.004
+    # Shadows and multi-sampling off: with a software renderer a frame costs twenty times as much with them.
+    spec.visual.quality.shadowsize = 0
+    spec.visual.quality.offsamples = 0
+
+
+def _add_object(spec: mujoco.MjSpec, number: int) -> None:
+    """Add a free body with one geometry to touch and some to look at; each simulation gives them their size."""
+    body = spec.worldbody.add_body(name=f"object_{number}", pos=PARKED[number], gravcomp=1.0)
+    body.add_freejoint(name=f"object_{number}")
+    # As long as the inertia is a sphere's, the compiler turns no axes; simulations write theirs for the body's.
+    body.mass, body.inertia, body.ipos, body.explicitinertial = 0.2, [2e-4] * 3, [0.0] * 3, True
+    body.add_geom(
+        name=f"object_{number}",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[0.05, 0.05, 0.05],
+        contype=OBJECT_BIT,
+        conaffinity=TABLE_BIT | ARM_BIT | OBJECT_BIT,
+        condim=3,
+        mass=0.0,
+        group=5,
+    )
+    for part in ("top", *(f"handle_{index}" for index in range(HANDLE_PARTS))):
+        _visual(body, "box", (0, 0, 0), (0.001,) * 3, name=f"object_{number}_{part}", group=5)
+    # Written out as pairs, the pads' friction is a property of the two that touch; and only what is gripped needs
+    # friction against turning.
+    for pad in PADS:
+        spec.add_pair(
+            geomname1=pad,
+            geomname2=f"object_{number}",
+            condim=4,
+            friction=[0.9, 0.9, 0.008, 0.0001, 0.0001],
+            solref=[0.008, 1.0],
+            solimp=[0.95, 0.99, 0.0005, 0.5, 2.0],
+        )
+
+
+def _add_target(spec: mujoco.MjSpec) -> None:
+    """Add the axes that mark a wanted tool pose: x red, y green, z blue."""
+    target = spec.worldbody.add_body(name="target", pos=PARKED[0])
+    for axis, colour in enumerate(((0.9, 0.1, 0.1), (0.1, 0.75, 0.1), (0.15, 0.3, 0.95))):
+        end = [0.0, 0.0, 0.0]
+        end[axis] = 0.09
+        target.add_geom(
+            name=f"target_{axis}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=[0, 0, 0, *end],
+            size=[0.004, 0, 0],
+            rgba=[*colour, 0.9],
+            contype=0,
+            conaffinity=0,
+            group=1,
+            mass=0.0,
+        )
+
+
+def _add_touch_sensors(spec: mujoco.MjSpec, arm: Arm) -> None:
+    """Count contacts: of the whole arm with anything, the table and itself, and of the gripper with each object."""
+    tree, one = mujoco.mjtObj.mjOBJ_XBODY, mujoco.mjtObj.mjOBJ_BODY
+    pairs = [
+        ("touch_any", arm.root, None, None),
+        ("touch_table", arm.root, one, "table"),
+        ("touch_self", arm.root, tree, arm.root),
+        *((f"touch_object_{number}", "gripper", one, f"object_{number}") for number in range(MAX_OBJECTS)),
+    ]
+    for name, subtree, kind, other in pairs:
+        reference = {} if kind is None else {"reftype": kind, "refname": other}
+        spec.add_sensor(
+            name=name,
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=tree,
+            objname=subtree,
+            intprm=[1, 0, 1],  # data: found; reduce: none; num: one slot
+            **reference,
+        )
+
+
+def _add_start(spec: mujoco.MjSpec, arm: Arm) -> None:
+    """Add the state that a reset leads to: the arm at home, no object on the table."""
+    fingers = [arm.home[-1] / 2] * len(arm.gripper.joints)
+    objects = [value for place in PARKED for value in (*place, 1.0, 0.0, 0.0, 0.0)]
+    spec.add_key(name="home", qpos=[*arm.home[:-1], *fingers, *objects])
+
+
+def _visual(
+    body: mujoco.MjsBody,
+    kind: str,
+    position: tuple[float, ...],
+    size: tuple[float, ...],
+    *,
+    name: str = "",
+    material: str = "",
+    group: int = 1,
+) -> None:
+    """Add a geometry that is seen and touches nothing."""
+    body.add_geom(
+        name=name,
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),
+        pos=position,
+        size=size,
+        material=material,
+        contype=0,
+        conaffinity=0,
+        group=group,
+        mass=0.0,
+    )
+
+
+def _towards(position: tuple[float, ...], target: tuple[float, ...]) -> list[float]:
+    """Return a camera's x and y axis, side by side, when it looks from one point to another and stands upright."""
+    ahead: NDArray[np.float64] = np.subtract(target, position)
+    right = np.array([ahead[1], -ahead[0], 0.0]) / math.hypot(ahead[0], ahead[1])
+    up = np.cross(right, ahead)
+    return [*right, *(up / np.linalg.norm(up))]

@@ -1,0 +1,231 @@
+"""An arm's table in n simulations, each with objects, light and friction of its own."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene
+from bhd_lerobot.errors import SimulationError
+from bhd_lerobot.sim.engine import mujoco
+from bhd_lerobot.sim.table_stage import HANDLE_PARTS, PADS, PARKED
+from bhd_lerobot.sim.world import Ids, World
+
+_TYPES = {name: int(getattr(mujoco.mjtGeom, f"mjGEOM_{name.upper()}")) for name in ("box", "capsule", "cylinder")}
+_HIDDEN, _SEEN, _TOUCHED = 5, 1, 0  # geometry groups: the camera looks at 0 and 1
+_FIELDS = (
+    *("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_group", "geom_rgba", "geom_friction"),
+    *("body_mass", "body_inertia", "body_gravcomp", "body_pos", "body_quat"),
+    *("pair_friction", "geom_aabb", "cam_pos", "light_diffuse", "light_ambient", "light_dir"),
+)
+# The engine counts the bodies with a compensation that is not 0, and all simulations must have the same number.
+_HEAVY = 1e-30
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+_ALONG_X = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)  # turns z to x
+
+
+class Tabletop:
+    """Lays the tables of a world's simulations, and says what lies where and what touches what.
+
+    Flags and the tool's pose are of the last physics step's beginning, like every reading of a sensor; `World.forward`
+    brings them up to date.
+
+    Args:
+        world: the simulations; their body is an arm.
+
+    Raises:
+        SimulationError: the body is no arm.
+    """
+
+    def __init__(self, world: World) -> None:
+        if not isinstance(world.body, Arm):
+            raise SimulationError(f"A tabletop is for arms; {world.body.name!r} is a {type(world.body).__name__}.")
+        self.world, self.arm = world, world.body
+        model = world.model
+        self._field = {name: world.model_field(name) for name in _FIELDS}
+        self._bodies = np.array([model.body(f"object_{k}").id for k in range(MAX_OBJECTS)])
+        self._geoms = [
+            [model.geom(f"object_{k}{part}").id for part in ("", "_top", *(f"_handle_{j}" for j in range(HANDLE_PARTS)))]
+            for k in range(MAX_OBJECTS)
+        ]
+        self._pads = [model.geom(pad).id for pad in PADS]
+        self._pairs = [
+            [i for i in range(model.npair) if self._geoms[k][0] in (model.pair_geom1[i], model.pair_geom2[i])]
+            for k in range(MAX_OBJECTS)
+        ]
+        self._joints = world.joint_slice(self.arm.chain.joints)[0]
+        self._fingers = world.joint_slice(self.arm.gripper.joints)[0]
+        self._free = [int(model.joint(f"object_{k}").qposadr[0]) for k in range(MAX_OBJECTS)]
+        self._target = model.body("target").id
+        self._scene, self._light = model.camera("scene").id, model.light("main").id
+        self._tool_pos, self._tool_quat = world.site("tool")
+        self._any = world.sensor("touch_any")[:, 0]
+        self._table = world.sensor("touch_table")[:, 0]
+        self._self = world.sensor("touch_self")[:, 0]
+        first, last = (int(model.sensor(f"touch_object_{k}").adr[0]) for k in (0, MAX_OBJECTS - 1))
+        self._grip = world.sensors(first, last + 1)
+        self.count = np.zeros(world.n, np.intp)
+        world.forward()
+
+    # --- scenes ------------------------------------------------------------------------------------------------------
+
+    def place(self, scenes: Sequence[TableScene], ids: Ids = None) -> None:
+        """Start simulations anew: everything as the scene says, at rest, the servos holding the arm's posture.
+
+        Args:
+            scenes: one for each simulation named.
+            ids: the simulations, all if None.
+
+        Raises:
+            SimulationError: the number of scenes does not fit, or a posture does not fit the arm.
+        """
+        world = self.world
+        ids = world.selected(ids)
+        if len(scenes) != len(ids):
+            raise SimulationError(f"{len(scenes)} scenes were given for {len(ids)} simulations.")
+        for scene in scenes:
+            if len(scene.posture) != len(self.arm.home) or not np.isfinite(scene.posture).all():
+                raise SimulationError(
+                    f"The posture of scene {scene.name!r} is {scene.posture}; it needs {len(self.arm.home)} numbers."
+                )
+        world.reset(ids)
+        for sim, scene in zip(ids, scenes, strict=True):
+            self._surroundings(sim, scene)
+            for number in range(MAX_OBJECTS):
+                self._object(sim, number, scene.objects[number] if number < len(scene.objects) else None)
+                if number < len(scene.objects):
+                    self._friction(sim, number, scene.objects[number].friction * scene.variation.finger_friction)
+            self.count[sim] = len(scene.objects)
+        world.update_constants(ids)
+        # Constants are computed with the state put back to the model's own; the state comes after them.
+        for sim, scene in zip(ids, scenes, strict=True):
+            world.qpos[sim, self._joints] = scene.posture[:-1]
+            world.qpos[sim, self._fingers] = scene.posture[-1] / 2
+            for number, thing in enumerate(scene.objects):
+                turn = thing.yaw / 2
+                at = self._free[number]
+                world.qpos[sim, at : at + 3] = (thing.x, thing.y, thing.height / 2)
+                world.qpos[sim, at + 3 : at + 7] = (math.cos(turn), 0.0, 0.0, math.sin(turn))
+        world.hold(ids)
+
+    def _surroundings(self, sim: int, scene: TableScene) -> None:
+        """Set light, camera, pads and marker."""
+        field, model, variation = self._field, self.world.model, scene.variation
+        field["light_diffuse"][sim] = model.light_diffuse * variation.light
+        field["light_ambient"][sim] = model.light_ambient * variation.light
+        field["light_dir"][sim] = model.light_dir
+        direction = model.light_dir[self._light] + (*variation.light_direction, 0.0)
+        field["light_dir"][sim, self._light] = direction / math.hypot(*direction)
+        field["cam_pos"][sim] = model.cam_pos
+        field["cam_pos"][sim, self._scene] += variation.camera_shift
+        field["geom_friction"][sim, self._pads] = model.geom_friction[self._pads]
+        field["geom_friction"][sim, self._pads, 0] *= variation.finger_friction
+        pose = (*PARKED[0], *_UPRIGHT) if scene.target_pose is None else scene.target_pose
+        field["body_pos"][sim, self._target] = pose[:3]
+        field["body_quat"][sim, self._target] = pose[3:]
+
+    def _friction(self, sim: int, number: int, friction: float) -> None:
+        """Set the sliding friction between an object and the pads."""
+        for pair in self._pairs[number]:
+            self._field["pair_friction"][sim, pair, :2] = friction
+
+    def _object(self, sim: int, number: int, thing: TableObject | None) -> None:
+        """Set shape, looks and inertia of an object; None is absent."""
+        field, body, geoms = self._field, self._bodies[number], self._geoms[number]
+        field["geom_group"][sim, geoms] = _HIDDEN
+        field["body_gravcomp"][sim, body] = 1.0 if thing is None else _HEAVY
+        if thing is None:
+            return
+        colour = np.clip(np.add(COLOURS[thing.colour], thing.shade), 0.0, 1.0)
+        a, b, h = thing.size_x, thing.size_y, thing.height / 2
+        self._geom(sim, geoms[0], "box" if thing.kind == "box" else "cylinder", (a, b, h), (0, 0, 0), colour, _TOUCHED)
+        field["geom_friction"][sim, geoms[0], 0] = thing.friction
+        field["body_mass"][sim, body] = thing.mass
+        if thing.kind == "box":
+            square = (b * b + h * h, a * a + h * h, a * a + b * b)
+            field["body_inertia"][sim, body] = np.multiply(square, thing.mass / 3)
+            # A strip of tape.
+            self._geom(sim, geoms[1], "box", (a + 0.0003, 0.2 * b, h + 0.0003), (0, 0, 0), 0.55 + 0.45 * colour, _SEEN)
+            return
+        across = thing.mass * (3 * a * a + 4 * h * h) / 12
+        field["body_inertia"][sim, body] = (across, across, thing.mass * a * a / 2)
+        self._geom(sim, geoms[1], "cylinder", (0.86 * a, 0, 0.0004), (0, 0, h), 0.22 * colour, _SEEN)
+        thick, reach = 0.10 * a, 0.55 * a
+        middle = a + reach / 2 - thick / 2
+        for geom, z in ((geoms[2], 0.5 * h), (geoms[3], -0.4 * h)):
+            self._geom(sim, geom, "capsule", (thick, reach / 2, 0), (middle, 0, z), colour, _SEEN, _ALONG_X)
+        self._geom(sim, geoms[4], "capsule", (thick, 0.45 * h, 0), (a + reach - thick / 2, 0, 0.05 * h), colour, _SEEN)
+
+    def _geom(
+        self,
+        sim: int,
+        geom: int,
+        kind: str,
+        size: tuple[float, float, float],
+        position: tuple[float, float, float],
+        colour: NDArray[np.float64],
+        group: int,
+        quaternion: tuple[float, float, float, float] = _UPRIGHT,
+    ) -> None:
+        field = self._field
+        if kind == "cylinder":
+            size = (size[0], size[2], 0.0)
+        box = size if kind == "box" else (size[0], size[0], size[1] + (size[0] if kind == "capsule" else 0.0))
+        field["geom_type"][sim, geom] = _TYPES[kind]
+        field["geom_size"][sim, geom] = size
+        field["geom_pos"][sim, geom] = position
+        field["geom_quat"][sim, geom] = quaternion
+        field["geom_rbound"][sim, geom] = box[2] if kind == "capsule" else math.hypot(*(box if kind == "box" else size))
+        field["geom_aabb"][sim, geom, 3:] = box
+        field["geom_rgba"][sim, geom, :3] = colour
+        field["geom_rgba"][sim, geom, 3] = 1.0
+        field["geom_group"][sim, geom] = group
+
+    # --- ground truth ------------------------------------------------------------------------------------------------
+
+    @property
+    def object_poses(self) -> NDArray[np.float64]:
+        """Position [m] and quaternion w, x, y, z of each object's centre in the base frame, a copy.
+
+        Shape (n, MAX_OBJECTS, 7). An absent object is at the origin, upright.
+        """
+        poses = np.empty((self.world.n, MAX_OBJECTS, 7))
+        for number, at in enumerate(self._free):
+            poses[:, number] = self.world.qpos[:, at : at + 7]
+            poses[self._absent(number), number] = (0.0, 0.0, 0.0, *_UPRIGHT)
+        return poses
+
+    def _absent(self, number: int) -> NDArray[np.bool_]:
+        return self._field["body_gravcomp"][:, self._bodies[number]] > _HEAVY
+
+    @property
+    def tool_pose(self) -> NDArray[np.float64]:
+        """Position [m] and quaternion w, x, y, z of the tool in the base frame, shape (n, 7), a copy."""
+        return np.concatenate([self._tool_pos, self._tool_quat], axis=1)
+
+    @property
+    def arm_on_table(self) -> NDArray[np.bool_]:
+        """Whether any part of the arm or its gripper touches the table, shape (n,)."""
+        return self._table > 0
+
+    @property
+    def self_contact(self) -> NDArray[np.bool_]:
+        """Whether the arm touches itself, shape (n,); the two fingers may touch each other."""
+        return self._self > 0
+
+    @property
+    def finger_on_object(self) -> NDArray[np.bool_]:
+        """Whether the gripper, its fingers or its palm, touches each object, shape (n, MAX_OBJECTS)."""
+        return self._grip > 0
+
+    @property
+    def arm_on_object(self) -> NDArray[np.bool_]:
+        """Whether a link of the arm other than the gripper touches an object, shape (n,)."""
+        grip = self._grip
+        # Whatever the arm touches is the table, itself or an object. The counts are whole numbers.
+        known = self._table + self._self
+        for number in range(MAX_OBJECTS):
+            known = known + grip[:, number]
+        return self._any > known
