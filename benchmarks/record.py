@@ -28,7 +28,7 @@ from rich.table import Table
 from bhd_lerobot.data.video import CameraEncoder, VideoSettings
 from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import parse
 from bhd_lerobot.runs.record import record

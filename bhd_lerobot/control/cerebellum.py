@@ -21,6 +21,7 @@ from bhd_lerobot.control.messages import (
     Watchdog,
 )
 from bhd_lerobot.control.plant import Plant, PlantReading
+from bhd_lerobot.errors import ConfigError
 
 MOVING = 0.01  # [rad/s] a joint faster than this moves: the articles' `is_moving`
 

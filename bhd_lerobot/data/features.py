@@ -28,6 +28,8 @@ SUCCESS = "next.success"
 DONE = "next.done"
 EVENT = "event"
 
+SUBTASK = "subtask"
+
 PHYSICS_STATE = "simulation.state"
 
 # dtype and meaning of the columns that hold one number a frame
@@ -37,7 +39,7 @@ SCALARS: dict[str, tuple[str, str]] = {
     COMMAND_AGE: ("float32", "age of the command in force at the end of the frame [s]"),
     LATENESS: ("float32", "largest lateness of a control tick in the frame [s]"),
     OVERRUNS: ("int64", "control ticks of the frame that ended after the next was due"),
-    LIMITS: ("int64", "what the safety filter changed: 1 not finite, 2 velocity, 4 acceleration, 8 effort; sum"),
+    LIMITS: ("int64", "what the safety filter changed: 1 not finite, 2 velocity, 4 acceleration, 8 effort, 16 position; sum"),
     WATCHDOG: ("int64", "what the watchdogs noticed: 1 command too old; sum"),
     MODE: (
         "int64",
@@ -49,7 +51,8 @@ SCALARS: dict[str, tuple[str, str]] = {
     DONE: ("bool", "the episode ended with this frame"),
     EVENT: (
         "int64",
-        "0 nothing, 1 success, 2 collision, 3 stuck, 4 time-out, 5 intervention, 6 emergency stop",
+        "0 nothing, 1 success, 2 collision, 3 stuck, 4 time-out, 5 intervention, 6 emergency stop, 7 wrong object, "
+        "8 dropped, 9 unreachable",
     ),
 }
 
@@ -60,6 +63,8 @@ def dataset_features(
     images: Mapping[str, tuple[int, int, int]],
     physics_names: Sequence[str],
     environment_names: Sequence[str] = (),
+    *,
+    subtask: bool = False,
 ) -> dict[str, dict[str, Any]]:
     """Return the features of a dataset in LeRobot's form.
 
@@ -69,6 +74,7 @@ def dataset_features(
         images: image shapes (height, width, 3) by camera name.
         physics_names: the simulator's generalised positions and velocities, in order.
         environment_names: what the task tells the brain, in order; no such column if there is nothing.
+        subtask: whether the brain says what it is doing.
     """
     features: dict[str, dict[str, Any]] = {OBSERVATION_STATE: _vector("float32", observation_names)}
     if environment_names:
@@ -83,6 +89,8 @@ def dataset_features(
     features[APPLIED_ACTION] = _vector("float32", action_names)
     for key, (dtype, _) in SCALARS.items():
         features[key] = {"dtype": dtype, "shape": (1,), "names": None}
+    if subtask:
+        features[SUBTASK] = {"dtype": "string", "shape": (1,), "names": None}
     features[PHYSICS_STATE] = _vector("float64", physics_names)
     return features
 

@@ -52,7 +52,9 @@ class AvoidanceBrain:
     """
 
     name = "avoidance"
+    robot_type = "turtlebot3"
     uses_images = False
+    has_plan = False
 
     def __init__(self, config: AvoidanceConfig | None = None) -> None:
         self.config = config or AvoidanceConfig()
@@ -61,14 +63,20 @@ class AvoidanceBrain:
         self._forward = self._turn = 0
         self._width = 0
 
-    def bind(self, observation_names: Sequence[str], action_names: Sequence[str], fps: int) -> None:
+    def bind(
+        self,
+        observation_names: Sequence[str],
+        action_names: Sequence[str],
+        fps: int,
+        environment_names: Sequence[str] = (),
+    ) -> None:
         """Find the scan and the twist."""
         self._scan, angles = find_scan(observation_names, self.name)
         self._front = np.abs(angles) <= math.radians(self.config.front_sector_deg) + 1e-9
         self._forward, self._turn = find_columns(action_names, ("x.vel", "theta.vel"), self.name, "action")
         self._width = len(action_names)
 
-    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int) -> None:
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Nothing to forget: the rule has no memory."""
 
     def act(self, observation: Observation) -> NDArray[np.float64]:
@@ -84,6 +92,14 @@ class AvoidanceBrain:
         action[:, self._forward] = np.where(seen & free, config.forward_speed, 0.0)
         action[:, self._turn] = np.where(seen & ~free, config.turn_speed, 0.0)
         return action
+
+    def subtasks(self) -> Sequence[str]:
+        """Return nothing: the rule has no plan."""
+        return ()
+
+    def plan(self, sim: int) -> dict[str, Any]:
+        """Return nothing: the rule has no plan."""
+        return {}
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters."""

@@ -1,12 +1,13 @@
 """What a brain is: it looks at an observation a few times a second and says what it wants."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import ConfigError
 
 
@@ -19,12 +20,27 @@ class Observation:
         state: the robots' floats, shape (n, len(names)), read-only.
         images: by camera name, shape (n, height, width, 3), RGB.
         environment_state: what the task tells the brain, shape (n, k), or None.
+        results: how goals ended since the last observation, by simulation.
+        running: which simulations are in an episode, shape (n,); all if None. What the others see means nothing.
     """
 
     names: tuple[str, ...]
     state: NDArray[np.float64]
     images: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
     environment_state: NDArray[np.float64] | None = None
+    results: Mapping[int, Sequence[CommandResult]] = field(default_factory=dict)
+    running: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True)
+class Goals:
+    """What a brain wants that gives goals instead of setpoints.
+
+    Attributes:
+        commands: new goals, by simulation; one without goes on with what it does.
+    """
+
+    commands: Mapping[int, Sequence[BrainCommand]]
 
 
 class Brain(Protocol):
@@ -35,27 +51,44 @@ class Brain(Protocol):
     """
 
     name: str
+    robot_type: str
+    """The robots that it is for."""
     uses_images: bool
     """Whether `act` looks at the observation's images. If not, it is not kept waiting for them and may not get any."""
+    has_plan: bool
+    """Whether it works step by step, and `subtasks` and `plan` say what it does."""
 
-    def bind(self, observation_names: Sequence[str], action_names: Sequence[str], fps: int) -> None:
-        """Learn the order of the observation's and the action's features, and the frame rate [Hz].
+    def bind(
+        self,
+        observation_names: Sequence[str],
+        action_names: Sequence[str],
+        fps: int,
+        environment_names: Sequence[str] = (),
+    ) -> None:
+        """Learn the order of the features that it will see and command, and the frame rate [Hz].
 
         Raises:
             ConfigError: a feature that the brain needs is missing.
         """
 
-    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int) -> None:
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Start episodes in some of n simulations: forget what was seen there.
 
         Args:
             ids: the simulations.
             seeds: a seed for each of them; all that is random in the brain follows from it.
             n: number of simulations that `act` will be called for.
+            instructions: what is asked for in each of them, if anything is.
         """
 
-    def act(self, observation: Observation) -> NDArray[np.float64]:
-        """Return the setpoints, shape (n, actions), in the order of the action features."""
+    def subtasks(self) -> Sequence[str]:
+        """Return what the brain is doing in each simulation, in words; of a brain that `has_plan`."""
+
+    def plan(self, sim: int) -> dict[str, Any]:
+        """Return the plan of one simulation, as plain values; of a brain that `has_plan`."""
+
+    def act(self, observation: Observation) -> NDArray[np.float64] | Goals:
+        """Return setpoints, shape (n, actions), in the order of the action features, or goals; always the same kind."""
 
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the brain, as plain values."""

@@ -113,7 +113,9 @@ class GapFollowerBrain:
     """
 
     name = "gap_follower"
+    robot_type = "turtlebot3"
     uses_images = False
+    has_plan = False
 
     def __init__(self, config: GapFollowerConfig | None = None) -> None:
         self.config = config = config or GapFollowerConfig()
@@ -141,7 +143,13 @@ class GapFollowerBrain:
         self._weight, self._all = weight[:, None] * moved, float(weight.sum())
         self.reset(np.zeros(0, np.intp), [], 0)
 
-    def bind(self, observation_names: Sequence[str], action_names: Sequence[str], fps: int) -> None:
+    def bind(
+        self,
+        observation_names: Sequence[str],
+        action_names: Sequence[str],
+        fps: int,
+        environment_names: Sequence[str] = (),
+    ) -> None:
         """Find the scan and the twist, and prepare the look-up table for this number of beams."""
         config = self.config
         self._scan, angles = find_scan(observation_names, self.name)
@@ -157,7 +165,7 @@ class GapFollowerBrain:
         self._table = ClearanceTable(self._paths, beams // self._group, spread, self._levels, config.range_max_m)
         self._memory_frames = max(1, round(min(config.memory_s * fps, 2**29)))
 
-    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int) -> None:
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Forget where the robots have been; the seeds are not used, the rule draws nothing."""
         if n != getattr(self, "_n", -1):
             self._n = n
@@ -207,6 +215,14 @@ class GapFollowerBrain:
         action[:, self._forward] = np.where(blind, 0.0, forward)
         action[:, self._turn] = np.where(blind, 0.0, np.copysign(turn, heading))
         return action
+
+    def subtasks(self) -> Sequence[str]:
+        """Return nothing: the rule has no plan."""
+        return ()
+
+    def plan(self, sim: int) -> dict[str, Any]:
+        """Return nothing: the rule has no plan."""
+        return {}
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters."""

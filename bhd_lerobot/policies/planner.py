@@ -288,7 +288,7 @@ def _step(number: int, value: object, objects: dict[int, SceneObject], target: S
     fields = _fields(value, f"Step {number}", ("skill", "object"))
     name = fields["skill"]
     if name not in list(Skill):
-        raise InstructionError(f"Step {number}: " + unknown_name("skill", name, Skill))
+        raise InstructionError(f"Step {number}: " + unknown_name("skill", name, [skill.value for skill in Skill]))
     # None leaves it to the plan's target.
     thing = target if fields["object"] is None else _object(fields["object"], f"Step {number}: object", objects)
     return PlanStep(Skill(name), thing.index, Skill(name).text(thing.name))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.bodies.arenas import ARENAS
-from bhd_lerobot.bodies.body import Body, Rates
+from bhd_lerobot.bodies.body import MobileBase, Rates
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.sim.lidar import check_beams
@@ -76,7 +76,7 @@ class TurtleBot3Config(RobotConfig):
         """The three rates."""
         return Rates(self.physics_hz, self.control_hz, self.fps)
 
-    def body(self) -> Body:
+    def body(self) -> MobileBase:
         """Return the hardware that this configuration describes."""
         return turtlebot3_burger(
             lidar_noise_std=self.lidar_noise_std,

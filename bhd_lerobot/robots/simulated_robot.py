@@ -12,11 +12,9 @@ from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.simulation import Simulation
 
 # Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator; one that
 # thinks for itself finds its robot here. Weak, so that a forgotten robot is freed.
@@ -36,12 +34,12 @@ class SimulatedRobot(Robot):
     then.
     """
 
-    config: TurtleBot3Config
+    config: Any
 
-    def __init__(self, config: TurtleBot3Config) -> None:
+    def __init__(self, config: Any) -> None:
         super().__init__(config)
         self.config = config
-        self._simulation: TurtleBot3Simulation | None = None
+        self._simulation: Simulation | None = None
         self._last_observation: dict[str, Any] | None = None
         # lerobot-record asks for its length, with or without cameras.
         self.cameras: dict[str, Any] = dict.fromkeys(self.camera_shapes)
@@ -51,8 +49,12 @@ class SimulatedRobot(Robot):
         return self.name if self.id is None else f"{self.name} {self.id!r}"
 
     @abstractmethod
-    def make_simulation(self) -> TurtleBot3Simulation:
+    def make_simulation(self) -> Simulation:
         """Return a new simulation of one robot."""
+
+    @abstractmethod
+    def make_scene(self) -> Any:
+        """Return where the robot is when it is used by itself."""
 
     @property
     @abstractmethod
@@ -90,7 +92,7 @@ class SimulatedRobot(Robot):
         return True
 
     def connect(self, calibrate: bool = True) -> None:
-        """Start the simulation, at the configured arena's start.
+        """Start the simulation, at the start of the configured scene.
 
         Raises:
             DeviceAlreadyConnectedError: it runs already.
@@ -109,9 +111,8 @@ class SimulatedRobot(Robot):
         _connected.add(self)
 
     def restart(self) -> None:
-        """Put the robot back to the start of its arena, at rest."""
-        arena = make_arena(self.config.arena, self.config.seed)
-        self.simulation.reset(np.zeros(1, np.intp), [arena], [self.config.seed])
+        """Put the robot back to the start of its scene, at rest."""
+        self.simulation.reset(np.zeros(1, np.intp), [self.make_scene()], [self.config.seed])
 
     def disconnect(self) -> None:
         """Stop the simulation. May be called at any time, also twice."""
@@ -128,7 +129,7 @@ class SimulatedRobot(Robot):
         """Nothing to configure beyond the configuration."""
 
     @property
-    def simulation(self) -> TurtleBot3Simulation:
+    def simulation(self) -> Simulation:
         """The simulation behind the robot.
 
         Raises:
@@ -187,7 +188,8 @@ class SimulatedRobot(Robot):
         reason = Reason(int(report.sent.reasons[0]))
         if reason != Reason.ACCEPTED:
             mode = Mode(int(report.mode[0])).name
-            raise CommandRefusedError(f"The {self.name} refused the action: {reason.explanation} (mode {mode}).")
+            why = report.refusals.get(0, reason.explanation)
+            raise CommandRefusedError(f"The {self.name} refused the action: {why} (mode {mode}).")
         return dict(zip(self.action_names, report.applied[0].tolist(), strict=True))
 
     def action_array(self, action: Mapping[str, Any]) -> NDArray[np.float64]:
@@ -208,7 +210,7 @@ class SimulatedRobot(Robot):
         if missing:
             raise ActionError(
                 f"The action lacks {', '.join(map(repr, missing))}. It needs a number for each of "
-                f"{', '.join(self.action_names)}; to leave a dimension alone, send 0."
+                f"{', '.join(self.action_names)}."
             )
         values = np.empty((1, len(self.action_names)))
         for column, name in enumerate(self.action_names):
@@ -220,6 +222,16 @@ class SimulatedRobot(Robot):
             if not math.isfinite(values[0, column]):
                 raise ActionError(f"Action {name!r} is {value!r}; it must be finite.")
         return values
+
+    @property
+    def environment(self) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+        """What the robot's scene tells a brain beyond the robot's own sensors: names, and values of shape (k,)."""
+        return (), np.zeros(0)
+
+    @property
+    def instruction(self) -> str:
+        """What a person would ask for in the robot's scene; empty if nothing."""
+        return ""
 
     def estop(self) -> None:
         """Latch the emergency stop: from the next tick the robot brakes as hard as it can, and refuses commands.

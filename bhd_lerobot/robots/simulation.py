@@ -1,27 +1,26 @@
 """n simulated robots under one cerebellum: what a LeRobot `Robot` and the batched runs are both made of."""
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.bodies.body import Body, Rates
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.messages import NANOSECONDS, SendResult
+from bhd_lerobot.control.commands import BrainCommand, CommandResult
+from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.sim.camera import Camera
-from bhd_lerobot.sim.lidar import Lidar
-from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.render_thread import Deliver, RenderThread
 from bhd_lerobot.sim.world import Snapshot, World
 
 # Streams of random numbers of one episode: what one draws more of must not shift the others.
-_SENSOR_STREAM = 1
+SENSOR_STREAM = 1
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Frame:
     Attributes:
         state: the observation's floats, shape (n, features).
         time_ns: when it was measured, since the episode's start [ns], shape (n,).
-        age_ns: age of the oldest reading in it, the scan [ns], shape (n,).
+        age_ns: age of the oldest reading in it [ns], shape (n,).
     """
 
     state: NDArray[np.float64]
@@ -44,13 +43,14 @@ class FrameReport:
     """What the cerebellum did during a frame, of n robots.
 
     Attributes:
-        applied: the command at the end of the frame, shape (n, actions).
+        applied: the command at the end of the frame, in the space of the actions, shape (n, actions).
         sent: what became of the setpoint that the frame began with.
         limits: `Limit` flags, shape (n,).
         watchdog: `Watchdog` flags, shape (n,).
         command_age_ns: age of the command in force at the end of the frame [ns], shape (n,).
         mode: `Mode` at the end of the frame, shape (n,).
-        touched: whether the robot touched the scene during the frame, shape (n,).
+        results: how goals ended, or were refused, during the frame, by simulation.
+        refusals: in words why setpoints were refused, by simulation, where a `Reason` does not say it all.
     """
 
     applied: NDArray[np.float64]
@@ -59,75 +59,131 @@ class FrameReport:
     watchdog: NDArray[np.int64]
     command_age_ns: NDArray[np.int64]
     mode: NDArray[np.int8]
-    touched: NDArray[np.bool_]
+    results: Mapping[int, Sequence[CommandResult]] = field(default_factory=dict)
+    refusals: Mapping[int, str] = field(default_factory=dict)
 
 
-class TurtleBot3Simulation:
-    """n simulated TurtleBot3s.
+class Simulation(ABC):
+    """n simulated robots of one kind.
 
     Each is in an episode of its own, which nothing outside it can change: not the number of the others, not what they
-    do, not the number of threads.
+    do, not the number of threads. A subclass makes world, cerebellum and bridge in its constructor, calls `_begin`, and
+    says what is sensed and what is true.
 
-    Args:
-        config: the robot.
-        n: how many.
-        threads: threads that step the physics; all processors if None.
+    Attributes:
+        config: the robot's configuration.
+        n: how many robots.
+        rates: the rates.
+        body: the robot's hardware.
+        world: the physics.
+        cerebellum: what controls the robots.
+        bridge: how commands get there.
+        action_names: names of the action's floats, in order.
+        observation_names: names of the observation's floats, in order.
+        camera_names: the cameras that are observed.
+        view: the camera that looks at the robot from outside, for films.
+        film_speed: how much faster than the robot was a film of it is shown.
+        running: which robots are in an episode, shape (n,).
     """
 
-    action_names = ("x.vel", "theta.vel")
+    config: Any
+    n: int
+    rates: Rates
+    body: Body
+    world: World
+    cerebellum: Cerebellum
+    bridge: LockstepBridge
+    action_names: tuple[str, ...]
+    observation_names: tuple[str, ...]
+    camera_names: tuple[str, ...]
+    view = "overview"
+    film_speed = 1
 
-    def __init__(self, config: TurtleBot3Config, n: int = 1, threads: int | None = None) -> None:
-        self.config, self.n = config, n
-        self.rates = config.rates
-        self.body = config.body()
-        self.world = World(self.body, n, physics_hz=config.physics_hz, threads=threads)
-        self.plant = SimulatedPlant(self.world)
-        self.cerebellum = Cerebellum(self.body, self.plant, config.control_hz)
-        self.bridge = LockstepBridge(self.cerebellum, self.rates, self._advance)
-        if self.body.lidar is None:
-            raise AssertionError("The Burger has a lidar.")
-        self.lidar = Lidar(self.world, self.body.lidar, config.beams)
-        self.observation_names = observation_names(config)
-        self.camera_names = ("front",) if config.camera else ()
+    def _begin(self) -> None:
+        """Set up what all kinds of robots have in common; the subclass has made the attributes above."""
+        n = self.n
         self.running = np.ones(n, np.bool_)
-        self._camera: Camera | None = None
-        self._render_thread: RenderThread | None = None
-        self._touch = self.world.sensor(self.body.touch_sensor)[:, 0]
-        self._gyro = self.world.sensor("imu_gyro")
-        self._touched = np.zeros(n, np.bool_)
-        self._reading = PlantReading(n, 2)
-        self._rngs = [np.random.default_rng(0) for _ in range(n)]
+        self._active: NDArray[np.intp] | None = None
         self._tick = 0
         self._start_tick = np.zeros(n, np.int64)
-        self._scan_ticks = config.control_hz // self.body.lidar.rate_hz
-        self._scanned_tick = np.zeros(n, np.int64)
-        self._next_scan = 0
-        self._active: NDArray[np.intp] | None = None
+        self._rngs = [np.random.default_rng(0) for _ in range(n)]
+        self._reading = PlantReading(n, self.cerebellum.controller.joints)
+        self._camera: Camera | None = None
+        self._render_thread: RenderThread | None = None
+
+    # --- what a kind of robot says ------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
+        """Put robots into scenes, at rest at their start; `reset` does that and starts an episode."""
+
+    @abstractmethod
+    def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the robot was in recorded states: the pose of its base, or of its tool.
+
+        Args:
+            states: recorded `physics_state`, shape (frames, nq + nv).
+
+        Returns:
+            x, y, z [m] and a quaternion w, x, y, z, shape (frames, 7).
+        """
+
+    def _started(self, ids: NDArray[np.intp], seeds: Sequence[int]) -> None:
+        """Take first readings of what is not read every frame, at the start of episodes."""
+        return
+
+    @abstractmethod
+    def _sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
+
+    @abstractmethod
+    def truth(self) -> Any:
+        """Return what the simulator knows that a task judges by; touches since the start of the last frame."""
+
+    @abstractmethod
+    def _clear_touches(self) -> None:
+        """Forget the touches so far: a frame begins."""
+
+    def _step(self) -> None:
+        """Let one control tick of physics go by."""
+        self.world.step(self.rates.steps_per_tick, self._active)
+
+    def _after_tick(self) -> None:
+        """Do what a tick brings with it: sensors with a rhythm of their own."""
+        return
+
+    def _applied(self) -> NDArray[np.float64]:
+        """Return the command in the space of the actions, shape (n, actions)."""
+        return self.cerebellum.command.copy()
+
+    def _setpoints(
+        self, action: NDArray[np.float64], mask: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
+        """Turn actions into setpoints of the cerebellum, shape (n, width), and say which cannot be, and why."""
+        return action, {}
 
     # --- episodes ----------------------------------------------------------------------------------------------------
 
-    def reset(self, ids: NDArray[np.intp], arenas: Sequence[Arena], seeds: Sequence[int]) -> None:
-        """Start episodes: place the obstacles, put the robots at the start at rest, take a first scan.
+    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
+        """Start episodes: put the robots into their scenes, at rest at the start, and take first readings.
 
         Args:
             ids: the simulations.
-            arenas: where each of them is.
+            scenes: where each of them is.
             seeds: a seed for each of them; their sensors' noise follows from it.
         """
         ids = np.asarray(ids, np.intp)
-        self.world.place([arena.shapes for arena in arenas], ids)
-        self.world.reset(ids, np.array([arena.start for arena in arenas]))
+        self.place(ids, scenes)
         for sim, seed in zip(ids, seeds, strict=True):
-            self._rngs[sim] = np.random.default_rng(np.random.SeedSequence([_SENSOR_STREAM, seed]))
+            self._rngs[sim] = np.random.default_rng(np.random.SeedSequence([SENSOR_STREAM, seed]))
         self.bridge.restart(ids)
-        self._touched[ids] = False
         self._start_tick[ids] = self._tick
         self.running[ids] = True
         self._active = None if self.running.all() else np.flatnonzero(self.running)
-        self._scan(ids)
+        self._started(ids, seeds)
 
     def stop(self, ids: NDArray[np.intp]) -> None:
-        """Leave simulations alone from now on: they are neither stepped nor scanned before their next `reset`."""
+        """Leave simulations alone from now on: they are neither stepped nor sensed before their next `reset`."""
         self.running[ids] = False
         self._active = np.flatnonzero(self.running)
 
@@ -135,43 +191,77 @@ class TurtleBot3Simulation:
 
     def observe(self) -> Frame:
         """Return what the robots see now."""
-        self.plant.read(self._reading)
-        twist = self.cerebellum.controller.drive.twist_from_wheels(self._reading.velocity)
-        parts = [twist, self.lidar.ranges]
-        if self.config.odometry:
-            parts.append(self.cerebellum.controller.drive.odometry_at(self._reading.position))
-        if self.config.imu:
-            parts.append(self._gyro)
+        state, oldest = self._sense()
         now = (self._tick - self._start_tick) * NANOSECONDS // self.rates.control_hz
-        scanned = (self._scanned_tick - self._start_tick) * NANOSECONDS // self.rates.control_hz
-        return Frame(np.concatenate(parts, axis=1), now, now - scanned)
+        measured = (oldest - self._start_tick) * NANOSECONDS // self.rates.control_hz
+        return Frame(state, now, now - measured)
 
-    def act(self, action: NDArray[np.float64]) -> FrameReport:
-        """Send a setpoint to the running robots and let one frame go by.
+    def act(self, action: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> FrameReport:
+        """Send a setpoint to running robots and let one frame go by.
 
         Args:
-            action: forward speed [m/s] and yaw rate [rad/s], shape (n, 2).
+            action: the actions, shape (n, actions).
+            mask: the robots that it is for, shape (n,); all that run if None.
         """
-        sent = self.bridge.send(action, self.running)
-        return self.wait(sent)
+        mask = self.running if mask is None else mask & self.running
+        setpoints, refused = self._setpoints(action, mask)
+        if refused:
+            mask = mask.copy()
+            mask[list(refused)] = False
+        sent = self.bridge.send(setpoints, mask)
+        for sim, (reason, _) in refused.items():
+            sent.reasons[sim] = reason
+        return self.wait(sent, refusals={sim: message for sim, (_, message) in refused.items()})
 
-    def wait(self, sent: SendResult) -> FrameReport:
-        """Let one frame go by without a new setpoint; `sent` is passed on to the report."""
-        self._touched[:] = False
+    def pursue(self, commands: Mapping[int, Sequence[BrainCommand]]) -> FrameReport:
+        """Send goals to running robots and let one frame go by.
+
+        Args:
+            commands: new goals, by simulation; a robot without one goes on with what it does.
+        """
+        refused: dict[int, list[CommandResult]] = {}
+        for sim, goals in commands.items():
+            for goal in goals:
+                refusal = self.bridge.submit(goal, sim)
+                if refusal is not None:
+                    refused.setdefault(sim, []).append(refusal)
+        return self.wait(SendResult(np.zeros(self.n, np.int8)), refused=refused)
+
+    def wait(
+        self,
+        sent: SendResult,
+        refused: Mapping[int, Sequence[CommandResult]] | None = None,
+        refusals: Mapping[int, str] | None = None,
+    ) -> FrameReport:
+        """Let one frame go by without a new command; what is given is passed on to the report.
+
+        Args:
+            sent: what became of a setpoint.
+            refused: goals that were refused, by simulation.
+            refusals: in words why setpoints were refused, by simulation.
+        """
+        self._clear_touches()
         self.bridge.advance_frame()
         self.world.check()
         limits, watchdog = self.cerebellum.take_flags()
+        results = {sim: list(values) for sim, values in (refused or {}).items()}
+        for sim in np.flatnonzero(self.running).tolist():
+            done = self.bridge.take_results(sim)
+            if done:
+                known = {id(result) for result in results.get(sim, ())}
+                results.setdefault(sim, []).extend(result for result in done if id(result) not in known)
         return FrameReport(
-            applied=self.cerebellum.command.copy(),
+            applied=self._applied(),
             sent=sent,
             limits=limits,
             watchdog=watchdog,
             command_age_ns=self.cerebellum.command_age_ns(self.bridge.now_ns),
             mode=self.cerebellum.mode.copy(),
-            touched=self._touched.copy(),
+            results=results,
+            refusals=refusals or {},
         )
 
-    def render(self, sim: int, camera: str = "front") -> NDArray[np.uint8]:
+    def render(self, sim: int, camera: str) -> NDArray[np.uint8]:
         """Return what a camera of one robot sees now, shape (height, width, 3)."""
         if self._camera is None:
             self._camera = Camera(self.world, self.config.camera_width, self.config.camera_height)
@@ -219,45 +309,34 @@ class TurtleBot3Simulation:
         self.world.qpos[sim], self.world.qvel[sim] = state[:nq], state[nq:]
         self.world.forward(np.array([sim]))
 
+    @property
+    def not_in_state(self) -> tuple[str, ...]:
+        """Observed features that do not follow from a physics state."""
+        return ()
+
+    def resense(self, sim: int, time_s: float, age_s: float) -> None:
+        """Read again, in a restored state, what is not read every frame.
+
+        Args:
+            sim: the robot.
+            time_s: when the state was recorded, since the episode's start [s].
+            age_s: how old the oldest reading was then [s].
+        """
+        return
+
     def snapshot(self, ids: NDArray[np.intp] | None = None) -> Snapshot:
         """Return the physics of simulations: to continue from there with the same commands, bit-exactly."""
         return self.world.snapshot(ids)
 
-    def scan_now(self, ids: NDArray[np.intp]) -> None:
-        """Take a scan outside of the lidar's own rhythm; it continues from here."""
-        self._scan(np.asarray(ids, np.intp))
-
     # --- inside a tick -----------------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
-        for _ in range(self.rates.steps_per_tick):
-            # One by one: a touch may last a single step, and the sensor tells of the last one only.
-            self.world.step(1, self._active)
-            np.logical_or(self._touched, self._touch, out=self._touched)
+        self._step()
         self._tick += 1
-        if self._tick >= self._next_scan:
-            due = self.running & (self._tick - self._scanned_tick >= self._scan_ticks)
-            self._scan(np.flatnonzero(due))
-
-    def _scan(self, ids: NDArray[np.intp]) -> None:
-        if len(ids):
-            self.lidar.scan(self._rngs, ids)
-            self._scanned_tick[ids] = self._tick
-        running = self._scanned_tick[self.running]
-        self._next_scan = (int(running.min()) if len(running) else self._tick) + self._scan_ticks
+        self._after_tick()
 
 
-def observation_names(config: TurtleBot3Config) -> tuple[str, ...]:
-    """Return the names of the observation's floats, in order."""
-    names = ["x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(config.beams))]
-    if config.odometry:
-        names += ["x.pos", "y.pos", "theta.pos"]
-    if config.imu:
-        names += ["imu_x.vel", "imu_y.vel", "imu_z.vel"]
-    return tuple(names)
-
-
-def describe(config: TurtleBot3Config) -> dict[str, Any]:
-    """Return everything about the robot that shapes its data, as plain values."""
-    plain = {key: value for key, value in vars(config).items() if key not in ("id", "calibration_dir", "seed", "arena")}
-    return {"type": config.type, **plain}
+def describe(config: Any) -> dict[str, Any]:
+    """Return everything about a robot that shapes its data, as plain values."""
+    left_out = ("id", "calibration_dir", "seed", "arena", "scene")
+    return {"type": config.type, **{key: value for key, value in vars(config).items() if key not in left_out}}

@@ -1,8 +1,9 @@
 """The simulated TurtleBot3 Burger as a LeRobot robot."""
 
+from bhd_lerobot.bodies.arenas import Arena, make_arena
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot
-from bhd_lerobot.robots.simulation import TurtleBot3Simulation, observation_names
+from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation, observation_names
 
 
 class TurtleBot3(SimulatedRobot):
@@ -22,6 +23,10 @@ class TurtleBot3(SimulatedRobot):
     def make_simulation(self) -> TurtleBot3Simulation:
         """Return a new simulation of one robot."""
         return TurtleBot3Simulation(self.config)
+
+    def make_scene(self) -> Arena:
+        """Return the configured arena."""
+        return make_arena(self.config.arena, self.config.seed)
 
     @property
     def observation_names(self) -> tuple[str, ...]:

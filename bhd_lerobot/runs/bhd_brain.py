@@ -6,13 +6,16 @@ from typing import Any
 import numpy as np
 from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.commands import CommandResult
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.policies.brain import Brain, Goals, Observation
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
-from bhd_lerobot.robots.simulation import TurtleBot3Simulation
 from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
-from bhd_lerobot.runs.registry import make_brain
+from bhd_lerobot.runs.goal_streamer import GoalStreamer
+from bhd_lerobot.runs.registry import action_names_of, make_brain
 
 
 class BhdBrain(Teleoperator):
@@ -34,11 +37,13 @@ class BhdBrain(Teleoperator):
         self._is_connected = False
         self._brain: Brain | None = None
         self._robot: SimulatedRobot | None = None
+        self._streamer: GoalStreamer | None = None
+        self._results: list[CommandResult] = []
 
     @cached_property
     def action_features(self) -> dict[str, type]:
-        """The actions that it gives."""
-        return dict.fromkeys(TurtleBot3Simulation.action_names, float)
+        """The actions that it gives: those of the robots that the brain is for."""
+        return dict.fromkeys(action_names_of(self.config.brain), float)
 
     @property
     def feedback_features(self) -> dict[str, type]:
@@ -83,14 +88,36 @@ class BhdBrain(Teleoperator):
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
             self._brain = make_brain(self.config.brain)
-            self._brain.bind(robot.observation_names, robot.action_names, self.config.fps or robot.config.fps)
-            self._brain.reset(np.zeros(1, np.intp), [self.config.seed], 1)
-            self._robot = robot
+            names, _ = robot.environment
+            self._brain.bind(robot.observation_names, robot.action_names, self.config.fps or robot.config.fps, names)
+            self._brain.reset(np.zeros(1, np.intp), [self.config.seed], 1, [robot.instruction])
+            self._robot, self._streamer, self._results = robot, None, []
         seen = robot.last_observation
         state = np.array([[seen[name] for name in robot.observation_names]])
         images = {name: seen[name][None] for name in robot.camera_shapes}
-        action = self._brain.act(Observation(robot.observation_names, state, images))
-        return dict(zip(robot.action_names, action[0].tolist(), strict=True))
+        names, told = robot.environment
+        observation = Observation(
+            robot.observation_names, state, images, told[None] if names else None, {0: self._results}
+        )
+        wanted = self._brain.act(observation)
+        if isinstance(wanted, Goals):
+            action, self._results = self._stream(robot, wanted)
+        else:
+            action = wanted[0]
+        return dict(zip(robot.action_names, action.tolist(), strict=True))
+
+    def _stream(self, robot: SimulatedRobot, goals: Goals) -> tuple[NDArray[np.float64], list[CommandResult]]:
+        """Return the setpoint that goals mean for the coming frame, and the goals that ended."""
+        body, rates = robot.simulation.body, robot.simulation.rates
+        if not isinstance(body, Arm) or robot.action_names != body.limits.names:
+            raise ConfigError(
+                f"The brain {self._brain_name!r} gives goals, which become joint positions; {robot} takes "
+                f"{', '.join(robot.action_names)}. Use a ur5 with robot.action_space = joint."
+            )
+        if self._streamer is None:
+            self._streamer = GoalStreamer(body, rates, robot.simulation.cerebellum.command[0])
+        reading = robot.simulation.bridge.state()
+        return self._streamer.frame(goals.commands.get(0, ()), reading.joint_positions[0])
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Do nothing: a brain feels no feedback."""
@@ -98,7 +125,11 @@ class BhdBrain(Teleoperator):
     def disconnect(self) -> None:
         """Forget the robot. May be called twice."""
         self._is_connected = False
-        self._brain = self._robot = None
+        self._brain = self._robot = self._streamer = None
+
+    @property
+    def _brain_name(self) -> str:
+        return self.config.brain.get_choice_name(type(self.config.brain))
 
     def _find_robot(self) -> SimulatedRobot:
         robots = connected_robots()
@@ -111,6 +142,6 @@ class BhdBrain(Teleoperator):
             found = ", ".join(str(robot) for robot in robots) or "none"
             raise ConfigError(
                 f"bhd_brain drives one simulated robot of its own process; connected are: {found}. "
-                "Use --robot.type=turtlebot3, and --teleop.robot_id if there are several."
+                "Use --robot.type=turtlebot3 or ur5, and --teleop.robot_id if there are several."
             )
         return robots[0]

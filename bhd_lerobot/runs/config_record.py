@@ -7,8 +7,7 @@ from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.config_brain import BrainConfig
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.runs import registry  # noqa: F401  registers the brains and tasks
+from bhd_lerobot.runs.registry import SIMULATED_ROBOTS, robot_of_task
 from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import SPLITS
 
@@ -20,7 +19,7 @@ class DatasetConfig:
     Attributes:
         repo_id: name of the dataset on the Hub, `user/name`.
         root: folder of the dataset; LeRobot's default place if nothing.
-        fps: frames a second [Hz].
+        fps: frames a second [Hz]; the robot's own if 0.
         num_episodes: number of episodes that the dataset holds in the end.
         episode_time_s: longest duration of an episode [s]; the task's if nothing.
         push_to_hub: upload the dataset when it is complete.
@@ -30,7 +29,7 @@ class DatasetConfig:
 
     repo_id: str
     root: str | None = None
-    fps: int = 10
+    fps: int = 0
     num_episodes: int = 50
     episode_time_s: float | None = None
     push_to_hub: bool = False
@@ -74,10 +73,17 @@ class RecordConfig:
         Raises:
             ConfigError: names the value and the valid ones.
         """
-        if not isinstance(self.robot, TurtleBot3Config):
+        simulated = {kind.get_choice_name(kind): kind for kind in SIMULATED_ROBOTS}
+        if self.robot.type not in simulated:
             raise ConfigError(
-                f"robot.type is {self.robot.type!r}; bhd-record drives simulated robots: turtlebot3. "
-                "Record another robot with lerobot-record."
+                f"robot.type is {self.robot.type!r}; bhd-record drives simulated robots: "
+                f"{', '.join(sorted(simulated))}. Record another robot with lerobot-record."
+            )
+        wanted = robot_of_task(self.task)
+        if wanted != self.robot.type:
+            task = self.task.get_choice_name(type(self.task))
+            raise ConfigError(
+                f"task.type is {task!r}, which is for robot.type = {wanted!r}; robot.type is {self.robot.type!r}."
             )
         for name, value in (
             ("dataset.num_episodes", self.dataset.num_episodes),
@@ -90,7 +96,9 @@ class RecordConfig:
             raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
-        robot = self.robot
+        robot: Any = self.robot
+        if self.dataset.fps == 0:
+            self.dataset.fps = robot.fps
         if robot.fps not in (self.dataset.fps, type(robot).fps):
             raise ConfigError(
                 f"robot.fps is {robot.fps} and dataset.fps is {self.dataset.fps}; leave robot.fps out, "
@@ -101,5 +109,5 @@ class RecordConfig:
         if self.dataset.episode_time_s is not None:
             if not 0 < self.dataset.episode_time_s < float("inf"):
                 raise ConfigError(f"dataset.episode_time_s is {self.dataset.episode_time_s}; it must be positive.")
-            task: Any = self.task
-            task.duration_s = self.dataset.episode_time_s
+            chosen: Any = self.task
+            chosen.duration_s = self.dataset.episode_time_s

@@ -2,20 +2,20 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent import futures
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.data import features as keys
-from bhd_lerobot.policies.brain import Brain, Observation
-from bhd_lerobot.robots.simulation import TurtleBot3Simulation
-from bhd_lerobot.tasks.task import Event, Outcome, Task, Truth
+from bhd_lerobot.policies.brain import Brain, Goals, Observation
+from bhd_lerobot.robots.simulation import FrameReport, Simulation
+from bhd_lerobot.tasks.task import Event, Outcome, Task
 
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.
 _BRAIN_STREAM = 2
@@ -40,21 +40,29 @@ class Episode:
 
     Attributes:
         spec: what was asked for.
-        arena: where it was.
+        scene: where it was: an `Arena` or a `TableScene`.
+        instruction: what a person would ask for in it.
         initial_state: the simulator's complete state at its start, shape (nstate,).
         columns: the dataset's columns by key, each of shape (frames, ...), images left out.
         outcome: how it ended.
         timing: how punctual its control ticks were.
         writer: what was given for the episode's images at its start, or None.
+        commands: the goals that the brain gave, each with the frame in which it gave it.
+        results: how goals ended, each with the frame in which it did.
+        plan: the brain's plan, as plain values, if it has one.
     """
 
     spec: EpisodeSpec
-    arena: Arena
+    scene: Any
+    instruction: str
     initial_state: NDArray[np.float64]
     columns: dict[str, NDArray]
     outcome: Outcome
     timing: TimingSummary
     writer: Any
+    commands: list[tuple[int, BrainCommand]] = field(default_factory=list)
+    results: list[tuple[int, CommandResult]] = field(default_factory=list)
+    plan: dict[str, Any] = field(default_factory=dict)
 
     @property
     def frames(self) -> int:
@@ -77,7 +85,7 @@ class EpisodeLoop:
 
     def __init__(
         self,
-        simulation: TurtleBot3Simulation,
+        simulation: Simulation,
         task: Task,
         brain: Brain,
         open_images: Callable[[], Any] | None = None,
@@ -88,7 +96,9 @@ class EpisodeLoop:
         self._columns: dict[str, NDArray] = {}
         self._length = np.zeros(simulation.n, np.int64)
         self.frames = 0
-        brain.bind(simulation.observation_names, simulation.action_names, simulation.rates.fps)
+        self._results: Mapping[int, Sequence[CommandResult]] = {}
+        environment = task.environment_names
+        brain.bind(simulation.observation_names, simulation.action_names, simulation.rates.fps, environment)
 
     def run(self, specs: Sequence[EpisodeSpec], stop: Callable[[], bool] = lambda: False) -> Iterator[Episode]:
         """Run episodes and yield them in their order, each as soon as it and all before it are done.
@@ -102,7 +112,9 @@ class EpisodeLoop:
         order = [spec.index for spec in specs]
         n = self.simulation.n
         self._specs: list[EpisodeSpec | None] = [None] * n
-        self._arenas: list[Arena | None] = [None] * n
+        self._scenes: list[Any] = [None] * n
+        self._commands: list[list[tuple[int, BrainCommand]]] = [[] for _ in range(n)]
+        self._ends: list[list[tuple[int, CommandResult]]] = [[] for _ in range(n)]
         self._initial: list[NDArray[np.float64] | None] = [None] * n
         self._sinks: list[Any] = [None] * n
         self._pending: list[list[futures.Future[NDArray[np.uint8]]]] = [[] for _ in range(n)]
@@ -136,50 +148,79 @@ class EpisodeLoop:
         if not len(ids):
             return
         specs = [waiting.pop() for _ in ids]
-        arenas = [self.task.sample(spec.seed) for spec in specs]
-        self.simulation.reset(ids, arenas, [spec.seed for spec in specs])
-        self.task.begin(ids, arenas)
+        scenes = [self.task.sample(spec.seed) for spec in specs]
+        self.simulation.reset(ids, scenes, [spec.seed for spec in specs])
+        self.task.begin(ids, scenes)
         brain_seeds = [int(np.random.SeedSequence([_BRAIN_STREAM, spec.seed]).generate_state(1)[0]) for spec in specs]
-        self.brain.reset(ids, brain_seeds, self.simulation.n)
+        instructions = [self.task.instruction(scene) for scene in scenes]
+        self.brain.reset(ids, brain_seeds, self.simulation.n, instructions)
         states = self.simulation.snapshot(ids).state
-        for sim, spec, arena, state in zip(ids, specs, arenas, states, strict=True):
-            self._specs[sim], self._arenas[sim], self._initial[sim] = spec, arena, state
+        self._results = {sim: results for sim, results in self._results.items() if sim not in ids}
+        for sim, spec, scene, state in zip(ids, specs, scenes, states, strict=True):
+            self._specs[sim], self._scenes[sim], self._initial[sim] = spec, scene, state
+            self._commands[sim], self._ends[sim] = [], []
             self._sinks[sim] = self._open_images() if self._open_images and self.simulation.camera_names else None
         self._length[ids] = 0
 
     def _frame(self) -> list[tuple[int, Event]]:
         """Run one frame of all running simulations; return those that ended, and why."""
-        simulation = self.simulation
+        simulation, task, brain = self.simulation, self.task, self.brain
         frame = simulation.observe()
         state = frame.state.astype(np.float32)
         images = self._images()
-        seen = Observation(simulation.observation_names, state.astype(np.float64), images)
-        action = np.asarray(self.brain.act(seen)).astype(np.float32)
-        physics = simulation.physics_state
-        report = simulation.act(action.astype(np.float64))
-        running = np.flatnonzero(simulation.running)
-        truth = Truth(simulation.world.base_pose, report.touched)
-        reward, event = self.task.judge(truth, simulation.running)
-        self._store(
-            running,
-            {
-                keys.OBSERVATION_STATE: state,
-                keys.ACTION: action,
-                keys.APPLIED_ACTION: report.applied,
-                keys.TIME: frame.time_ns / NANOSECONDS,
-                keys.AGE: frame.age_ns / NANOSECONDS,
-                keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,
-                keys.LIMITS: report.limits,
-                keys.WATCHDOG: report.watchdog,
-                keys.MODE: report.mode,
-                keys.REWARD: reward,
-                keys.EVENT: event,
-                keys.PHYSICS_STATE: physics,
-            },
+        values: dict[str, NDArray] = {}
+        environment = None
+        if task.environment_names:
+            told = task.environment_state(simulation.truth()).astype(np.float32)
+            environment, values[keys.ENVIRONMENT_STATE] = told.astype(np.float64), told
+        seen = Observation(
+            simulation.observation_names,
+            state.astype(np.float64),
+            images,
+            environment,
+            self._results,
+            simulation.running,
         )
+        decision = brain.act(seen)
+        physics = simulation.physics_state
+        if isinstance(decision, Goals):
+            report = simulation.pursue(decision.commands)
+            action = report.applied.astype(np.float32)
+        else:
+            action = np.asarray(decision).astype(np.float32)
+            report = simulation.act(action.astype(np.float64))
+        self._log(decision, report)
+        running = np.flatnonzero(simulation.running)
+        reward, event = task.judge(simulation.truth(), simulation.running)
+        if brain.has_plan:
+            values[keys.SUBTASK] = np.array(brain.subtasks(), object)
+        values |= {
+            keys.OBSERVATION_STATE: state,
+            keys.ACTION: action,
+            keys.APPLIED_ACTION: report.applied,
+            keys.TIME: frame.time_ns / NANOSECONDS,
+            keys.AGE: frame.age_ns / NANOSECONDS,
+            keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,
+            keys.LIMITS: report.limits,
+            keys.WATCHDOG: report.watchdog,
+            keys.MODE: report.mode,
+            keys.REWARD: reward,
+            keys.EVENT: event,
+            keys.PHYSICS_STATE: physics,
+        }
+        self._store(running, values)
         self._length[running] += 1
         self.frames += len(running)
         return [(int(sim), Event(int(event[sim]))) for sim in running if event[sim] != Event.NOTHING]
+
+    def _log(self, decision: Any, report: FrameReport) -> None:
+        """Remember goals and how they ended, for the episode's metadata and for the brain."""
+        if isinstance(decision, Goals):
+            for sim, commands in decision.commands.items():
+                self._commands[sim] += [(int(self._length[sim]), command) for command in commands]
+        for sim, results in report.results.items():
+            self._ends[sim] += [(int(self._length[sim]), result) for result in results]
+        self._results = report.results
 
     def _images(self) -> dict[str, NDArray[np.uint8]]:
         """Order the images of the running simulations; return them if the brain looks at them.
@@ -214,15 +255,15 @@ class EpisodeLoop:
         if not self._columns:
             for key, value in values.items():
                 dtype = keys.SCALARS[key][0] if key in keys.SCALARS else "float32"
-                dtype = "float64" if key == keys.PHYSICS_STATE else dtype
+                dtype = {keys.PHYSICS_STATE: "float64", keys.SUBTASK: "object"}.get(key, dtype)
                 self._columns[key] = np.zeros((self.simulation.n, self._frames, *value.shape[1:]), dtype)
         rows = self._length[running]
         for key, value in values.items():
             self._columns[key][running, rows] = value[running]
 
     def _finish(self, sim: int, event: Event) -> Episode:
-        spec, arena, initial = self._specs[sim], self._arenas[sim], self._initial[sim]
-        if spec is None or arena is None or initial is None:
+        spec, scene, initial = self._specs[sim], self._scenes[sim], self._initial[sim]
+        if spec is None or initial is None:
             raise AssertionError(f"Simulation {sim} ended an episode that it never started.")
         self._wait_for_images(sim)
         length = int(self._length[sim])
@@ -238,4 +279,16 @@ class EpisodeLoop:
         timing = TimingStatistics(NANOSECONDS // rates.control_hz)
         timing.add_punctual(length * rates.ticks_per_frame)
         sink, self._sinks[sim] = self._sinks[sim], None
-        return Episode(spec, arena, initial, columns, outcome, timing.summary(), sink)
+        return Episode(
+            spec=spec,
+            scene=scene,
+            instruction=self.task.instruction(scene),
+            initial_state=initial,
+            columns=columns,
+            outcome=outcome,
+            timing=timing.summary(),
+            writer=sink,
+            commands=self._commands[sim],
+            results=self._ends[sim],
+            plan=self.brain.plan(sim) if self.brain.has_plan else {},
+        )

@@ -13,6 +13,7 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.bodies.tabletop import COLOURS, TableScene
 
 PANELS = 100  # panels on one page
 
@@ -25,13 +26,13 @@ class Trajectory:
 
     Attributes:
         title: what stands above the panel.
-        arena: the obstacles.
+        scene: the obstacles, or the objects on the table.
         xy: positions in the world frame [m], shape (frames, 2).
         success: whether the episode was one.
     """
 
     title: str
-    arena: Arena
+    scene: Arena | TableScene
     xy: NDArray[np.float64]
     success: bool
 
@@ -71,13 +72,51 @@ def _grid(count: int) -> tuple[int, int]:
 
 
 def _draw_panel(axes: Axes, trajectory: Trajectory) -> None:
-    draw_arena(axes, trajectory.arena)
+    draw_scene(axes, trajectory.scene)
     color = _GOOD if trajectory.success else _BAD
     axes.plot(trajectory.xy[:, 0], trajectory.xy[:, 1], color=color, linewidth=1.1)
     axes.plot(*trajectory.xy[0], marker="o", color=color, markersize=4)
     if not trajectory.success:
         axes.plot(*trajectory.xy[-1], marker="x", color=color, markersize=7, markeredgewidth=2)
     axes.set_title(trajectory.title, fontsize=7.5, color=color)
+
+
+def draw_scene(axes: Axes, scene: Arena | TableScene) -> None:
+    """Draw what is around the robot from above, to scale."""
+    if isinstance(scene, Arena):
+        draw_arena(axes, scene)
+    else:
+        draw_table(axes, scene)
+
+
+def draw_table(axes: Axes, scene: TableScene) -> None:
+    """Draw the objects before an arm from above, to scale, the base of the arm at the left."""
+    axes.set_facecolor(_FREE)
+    axes.add_patch(Circle((0.0, 0.0), 0.075, color=_WALL, linewidth=0))
+    for number, one in enumerate(scene.objects):
+        edge: dict[str, Any] = {"facecolor": COLOURS[one.colour], "edgecolor": "black"}
+        edge["linewidth"] = 1.6 if number == scene.target_object else 0.3
+        if one.kind == "cup":
+            axes.add_patch(Circle((one.x, one.y), one.size_x, **edge))
+        else:
+            corner = (one.x - one.size_x, one.y - one.size_y)
+            angle = math.degrees(one.yaw)
+            axes.add_patch(
+                Rectangle(corner, 2 * one.size_x, 2 * one.size_y, angle=angle, rotation_point="center", **edge)
+            )
+    if scene.target_pose is not None:
+        axes.plot(*scene.target_pose[:2], marker="+", color="black", markersize=8, markeredgewidth=1.5)
+    _frame_axes(axes, (-0.15, 0.85, -0.5, 0.5))
+
+
+def _frame_axes(axes: Axes, limits: tuple[float, float, float, float]) -> None:
+    axes.set_xlim(*limits[:2])
+    axes.set_ylim(*limits[2:])
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for side in axes.spines.values():
+        side.set_visible(False)
 
 
 def draw_arena(axes: Axes, arena: Arena) -> None:
@@ -100,18 +139,12 @@ def draw_arena(axes: Axes, arena: Arena) -> None:
                     linewidth=0,
                 )
             )
-    axes.set_xlim(x_min - 0.12, x_max + 0.12)
-    axes.set_ylim(y_min - 0.12, y_max + 0.12)
-    axes.set_aspect("equal")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for side in axes.spines.values():
-        side.set_visible(False)
+    _frame_axes(axes, (x_min - 0.12, x_max + 0.12, y_min - 0.12, y_max + 0.12))
 
 
 def draw_divergence(
     *,
-    arena: Arena,
+    scene: Arena | TableScene,
     recorded: NDArray,
     replayed: NDArray,
     time: NDArray,
@@ -122,7 +155,7 @@ def draw_divergence(
     """Draw a replay beside its recording.
 
     Args:
-        arena: the obstacles.
+        scene: the obstacles, or the objects on the table.
         recorded: recorded positions [m], shape (frames, 2).
         replayed: replayed positions [m], shape (frames, 2).
         time: time of the frames [s], shape (frames,).
@@ -133,7 +166,7 @@ def draw_divergence(
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     figure.suptitle(heading, fontsize=11)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
-    draw_arena(left, arena)
+    draw_scene(left, scene)
     left.plot(recorded[:, 0], recorded[:, 1], color="#2c3e50", linewidth=3, alpha=0.35, label="recorded")
     left.plot(replayed[:, 0], replayed[:, 1], color=_BAD, linewidth=1.1, label="replayed")
     left.plot(*recorded[0], marker="o", color="#2c3e50", markersize=5)

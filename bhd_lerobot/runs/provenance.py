@@ -8,6 +8,8 @@ from typing import Any
 from bhd_lerobot import __version__
 from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.bodies.tabletop import TableObject, TableScene, Variation
+from bhd_lerobot.control.commands import BrainCommand, Pose
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.runs.episode import Episode
 
@@ -31,37 +33,68 @@ def episode_metadata(episode: Episode, *, split: str, task: dict[str, Any], brai
         **outcome.details,
         "task": _json(task),
         "brain": _json(brain),
-        "scene": scene_to_json(episode.arena),
+        "scene": scene_to_json(episode.scene),
         "initial_state": episode.initial_state.tolist(),
         "timing": _json(asdict(episode.timing)),
         "versions": _json(versions()),
+        **_goals(episode),
     }
 
 
-def scene_to_json(arena: Arena) -> str:
-    """Return an arena as JSON: a replay needs no generator that may have changed since."""
-    return _json(
-        {
-            "name": arena.name,
-            "extent": arena.extent,
-            "start": arena.start,
-            "shapes": [[s.kind, s.x, s.y, s.yaw, s.size_x, s.size_y, s.height] for s in arena.shapes],
-        }
-    )
+def _goals(episode: Episode) -> dict[str, Any]:
+    """Return the plan, the goals and how they ended, of an episode that was driven by goals."""
+    columns: dict[str, Any] = {}
+    if episode.plan:
+        columns["plan"] = _json(episode.plan)
+    if episode.commands:
+        columns["goals"] = _json([[frame, asdict(command)] for frame, command in episode.commands])
+        columns["results"] = _json(
+            [[frame, one.task_id, one.success, one.code.name.lower(), one.message] for frame, one in episode.results]
+        )
+    return columns
 
 
-def scene_from_json(text: str) -> Arena:
-    """Return the arena that `scene_to_json` wrote.
+def scene_to_json(scene: Any) -> str:
+    """Return a scene as JSON: a replay needs no generator that may have changed since."""
+    if isinstance(scene, Arena):
+        return _json(
+            {
+                "name": scene.name,
+                "extent": scene.extent,
+                "start": scene.start,
+                "shapes": [[s.kind, s.x, s.y, s.yaw, s.size_x, s.size_y, s.height] for s in scene.shapes],
+            }
+        )
+    return _json(asdict(scene))
+
+
+def scene_from_json(text: str) -> Any:
+    """Return the scene that `scene_to_json` wrote: an `Arena` or a `TableScene`.
 
     Raises:
-        DatasetError: the text is no such arena.
+        DatasetError: the text is no scene.
     """
     try:
         scene = json.loads(text)
-        shapes = tuple(Shape(*row) for row in scene["shapes"])
-        return Arena(scene["name"], shapes, tuple(scene["extent"]), tuple(scene["start"]))
-    except (KeyError, TypeError, ValueError) as error:
+        if "shapes" in scene:
+            shapes = tuple(Shape(*row) for row in scene["shapes"])
+            return Arena(scene["name"], shapes, tuple(scene["extent"]), tuple(scene["start"]))
+        objects = tuple(TableObject(**_tuples(one)) for one in scene.pop("objects"))
+        variation = Variation(**_tuples(scene.pop("variation")))
+        return TableScene(objects=objects, variation=variation, **_tuples(scene))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"The recorded scene cannot be read: {error!r}.") from error
+
+
+def command_from_json(fields: dict[str, Any]) -> BrainCommand:
+    """Return the goal whose fields were recorded."""
+    pose = fields["target_pose"]
+    return BrainCommand(**{**_tuples(fields), "target_pose": None if pose is None else Pose(**_tuples(pose))})
+
+
+def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
+    """JSON knows lists only."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()}
 
 
 def _json(value: Any) -> str:

@@ -20,17 +20,17 @@ from bhd_lerobot.data.features import PHYSICS_STATE, dataset_features
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.simulation import TurtleBot3Simulation, describe
+from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.robots.simulation import Simulation, describe
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import encode, run
 from bhd_lerobot.runs.episode import Episode, EpisodeLoop, EpisodeSpec
 from bhd_lerobot.runs.plots import Trajectory, draw_trajectories
 from bhd_lerobot.runs.preview import Preview
 from bhd_lerobot.runs.provenance import episode_metadata
-from bhd_lerobot.runs.registry import make_brain, make_task
+from bhd_lerobot.runs.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
-from bhd_lerobot.tasks.task import episode_seed
+from bhd_lerobot.tasks.task import Task, episode_seed
 
 
 @dataclass
@@ -82,10 +82,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     """
     console = console or Console(stderr=True)
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
-    robot = config.robot
-    if not isinstance(robot, TurtleBot3Config):
-        raise AssertionError("RecordConfig refuses other robots.")
-    simulation = TurtleBot3Simulation(robot, min(config.n_envs, config.dataset.num_episodes), config.threads)
+    simulation = make_simulation(config.robot, min(config.n_envs, config.dataset.num_episodes), config.threads)
     task = make_task(config.task, simulation.n, config.dataset.fps)
     brain = make_brain(config.brain)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
@@ -95,7 +92,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
             simulation.start_rendering()  # a machine without OpenGL fails here, before a dataset exists
         output_dir = _make_output_dir(config)
         result = RecordResult(root, output_dir, stopped_by=stop)
-        with _open_recorder(config, root, simulation, task.parameters(), brain.parameters()) as recorder:
+        with _open_recorder(config, root, simulation, task, brain) as recorder:
             if recorder.repair_report:
                 console.print(f"Mended before resuming: {recorder.repair_report}")
             loop = EpisodeLoop(simulation, task, brain, recorder.begin_episode)
@@ -104,7 +101,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         heading = f"{task.name}, {brain.name}: {result.successes} of {result.recorded} episodes succeeded"
         draw_trajectories(trajectories, output_dir / "trajectories.png", heading)
     if first is not None and preview is not None:
-        preview.write(first.arena, first.columns[PHYSICS_STATE], config.dataset.fps, output_dir / "episode.mp4")
+        preview.write(first.scene, first.columns[PHYSICS_STATE], config.dataset.fps, output_dir / "episode.mp4")
         preview.close()
     _summary(console, config, result, preview is not None and first is not None)
     if config.dataset.push_to_hub and not stop:
@@ -128,10 +125,10 @@ def _run(
         started = time.perf_counter()
         for episode in loop.run(specs, lambda: bool(result.stopped_by)):
             metadata = episode_metadata(episode, split=config.split, task=task.parameters(), brain=brain.parameters())
-            _save(recorder, episode, task.instruction, metadata)
+            _save(recorder, episode, metadata)
             _count(result, episode, config.dataset.fps)
             result.wall_s = time.perf_counter() - started
-            trajectories.append(_trajectory(episode))
+            trajectories.append(_trajectory(episode, loop.simulation))
             first = first or episode
             progress.update(
                 bar,
@@ -146,21 +143,28 @@ def _run(
 
 
 def _open_recorder(
-    config: RecordConfig, root: Path, simulation: TurtleBot3Simulation, task: dict[str, Any], brain: dict[str, Any]
+    config: RecordConfig, root: Path, simulation: Simulation, task: Task, brain: Brain
 ) -> DatasetRecorder:
     images = dict.fromkeys(
         simulation.camera_names, (simulation.config.camera_height, simulation.config.camera_width, 3)
     )
     nq, nv = simulation.world.qpos.shape[1], simulation.world.qvel.shape[1]
     physics = [f"qpos_{i}" for i in range(nq)] + [f"qvel_{i}" for i in range(nv)]
-    features = dataset_features(simulation.observation_names, simulation.action_names, images, physics)
+    features = dataset_features(
+        simulation.observation_names,
+        simulation.action_names,
+        images,
+        physics,
+        task.environment_names,
+        subtask=brain.has_plan,
+    )
     # What decides the episodes. How many there are, and how many run side by side, does not.
     recording = {
         "robot": {
             key: str(value) if isinstance(value, Path) else value for key, value in describe(simulation.config).items()
         },
-        "task": task,
-        "brain": brain,
+        "task": task.parameters(),
+        "brain": brain.parameters(),
         "seed": config.seed,
         "split": config.split,
     }
@@ -175,11 +179,11 @@ def _open_recorder(
     )
 
 
-def _save(recorder: DatasetRecorder, episode: Episode, instruction: str, metadata: dict[str, Any]) -> None:
+def _save(recorder: DatasetRecorder, episode: Episode, metadata: dict[str, Any]) -> None:
     writer = episode.writer or recorder.begin_episode()
     try:
         writer.set_columns(episode.columns)
-        recorder.save(writer, task=instruction, metadata=metadata)
+        recorder.save(writer, task=episode.instruction, metadata=metadata)
     except BaseException:
         writer.discard()
         raise
@@ -194,17 +198,18 @@ def _count(result: RecordResult, episode: Episode, fps: int) -> None:
     result.simulated_s += episode.frames / fps
 
 
-def _trajectory(episode: Episode) -> Trajectory:
+def _trajectory(episode: Episode, simulation: Simulation) -> Trajectory:
     outcome = episode.outcome
     title = f"{episode.spec.index}: {outcome.event.cause}, score {outcome.score:.2f}"
-    return Trajectory(title, episode.arena, episode.columns[PHYSICS_STATE][:, :2], outcome.success)
+    track = simulation.track(episode.columns[PHYSICS_STATE])
+    return Trajectory(title, episode.scene, track[:, :2], outcome.success)
 
 
-def _make_preview(config: RecordConfig, simulation: TurtleBot3Simulation, console: Console) -> Preview | None:
+def _make_preview(config: RecordConfig, simulation: Simulation, console: Console) -> Preview | None:
     if config.preview_video is False:
         return None
     try:
-        return Preview(simulation.body)
+        return Preview(make_simulation(config.robot))
     except RenderingError as error:
         if config.preview_video:
             raise

@@ -1,12 +1,17 @@
-"""Which brain and which task belong to a configuration."""
+"""Which brain, which task and which simulation belong to a configuration."""
 
 from collections.abc import Callable
 from typing import Any
+
+from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.policies.avoidance import AvoidanceBrain, AvoidanceConfig
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.policies.config_brain import BrainConfig
 from bhd_lerobot.policies.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import Task
@@ -17,11 +22,34 @@ _BRAINS: dict[type, Callable[[Any], Brain]] = {
     GapFollowerConfig: GapFollowerBrain,
 }
 _TASKS: dict[type, Callable[[Any, int, int], Task]] = {AvoidConfig: AvoidTask}
+_SIMULATIONS: dict[type[RobotConfig], Callable[[Any, int, int | None], Simulation]] = {TurtleBot3Config: TurtleBot3Simulation}
+
+SIMULATED_ROBOTS = tuple(_SIMULATIONS)
+"""Configurations of the robots that can be simulated."""
+
+
+def make_simulation(config: Any, n: int = 1, threads: int | None = None) -> Simulation:
+    """Return n simulations of the robot that a configuration describes."""
+    return _SIMULATIONS[type(config)](config, n, threads)
 
 
 def make_brain(config: BrainConfig) -> Brain:
     """Return the brain that a configuration describes."""
     return _BRAINS[type(config)](config)
+
+
+def action_names_of(config: BrainConfig) -> tuple[str, ...]:
+    """Return the names of the actions of the robots that a brain is for."""
+    brain: Any = _BRAINS[type(config)]
+    simulations = {kind.get_choice_name(kind): simulation for kind, simulation in _SIMULATIONS.items()}
+    simulation: Any = simulations[brain.robot_type]
+    return tuple(simulation.action_names)
+
+
+def robot_of_task(config: TaskConfig) -> str:
+    """Return the type of the robot that a task is for."""
+    task: Any = _TASKS[type(config)]
+    return str(task.robot_type)
 
 
 def make_task(config: TaskConfig, n: int, fps: int) -> Task:

@@ -12,21 +12,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lerobot.robots.config import RobotConfig
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.control.commands import BrainCommand
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.inspect import dataset_info
 from bhd_lerobot.data.read import read_episode
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.simulation import Simulation
 from bhd_lerobot.runs.configuration import run
 from bhd_lerobot.runs.plots import draw_divergence
-from bhd_lerobot.runs.provenance import scene_from_json, versions
+from bhd_lerobot.runs.provenance import command_from_json, scene_from_json, versions
+from bhd_lerobot.runs.registry import make_simulation
 
 MODES = ("open_loop", "state", "both")
 
@@ -81,17 +82,17 @@ class Divergence:
     Attributes:
         mode: how it was replayed.
         position_m: distance of the base positions [m], shape (frames,).
-        yaw_rad: difference of the base's yaw [rad], shape (frames,).
+        angle_rad: difference of the base's yaw [rad], shape (frames,).
         state: largest difference of any recorded physics value, in its own unit, shape (frames,).
         observation: largest difference of any compared observation, in its own unit, shape (frames,).
-        recorded_xy: recorded base positions [m], shape (frames, 2).
-        replayed_xy: replayed base positions [m], shape (frames, 2).
+        recorded_xy: recorded positions of base or tool [m], shape (frames, 2).
+        replayed_xy: replayed positions of base or tool [m], shape (frames, 2).
         not_compared: observations that this mode cannot reproduce.
     """
 
     mode: str
     position_m: NDArray[np.float64]
-    yaw_rad: NDArray[np.float64]
+    angle_rad: NDArray[np.float64]
     state: NDArray[np.float64]
     observation: NDArray[np.float64]
     recorded_xy: NDArray[np.float64]
@@ -127,12 +128,13 @@ class Replay:
                 "Replay its actions on a robot with lerobot-replay."
             )
         self.metadata = metadata
-        self.arena: Arena = scene_from_json(metadata["scene"])
+        self.scene = scene_from_json(metadata["scene"])
         self.seed = int(metadata["seed"])
         self.fps = summary.fps
-        known = {one.name for one in fields(TurtleBot3Config)}
-        parameters = {key: value for key, value in summary.recording["robot"].items() if key in known}
-        self.simulation = TurtleBot3Simulation(TurtleBot3Config(**{**parameters, "camera": False}))
+        self.simulation = make_simulation(_robot_config(summary.recording["robot"]))
+        self.goals: dict[int, list[BrainCommand]] = {}
+        for frame, fields_ in json.loads(metadata.get("goals") or "[]"):
+            self.goals.setdefault(frame, []).append(command_from_json(fields_))
         self._initial = np.asarray(metadata["initial_state"], np.float64)
 
     def changed_versions(self) -> dict[str, tuple[str, str]]:
@@ -143,43 +145,38 @@ class Replay:
         }
 
     def open_loop(self) -> Divergence:
-        """Replay the recorded actions from the recorded initial state."""
+        """Replay the recorded commands from the recorded initial state.
+
+        They are the recorded actions, or, of an episode that was driven by goals, the goals.
+        """
         simulation = self._start()
         actions = self.columns[keys.ACTION].astype(np.float64)
         states, observations = [], []
-        for action in actions:
+        for frame, action in enumerate(actions):
             states.append(simulation.physics_state[0])
             observations.append(simulation.observe().state[0])
-            simulation.act(action[None])
+            if self.goals:
+                simulation.pursue({0: self.goals.get(frame, [])})
+            else:
+                simulation.act(action[None])
         return self._compare("open_loop", np.array(states), np.array(observations), ())
 
     def state_exact(self) -> Divergence:
         """Put the robot into every recorded state and read its sensors again."""
         simulation = self._start()
-        config = simulation.config
-        # The rhythm of the scans: the noise of a scan that fell between two frames must be drawn, too.
-        period = simulation.body.lidar.rate_hz if simulation.body.lidar else 1
-        taken = 1
         states, observations = [], []
+        ages = self.columns[keys.AGE]
         for frame, state in enumerate(self.columns[keys.PHYSICS_STATE]):
             simulation.restore_physics(0, state)
-            now = self.columns[keys.TIME][frame]
-            due = round((now - self.columns[keys.AGE][frame]) * period) + 1
-            while taken < due:
-                simulation.scan_now(np.zeros(1, np.intp))
-                taken += 1
+            simulation.resense(0, float(self.columns[keys.TIME][frame]), float(ages[frame]))
             states.append(simulation.physics_state[0])
             observations.append(simulation.observe().state[0])
-        # Odometry is the cerebellum's memory and a gyroscope's reading is a time derivative: neither is in a state.
-        skipped = tuple(["x.pos", "y.pos", "theta.pos"] * config.odometry) + tuple(
-            ["imu_x.vel", "imu_y.vel", "imu_z.vel"] * config.imu
-        )
-        return self._compare("state", np.array(states), np.array(observations), skipped)
+        return self._compare("state", np.array(states), np.array(observations), simulation.not_in_state)
 
-    def _start(self) -> TurtleBot3Simulation:
+    def _start(self) -> Simulation:
         simulation = self.simulation
         first = np.zeros(1, np.intp)
-        simulation.reset(first, [self.arena], [self.seed])
+        simulation.reset(first, [self.scene], [self.seed])
         world = simulation.world
         if self._initial.shape != world.snapshot().state.shape[1:]:
             raise DatasetError(
@@ -201,15 +198,15 @@ class Replay:
         scan = np.array([name.startswith("scan_") for name in names])
         difference = np.abs(observations.astype(np.float32) - self.columns[keys.OBSERVATION_STATE])
         difference[np.ix_(~fresh, scan)] = 0.0
-        yaw = _yaw(states) - _yaw(recorded)
+        now, then = self.simulation.track(states), self.simulation.track(recorded)
         return Divergence(
             mode=mode,
-            position_m=np.hypot(*(states[:, :2] - recorded[:, :2]).T),
-            yaw_rad=np.abs((yaw + np.pi) % (2 * np.pi) - np.pi),
+            position_m=np.sqrt(((now[:, :3] - then[:, :3]) ** 2).sum(axis=1)),
+            angle_rad=_angle(now[:, 3:], then[:, 3:]),
             state=np.abs(states - recorded).max(axis=1),
             observation=difference[:, kept].max(axis=1),
-            recorded_xy=recorded[:, :2],
-            replayed_xy=states[:, :2],
+            recorded_xy=then[:, :2],
+            replayed_xy=now[:, :2],
             not_compared=skipped,
         )
 
@@ -232,7 +229,7 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
         console.print(f"Recorded with {name} {then}, replayed with {now}: differences may come from that.")
     results = []
     table = Table(title=f"Replay of episode {config.dataset.episode} of {root}", title_justify="left")
-    for heading in ("largest difference", "frames", "position", "yaw", "state", "observed", ""):
+    for heading in ("largest difference", "frames", "position", "angle", "state", "observed", ""):
         table.add_column(heading, justify="left" if heading in ("largest difference", "") else "right")
     for mode in ("open_loop", "state") if config.mode == "both" else (config.mode,):
         result = episode.open_loop() if mode == "open_loop" else episode.state_exact()
@@ -242,7 +239,7 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
             str(len(result.state)),
             *(
                 f"{values.max():.3g}"
-                for values in (result.position_m, result.yaw_rad, result.state, result.observation)
+                for values in (result.position_m, result.angle_rad, result.state, result.observation)
             ),
             "identical" if result.identical else "",
         )
@@ -250,14 +247,14 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
             table.caption = f"Not compared in mode state: {', '.join(result.not_compared)}."
         curves: dict[str, Any] = {
             "position [m]": result.position_m,
-            "yaw [rad]": result.yaw_rad,
+            "angle [rad]": result.angle_rad,
             "observation, largest": result.observation,
         }
         time = np.arange(len(result.state)) / episode.fps
         heading = f"Episode {config.dataset.episode}, replay mode {mode}"
         path = folder / f"episode_{config.dataset.episode:06d}_{mode}.png"
         draw_divergence(
-            arena=episode.arena,
+            scene=episode.scene,
             recorded=result.recorded_xy,
             replayed=result.replayed_xy,
             time=time,
@@ -270,9 +267,23 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
     return results
 
 
-def _yaw(states: NDArray[np.float64]) -> NDArray[np.float64]:
-    w, x, y, z = states[:, 3:7].T
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+def _angle(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angles between orientations, exactly 0 for equal ones."""
+    # A quaternion and its negative are the same orientation.
+    apart, across = first - second, first + second
+    chord = np.sqrt(np.minimum((apart * apart).sum(axis=1), (across * across).sum(axis=1)))
+    return np.asarray(4 * np.arcsin(np.minimum(chord / 2, 1.0)))
+
+
+def _robot_config(recorded: dict[str, Any]) -> Any:
+    """Return the configuration of the robot that recorded an episode, without cameras."""
+    try:
+        kind = RobotConfig.get_choice_class(recorded["type"])
+    except KeyError:
+        raise DatasetError(f"The dataset was recorded by an unknown robot, {recorded.get('type')!r}.") from None
+    known = {one.name for one in fields(kind)}
+    parameters = {key: value for key, value in recorded.items() if key in known}
+    return kind(**{**parameters, "camera": False})
 
 
 def _main(config: ReplayConfig) -> int:

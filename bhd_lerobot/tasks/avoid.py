@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.arenas import ARENAS, Arena, make_arena
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.tasks.config_task import TaskConfig
-from bhd_lerobot.tasks.task import Event, Outcome, Truth
+from bhd_lerobot.tasks.task import BaseTruth, Event, Outcome
 
 
 @TaskConfig.register_subclass("avoid")
@@ -63,7 +63,8 @@ class AvoidTask:
     """
 
     name = "avoid"
-    instruction = "Roam without touching anything."
+    robot_type = "turtlebot3"
+    environment_names: tuple[str, ...] = ()
 
     def __init__(self, config: AvoidConfig, n: int, fps: int) -> None:
         self.config = config
@@ -85,6 +86,14 @@ class AvoidTask:
         """Return the arena of the episode with this seed."""
         return make_arena(self.config.arena, seed, self.config.random_start)
 
+    def instruction(self, scene: Arena) -> str:
+        """Return what a person would ask for."""
+        return "Roam without touching anything."
+
+    def environment_state(self, truth: BaseTruth) -> NDArray[np.float64]:
+        """Return nothing: the robot's own sensors tell all that the brain may know, shape (n, 0)."""
+        return np.zeros((len(truth.touched), 0))
+
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
         """Start episodes: the robot stands at each arena's start."""
         for sim, arena in zip(ids, scenes, strict=True):
@@ -105,7 +114,7 @@ class AvoidTask:
         self._history[:, ids] = 0.0
         self._frame[ids] = 0
 
-    def judge(self, truth: Truth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def judge(self, truth: BaseTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""
         event = np.full(len(running), int(Event.NOTHING))
         position = truth.base_pose_in_world[:, :2]

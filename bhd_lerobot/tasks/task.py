@@ -8,7 +8,6 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.errors import ConfigError
 
 Split = Literal["train", "held_out"]
@@ -25,6 +24,9 @@ class Event(IntEnum):
     TIMEOUT = 4
     INTERVENTION = 5
     ESTOP = 6
+    WRONG_OBJECT = 7
+    DROPPED = 8
+    UNREACHABLE = 9
 
     @property
     def cause(self) -> str:
@@ -54,8 +56,8 @@ def episode_seed(seed: int, episode: int, split: Split) -> int:
 
 
 @dataclass(frozen=True)
-class Truth:
-    """What the simulator knows, at the end of a frame.
+class BaseTruth:
+    """What the simulator knows about bases, at the end of a frame.
 
     Attributes:
         base_pose_in_world: x [m], y [m], yaw [rad], shape (n, 3).
@@ -64,6 +66,29 @@ class Truth:
 
     base_pose_in_world: NDArray[np.float64]
     touched: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ArmTruth:
+    """What the simulator knows about arms, at the end of a frame. Poses are in the base frame: x, y, z [m], wxyz.
+
+    Attributes:
+        tool_pose: of the tool frame, shape (n, 7).
+        object_poses: of the objects' centres, shape (n, MAX_OBJECTS, 7); the origin for those that are not there.
+        opening: opening of the gripper [m], shape (n,).
+        arm_on_table: whether the arm touched the table at any time in the frame, shape (n,).
+        arm_on_object: whether a link other than the gripper touched an object, shape (n,).
+        self_contact: whether the arm touched itself, shape (n,).
+        fingers_on_object: whether a finger touches each object at the end of the frame, shape (n, MAX_OBJECTS).
+    """
+
+    tool_pose: NDArray[np.float64]
+    object_poses: NDArray[np.float64]
+    opening: NDArray[np.float64]
+    arm_on_table: NDArray[np.bool_]
+    arm_on_object: NDArray[np.bool_]
+    self_contact: NDArray[np.bool_]
+    fingers_on_object: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -84,19 +109,33 @@ class Outcome:
 
 
 class Task(Protocol):
-    """A task for n simulations at once; each of them is in an episode of its own."""
+    """A task for n simulations at once; each of them is in an episode of its own.
+
+    Attributes:
+        name: its name.
+        robot_type: the robot that it is for.
+        duration_s: longest duration of an episode [s].
+        environment_names: names of what the task tells the brain, in order; empty if nothing.
+    """
 
     name: str
-    instruction: str
+    robot_type: str
     duration_s: float
+    environment_names: tuple[str, ...]
 
-    def sample(self, seed: int) -> Arena:
-        """Return the scene and the start pose of the episode with this seed."""
+    def sample(self, seed: int) -> Any:
+        """Return the scene of the episode with this seed: an `Arena` or a `TableScene`."""
 
-    def begin(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
+    def instruction(self, scene: Any) -> str:
+        """Return what a person would ask for in this scene."""
+
+    def begin(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
         """Start episodes in some simulations."""
 
-    def judge(self, truth: Truth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def environment_state(self, truth: Any) -> NDArray[np.float64]:
+        """Return what the task tells the brain now, shape (n, len(environment_names))."""
+
+    def judge(self, truth: Any, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the reward and the `Event` of the frame that just ended, each of shape (n,).
 
         An event other than `NOTHING` ends the episode. Simulations that are not running get 0.

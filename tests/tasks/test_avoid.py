@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.arenas import make_arena, random_arena
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
-from bhd_lerobot.tasks.task import Event, Truth
+from bhd_lerobot.tasks.task import Event, BaseTruth
 
 FPS = 10
 EMPTY = make_arena("empty", 0)  # 6 m by 6 m, start in the middle
@@ -35,7 +35,7 @@ class Run:
         """Judge a frame; an episode that ended is not running any more."""
         self.pose[:, :2] = positions
         reward, event = self.task.judge(
-            Truth(self.pose.copy(), np.broadcast_to(touched, (self.n,)).copy()), self.running.copy()
+            BaseTruth(self.pose.copy(), np.broadcast_to(touched, (self.n,)).copy()), self.running.copy()
         )
         assert (reward[~self.running] == 0).all()
         assert (event[~self.running] == Event.NOTHING).all()

@@ -1,0 +1,160 @@
+"""The controller of arms with position servos: setpoints and goals to servo positions."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
+from bhd_lerobot.control.controller import Controller
+from bhd_lerobot.control.goals import GoalManager
+from bhd_lerobot.control.messages import Limit, Mode
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.setpoints import SetpointFilter
+
+_REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
+
+
+class ArmController(Controller):
+    """Joint positions and the gripper's opening, from setpoints or from goals.
+
+    A command is the position of each joint [rad] and the gripper's opening [m]. What goes to the servos is the
+    reference plus the lead that makes up for the servos' damping, so that they follow a moving reference without a lag.
+
+    Args:
+        arm: the arm.
+        n: number of arms.
+        control_hz: ticks a second [Hz].
+        frame_ticks: ticks in a frame, over which a setpoint is approached.
+    """
+
+    def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int) -> None:
+        limits = arm.limits
+        self.arm = arm
+        self.width = self.joints = width = len(limits.names)
+        self.goals = GoalManager(arm, n, control_hz)
+        self.setpoints = SetpointFilter(limits, n, control_hz, frame_ticks)
+        self.command = np.tile(np.asarray(arm.home), (n, 1))
+        self.velocity: NDArray[np.float64] = np.zeros((n, width))
+        self.acceleration: NDArray[np.float64] = np.zeros((n, width))
+        self.actuators = self.command.copy()
+        self.following, self.busy = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self._lead = np.asarray(arm.servo_damping) / np.asarray(arm.servo_stiffness)
+        self._stiffness, self._damping = np.asarray(arm.servo_stiffness), np.asarray(arm.servo_damping)
+        self._largest_error = np.asarray(limits.effort) / self._stiffness
+        self._flat_command, self._zeros = self.command.reshape(-1), np.zeros(n * width)
+        self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self._work, self._centre = np.zeros((n, width)), np.zeros((n, width))
+
+    # --- motion ------------------------------------------------------------------------------------------------------
+
+    def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
+        """Head for new setpoints; goals that are still followed end, because the newer command counts."""
+        bad = mask & ~np.isfinite(values).all(axis=1)
+        if bad.any():
+            # Commands are checked when they are sent; a queue in shared memory is written by another process.
+            self._limited_finite |= bad
+            self.stop(bad, Mode.FAULT)
+            mask = mask & ~bad
+        if (self.busy & mask).any():
+            self.goals.drop_for_setpoint(mask)
+        self.setpoints.head_for(values, mask, self.command)
+
+    def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
+        """Decelerate to rest; all goals of these arms end, with the cause as their result."""
+        if cause not in _STOP_CODES:
+            return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
+        self.setpoints.drop(mask)
+        hard = cause in (Mode.ESTOP, Mode.FAULT)
+        self.goals.stop(mask, _STOP_CODES[cause], hard, self.command, self.velocity, self.acceleration)
+
+    def run(self, reading: PlantReading) -> None:
+        """Advance by one tick."""
+        if self.setpoints.active.any():
+            self.setpoints.run(self.command, self.velocity, self.acceleration)
+        self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
+        np.copyto(self.busy, self.goals.busy)
+        np.copyto(self.following, self.goals.following)
+        if (self.following & self.setpoints.active).any():
+            self.setpoints.drop(self.following)
+        actuators, centre, work = self.actuators, self._centre, self._work
+        np.multiply(self.velocity, self._lead, out=actuators)
+        actuators += self.command
+        # The servo's force is stiffness * (command - position) - damping * speed: keep it within the effort limit.
+        np.multiply(reading.velocity, self._lead, out=centre)
+        centre += reading.position
+        np.subtract(actuators, centre, out=work)
+        np.abs(work, out=work)
+        if (work > self._largest_error).any():
+            self._limited_effort |= (work > self._largest_error)[:, : self.width - 1].any(axis=1)
+            np.maximum(actuators, centre - self._largest_error, out=actuators)
+            np.minimum(actuators, centre + self._largest_error, out=actuators)
+
+    def at_rest(self) -> NDArray[np.bool_]:
+        """Return whether each arm is commanded to be at rest, shape (n,)."""
+        return np.asarray((np.abs(self.velocity) < _REST).all(axis=1)) & ~self.busy
+
+    def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
+        """Start from the posture that the arms are in."""
+        lower, upper = np.asarray(self.arm.limits.lower), np.asarray(self.arm.limits.upper)
+        self.command[ids] = np.minimum(np.maximum(reading.position[ids], lower), upper)
+        self.actuators[ids] = self.command[ids]
+        self.velocity[ids] = self.acceleration[ids] = 0.0
+
+    def restart(self, ids: NDArray[np.intp]) -> None:
+        """Forget everything about arms that were put somewhere else."""
+        self.goals.restart(ids)
+        self.setpoints.restart(ids)
+        self.velocity[ids] = self.acceleration[ids] = 0.0
+        for flags in (self._limited_finite, self._limited_effort, self.busy, self.following):
+            flags[ids] = False
+
+    # --- reports -----------------------------------------------------------------------------------------------------
+
+    def take_limits(self) -> NDArray[np.int64]:
+        """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
+        setpoints = self.setpoints
+        limits = np.asarray(
+            self._limited_finite * int(Limit.NON_FINITE)
+            + setpoints.limited_position * int(Limit.POSITION)
+            + setpoints.limited_velocity * int(Limit.VELOCITY)
+            + setpoints.limited_acceleration * int(Limit.ACCELERATION)
+            + self._limited_effort * int(Limit.EFFORT)
+        )
+        for flags in (
+            self._limited_finite,
+            self._limited_effort,
+            setpoints.limited_position,
+            setpoints.limited_velocity,
+            setpoints.limited_acceleration,
+        ):
+            flags[:] = False
+        return limits
+
+    def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
+        """Return the torques that the servos are asked for beyond gravity [N m], the gripper's force last [N]."""
+        return (self.actuators - reading.position) * self._stiffness - reading.velocity * self._damping
+
+    # --- goals -------------------------------------------------------------------------------------------------------
+
+    def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
+        """Take a goal; None if it was accepted, otherwise the refusal."""
+        return self.goals.submit(sim, command, blocked)
+
+    def cancel(self, sim: int, task_id: str) -> ResultCode:
+        """Cancel a goal: decelerate, then hold."""
+        return self.goals.cancel(sim, task_id)
+
+    def take_results(self, sim: int) -> list[CommandResult]:
+        """Return the results of one arm that nobody has taken yet."""
+        return self.goals.take_results(sim)
+
+    def feedback(self, sim: int) -> Feedback | None:
+        """Return how far the goal is that one arm follows, or None."""
+        return self.goals.feedback(sim)
+
+
+_STOP_CODES = {
+    Mode.STOPPING: ResultCode.CANCELLED,
+    Mode.ESTOP: ResultCode.ESTOP,
+    Mode.FAULT: ResultCode.FAULT,
+}

@@ -1,0 +1,126 @@
+"""n simulated TurtleBot3s under one cerebellum."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.control.base_controller import BaseController
+from bhd_lerobot.control.bridge import LockstepBridge
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.sim.lidar import Lidar
+from bhd_lerobot.sim.plant import SimulatedPlant
+from bhd_lerobot.sim.world import World
+from bhd_lerobot.tasks.task import BaseTruth
+
+
+class TurtleBot3Simulation(Simulation):
+    """n simulated TurtleBot3s.
+
+    Args:
+        config: the robot.
+        n: how many.
+        threads: threads that step the physics; all processors if None.
+    """
+
+    action_names = ("x.vel", "theta.vel")
+    film_speed = 4
+
+    def __init__(self, config: TurtleBot3Config, n: int = 1, threads: int | None = None) -> None:
+        self.config, self.n = config, n
+        self.rates = config.rates
+        body = self.body = config.body()
+        self.world = World(body, n, physics_hz=config.physics_hz, threads=threads)
+        self.plant = SimulatedPlant(self.world)
+        self._controller = BaseController(body, n, config.control_hz)
+        self.cerebellum = Cerebellum(body, self.plant, config.control_hz, controller=self._controller)
+        self.bridge = LockstepBridge(self.cerebellum, self.rates, self._advance)
+        if body.lidar is None:
+            raise AssertionError("The Burger has a lidar.")
+        self.lidar = Lidar(self.world, body.lidar, config.beams)
+        self.observation_names = observation_names(config)
+        self.camera_names = ("front",) if config.camera else ()
+        self._begin()
+        self._touch = self.world.sensor(body.touch_sensor)[:, 0]
+        self._gyro = self.world.sensor("imu_gyro")
+        self._touched = np.zeros(n, np.bool_)
+        self.scan_rate_hz = body.lidar.rate_hz
+        self._scan_ticks = config.control_hz // body.lidar.rate_hz
+        self._scanned_tick = np.zeros(n, np.int64)
+        self._scans = np.zeros(n, np.int64)  # scans taken in the episode
+        self._next_scan = 0
+
+    def truth(self) -> BaseTruth:
+        """Return where the bases are, and whether they touched the scene since the start of the last frame."""
+        return BaseTruth(self.world.base_pose, self._touched.copy())
+
+    def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pose of the base in recorded states, shape (frames, 7)."""
+        return states[:, :7]
+
+    @property
+    def not_in_state(self) -> tuple[str, ...]:
+        """Odometry, the cerebellum's memory, and the gyroscope's readings, which are time derivatives."""
+        odometry, imu = ("x.pos", "y.pos", "theta.pos"), ("imu_x.vel", "imu_y.vel", "imu_z.vel")
+        return odometry * self.config.odometry + imu * self.config.imu
+
+    def resense(self, sim: int, time_s: float, age_s: float) -> None:
+        """Take the scans that were due until then: the noise of one that fell between two frames is drawn, too."""
+        due = round((time_s - age_s) * self.scan_rate_hz) + 1
+        while self._scans[sim] < due:
+            self._scan(np.array([sim]))
+
+    def place(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
+        """Put robots into arenas, at rest at their start."""
+        self.world.place([arena.shapes for arena in scenes], ids)
+        self.world.reset(ids, np.array([arena.start for arena in scenes]))
+        self._touched[ids] = False
+
+    def _started(self, ids: NDArray[np.intp], seeds: Sequence[int]) -> None:
+        self._scans[ids] = 0
+        self._scan(ids)
+
+    def _sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        self.plant.read(self._reading)
+        drive = self._controller.drive
+        parts = [drive.twist_from_wheels(self._reading.velocity), self.lidar.ranges]
+        if self.config.odometry:
+            parts.append(drive.odometry_at(self._reading.position))
+        if self.config.imu:
+            parts.append(self._gyro)
+        return np.concatenate(parts, axis=1), self._scanned_tick
+
+    def _clear_touches(self) -> None:
+        self._touched[:] = False
+
+    def _step(self) -> None:
+        for _ in range(self.rates.steps_per_tick):
+            # One by one: a touch may last a single step, and the sensor tells of the last one only.
+            self.world.step(1, self._active)
+            np.logical_or(self._touched, self._touch, out=self._touched)
+
+    def _after_tick(self) -> None:
+        if self._tick >= self._next_scan:
+            due = self.running & (self._tick - self._scanned_tick >= self._scan_ticks)
+            self._scan(np.flatnonzero(due))
+
+    def _scan(self, ids: NDArray[np.intp]) -> None:
+        if len(ids):
+            self.lidar.scan(self._rngs, ids)
+            self._scanned_tick[ids] = self._tick
+            self._scans[ids] += 1
+        running = self._scanned_tick[self.running]
+        self._next_scan = (int(running.min()) if len(running) else self._tick) + self._scan_ticks
+
+
+def observation_names(config: TurtleBot3Config) -> tuple[str, ...]:
+    """Return the names of the observation's floats, in order."""
+    names = ["x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(config.beams))]
+    if config.odometry:
+        names += ["x.pos", "y.pos", "theta.pos"]
+    if config.imu:
+        names += ["imu_x.vel", "imu_y.vel", "imu_z.vel"]
+    return tuple(names)
