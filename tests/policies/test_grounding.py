@@ -1,0 +1,114 @@
+"""Left, right, near, far, big and small: among which objects they choose, and when they do not decide."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.bodies.tabletop import COLOURS, KINDS
+from bhd_lerobot.policies.grounding import DISTANCE_MARGIN, SIZE_MARGIN, Description, descriptions, fitting
+from bhd_lerobot.policies.lexicon import Relation
+from bhd_lerobot.policies.planner import SceneObject
+
+SIDES = (Relation.LEFT, Relation.RIGHT)
+MOST: dict[Relation, Callable[[SceneObject], float]] = {
+    Relation.LEFT: lambda o: o.position[1],
+    Relation.RIGHT: lambda o: -o.position[1],
+    Relation.NEAREST: lambda o: -math.dist((0, 0), o.position[:2]),
+    Relation.FARTHEST: lambda o: math.dist((0, 0), o.position[:2]),
+    Relation.BIGGEST: lambda o: math.prod(o.size),
+    Relation.SMALLEST: lambda o: -math.prod(o.size),
+}
+
+
+def cup(index: int, x: float = 0.5, y: float = 0.0, edge: float = 0.05) -> SceneObject:
+    return SceneObject(index, "cup", "red", (x, y, edge / 2), (edge, edge, edge))
+
+
+@st.composite
+def scenes(draw: Callable[..., Any]) -> list[SceneObject]:
+    step = st.integers(-20, 20).map(lambda number: number * 0.025)
+    edge = st.floats(0.03, 0.08)
+    return [
+        SceneObject(
+            index,
+            draw(st.sampled_from(KINDS)),
+            draw(st.sampled_from(list(COLOURS)[:2])),
+            (draw(step), draw(step), 0.03),
+            (draw(edge), draw(edge), draw(edge)),
+        )
+        for index in draw(st.lists(st.integers(0, 99), max_size=5, unique=True))
+    ]
+
+
+@given(scenes(), st.sampled_from(Relation), st.sampled_from([None, *KINDS]))
+def test_a_relation_chooses_the_most_extreme_of_those_that_fit_without_it(
+    scene: list[SceneObject], relation: Relation, kind: str | None
+) -> None:
+    without = fitting(Description(kind), scene)
+    found = fitting(Description(kind, None, relation), scene)
+    assert all(each in without for each in found)
+    if len(without) > 1 or (without and relation not in SIDES):
+        assert max(without, key=MOST[relation]) in found
+
+
+@given(scenes(), st.sampled_from(Relation), st.data())
+def test_the_order_of_the_objects_does_not_count(
+    scene: list[SceneObject], relation: Relation, data: st.DataObject
+) -> None:
+    what = Description(relation=relation)
+    assert fitting(what, data.draw(st.permutations(scene))) == fitting(what, scene)
+
+
+@given(scenes())
+def test_mirroring_the_table_swaps_left_and_right_and_nothing_else(scene: list[SceneObject]) -> None:
+    swap = {Relation.LEFT: Relation.RIGHT, Relation.RIGHT: Relation.LEFT}
+    mirrored = [
+        SceneObject(o.index, o.kind, o.colour, (o.position[0], -o.position[1], o.position[2]), o.size) for o in scene
+    ]
+    for relation in Relation:
+        before = fitting(Description(relation=relation), scene)
+        after = fitting(Description(relation=swap.get(relation, relation)), mirrored)
+        assert [o.index for o in before] == [o.index for o in after]
+
+
+@pytest.mark.parametrize(
+    ("measure", "relation", "further"),
+    [
+        ("y", Relation.LEFT, 1),
+        ("y", Relation.RIGHT, 0),
+        ("x", Relation.FARTHEST, 1),
+        ("x", Relation.NEAREST, 0),
+        ("edge", Relation.BIGGEST, 1),
+        ("edge", Relation.SMALLEST, 0),
+    ],
+)
+@pytest.mark.parametrize(("factor", "decided"), [(0.0, False), (0.99, False), (1.01, True)])
+def test_a_difference_counts_from_the_margin_on(
+    measure: str, relation: Relation, further: int, factor: float, decided: bool
+) -> None:
+    change = {
+        "x": 0.5 + factor * DISTANCE_MARGIN,
+        "y": factor * DISTANCE_MARGIN,
+        "edge": 0.05 * (1 + factor * SIZE_MARGIN) ** (1 / 3),
+    }
+    found = fitting(Description(relation=relation), [cup(0), cup(1, **{measure: change[measure]})])
+    assert [o.index for o in found] == ([further] if decided else [0, 1])
+
+
+def test_an_only_object_is_not_on_the_other_side() -> None:
+    for y, expected in ((0.1, [1, 0]), (-0.1, [0, 1]), (0.0, [0, 0])):
+        assert [len(fitting(Description("cup", None, side), [cup(0, y=y)])) for side in SIDES] == expected
+
+
+@given(scenes())
+def test_descriptions_fit_their_target_only_and_begin_with_the_plainest(scene: list[SceneObject]) -> None:
+    for target in scene:
+        made = descriptions(scene, target)
+        assert all(fitting(what, scene) == [target] for what in made)
+        namesakes = [o for o in scene if o.name == target.name]
+        if len(namesakes) == 1:
+            assert made[0] == Description(target.kind, target.colour)
