@@ -1,4 +1,4 @@
-"""The model that a world simulates: a base among a pool of obstacles that each simulation places, or an arm on a table."""
+"""The model that a world simulates: a base among obstacles that each simulation places, or an arm on a table."""
 
 import math
 

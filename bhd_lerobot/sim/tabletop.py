@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,15 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 _ALONG_X = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)  # turns z to x
 
 
+class _Form(NamedTuple):
+    """Kind, MuJoCo's size, and place in the body's frame of a geometry."""
+
+    kind: str
+    size: tuple[float, float, float]
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, float, float, float] = _UPRIGHT
+
+
 class Tabletop:
     """Lays the tables of a world's simulations, and says what lies where and what touches what.
 
@@ -47,7 +57,10 @@ class Tabletop:
         self._field = {name: world.model_field(name) for name in _FIELDS}
         self._bodies = np.array([model.body(f"object_{k}").id for k in range(MAX_OBJECTS)])
         self._geoms = [
-            [model.geom(f"object_{k}{part}").id for part in ("", "_top", *(f"_handle_{j}" for j in range(HANDLE_PARTS)))]
+            [
+                model.geom(f"object_{k}{part}").id
+                for part in ("", "_top", *(f"_handle_{j}" for j in range(HANDLE_PARTS)))
+            ]
             for k in range(MAX_OBJECTS)
         ]
         self._pads = [model.geom(pad).id for pad in PADS]
@@ -66,7 +79,6 @@ class Tabletop:
         self._self = world.sensor("touch_self")[:, 0]
         first, last = (int(model.sensor(f"touch_object_{k}").adr[0]) for k in (0, MAX_OBJECTS - 1))
         self._grip = world.sensors(first, last + 1)
-        self.count = np.zeros(world.n, np.intp)
         world.forward()
 
     # --- scenes ------------------------------------------------------------------------------------------------------
@@ -93,13 +105,13 @@ class Tabletop:
         world.reset(ids)
         for sim, scene in zip(ids, scenes, strict=True):
             self._surroundings(sim, scene)
-            for number in range(MAX_OBJECTS):
-                self._object(sim, number, scene.objects[number] if number < len(scene.objects) else None)
-                if number < len(scene.objects):
-                    self._friction(sim, number, scene.objects[number].friction * scene.variation.finger_friction)
-            self.count[sim] = len(scene.objects)
+            for number, thing in enumerate(scene.objects):
+                self._object(sim, number, thing)
+                for pair in self._pairs[number]:
+                    self._field["pair_friction"][sim, pair, :2] = thing.friction * scene.variation.finger_friction
+            for number in range(len(scene.objects), MAX_OBJECTS):
+                self._field["geom_group"][sim, self._geoms[number]] = _HIDDEN
         world.update_constants(ids)
-        # Constants are computed with the state put back to the model's own; the state comes after them.
         for sim, scene in zip(ids, scenes, strict=True):
             world.qpos[sim, self._joints] = scene.posture[:-1]
             world.qpos[sim, self._fingers] = scene.posture[-1] / 2
@@ -126,58 +138,44 @@ class Tabletop:
         field["body_pos"][sim, self._target] = pose[:3]
         field["body_quat"][sim, self._target] = pose[3:]
 
-    def _friction(self, sim: int, number: int, friction: float) -> None:
-        """Set the sliding friction between an object and the pads."""
-        for pair in self._pairs[number]:
-            self._field["pair_friction"][sim, pair, :2] = friction
-
-    def _object(self, sim: int, number: int, thing: TableObject | None) -> None:
-        """Set shape, looks and inertia of an object; None is absent."""
+    def _object(self, sim: int, number: int, thing: TableObject) -> None:
+        """Set shape, looks, inertia and weight of an object."""
         field, body, geoms = self._field, self._bodies[number], self._geoms[number]
         field["geom_group"][sim, geoms] = _HIDDEN
-        field["body_gravcomp"][sim, body] = 1.0 if thing is None else _HEAVY
-        if thing is None:
-            return
+        field["body_gravcomp"][sim, body] = _HEAVY
         colour = np.clip(np.add(COLOURS[thing.colour], thing.shade), 0.0, 1.0)
         a, b, h = thing.size_x, thing.size_y, thing.height / 2
-        self._geom(sim, geoms[0], "box" if thing.kind == "box" else "cylinder", (a, b, h), (0, 0, 0), colour, _TOUCHED)
+        solid = _Form("box", (a, b, h)) if thing.kind == "box" else _Form("cylinder", (a, h, 0))
+        self._geom(sim, geoms[0], solid, colour, group=_TOUCHED)
         field["geom_friction"][sim, geoms[0], 0] = thing.friction
         field["body_mass"][sim, body] = thing.mass
         if thing.kind == "box":
-            square = (b * b + h * h, a * a + h * h, a * a + b * b)
-            field["body_inertia"][sim, body] = np.multiply(square, thing.mass / 3)
-            # A strip of tape.
-            self._geom(sim, geoms[1], "box", (a + 0.0003, 0.2 * b, h + 0.0003), (0, 0, 0), 0.55 + 0.45 * colour, _SEEN)
+            squares = (b * b + h * h, a * a + h * h, a * a + b * b)
+            field["body_inertia"][sim, body] = np.multiply(squares, thing.mass / 3)
+            tape = _Form("box", (a + 0.0003, 0.2 * b, h + 0.0003))
+            self._geom(sim, geoms[1], tape, 0.55 + 0.45 * colour)
             return
         across = thing.mass * (3 * a * a + 4 * h * h) / 12
         field["body_inertia"][sim, body] = (across, across, thing.mass * a * a / 2)
-        self._geom(sim, geoms[1], "cylinder", (0.86 * a, 0, 0.0004), (0, 0, h), 0.22 * colour, _SEEN)
+        mouth = _Form("cylinder", (0.86 * a, 0.0004, 0), (0, 0, h))
+        self._geom(sim, geoms[1], mouth, 0.22 * colour)
         thick, reach = 0.10 * a, 0.55 * a
-        middle = a + reach / 2 - thick / 2
         for geom, z in ((geoms[2], 0.5 * h), (geoms[3], -0.4 * h)):
-            self._geom(sim, geom, "capsule", (thick, reach / 2, 0), (middle, 0, z), colour, _SEEN, _ALONG_X)
-        self._geom(sim, geoms[4], "capsule", (thick, 0.45 * h, 0), (a + reach - thick / 2, 0, 0.05 * h), colour, _SEEN)
+            bar = _Form("capsule", (thick, reach / 2, 0), (a + reach / 2 - thick / 2, 0, z), _ALONG_X)
+            self._geom(sim, geom, bar, colour)
+        grip = _Form("capsule", (thick, 0.45 * h, 0), (a + reach - thick / 2, 0, 0.05 * h))
+        self._geom(sim, geoms[4], grip, colour)
 
-    def _geom(
-        self,
-        sim: int,
-        geom: int,
-        kind: str,
-        size: tuple[float, float, float],
-        position: tuple[float, float, float],
-        colour: NDArray[np.float64],
-        group: int,
-        quaternion: tuple[float, float, float, float] = _UPRIGHT,
-    ) -> None:
-        field = self._field
-        if kind == "cylinder":
-            size = (size[0], size[2], 0.0)
-        box = size if kind == "box" else (size[0], size[0], size[1] + (size[0] if kind == "capsule" else 0.0))
-        field["geom_type"][sim, geom] = _TYPES[kind]
-        field["geom_size"][sim, geom] = size
-        field["geom_pos"][sim, geom] = position
-        field["geom_quat"][sim, geom] = quaternion
-        field["geom_rbound"][sim, geom] = box[2] if kind == "capsule" else math.hypot(*(box if kind == "box" else size))
+    def _geom(self, sim: int, geom: int, form: _Form, colour: NDArray[np.float64], *, group: int = _SEEN) -> None:
+        field, (radius, half, _) = self._field, form.size
+        length = half + (radius if form.kind == "capsule" else 0.0)
+        box = form.size if form.kind == "box" else (radius, radius, length)
+        field["geom_type"][sim, geom] = _TYPES[form.kind]
+        field["geom_size"][sim, geom] = form.size
+        field["geom_pos"][sim, geom] = form.position
+        field["geom_quat"][sim, geom] = form.quaternion
+        bound = {"box": math.hypot(*box), "cylinder": math.hypot(radius, half), "capsule": radius + half}
+        field["geom_rbound"][sim, geom] = bound[form.kind]
         field["geom_aabb"][sim, geom, 3:] = box
         field["geom_rgba"][sim, geom, :3] = colour
         field["geom_rgba"][sim, geom, 3] = 1.0
