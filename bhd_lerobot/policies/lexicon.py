@@ -98,8 +98,8 @@ _ENGLISH_WORDS = _words(
         (Part.UP, ""): "up",
         (Part.OVER, ""): "over; here; over here",
         (Part.POLITE, ""): (
-            "please; kindly; robot; hey; hello; hi; thanks; thank you; could you; can you; would you; will you; "
-            "could you please; can you please; would you please; will you please"
+            "please; kindly; sorry; excuse me; robot; hey; hello; hi; thanks; thank you; could you; can you; would you; "
+            "will you; could you please; can you please; would you please; will you please"
         ),
         (Part.THE, ""): "the; a; an; this; that",
         (Part.WHICH, Relation.LEFT): "left; leftmost; left-most; left-hand",
@@ -170,7 +170,7 @@ _CHINESE_WORDS = _words(
         (Part.TO_ME, ""): "给我",
         (Part.POLITE, ""): (
             "请; 请你; 麻烦; 麻烦你; 帮我; 请帮我; 请你帮我; 能不能; 可不可以; 能; 可以; 你能; 你能不能; 你可以; "
-            "机器人; 你好; 一下; 吧; 谢谢; 谢谢你; 好吗; 可以吗; 吗"
+            "不好意思; 机器人; 你好; 一下; 吧; 谢谢; 谢谢你; 好吗; 可以吗; 吗"
         ),
         (Part.FROM, ""): "从",
         (Part.OBJECT_FIRST, ""): "把; 将",
@@ -201,9 +201,9 @@ _CHINESE_WORDS = _words(
 _CHINESE_OBJECT = "(?:D|[LRC]d?)*N"
 CHINESE = Language(
     words=_CHINESE_WORDS,
-    lift=re.compile(f"P*(?:FL)?P*(?:[VT]P*{_CHINESE_OBJECT}|B{_CHINESE_OBJECT}(?:FL)?[VT])P*"),
+    lift=re.compile(f"P*(?:FL)?P*(?:[VT]P*{_CHINESE_OBJECT}|B?{_CHINESE_OBJECT}(?:FL)?[VT])P*"),
     give=re.compile(
-        f"P*(?:FL)?P*(?:[KG]{_CHINESE_OBJECT}|B{_CHINESE_OBJECT}(?:FL)?[KG]"
+        f"P*(?:FL)?P*(?:[KG]{_CHINESE_OBJECT}|B?{_CHINESE_OBJECT}(?:FL)?[KG]"
         f"|[TE]P*{_CHINESE_OBJECT}G|G[TE]P*{_CHINESE_OBJECT})P*"
     ),
     names={

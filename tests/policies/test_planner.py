@@ -188,6 +188,7 @@ def test_the_prompt_says_all_that_the_answer_is_checked_against() -> None:
     for thing in SCENE:
         told = {"index": thing.index, "kind": thing.kind, "colour": thing.colour}
         assert json.dumps(told)[:-1] in asked[0]
+    assert '"拿起红色的杯子"' in prompt("拿起红色的杯子", SCENE)
     assert prompt("x", SCENE) == prompt("x", SCENE[::-1])
 
 
