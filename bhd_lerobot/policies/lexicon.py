@@ -98,8 +98,8 @@ _ENGLISH_WORDS = _words(
         (Part.UP, ""): "up",
         (Part.OVER, ""): "over; here; over here",
         (Part.POLITE, ""): (
-            "please; kindly; sorry; excuse me; robot; hey; hello; hi; thanks; thank you; could you; can you; would you; "
-            "will you; could you please; can you please; would you please; will you please"
+            "please; kindly; sorry; excuse me; robot; hey; hello; hi; thanks; thank you; could you; can you; "
+            "would you; will you; could you please; can you please; would you please; will you please"
         ),
         (Part.THE, ""): "the; a; an; this; that",
         (Part.WHICH, Relation.LEFT): "left; leftmost; left-most; left-hand",
