@@ -1,0 +1,89 @@
+"""Plays trajectories back, one tick at a time, for n simulations at once."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.trajectory import Trajectory
+
+
+class TrajectoryPlayer:
+    """One trajectory for each simulation, or none.
+
+    The rows of all trajectories lie in one block, so that a tick is one gather however many are played.
+
+    Attributes:
+        active: which simulations a trajectory is played for, shape (n,).
+
+    Args:
+        n: number of simulations.
+        dof: dimensions of a trajectory.
+    """
+
+    def __init__(self, n: int, dof: int) -> None:
+        self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self._rows = np.zeros((4096, 3, dof))
+        self._used = 0
+        self._next, self._end = np.zeros(n, np.intp), np.zeros(n, np.intp)
+        self._ids = np.flatnonzero(self.active)
+        self._soonest = 0  # ticks until the first of the trajectories ends
+
+    def start(self, sim: int, trajectory: Trajectory) -> None:
+        """Play a trajectory from the next tick on; it takes the place of the one that is being played."""
+        self.active[sim] = False
+        if self._used + trajectory.ticks > len(self._rows):
+            self._make_room(trajectory.ticks)
+        begin, end = self._used, self._used + trajectory.ticks
+        rows = self._rows[begin:end]
+        rows[:, 0], rows[:, 1], rows[:, 2] = trajectory.position, trajectory.velocity, trajectory.acceleration
+        self._next[sim], self._end[sim], self._used = begin, end, end
+        self.active[sim] = True
+        self._changed()
+
+    def stop(self, sim: int) -> None:
+        """Play nothing for a simulation: its reference stays as it is."""
+        self.active[sim] = False
+        self._changed()
+
+    def remaining(self, sim: int) -> int:
+        """Return how many ticks are left."""
+        return int(self._end[sim] - self._next[sim]) if self.active[sim] else 0
+
+    def tick(
+        self, position: NDArray[np.float64], velocity: NDArray[np.float64], acceleration: NDArray[np.float64]
+    ) -> None:
+        """Write the next row of each trajectory; who plays none keeps what is there. The arrays have shape (n, dof)."""
+        ids = self._ids
+        if not len(ids):
+            return
+        if len(ids) == 1:
+            sim = ids[0]
+            row = self._rows[self._next[sim]]
+            position[sim], velocity[sim], acceleration[sim] = row
+        else:
+            rows = self._rows[self._next[ids]]
+            position[ids], velocity[ids], acceleration[ids] = rows[:, 0], rows[:, 1], rows[:, 2]
+        self._next[ids] += 1
+        self._soonest -= 1
+        if self._soonest == 0:
+            self.active[ids] = self._next[ids] < self._end[ids]
+            self._changed()
+
+    def _changed(self) -> None:
+        self._ids = ids = np.flatnonzero(self.active)
+        self._soonest = int((self._end[ids] - self._next[ids]).min()) if len(ids) else 0
+        if not len(ids):
+            self._used = 0
+
+    def _make_room(self, ticks: int) -> None:
+        """Move the rows that are still to be played to the front of a block that holds `ticks` more."""
+        ids = np.flatnonzero(self.active)
+        lengths = self._end[ids] - self._next[ids]
+        needed = int(lengths.sum()) + ticks
+        # Half of the block stays free, so that rows are moved seldom.
+        rows = np.zeros((max(len(self._rows), 2 * needed), *self._rows.shape[1:]))
+        used = 0
+        for sim, length in zip(ids, lengths, strict=True):
+            rows[used : used + length] = self._rows[self._next[sim] : self._end[sim]]
+            self._next[sim], self._end[sim] = used, used + length
+            used += length
+        self._rows, self._used = rows, used

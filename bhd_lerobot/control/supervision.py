@@ -1,0 +1,149 @@
+"""Whether a goal that is being followed is on its way, has arrived or has failed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.commands import BrainCommand, ResultCode
+
+Array = NDArray[np.float64]
+
+PATH_TOLERANCE = 0.1  # [rad] a joint this far from its reference does not follow
+JOINT_TOLERANCE = 0.002  # [rad] a joint this close to its target has arrived,
+JOINT_STILL = 0.01  # [rad/s] if it is also slower than this: it does not move
+SETTLING_S = 0.5  # [s] after its trajectory's end that the arm may take to arrive
+OPENING_TOLERANCE = 0.002  # [m] a gripper this close to its target has arrived
+GRIPPER_STILL = 0.002  # [m/s] a gripper that is slower than this
+GRIPPER_STALL_S = 0.1  # [s] for so long, though it is not to be at rest where it is, holds something
+GRIPPING_S = 1.5  # [s] after its trajectory's end that a gripper may take to arrive or to hold something
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of the goal of one simulation.
+
+    Attributes:
+        sim: the simulation.
+        code: how the goal ended.
+        message: in words, with the offending value and the limit.
+    """
+
+    sim: int
+    code: ResultCode
+    message: str
+
+
+class Supervisor:
+    """Judges goals of n simulations by what is measured, once a tick.
+
+    Attributes:
+        error: largest distance of a joint from its reference at the last tick [rad], shape (n,).
+
+    Args:
+        arm: the arm.
+        n: number of simulations.
+        control_hz: ticks a second [Hz].
+    """
+
+    def __init__(self, arm: Arm, n: int, control_hz: int) -> None:
+        self.error: Array = np.zeros(n)
+        self._joints, self._dof = arm.chain.joints, len(arm.chain.joints)
+        self._stall_ticks = round(GRIPPER_STALL_S * control_hz)
+        self._settling_ticks = round(SETTLING_S * control_hz)
+        self._gripping_ticks = round(GRIPPING_S * control_hz)
+        self._hz = control_hz
+        self._target = np.zeros((n, self._dof + 1))
+        self._moves_arm, self._moves_gripper = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self._elapsed, self._deadline = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._since_end, self._still = np.zeros(n, np.int64), np.zeros(n, np.int64)
+
+    def begin(self, sim: int, command: BrainCommand, target: Array) -> None:
+        """Forget the last goal; judge a new one, whose trajectory ends at a target of shape (dof + 1,)."""
+        self._target[sim] = target
+        self._moves_arm[sim] = command.target_pose is not None or command.joint_target is not None
+        self._moves_gripper[sim] = command.gripper is not None
+        self._deadline[sim] = np.ceil(command.timeout_s * self._hz - 1e-6)
+        self._elapsed[sim] = self._since_end[sim] = self._still[sim] = 0
+        self.error[sim] = 0.0
+
+    def judge(
+        self,
+        ids: NDArray[np.intp],
+        playing: NDArray[np.bool_],
+        reference: tuple[Array, Array],
+        measured: tuple[Array, Array],
+    ) -> list[Verdict]:
+        """Return the goals that end now.
+
+        Args:
+            ids: the simulations that follow a goal.
+            playing: whose trajectory has not ended yet, shape (n,).
+            reference: what the plant was last told: positions and velocities, each of shape (n, dof + 1).
+            measured: what it did: positions and velocities, each of shape (n, dof + 1).
+        """
+        dof = self._dof
+        self.error[ids] = error = np.abs(measured[0][ids, :dof] - reference[0][ids, :dof]).max(axis=1)
+        self._elapsed[ids] += 1
+        still = (np.abs(measured[1][ids, dof]) < GRIPPER_STILL) & (reference[1][ids, dof] == 0.0)
+        self._still[ids] = (self._still[ids] + 1) * still
+        look = (error > PATH_TOLERANCE) | ~playing[ids] | (self._elapsed[ids] >= self._deadline[ids])
+        if not look.any():
+            return []
+        verdicts = (self._judge(int(sim), bool(playing[sim]), reference[0], measured) for sim in ids[look])
+        return [verdict for verdict in verdicts if verdict is not None]
+
+    def _judge(self, sim: int, playing: bool, reference: Array, measured: tuple[Array, Array]) -> Verdict | None:
+        position, velocity = measured[0][sim], measured[1][sim]
+        if self.error[sim] > PATH_TOLERANCE:
+            joint = int(np.abs(position - reference[sim])[: self._dof].argmax())
+            return Verdict(
+                sim,
+                ResultCode.PATH_TOLERANCE,
+                f"{self._joints[joint]} is {self.error[sim]:.3f} rad from its reference; {PATH_TOLERANCE} rad is the "
+                "most: something is in its way, or it carries too much.",
+            )
+        verdict = None if playing else self._judge_end(sim, position, velocity)
+        if verdict is None and self._elapsed[sim] >= self._deadline[sim]:
+            seconds = self._deadline[sim] / self._hz
+            return Verdict(sim, ResultCode.TIMEOUT, f"The goal was not reached within its {seconds:.3g} s.")
+        return verdict
+
+    def _judge_end(self, sim: int, position: Array, velocity: Array) -> Verdict | None:
+        """Judge a goal whose trajectory has ended."""
+        dof = self._dof
+        self._since_end[sim] += 1
+        off, speed = np.abs(position - self._target[sim]), np.abs(velocity)
+        away = np.maximum(off[:dof] / JOINT_TOLERANCE, speed[:dof] / JOINT_STILL)
+        arm_away = self._moves_arm[sim] and away.max() > 1.0
+        stalled = self._still[sim] >= self._stall_ticks
+        gripper_away = self._moves_gripper[sim] and off[dof] > OPENING_TOLERANCE and not stalled
+        if not arm_away and not gripper_away:
+            return Verdict(sim, ResultCode.SUCCEEDED, self._arrival(sim, float(position[dof])))
+        if arm_away and self._since_end[sim] > self._settling_ticks:
+            joint = int(away.argmax())
+            return Verdict(
+                sim,
+                ResultCode.GOAL_TOLERANCE,
+                f"{self._joints[joint]} is {off[joint]:.4f} rad from its target at {speed[joint]:.3f} rad/s, "
+                f"{SETTLING_S} s after the end of the motion; "
+                f"{JOINT_TOLERANCE} rad and {JOINT_STILL} rad/s are the most.",
+            )
+        if gripper_away and self._since_end[sim] > self._gripping_ticks:
+            return Verdict(
+                sim,
+                ResultCode.GOAL_TOLERANCE,
+                f"The gripper has neither reached {self._target[sim, dof]:.4f} m nor stalled {GRIPPING_S} s after the "
+                f"end of the motion; the opening is {position[dof]:.4f} m.",
+            )
+        return None
+
+    def _arrival(self, sim: int, opening: float) -> str:
+        """Return what to say about a goal that was reached."""
+        if not self._moves_gripper[sim]:
+            return "The target is reached."
+        target = float(self._target[sim, self._dof])
+        if abs(opening - target) <= OPENING_TOLERANCE:
+            return f"The target is reached; the opening is {opening:.4f} m."
+        return f"The gripper has stalled on its way to {target:.4f} m; the opening is {opening:.4f} m."

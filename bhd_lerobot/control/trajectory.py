@@ -1,0 +1,279 @@
+"""Jerk-limited trajectories sampled at control ticks: to a target, and to rest. Pure: no clock, no state, no plant."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+import ruckig
+from numpy.typing import ArrayLike, NDArray
+
+from bhd_lerobot.bodies.body import PositionLimits
+from bhd_lerobot.control.commands import ResultCode
+
+Array = NDArray[np.float64]
+
+_SLACK = 1e-9  # [rad or m] what rounding may add to a position
+_CODES = {int(code): name for name, code in ruckig.Result.__members__.items()}
+
+
+@dataclass(frozen=True)
+class PlanFailure:
+    """Why there is no trajectory.
+
+    Attributes:
+        code: the result that the goal ends in.
+        message: what is wrong, in words, with the offending value and the valid ones.
+    """
+
+    code: ResultCode
+    message: str
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a trajectory starts, each of shape (dof,).
+
+    Attributes:
+        position: [rad or m].
+        velocity: [rad/s or m/s].
+        acceleration: [rad/s^2 or m/s^2].
+    """
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+
+    @classmethod
+    def of(cls, position: ArrayLike, velocity: ArrayLike, acceleration: ArrayLike) -> Self:
+        """Return a copy of a state."""
+        return cls(*(np.array(value, np.float64) for value in (position, velocity, acceleration)))
+
+    @classmethod
+    def at_rest(cls, position: ArrayLike) -> Self:
+        """Return the state that stands still at a position, shape (dof,)."""
+        copy = np.array(position, np.float64)
+        return cls(copy, np.zeros_like(copy), np.zeros_like(copy))
+
+    def __getitem__(self, dims: slice) -> Self:
+        """Return the state of some of the dimensions."""
+        return type(self)(self.position[dims], self.velocity[dims], self.acceleration[dims])
+
+    @property
+    def moving(self) -> bool:
+        """Whether any dimension has a speed or an acceleration."""
+        return bool(self.velocity.any() or self.acceleration.any())
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """What a trajectory has to stay within, one value for each dimension, each of shape (dof,).
+
+    Attributes:
+        velocity: largest speed [rad/s or m/s].
+        acceleration: largest acceleration [rad/s^2 or m/s^2].
+        jerk: largest change of the acceleration [rad/s^3 or m/s^3].
+        lower: smallest position [rad or m].
+        upper: largest position [rad or m].
+    """
+
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+    lower: Array
+    upper: Array
+
+    @classmethod
+    def of(cls, limits: PositionLimits, *, stop: bool = False) -> Self:
+        """Return the limits of normal motion, or those of a stop."""
+        acceleration, jerk = (
+            (limits.stop_deceleration, limits.stop_jerk) if stop else (limits.acceleration, limits.jerk)
+        )
+        values = (limits.velocity, acceleration, jerk, limits.lower, limits.upper)
+        return cls(*(np.asarray(value, np.float64) for value in values))
+
+    def __getitem__(self, dims: slice) -> Self:
+        """Return the limits of some of the dimensions."""
+        return type(self)(
+            self.velocity[dims], self.acceleration[dims], self.jerk[dims], self.lower[dims], self.upper[dims]
+        )
+
+    def scaled(self, velocity: float = 1.0, acceleration: float = 1.0) -> Self:
+        """Return limits with the speeds and the accelerations multiplied by factors."""
+        return replace(self, velocity=self.velocity * velocity, acceleration=self.acceleration * acceleration)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where every dimension is to be at ticks 1 to T after the start; at rest in the last.
+
+    Attributes:
+        position: [rad or m], shape (T, dof).
+        velocity: [rad/s or m/s], shape (T, dof).
+        acceleration: [rad/s^2 or m/s^2], shape (T, dof).
+    """
+
+    position: Array
+    velocity: Array
+    acceleration: Array
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks, at least 1."""
+        return len(self.position)
+
+    @property
+    def target(self) -> Array:
+        """Where it ends, shape (dof,)."""
+        return self.position[-1]
+
+    def then(self, other: "Trajectory") -> "Trajectory":
+        """Return this trajectory and after it another one, which starts where this one ends."""
+        return Trajectory(
+            np.concatenate((self.position, other.position)),
+            np.concatenate((self.velocity, other.velocity)),
+            np.concatenate((self.acceleration, other.acceleration)),
+        )
+
+    def beside(self, other: "Trajectory") -> "Trajectory":
+        """Return this trajectory and the dimensions of another one behind its own; who arrives first waits."""
+        ticks = max(self.ticks, other.ticks)
+        rows = [np.minimum(np.arange(ticks), one.ticks - 1) for one in (self, other)]
+        return Trajectory(
+            np.concatenate((self.position[rows[0]], other.position[rows[1]]), axis=1),
+            np.concatenate((self.velocity[rows[0]], other.velocity[rows[1]]), axis=1),
+            np.concatenate((self.acceleration[rows[0]], other.acceleration[rows[1]]), axis=1),
+        )
+
+
+def to_target(start: State, target: ArrayLike, limits: MotionLimits, hz: int) -> Trajectory | PlanFailure:
+    """Return the quickest trajectory to rest at a target on which all dimensions arrive together.
+
+    The start may be any state: what exceeds the limits is first brought within them, as fast as they allow. Where the
+    way from a moving start would leave the position limits, the motion is braked first.
+
+    Args:
+        start: where it starts.
+        target: the end [rad or m], within the position limits, shape (dof,).
+        limits: the limits.
+        hz: ticks a second [Hz].
+    """
+    goal = np.asarray(target, np.float64)
+    first = _calculate(start, goal, limits, hz, ruckig.Synchronization.Phase)
+    if isinstance(first, Trajectory) and _stays_within(first, start, limits):
+        return first
+    # Rounding may have put a state a hair outside of what Ruckig takes; or it came too close to a position limit.
+    brake = to_rest(start, limits, hz)
+    if isinstance(brake, PlanFailure):
+        return first if isinstance(first, PlanFailure) else brake
+    second = _calculate(State.at_rest(brake.target), goal, limits, hz, ruckig.Synchronization.Phase)
+    return brake.then(second) if isinstance(second, Trajectory) else second
+
+
+def to_rest(start: State, limits: MotionLimits, hz: int) -> Trajectory | PlanFailure:
+    """Return the trajectory on which each dimension comes to rest as soon as it can.
+
+    A dimension that cannot come to rest before its position limit overshoots it by as little as its limits allow and
+    comes to rest on it.
+
+    Args:
+        start: where it starts.
+        limits: the limits; those of a stop if it is urgent.
+        hz: ticks a second [Hz].
+    """
+    brake = _calculate(start, None, limits, hz, ruckig.Synchronization.No)
+    if isinstance(brake, PlanFailure) or _stays_within(brake, start, limits):
+        return brake
+    lower, upper = _bounds(start, limits)
+    outside = ((brake.position < lower - _SLACK) | (brake.position > upper + _SLACK)).any(axis=0)
+    target = np.where(outside, np.clip(brake.target, lower, upper), brake.target)
+    back = _calculate(start, target, limits, hz, ruckig.Synchronization.No)
+    if isinstance(back, PlanFailure):
+        return brake
+    pick = np.flatnonzero(outside)
+    both = brake.beside(back)
+    dof = len(target)
+    columns = np.arange(dof)
+    columns[pick] += dof
+    return Trajectory(both.position[:, columns], both.velocity[:, columns], both.acceleration[:, columns])
+
+
+def at_once(position: ArrayLike) -> Trajectory:
+    """Return the trajectory of one tick that stands still at a position, shape (dof,)."""
+    row = np.array(position, np.float64)[None]
+    return Trajectory(row, np.zeros_like(row), np.zeros_like(row))
+
+
+def _bounds(start: State, limits: MotionLimits) -> tuple[Array, Array]:
+    """Return the position limits, widened to hold the start."""
+    return np.minimum(limits.lower, start.position), np.maximum(limits.upper, start.position)
+
+
+def _stays_within(trajectory: Trajectory, start: State, limits: MotionLimits) -> bool:
+    lower, upper = _bounds(start, limits)
+    position = trajectory.position
+    return bool((position >= lower - _SLACK).all() and (position <= upper + _SLACK).all())
+
+
+def _calculate(
+    start: State, target: Array | None, limits: MotionLimits, hz: int, synchronization: ruckig.Synchronization
+) -> Trajectory | PlanFailure:
+    """Let Ruckig calculate a trajectory to a target, or to rest where the target is None."""
+    dof = len(start.position)
+    request = ruckig.InputParameter(dof)
+    request.synchronization = synchronization
+    request.current_position = start.position
+    request.current_velocity = start.velocity
+    request.current_acceleration = start.acceleration
+    request.max_velocity = limits.velocity
+    request.max_acceleration = limits.acceleration
+    request.max_jerk = limits.jerk
+    if target is None:
+        request.control_interface = ruckig.ControlInterface.Velocity
+    else:
+        request.target_position = target
+    answer = ruckig.Trajectory(dof)
+    try:
+        code = int(ruckig.Ruckig(dof).calculate(request, answer))
+    except ruckig.RuckigError as error:
+        return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory: {error}")
+    if code < 0:
+        return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory: Ruckig returns {_CODES.get(code, code)}.")
+    trajectory = sample(answer, hz)
+    if target is not None:
+        trajectory.position[-1] = target
+    # What is left of rounding in the last tick.
+    trajectory.velocity[-1] = trajectory.acceleration[-1] = 0.0
+    return trajectory
+
+
+def sample(answer: ruckig.Trajectory, hz: int) -> Trajectory:
+    """Return what a Ruckig trajectory is at ticks 1 to T; T is the first at or after its end.
+
+    Between two switches the jerk is constant. Each dimension has up to nine such stretches: two in which it is brought
+    within the limits, and seven to the target. After the last one it stands still.
+
+    Args:
+        answer: a trajectory of one section that Ruckig has calculated.
+        hz: ticks a second [Hz].
+    """
+    lengths, states = [], []
+    for profile in answer.profiles[0]:
+        brake = profile.brake
+        lengths.append((*(brake.t if brake.duration > 0 else (0.0, 0.0)), *profile.t))
+        states.append(
+            (
+                (*brake.p, *profile.p),
+                (*brake.v, *profile.v[:-1], 0.0),
+                (*brake.a, *profile.a[:-1], 0.0),
+                (*brake.j, *profile.j, 0.0),
+            )
+        )
+    ends = np.cumsum(lengths, axis=1)
+    begins = np.concatenate((np.zeros((len(ends), 1)), ends), axis=1)
+    ticks = max(1, int(np.ceil(answer.duration * hz - 1e-6)))
+    time = np.arange(1, ticks + 1)[:, None] / hz
+    dims = np.arange(len(ends))
+    stretch = (time[:, :, None] >= ends).sum(axis=2)
+    p, v, a, j = (np.asarray(states).transpose(1, 0, 2))[:, dims, stretch]
+    since = time - begins[dims, stretch]
+    return Trajectory(p + since * (v + since * (a / 2 + since * j / 6)), v + since * (a + since * j / 2), a + since * j)
