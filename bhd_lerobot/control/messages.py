@@ -51,6 +51,7 @@ class Reason(IntEnum):
     FAULT = 8
     WRONG_MODE = 9
     NOT_AT_REST = 10
+    NO_POSTURE = 11
 
     @property
     def explanation(self) -> str:
@@ -69,6 +70,7 @@ _EXPLANATIONS = {
     Reason.ESTOP: "the emergency stop is latched; clear its cause, then call reset() and activate()",
     Reason.FAULT: "a plant fault is latched; clear its cause, then call reset() and activate()",
     Reason.WRONG_MODE: "the request does not apply in the present mode",
+    Reason.NO_POSTURE: "no admissible posture of the arm puts the tool there",
     Reason.NOT_AT_REST: "the robot is still stopping; ask again when it is at rest",
 }
 
@@ -85,6 +87,8 @@ class Limit(IntFlag):
     """Slowed to the acceleration limit."""
     EFFORT = 8
     """Clipped so that the servo does not ask for more than the largest effort."""
+    POSITION = 16
+    """Clipped to the range of the joint."""
 
 
 class Watchdog(IntFlag):

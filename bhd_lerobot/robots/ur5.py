@@ -1,0 +1,81 @@
+"""The simulated UR5 as a LeRobot robot."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.simulated_robot import SimulatedRobot
+from bhd_lerobot.robots.tool_space import TOOL_NAMES
+from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, OBSERVED, UR5Simulation
+from bhd_lerobot.tasks.pick import PickConfig, PickTask
+from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
+
+
+class UR5(SimulatedRobot):
+    """UR5 with a parallel gripper.
+
+    Action: `shoulder_pan.pos`, `shoulder_lift.pos`, `elbow.pos`, `wrist_1.pos`, `wrist_2.pos`, `wrist_3.pos` [rad] and
+    `gripper.pos` [m of opening]; or, with `action_space = "tool"`, `tool_x.pos`, `tool_y.pos`, `tool_z.pos` [m], the
+    quaternion `tool_qw.pos` … `tool_qz.pos`, and `gripper.pos`. Observation: `.pos` and `.vel` of the joints and of the
+    gripper; by option the images `scene` and `wrist`.
+
+    Args:
+        config: the configuration.
+    """
+
+    config_class = UR5Config
+    name = "ur5"
+
+    def __init__(self, config: UR5Config) -> None:
+        super().__init__(config)
+        self._task: Any = None
+        if config.scene == "reach":
+            self._task = ReachTask(ReachConfig(), 1, config.fps)
+        elif config.scene == "pick":
+            self._task = PickTask(PickConfig(), 1, config.fps)
+        self._scene: TableScene | None = None
+
+    def make_simulation(self) -> UR5Simulation:
+        """Return a new simulation of one robot."""
+        return UR5Simulation(self.config)
+
+    def make_scene(self) -> TableScene:
+        """Return the configured scene."""
+        if self._task is None:
+            scene = TableScene("empty", (), self.config.body().home)
+        else:
+            scene = self._task.sample(self.config.seed)
+            self._task.begin(np.zeros(1, np.intp), [scene])
+        self._scene = scene
+        return scene
+
+    @property
+    def environment(self) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+        """What the scene tells a brain: target and objects, names and values of shape (k,)."""
+        if self._task is None:
+            return (), np.zeros(0)
+        return self._task.environment_names, self._task.environment_state(self.simulation.truth())[0]
+
+    @property
+    def instruction(self) -> str:
+        """What a person would ask for in the scene."""
+        return "" if self._task is None or self._scene is None else self._task.instruction(self._scene)
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """Names of the observation's floats, in order."""
+        return OBSERVED
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the action's floats, in order."""
+        return TOOL_NAMES if self.config.action_space == "tool" else JOINT_ACTIONS
+
+    @property
+    def camera_shapes(self) -> dict[str, tuple[int, int, int]]:
+        """Image shapes (height, width, 3) by camera name."""
+        shape = (self.config.camera_height, self.config.camera_width, 3)
+        return dict.fromkeys(("scene", "wrist"), shape) if self.config.camera else {}

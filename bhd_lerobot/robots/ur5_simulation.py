@@ -1,0 +1,133 @@
+"""n simulated UR5s under one cerebellum."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.bodies.ur5 import JOINTS
+from bhd_lerobot.control.arm_controller import ArmController
+from bhd_lerobot.control.bridge import LockstepBridge
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.kinematics import ArmKinematics
+from bhd_lerobot.control.messages import Reason
+from bhd_lerobot.control.poses import pose_vectors
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.latency import LatePlant
+from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.robots.tool_space import TOOL_NAMES, pose_matrices
+from bhd_lerobot.sim.plant import SimulatedPlant
+from bhd_lerobot.sim.tabletop import Tabletop
+from bhd_lerobot.sim.world import World
+from bhd_lerobot.tasks.task import ArmTruth
+
+JOINT_ACTIONS = (*(f"{joint}.pos" for joint in JOINTS), "gripper.pos")
+OBSERVED = (*JOINT_ACTIONS, *(f"{joint}.vel" for joint in JOINTS), "gripper.vel")
+_SPEED_NOISE = 10.0  # [1/s] noise on speeds, as a multiple of the noise on positions
+
+
+class UR5Simulation(Simulation):
+    """n simulated UR5s, each on a table of its own.
+
+    Args:
+        config: the robot.
+        n: how many.
+        threads: threads that step the physics; all processors if None.
+    """
+
+    action_names = JOINT_ACTIONS
+    observation_names = OBSERVED
+
+    def __init__(self, config: UR5Config, n: int = 1, threads: int | None = None) -> None:
+        self.config, self.n = config, n
+        self.rates = config.rates
+        body = self.body = config.body()
+        self.world = World(body, n, physics_hz=config.physics_hz, threads=threads)
+        self.table = Tabletop(self.world)
+        self.plant = LatePlant(SimulatedPlant(self.world), body)
+        self._controller = ArmController(body, n, config.control_hz, self.rates.ticks_per_frame)
+        self.cerebellum = Cerebellum(body, self.plant, config.control_hz, controller=self._controller)
+        self.bridge = LockstepBridge(self.cerebellum, self.rates, self._advance)
+        self.kinematics = ArmKinematics(body.chain, body.limits)
+        if config.action_space == "tool":
+            self.action_names = TOOL_NAMES
+        self.camera_names = ("scene", "wrist") if config.camera else ()
+        self._begin()
+        self._noise = np.zeros(n)
+        self._arm_on_table, self._arm_on_object, self._self_contact = (np.zeros(n, np.bool_) for _ in range(3))
+
+    def place(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
+        """Put the arms and their objects where the scenes want them, at rest."""
+        self.table.place(scenes, ids)
+        self._noise[ids] = [scene.variation.sensor_noise for scene in scenes]
+        self.plant.set_latency(ids, [scene.variation.latency_ticks for scene in scenes])
+        for flags in (self._arm_on_table, self._arm_on_object, self._self_contact):
+            flags[ids] = False
+
+    def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pose of the tool in recorded states, shape (frames, 7)."""
+        joints, _ = self.world.joint_slice(JOINTS)
+        return pose_vectors(self.kinematics.tool(states[:, joints]))
+
+    def truth(self) -> ArmTruth:
+        """Return where tool and objects are, and what the arms touched since the start of the last frame."""
+        self.plant.read(self._reading)
+        return ArmTruth(
+            tool_pose=self.table.tool_pose,
+            object_poses=self.table.object_poses,
+            opening=self._reading.position[:, -1].copy(),
+            arm_on_table=self._arm_on_table.copy(),
+            arm_on_object=self._arm_on_object.copy(),
+            self_contact=self._self_contact.copy(),
+            fingers_on_object=np.array(self.table.finger_on_object),
+        )
+
+    def _sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        self.plant.read(self._reading)
+        position, velocity = self._reading.position.copy(), self._reading.velocity.copy()
+        for sim in np.flatnonzero((self._noise > 0) & self.running):
+            noise = self._rngs[sim].normal(0.0, self._noise[sim], (2, len(JOINTS)))
+            position[sim, : len(JOINTS)] += noise[0]
+            velocity[sim, : len(JOINTS)] += noise[1] * _SPEED_NOISE
+        return np.concatenate([position, velocity], axis=1), np.full(self.n, self._tick)
+
+    def _clear_touches(self) -> None:
+        for flags in (self._arm_on_table, self._arm_on_object, self._self_contact):
+            flags[:] = False
+
+    def _after_tick(self) -> None:
+        # Contacts of an arm last longer than a physics step: once a tick is often enough.
+        table = self.table
+        np.logical_or(self._arm_on_table, table.arm_on_table, out=self._arm_on_table)
+        np.logical_or(self._arm_on_object, table.arm_on_object, out=self._arm_on_object)
+        np.logical_or(self._self_contact, table.self_contact, out=self._self_contact)
+
+    # --- tool space ---------------------------------------------------------------------------------------------------
+
+    def _applied(self) -> NDArray[np.float64]:
+        command = self.cerebellum.command
+        if self.config.action_space == "joint":
+            return command.copy()
+        tool = pose_vectors(self.kinematics.tool(command[:, :-1]))
+        return np.concatenate([tool, command[:, -1:]], axis=1)
+
+    def _setpoints(
+        self, action: NDArray[np.float64], mask: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
+        if self.config.action_space == "joint":
+            return action, {}
+        command = self.cerebellum.command
+        setpoints, refused = command.copy(), {}
+        for sim in np.flatnonzero(mask).tolist():
+            matrix, problem = pose_matrices(action[sim, :7])
+            if problem is not None:
+                refused[sim] = (Reason.NO_POSTURE, problem)
+                continue
+            result = self.kinematics.solve(matrix, command[sim, :-1])
+            if result.code != ResultCode.SUCCEEDED:
+                refused[sim] = (Reason.NO_POSTURE, result.message)
+                continue
+            setpoints[sim, :-1], setpoints[sim, -1] = result.postures[0], action[sim, -1]
+        return setpoints, refused

@@ -1,0 +1,269 @@
+"""Pick up the object that the instruction names, and no other."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, TableObject, TableScene
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.tasks.config_task import TaskConfig
+from bhd_lerobot.tasks.task import ArmTruth, Event, Outcome
+from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
+
+# Where objects stand, in the base frame [m]: what a tool that points down reaches with room to spare.
+_AREA = np.array([[0.35, -0.30], [0.65, 0.30]])
+_APART = 0.05  # [m] free space between the circles around two objects: an open finger fits between them
+_LIFTED, _FALLEN = 0.05, 0.015  # [m] above and below which an object counts as in the gripper, and as back on the table
+_STRAY = 0.03  # [m] an object that nobody asked for and that is lifted this far was picked up, not brushed
+_REACH = 0.80  # [m] horizontal distance from the base beyond which a tool that points down does not get
+_TRIES = 1000
+
+_FIELDS = (
+    *("present", "target", "box", "x", "y", "z", "qw", "qx", "qy", "qz"),
+    *("length", "width", "height", "red", "green", "blue"),
+)
+ENVIRONMENT = tuple(f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in _FIELDS)
+
+INSTRUCTIONS = {
+    "en": ("pick up the {}", "grab the {}", "lift the {}", "take the {}", "please pick up the {}"),
+    "zh": ("拿起{}", "抓住{}", "请把桌上的{}拿起来"),
+}
+_ZH = {
+    **{"red": "红色", "green": "绿色", "blue": "蓝色", "yellow": "黄色"},
+    **{"orange": "橙色", "purple": "紫色", "white": "白色", "black": "黑色"},
+    **{"cup": "杯子", "box": "盒子"},
+}
+
+
+@TaskConfig.register_subclass("pick")
+@dataclass
+class PickConfig(TaskConfig):
+    """What the pick task asks for.
+
+    Attributes:
+        duration_s: longest duration of an episode [s].
+        lift_m: height above its start that the object must be lifted to [m].
+        hold_s: time that it must be held there [s].
+        min_objects: smallest number of objects on the table.
+        max_objects: largest number of objects on the table.
+        language: language of the instructions: ``"en"``, ``"zh"`` or ``"any"``.
+        randomisation: how much one episode's world differs from the next.
+    """
+
+    duration_s: float = 20.0
+    lift_m: float = 0.1
+    hold_s: float = 1.0
+    min_objects: int = 1
+    max_objects: int = MAX_OBJECTS
+    language: str = "en"
+    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("duration_s", "lift_m", "hold_s"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"task.{name} is {getattr(self, name)}; it must be positive and finite.")
+        if not 1 <= self.min_objects <= self.max_objects <= MAX_OBJECTS:
+            raise ConfigError(
+                f"task.min_objects is {self.min_objects} and task.max_objects is {self.max_objects}; "
+                f"they must be between 1 and {MAX_OBJECTS}, in this order."
+            )
+        if self.language not in (*INSTRUCTIONS, "any"):
+            raise ConfigError(unknown_name("task.language", self.language, (*INSTRUCTIONS, "any")))
+
+
+class PickTask:
+    """The pick task for n simulations.
+
+    Success: the object that the instruction names, and no other, lifted by `lift_m` and held for `hold_s`. Failures:
+    `collision` (the arm touches the table or itself, or a link other than the gripper an object), `wrong_object`
+    (another object was picked up), `dropped` (the right one was, and fell), `unreachable` (it was pushed out of reach)
+    and `timeout`. Score: the greatest height of the object as a share of `lift_m`, at most 0.9; 1 for a success. The
+    reward of a frame is what it adds to the score.
+
+    Args:
+        config: what is asked for.
+        n: number of simulations.
+        fps: frames a second [Hz].
+    """
+
+    name = "pick"
+    robot_type = "ur5"
+    environment_names = ENVIRONMENT
+
+    def __init__(self, config: PickConfig, n: int, fps: int) -> None:
+        self.config = config
+        self.duration_s = config.duration_s
+        self.frames = max(1, round(config.duration_s * fps))
+        self._hold = max(1, round(config.hold_s * fps))
+        self._sims = np.arange(n)
+        self._target = np.zeros(n, np.int64)
+        self._present = np.zeros((n, MAX_OBJECTS), np.bool_)
+        self._start = np.zeros((n, MAX_OBJECTS))  # height of the objects' centres at the start [m]
+        self._fixed = np.zeros((n, MAX_OBJECTS, len(_FIELDS)))
+        self._best, self._height = np.zeros(n), np.zeros(n)
+        self._held, self._frame = np.zeros(n, np.int64), np.zeros(n, np.int64)
+
+    # --- scenes ------------------------------------------------------------------------------------------------------
+
+    def sample(self, seed: int) -> TableScene:
+        """Return the objects, the start and the instruction of the episode with this seed."""
+        config = self.config
+        rng = np.random.default_rng(seed)
+        count = int(rng.integers(config.min_objects, config.max_objects + 1))
+        # No two alike, so that colour and kind name one object.
+        names = [(colour, kind) for colour in COLOURS for kind in KINDS]
+        chosen = [names[index] for index in rng.choice(len(names), count, replace=False)]
+        objects: list[TableObject] = []
+        while len(objects) < count:
+            objects = _draw_objects(config.randomisation, chosen, rng)
+        target = int(rng.integers(count))
+        languages = tuple(INSTRUCTIONS) if config.language == "any" else (config.language,)
+        language = languages[int(rng.integers(len(languages)))]
+        phrase = INSTRUCTIONS[language][int(rng.integers(len(INSTRUCTIONS[language])))]
+        name = objects[target].name
+        if language == "zh":
+            name = _ZH[objects[target].colour] + _ZH[objects[target].kind]
+        return TableScene(
+            name="pick",
+            objects=tuple(objects),
+            posture=_HOME,
+            target_object=target,
+            instruction=phrase.format(name),
+            variation=draw_variation(config.randomisation, rng),
+        )
+
+    def instruction(self, scene: TableScene) -> str:
+        """Return what a person would ask for."""
+        return scene.instruction
+
+    def begin(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
+        """Start episodes in some simulations."""
+        for sim, scene in zip(ids, scenes, strict=True):
+            if scene.target_object is None:
+                raise ConfigError(f"The scene {scene.name!r} names no object to pick up.")
+            self._target[sim] = scene.target_object
+            self._present[sim] = np.arange(MAX_OBJECTS) < len(scene.objects)
+            self._fixed[sim], self._start[sim] = 0.0, 0.0
+            self._fixed[sim, :, 6] = 1.0
+            for number, one in enumerate(scene.objects):
+                self._start[sim, number] = one.height / 2
+                colour = np.clip(np.array(COLOURS[one.colour]) + one.shade, 0.0, 1.0)
+                is_target, is_box = number == scene.target_object, one.kind == "box"
+                self._fixed[sim, number, :3] = 1.0, is_target, is_box
+                self._fixed[sim, number, 10:] = 2 * one.size_x, 2 * one.size_y, one.height, *colour
+        self._best[ids] = self._height[ids] = 0.0
+        self._held[ids] = self._frame[ids] = 0
+
+    def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
+        """Return what is on the table, 16 numbers for each place of an object, shape (n, 80).
+
+        Of each: whether there is one, whether it is the one asked for, whether it is a box; its pose in the base frame
+        (x, y, z [m], quaternion wxyz); length, width and height [m]; red, green and blue. Zeros, and the identity, for
+        places without one.
+        """
+        state = self._fixed.copy()
+        state[self._present, 3:10] = truth.object_poses[self._present]
+        return state.reshape(len(state), -1)
+
+    # --- judging -----------------------------------------------------------------------------------------------------
+
+    def judge(self, truth: ArmTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return reward and event of the frame that just ended, each of shape (n,)."""
+        config, sims, target = self.config, self._sims, self._target
+        lift = np.where(self._present, truth.object_poses[:, :, 2] - self._start, 0.0)
+        height = lift[sims, target]
+        others = lift.copy()
+        others[sims, target] = 0.0
+        gripped = truth.fingers_on_object[sims, target]
+        up = (height >= config.lift_m) & gripped
+        self._held[running] = np.where(up, self._held + 1, 0)[running]
+        self._frame[running] += 1
+        self._height[running] = height[running]
+        before = self._best.copy()
+        self._best[running] = np.maximum(self._best, height)[running]
+        reward = self._share(self._best) - self._share(before)
+        at = truth.object_poses[sims, target]
+        event = np.full(len(running), int(Event.NOTHING))
+        event[running & (self._frame >= self.frames)] = Event.TIMEOUT
+        event[running & ((np.hypot(at[:, 0], at[:, 1]) > _REACH) | (at[:, 2] < -0.05))] = Event.UNREACHABLE
+        event[running & (self._best >= _LIFTED) & (height < _FALLEN)] = Event.DROPPED
+        event[running & (self._held >= self._hold)] = Event.SUCCESS
+        # What must not happen counts also in the last frame of a success.
+        event[running & (others > _STRAY).any(axis=1)] = Event.WRONG_OBJECT
+        event[running & (truth.arm_on_table | truth.self_contact | truth.arm_on_object)] = Event.COLLISION
+        return np.where(event == Event.SUCCESS, 1.0 - self._share(before), reward), event
+
+    def outcome(self, sim: int, event: Event) -> Outcome:
+        """Return how an episode ended."""
+        success = event == Event.SUCCESS
+        return Outcome(
+            success=success,
+            event=event,
+            score=1.0 if success else float(self._share(self._best)[sim]),
+            details={"lifted_m": float(self._best[sim]), "objects": float(self._present[sim].sum())},
+        )
+
+    def parameters(self) -> dict[str, Any]:
+        """Return everything that defines the task."""
+        return {"type": self.name, **asdict(self.config)}
+
+    def _share(self, height: NDArray[np.float64]) -> NDArray[np.float64]:
+        return 0.9 * np.minimum(np.maximum(height, 0.0) / self.config.lift_m, 1.0)
+
+
+_HOME = ur5().home
+
+
+def _draw_objects(
+    config: RandomisationConfig, names: Sequence[tuple[str, str]], rng: np.random.Generator
+) -> list[TableObject]:
+    """Return objects of these colours and kinds that stand apart; fewer if the last found no place."""
+    objects: list[TableObject] = []
+    for colour, kind in names:
+        change = draw_object_changes(config, rng)
+        # One side of each fits between the fingers, also when it is made larger.
+        if kind == "cup":
+            length = width = rng.uniform(0.050, 0.072)
+            height = rng.uniform(0.07, 0.12)
+        else:
+            length, width = rng.uniform(0.045, 0.090), rng.uniform(0.035, 0.065)
+            height = rng.uniform(0.05, 0.10)
+        factor = change["size"]
+        size_x, size_y = length / 2 * factor[0], width / 2 * factor[0 if kind == "cup" else 1]
+        place = _draw_place(math.hypot(size_x, size_y) if kind == "box" else size_x, objects, rng)
+        if place is None:
+            break
+        objects.append(
+            TableObject(
+                kind=kind,  # type: ignore[arg-type]
+                colour=colour,
+                size_x=float(size_x),
+                size_y=float(size_y),
+                height=float(height * factor[2]),
+                x=float(place[0]),
+                y=float(place[1]),
+                yaw=float(rng.uniform(-math.pi, math.pi)),
+                mass=float(rng.uniform(0.08, 0.30) * change["mass"]),
+                friction=float(0.9 * change["friction"]),
+                shade=change["shade"],
+            )
+        )
+    return objects
+
+
+def _draw_place(radius: float, objects: Sequence[TableObject], rng: np.random.Generator) -> NDArray[np.float64] | None:
+    """Return a place for an object of this radius, apart from the others; None if there seems to be none."""
+    for _ in range(_TRIES):
+        place = rng.uniform(_AREA[0], _AREA[1])
+        for one in objects:
+            other = math.hypot(one.size_x, one.size_y) if one.kind == "box" else one.size_x
+            if math.hypot(place[0] - one.x, place[1] - one.y) < radius + other + _APART:
+                break
+        else:
+            return np.asarray(place)
+    return None

@@ -1,0 +1,187 @@
+"""Bring the tool to a pose."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.kinematics import ArmKinematics
+from bhd_lerobot.control.poses import pose_vectors
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.tasks.config_task import TaskConfig
+from bhd_lerobot.tasks.task import ArmTruth, Event, Outcome
+from bhd_lerobot.tasks.variation import RandomisationConfig, draw_variation
+
+# Where targets are, in the base frame [m]: before the arm, over the table.
+_BOX = np.array([[0.20, -0.45, 0.10], [0.70, 0.45, 0.60]])
+# A target is reached in a posture at least this many times better than one that counts as singular: a brain that comes
+# to the pose by another branch of the inverse kinematics shall find it reachable, too.
+_AWAY_FROM_SINGULAR = 3.0
+_TRIES = 10_000
+
+ENVIRONMENT = tuple(f"target_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+
+
+@TaskConfig.register_subclass("reach")
+@dataclass
+class ReachConfig(TaskConfig):
+    """What the reach task asks for.
+
+    Attributes:
+        duration_s: longest duration of an episode [s].
+        tolerance_m: distance of the tool from the target that counts as reached [m].
+        tolerance_deg: angle between the tool's and the target's orientation that counts as reached [deg].
+        hold_s: time that the tool must stay there [s].
+        start_spread_rad: every joint starts at home plus or minus up to this [rad].
+        randomisation: how much one episode's world differs from the next.
+    """
+
+    duration_s: float = 10.0
+    tolerance_m: float = 0.005
+    tolerance_deg: float = 2.0
+    hold_s: float = 0.25
+    start_spread_rad: float = 0.3
+    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("duration_s", "tolerance_m", "tolerance_deg", "hold_s"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"task.{name} is {getattr(self, name)}; it must be positive and finite.")
+        if not 0 <= self.start_spread_rad <= 1:
+            raise ConfigError(f"task.start_spread_rad is {self.start_spread_rad}; it must be between 0 and 1.")
+
+
+class ReachTask:
+    """The reach task for n simulations.
+
+    Success: the tool within the tolerances of the target for `hold_s`. Failures: `collision` (the arm touches the table
+    or itself) and `timeout`. Score: the share of the way to the target that was covered in the end, 1 for a success.
+    The reward of a frame is by how much the distance to the target fell, as a share of the distance at the start.
+
+    Args:
+        config: what is asked for.
+        n: number of simulations.
+        fps: frames a second [Hz].
+    """
+
+    name = "reach"
+    robot_type = "ur5"
+    environment_names = ENVIRONMENT
+
+    def __init__(self, config: ReachConfig, n: int, fps: int) -> None:
+        self.config = config
+        self.duration_s = config.duration_s
+        self.frames = max(1, round(config.duration_s * fps))
+        self._hold = max(1, round(config.hold_s * fps))
+        self._target = np.zeros((n, 7))
+        self._first, self._last = np.ones(n), np.ones(n)
+        self._angle = np.zeros(n)
+        self._within, self._frame = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._started = np.zeros(n, np.bool_)
+
+    def sample(self, seed: int) -> TableScene:
+        """Return the start posture and the target of the episode with this seed."""
+        rng = np.random.default_rng(seed)
+        kinematics, home = _kinematics()
+        return TableScene(
+            name="reach",
+            objects=(),
+            posture=(*self._draw_start(rng, kinematics, home), home[-1]),
+            target_pose=_draw_target(rng, kinematics),
+            instruction=self.instruction(None),
+            variation=draw_variation(self.config.randomisation, rng),
+        )
+
+    def instruction(self, scene: TableScene | None) -> str:
+        """Return what a person would ask for."""
+        return "Bring the tool to the target pose."
+
+    def begin(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
+        """Start episodes in some simulations."""
+        self._target[ids] = [scene.target_pose for scene in scenes]
+        self._within[ids] = self._frame[ids] = 0
+        self._started[ids] = False
+
+    def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
+        """Return the targets in the base frame: position [m] and quaternion wxyz, shape (n, 7)."""
+        return self._target.copy()
+
+    def judge(self, truth: ArmTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return reward and event of the frame that just ended, each of shape (n,)."""
+        config = self.config
+        distance, angle = self._errors(truth)
+        new = running & ~self._started
+        # The first frame's motion is part of it, but the start itself was not judged; at 25 frames a second that is
+        # a fraction of a per cent of the way.
+        self._first[new] = self._last[new] = np.maximum(distance[new], config.tolerance_m)
+        self._started |= new
+        reward = np.where(running, (self._last - distance) / self._first, 0.0)
+        self._last[running], self._angle[running] = distance[running], angle[running]
+        there = (distance <= config.tolerance_m) & (angle <= math.radians(config.tolerance_deg))
+        self._within[running] = np.where(there, self._within + 1, 0)[running]
+        self._frame[running] += 1
+        event = np.full(len(running), int(Event.NOTHING))
+        event[running & (self._frame >= self.frames)] = Event.TIMEOUT
+        event[running & (self._within >= self._hold)] = Event.SUCCESS
+        event[running & (truth.arm_on_table | truth.self_contact)] = Event.COLLISION
+        return reward, event
+
+    def outcome(self, sim: int, event: Event) -> Outcome:
+        """Return how an episode ended."""
+        success = event == Event.SUCCESS
+        covered = 1.0 if success else min(1.0, max(0.0, 1 - self._last[sim] / self._first[sim]))
+        return Outcome(
+            success=success,
+            event=event,
+            score=float(covered),
+            details={"error_m": float(self._last[sim]), "error_rad": float(self._angle[sim])},
+        )
+
+    def parameters(self) -> dict[str, Any]:
+        """Return everything that defines the task."""
+        return {"type": self.name, **asdict(self.config)}
+
+    def _errors(self, truth: ArmTruth) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return distance [m] and angle [rad] between tool and target, each of shape (n,)."""
+        apart = truth.tool_pose[:, :3] - self._target[:, :3]
+        distance = np.sqrt((apart * apart).sum(axis=1))
+        cosine = np.abs((truth.tool_pose[:, 3:] * self._target[:, 3:]).sum(axis=1))
+        return distance, 2 * np.arccos(np.minimum(cosine, 1.0))
+
+    def _draw_start(
+        self, rng: np.random.Generator, kinematics: ArmKinematics, home: tuple[float, ...]
+    ) -> tuple[float, ...]:
+        spread = self.config.start_spread_rad
+        for _ in range(_TRIES):
+            posture = np.array(home[:-1]) + rng.uniform(-spread, spread, len(home) - 1)
+            if kinematics.check(posture) == ResultCode.SUCCEEDED:
+                return tuple(posture.tolist())
+        raise AssertionError("No start posture is free; home is.")
+
+
+def _draw_target(rng: np.random.Generator, kinematics: ArmKinematics) -> tuple[float, ...]:
+    """Return a pose that an admissible posture has: reachable by construction."""
+    least = _AWAY_FROM_SINGULAR * kinematics.chain.min_manipulability
+    for _ in range(_TRIES):
+        # Elbow up and the tool somewhere before the arm: a random posture of all six is nearly always behind it.
+        posture = np.array([math.pi, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0]) + rng.uniform(
+            [-1.0, -0.9, -0.9, -1.2, -1.2, -math.pi], [1.0, 0.9, 0.9, 1.2, 1.2, math.pi]
+        )
+        tool = kinematics.tool(posture)
+        inside = ((tool[:3, 3] >= _BOX[0]) & (tool[:3, 3] <= _BOX[1])).all()
+        if inside and kinematics.manipulability(posture) >= least and kinematics.check(posture) == ResultCode.SUCCEEDED:
+            return tuple(pose_vectors(tool).tolist())
+    raise AssertionError("No target was found; the box before the arm is full of them.")
+
+
+@cache
+def _kinematics() -> tuple[ArmKinematics, tuple[float, ...]]:
+    arm = ur5()
+    return ArmKinematics(arm.chain, arm.limits), arm.home

@@ -1,0 +1,90 @@
+"""Domain randomisation: how much one episode's world may differ from the next."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from bhd_lerobot.bodies.tabletop import Variation
+from bhd_lerobot.errors import ConfigError
+
+
+@dataclass
+class RandomisationConfig:
+    """Ranges of domain randomisation. What is drawn is recorded with every episode, in its scene.
+
+    Attributes:
+        enabled: whether anything of this is done.
+        mass: an object's mass is multiplied by up to 1 + this, or divided by it.
+        friction: an object's friction is multiplied by up to 1 + this, or divided by it; so is that of the fingers.
+        size: an object's measures are multiplied by 1 - this to 1 + this.
+        colour: up to this is added to or taken from each of an object's red, green and blue.
+        light: brightness is multiplied by 1 - this to 1 + this.
+        light_direction: up to this is added to x and y of the main light's direction.
+        camera_m: up to this is added to each coordinate of the scene camera's position [m].
+        sensor_noise_rad: noise on observed joint positions has a standard deviation of up to this [rad], on speeds ten
+            times that [rad/s].
+        latency_s: the servos get their commands up to this late [s].
+    """
+
+    enabled: bool = False
+    mass: float = 0.5
+    friction: float = 0.25
+    size: float = 0.1
+    colour: float = 0.08
+    light: float = 0.4
+    light_direction: float = 0.3
+    camera_m: float = 0.02
+    sensor_noise_rad: float = 0.0005
+    latency_s: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if name != "enabled" and not 0 <= value < math.inf:
+                raise ConfigError(f"randomisation.{name} is {value}; it must be 0 (off) or positive, and finite.")
+        for name in ("size", "light"):
+            if getattr(self, name) >= 1:
+                raise ConfigError(f"randomisation.{name} is {getattr(self, name)}; it must be below 1.")
+
+
+def draw_variation(config: RandomisationConfig, rng: np.random.Generator, control_hz: int = 500) -> Variation:
+    """Return the world's variation of one episode.
+
+    Args:
+        config: the ranges.
+        rng: the episode's random numbers.
+        control_hz: ticks a second, of which the latency is a whole number [Hz].
+    """
+    if not config.enabled:
+        return Variation()
+    uniform = rng.uniform
+    return Variation(
+        light=float(uniform(1 - config.light, 1 + config.light)),
+        light_direction=_floats(uniform(-1, 1, 2) * config.light_direction),
+        camera_shift=_floats(uniform(-1, 1, 3) * config.camera_m),
+        sensor_noise=float(uniform(0, config.sensor_noise_rad)),
+        latency_ticks=round(float(uniform(0, config.latency_s)) * control_hz),
+        finger_friction=_factor(config.friction, rng),
+    )
+
+
+def draw_object_changes(config: RandomisationConfig, rng: np.random.Generator) -> dict[str, Any]:
+    """Return the factors `mass`, `friction` and `size`, and the `shade`, of one object."""
+    if not config.enabled:
+        return {"mass": 1.0, "friction": 1.0, "size": (1.0, 1.0, 1.0), "shade": (0.0, 0.0, 0.0)}
+    return {
+        "mass": _factor(config.mass, rng),
+        "friction": _factor(config.friction, rng),
+        "size": _floats(rng.uniform(1 - config.size, 1 + config.size, 3)),
+        "shade": _floats(rng.uniform(-1, 1, 3) * config.colour),
+    }
+
+
+def _factor(spread: float, rng: np.random.Generator) -> float:
+    """Return a factor between 1 / (1 + spread) and 1 + spread, both ways equally likely."""
+    return float((1 + spread) ** rng.uniform(-1, 1))
+
+
+def _floats(values: Any) -> tuple[Any, ...]:
+    return tuple(float(value) for value in values)
