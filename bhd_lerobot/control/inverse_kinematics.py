@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import ArmChain
-from bhd_lerobot.control.forward_kinematics import DOF
+from bhd_lerobot.control.forward_kinematics import DOF, components_first, components_last
 
 Array = NDArray[np.float64]
 
@@ -30,9 +30,9 @@ def solutions(chain: ArmChain, pose: Array, last: Array | float = 0.0) -> Array:
     Returns:
         Joint positions in [-pi, pi] [rad], shape (..., 8, 6); NaN where the branch does not reach the pose.
     """
-    q, reached = _branches(chain, np.moveaxis(np.asarray(pose, np.float64), (-2, -1), (0, 1)), last)
+    q, reached = _branches(chain, components_first(np.asarray(pose, np.float64), 2), last)
     np.copyto(q, np.nan, where=~reached)
-    return np.moveaxis(q.reshape(DOF, BRANCHES, *q.shape[4:]), (0, 1), (-1, -2))
+    return components_last(q.reshape(DOF, BRANCHES, *q.shape[4:]).swapaxes(0, 1), 2)
 
 
 def nearest(chain: ArmChain, pose: Array, last: float = 0.0) -> Array:
@@ -72,10 +72,13 @@ def _branches(chain: ArmChain, T: Array, last: Array | float) -> tuple[Array, ND
     u, v, w = (s1 * column[0] - c1 * column[1] for column in (x6, y6, z6))
     sine5 = np.sqrt(u * u + v * v)
     free = sine5 < _SINE_ZERO
-    scale = signs[:, None] / np.where(free, 1.0, sine5)
-    c6 = np.moveaxis(np.where(free, np.cos(last), scale * u), 0, 1)
-    s6 = np.moveaxis(np.where(free, np.sin(last), -scale * v), 0, 1)
-    cosine[4], sine[4] = w[:, None, None], np.moveaxis(signs[:, None] * sine5, 0, 1)[:, :, None]
+    scale = signs / np.where(free, 1.0, sine5)[:, None]
+    c6, s6 = scale * u[:, None], -scale * v[:, None]
+    if free.any():
+        free = np.broadcast_to(free[:, None], c6.shape)
+        np.copyto(c6, np.cos(last), where=free)
+        np.copyto(s6, np.sin(last), where=free)
+    cosine[4], sine[4] = w[:, None, None], (signs * sine5[:, None])[:, :, None]
     cosine[5], sine[5] = c6[:, :, None], s6[:, :, None]
 
     # Elbow: two links in the arm's plane, to the origin of the fourth frame.

@@ -1,0 +1,300 @@
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pinocchio
+import pytest
+from eaik.IK_DH import DhRobot
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.kinematics import ArmKinematics
+from bhd_lerobot.errors import ConfigError
+
+ARM = ur5()
+CHAIN = ARM.chain
+HOME = np.array(ARM.home[:6])
+KINEMATICS = ArmKinematics(CHAIN, ARM.limits)
+TILTED = ArmKinematics(dataclasses.replace(CHAIN, tool=(0.03, -0.02, 0.15)), ARM.limits)
+TURN = 2 * math.pi
+ANGLE = st.floats(-math.pi, math.pi) | st.sampled_from([0.0, math.pi / 2, -math.pi / 2, math.pi, -math.pi, 1e-7])
+POSTURE = arrays(np.float64, (6,), elements=ANGLE)
+MANY = np.random.default_rng(0).uniform(-math.pi, math.pi, (10_000, 6))
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Largest difference of a joint, whole turns aside, shape (...)."""
+    return np.abs((a - b + math.pi) % TURN - math.pi).max(axis=-1)
+
+
+def pose_error(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Largest distance [m] or angle [rad] between frames, shape (...)."""
+    turned = np.linalg.norm(found[..., :3, :3] - wanted[..., :3, :3], axis=(-2, -1)) / math.sqrt(2)
+    return np.maximum(turned, np.linalg.norm(found[..., :3, 3] - wanted[..., :3, 3], axis=-1))
+
+
+def moved(pose: np.ndarray, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    there = pose.copy()
+    there[:3, 3] += x, y, z
+    return there
+
+
+def product(q: np.ndarray) -> np.ndarray:
+    """The frames as the convention defines them."""
+    frames = [np.eye(4)]
+    for angle, a, d, alpha in zip(q, CHAIN.a, CHAIN.d, CHAIN.alpha, strict=True):
+        c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
+        step = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
+        frames.append(frames[-1] @ np.array(step))
+    return np.array(frames)
+
+
+@pytest.fixture(scope="module")
+def oracle() -> tuple[pinocchio.Model, int]:
+    """Pinocchio's model of the chain, and its tool frame."""
+    model, parent, placement = pinocchio.Model(), 0, pinocchio.SE3.Identity()
+    for name, a, d, alpha in zip(CHAIN.joints, CHAIN.a, CHAIN.d, CHAIN.alpha, strict=True):
+        parent = model.addJoint(parent, pinocchio.JointModelRZ(), placement, name)
+        twist = np.array([[1, 0, 0], [0, math.cos(alpha), -math.sin(alpha)], [0, math.sin(alpha), math.cos(alpha)]])
+        placement = pinocchio.SE3(twist, np.array([a, 0.0, d]))
+    placement = placement * pinocchio.SE3(np.eye(3), np.array(CHAIN.tool))
+    return model, model.addFrame(pinocchio.Frame("tool", parent, placement, pinocchio.FrameType.OP_FRAME))
+
+
+def test_frames_and_jacobian_agree_with_pinocchio(oracle: tuple[pinocchio.Model, int]) -> None:
+    model, tool = oracle
+    data = model.createData()
+    for q in MANY[:300]:
+        pinocchio.framesForwardKinematics(model, data, q)
+        np.testing.assert_allclose(KINEMATICS.tool(q), data.oMf[tool].homogeneous, atol=1e-14)
+        expected = pinocchio.computeFrameJacobian(model, data, q, tool, pinocchio.LOCAL_WORLD_ALIGNED)
+        np.testing.assert_allclose(KINEMATICS.jacobian(q), expected, atol=1e-14)
+
+
+@given(q=POSTURE)
+def test_frames_are_the_product_of_the_joints(q: np.ndarray) -> None:
+    np.testing.assert_allclose(KINEMATICS.frames(q), product(q), atol=1e-14)
+
+
+def test_jacobian_is_the_derivative() -> None:
+    step = 1e-6
+    for q in MANY[:50]:
+        jacobian = TILTED.jacobian(q)
+        for joint in range(6):
+            ahead, behind = (TILTED.tool(q + sign * step * np.eye(6)[joint]) for sign in (1, -1))
+            rate = (ahead - behind) / (2 * step)
+            spin = rate[:3, :3] @ TILTED.tool(q)[:3, :3].T
+            np.testing.assert_allclose(jacobian[:3, joint], rate[:3, 3], atol=1e-8)
+            np.testing.assert_allclose(jacobian[3:, joint], (spin[2, 1], spin[0, 2], spin[1, 0]), atol=1e-8)
+
+
+@pytest.mark.parametrize("kinematics", [KINEMATICS, TILTED])
+def test_manipulability_is_the_jacobian_s_determinant(kinematics: ArmKinematics) -> None:
+    expected = np.abs(np.linalg.det(kinematics.jacobian(MANY)))
+    np.testing.assert_allclose(kinematics.manipulability(MANY), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("kinematics", [KINEMATICS, TILTED])
+def test_every_solution_reaches_the_pose_and_the_generating_posture_is_among_them(kinematics: ArmKinematics) -> None:
+    poses = kinematics.tool(MANY)
+    found = kinematics.solutions(poses)
+    error = pose_error(kinematics.tool(found), poses[:, None])
+    exists = np.isfinite(found).all(axis=2)
+    np.testing.assert_array_equal(exists, np.isfinite(found).any(axis=2))
+    assert error[exists].max() < 1e-9
+    assert exists.any(axis=1).mean() >= 0.999
+    assert np.abs(found[exists]).max() <= math.pi
+    regular = kinematics.manipulability(MANY) > 1e-6
+    assert np.where(exists, apart(found, MANY[:, None]), np.inf).min(axis=1)[regular].max() < 1e-7
+
+
+@given(q=POSTURE)
+def test_solutions_at_and_near_the_borders(q: np.ndarray) -> None:
+    pose = KINEMATICS.tool(q)
+    found = KINEMATICS.solutions(pose, q[5])
+    exists = np.isfinite(found).all(axis=1)
+    assert exists.any()
+    assert pose_error(KINEMATICS.tool(found[exists]), pose).max() < 1e-9
+
+
+def test_a_free_last_joint_stays_where_it_is() -> None:
+    posture = np.array([0.4, -1.2, 1.5, -0.3, 0.0, 0.7])
+    found = KINEMATICS.solutions(KINEMATICS.tool(posture), 0.7)
+    assert np.nanmin(apart(found, posture)) < 1e-7
+
+
+def test_a_solution_does_not_depend_on_what_it_is_computed_with() -> None:
+    poses = KINEMATICS.tool(MANY[:60])
+    frames, found, codes = KINEMATICS.frames(MANY[:60]), KINEMATICS.solutions(poses), KINEMATICS.check(MANY[:60])
+    for index, (q, pose) in enumerate(zip(MANY[:60], poses, strict=True)):
+        np.testing.assert_array_equal(KINEMATICS.frames(q), frames[index])
+        np.testing.assert_array_equal(KINEMATICS.solutions(pose), found[index])
+        np.testing.assert_array_equal(KINEMATICS.check(q[None]), codes[index])
+    np.testing.assert_array_equal(KINEMATICS.solutions(poses.reshape(3, 20, 4, 4)).reshape(60, 8, 6), found)
+
+
+def test_solutions_agree_with_another_closed_form() -> None:
+    peer = DhRobot(np.array(CHAIN.alpha), np.array(CHAIN.a), np.array(CHAIN.d))
+    flange_from_tool = np.eye(4)
+    flange_from_tool[:3, 3] = -np.array(CHAIN.tool)
+    rng = np.random.default_rng(3)
+    poses = KINEMATICS.tool(MANY[:2000])
+    poses[1000:, :3, 3] += rng.uniform(-0.5, 0.5, (1000, 3))  # about half of them cannot be reached
+    ours = KINEMATICS.solutions(poses)
+    reached = 0
+    for pose, found in zip(poses, ours, strict=True):
+        answer = peer.IK(pose @ flange_from_tool)
+        theirs = answer.Q[~np.asarray(answer.is_LS, np.bool_)]  # the others are the nearest it can do
+        theirs = theirs[pose_error(KINEMATICS.tool(theirs), pose) < 1e-6] if len(theirs) else np.empty((0, 6))
+        mine = found[np.isfinite(found).all(axis=1)]
+        assert len(mine) == len(theirs)
+        if len(mine):
+            reached += 1
+            between = apart(mine[:, None], theirs[None])
+            assert max(between.min(axis=0).max(), between.min(axis=1).max()) < 1e-6
+    assert 1100 < reached < 1990
+
+
+def test_solutions_agree_with_the_ur_library() -> None:
+    library = pytest.importorskip("ur_analytic_ik")
+    tcp = np.eye(4)
+    tcp[:3, 3] = CHAIN.tool
+    for q, pose in zip(MANY[:1000], KINEMATICS.tool(MANY[:1000]), strict=True):
+        theirs = np.array(library.ur5.inverse_kinematics_with_tcp(pose, tcp)).reshape(-1, 6)
+        found = KINEMATICS.solutions(pose)
+        if len(theirs) and KINEMATICS.manipulability(q) > 1e-4:
+            assert np.nanmin(apart(found[:, None], theirs[None]), axis=0).max() < 1e-4
+
+
+def test_solve_orders_by_the_largest_change_and_answers_can_be_taken() -> None:
+    for q in MANY[:300]:
+        result = KINEMATICS.solve(KINEMATICS.tool(q), HOME)
+        if result.code != ResultCode.SUCCEEDED:
+            assert result.message
+            assert result.postures.shape == (0, 6)
+            continue
+        assert pose_error(KINEMATICS.tool(result.postures), KINEMATICS.tool(q)).max() < 1e-9
+        assert (KINEMATICS.check(result.postures) == ResultCode.SUCCEEDED).all()
+        change = np.abs(result.postures - HOME).max(axis=1)
+        assert (np.diff(change) >= 0).all()
+        assert change.max() <= math.pi + 1e-9  # no longer way round while the limits are far
+        raw = KINEMATICS.solutions(KINEMATICS.tool(q), HOME[5])
+        raw = raw[np.isfinite(raw).all(axis=1)]
+        assert len(result.postures) == (KINEMATICS.check(raw) == ResultCode.SUCCEEDED).sum()
+
+
+def test_solve_from_a_posture_returns_it_first() -> None:
+    admissible = MANY[KINEMATICS.check(MANY) == ResultCode.SUCCEEDED][:100]
+    for q in (HOME, *admissible, *(admissible[:20] + TURN * np.sign(-admissible[:20]))):
+        first = KINEMATICS.solve(KINEMATICS.tool(q), q).postures[0]
+        np.testing.assert_allclose(first, q, atol=1e-9)
+
+
+def test_turns_stay_within_the_limits() -> None:
+    """At a limit the joint takes the other way round, and an exact limit may be taken."""
+    q = HOME + np.array([0, 0, 0, 0, 0, TURN - 0.1])
+    beyond = KINEMATICS.tool(q + np.array([0, 0, 0, 0, 0, 0.3]))
+    first = KINEMATICS.solve(beyond, q).postures
+    assert (np.abs(first) <= TURN).all()
+    np.testing.assert_allclose(first[np.abs(first[:, :5] - HOME[:5]).max(axis=1) < 1e-9, 5], q[5] + 0.3 - TURN)
+    at_limit = HOME + np.array([0, 0, 0, 0, 0, TURN])
+    np.testing.assert_allclose(KINEMATICS.solve(KINEMATICS.tool(at_limit), at_limit).postures[0], at_limit, atol=1e-9)
+
+
+def limited(half: float) -> ArmKinematics:
+    """The arm with joints that turn by no more than `half` from home."""
+    lower, upper = ((*(HOME + sign * half).tolist(), bound) for sign, bound in ((-1, 0.0), (1, 0.085)))
+    return ArmKinematics(CHAIN, dataclasses.replace(ARM.limits, lower=lower, upper=upper))
+
+
+TOOL = KINEMATICS.tool(HOME)
+FOLDED = np.array([0.0, -1.5, 2.9, 0.5, 1.5, 0.0])
+STRAIGHT = np.array([0.3, -1.2, 1e-4, -0.4, 1.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("kinematics", "pose", "code", "words"),
+    [
+        (KINEMATICS, moved(TOOL, x=0.7), ResultCode.UNREACHABLE, "short of the pose.*towards"),
+        (KINEMATICS, moved(TOOL, x=-TOOL[0, 3], y=-TOOL[1, 3]), ResultCode.UNREACHABLE, "0.109 m is the least"),
+        (limited(0.5), KINEMATICS.tool(HOME + 0.6), ResultCode.JOINT_LIMIT, "its limits are"),
+        (KINEMATICS, KINEMATICS.tool(FOLDED), ResultCode.SELF_COLLISION, "and .* would come within"),
+        (KINEMATICS, moved(TOOL, z=-0.4), ResultCode.TABLE_COLLISION, "of the table"),
+        (KINEMATICS, KINEMATICS.tool(STRAIGHT), ResultCode.SINGULAR, "manipulability is"),
+        (KINEMATICS, moved(TOOL, z=math.nan), ResultCode.NON_FINITE, "nan"),
+        (KINEMATICS, TOOL * 1.01, ResultCode.NOT_NORMALISED, "Normalise"),
+        (KINEMATICS, TOOL @ np.diag([1.0, 1.0, -1.0, 1.0]), ResultCode.NOT_NORMALISED, "Normalise"),
+    ],
+)
+def test_every_failure_has_its_code(kinematics: ArmKinematics, pose: np.ndarray, code: ResultCode, words: str) -> None:
+    result = kinematics.solve(pose, HOME)
+    assert result.code == code, result.message
+    assert result.postures.shape == (0, 6)
+    assert re.search(words, result.message), result.message
+    along = kinematics.line(np.stack([TOOL, pose]), HOME)
+    assert along.code != ResultCode.SUCCEEDED
+    assert along.index == 1
+    assert along.message
+
+
+def test_home_can_be_taken() -> None:
+    assert KINEMATICS.check(HOME[None]) == ResultCode.SUCCEEDED
+    assert KINEMATICS.explain(HOME) == ""
+    assert KINEMATICS.manipulability(HOME) > 10 * CHAIN.min_manipulability
+
+
+@pytest.mark.parametrize("side", [-0.2, 0.2])
+def test_a_line_is_followed_continuously(side: float) -> None:
+    """Home has its first joint at pi, where the closed form's angles begin again: one of the sides crosses it."""
+    poses = np.stack([moved(TOOL, x=0.1 * s, y=side * s, z=0.1 * s) for s in np.linspace(0, 1, 40)])
+    result = KINEMATICS.line(poses, HOME)
+    assert (result.code, result.index, result.message) == (ResultCode.SUCCEEDED, None, "")
+    np.testing.assert_allclose(result.postures[0], HOME, atol=1e-9)
+    assert pose_error(KINEMATICS.tool(result.postures), poses).max() < 1e-9
+    assert np.abs(np.diff(result.postures, axis=0)).max() < 0.1
+
+
+def test_a_line_stops_at_a_limit() -> None:
+    """The same line that can be taken with the last joint in the middle of its range cannot at one of its ends."""
+    codes = []
+    for side in (-0.2, 0.2):
+        poses = np.stack([moved(TOOL, y=side * s) for s in np.linspace(0, 1, 40)])
+        result = KINEMATICS.line(poses, HOME + np.array([0, 0, 0, 0, 0, TURN]))
+        codes.append(result.code)
+    assert sorted(codes) == [ResultCode.SUCCEEDED, ResultCode.JOINT_LIMIT]
+
+
+def test_a_line_through_a_singularity_stops_before_it() -> None:
+    start = np.array([math.pi, -2.0, 1.5, -1.0, 0.8, 0.0])
+    turn = np.linspace(0, -1.6, 80)
+    poses = KINEMATICS.tool(start + turn[:, None] * np.eye(6)[4])
+    result = KINEMATICS.line(poses, start)
+    assert result.code == ResultCode.SINGULAR
+    assert result.index is not None
+    assert 0 < result.index < 40
+
+
+def test_a_line_has_to_start_where_the_arm_is() -> None:
+    result = KINEMATICS.line(TOOL[None], HOME + 0.1)
+    assert (result.code, result.index) == (ResultCode.UNREACHABLE, 0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"a": (0.1, -0.4, -0.4, 0.0, 0.0, 0.0)},
+        {"a": (0.0, 0.0, -0.4, 0.0, 0.0, 0.0)},
+        {"d": (0.1, 0.1, 0.0, 0.1, 0.1, 0.1)},
+        {"d": (0.1, 0.0, 0.0, 0.0, 0.1, 0.1)},
+        {"alpha": (math.pi / 2, 0.0, 0.0, math.pi / 2, math.pi / 2, 0.0)},
+        {"alpha": (0.0,) * 5},
+        {"tool": (0.0, math.inf, 0.0)},
+    ],
+)
+def test_another_geometry_is_refused(change: dict) -> None:
+    with pytest.raises(ConfigError):
+        ArmKinematics(dataclasses.replace(CHAIN, **change), ARM.limits)
