@@ -21,6 +21,14 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 }
 KINDS: tuple[Literal["cup", "box"], ...] = ("cup", "box")
 
+OBJECT_FIELDS = (
+    *("present", "target", "box", "x", "y", "z", "qw", "qx", "qy", "qz"),
+    *("length", "width", "height", "red", "green", "blue"),
+)
+"""What a task tells a brain about each place of an object, in order: whether there is one, whether it is the one that
+the task is about, whether it is a box; its pose in the base frame [m, unit quaternion]; its measures [m]; its colour, 0
+to 1."""
+
 
 @dataclass(frozen=True)
 class TableObject:

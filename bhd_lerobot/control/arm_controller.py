@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
-from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.goals import GoalManager
 from bhd_lerobot.control.messages import Limit, Mode
@@ -73,9 +73,10 @@ class ArmController(Controller):
             self.setpoints.run(self.command, self.velocity, self.acceleration)
         self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
         np.copyto(self.busy, self.goals.busy)
-        np.copyto(self.following, self.goals.following)
-        if (self.following & self.setpoints.active).any():
-            self.setpoints.drop(self.following)
+        phase = self.goals.phase
+        np.logical_or(phase == GoalPhase.CONVERTING, phase == GoalPhase.EXECUTING, out=self.following)
+        if (self.goals.following & self.setpoints.active).any():
+            self.setpoints.drop(self.goals.following)
         actuators, centre, work = self.actuators, self._centre, self._work
         np.multiply(self.velocity, self._lead, out=actuators)
         actuators += self.command

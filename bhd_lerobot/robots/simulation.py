@@ -244,12 +244,13 @@ class Simulation(ABC):
         self.bridge.advance_frame()
         self.world.check()
         limits, watchdog = self.cerebellum.take_flags()
-        results = {sim: list(values) for sim, values in (refused or {}).items()}
+        results = {}
         for sim in np.flatnonzero(self.running).tolist():
+            # A refusal is among the results, too, unless another goal has its name.
             done = self.bridge.take_results(sim)
+            done = [one for one in (refused or {}).get(sim, ()) if one not in done] + done
             if done:
-                known = {id(result) for result in results.get(sim, ())}
-                results.setdefault(sim, []).extend(result for result in done if id(result) not in known)
+                results[sim] = done
         return FrameReport(
             applied=self._applied(),
             sent=sent,

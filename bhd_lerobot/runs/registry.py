@@ -9,20 +9,37 @@ from bhd_lerobot.policies.avoidance import AvoidanceBrain, AvoidanceConfig
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.policies.config_brain import BrainConfig
 from bhd_lerobot.policies.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.policies.language_brain import LanguageBrain, LanguageBrainConfig
+from bhd_lerobot.policies.pick import PickBrain, PickBrainConfig
+from bhd_lerobot.policies.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.simulation import Simulation
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.config_task import TaskConfig
+from bhd_lerobot.tasks.pick import PickConfig, PickTask
+from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Task
 
 # Importing this module registers every configuration that it names.
 _BRAINS: dict[type, Callable[[Any], Brain]] = {
     AvoidanceConfig: AvoidanceBrain,
     GapFollowerConfig: GapFollowerBrain,
+    LanguageBrainConfig: LanguageBrain,
+    PickBrainConfig: PickBrain,
+    ReachBrainConfig: ReachBrain,
 }
-_TASKS: dict[type, Callable[[Any, int, int], Task]] = {AvoidConfig: AvoidTask}
-_SIMULATIONS: dict[type[RobotConfig], Callable[[Any, int, int | None], Simulation]] = {TurtleBot3Config: TurtleBot3Simulation}
+_TASKS: dict[type, Callable[[Any, int, int], Task]] = {
+    AvoidConfig: AvoidTask,
+    PickConfig: PickTask,
+    ReachConfig: ReachTask,
+}
+_SIMULATIONS: dict[type[RobotConfig], Callable[[Any, int, int | None], Simulation]] = {
+    TurtleBot3Config: TurtleBot3Simulation,
+    UR5Config: UR5Simulation,
+}
 
 SIMULATED_ROBOTS = tuple(_SIMULATIONS)
 """Configurations of the robots that can be simulated."""

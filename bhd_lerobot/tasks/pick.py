@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, TableObject, TableScene
+from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.tasks.config_task import TaskConfig
@@ -23,11 +23,7 @@ _STRAY = 0.03  # [m] an object that nobody asked for and that is lifted this far
 _REACH = 0.80  # [m] horizontal distance from the base beyond which a tool that points down does not get
 _TRIES = 1000
 
-_FIELDS = (
-    *("present", "target", "box", "x", "y", "z", "qw", "qx", "qy", "qz"),
-    *("length", "width", "height", "red", "green", "blue"),
-)
-ENVIRONMENT = tuple(f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in _FIELDS)
+ENVIRONMENT = tuple(f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS)
 
 INSTRUCTIONS = {
     "en": ("pick up the {}", "grab the {}", "lift the {}", "take the {}", "please pick up the {}"),
@@ -104,7 +100,7 @@ class PickTask:
         self._target = np.zeros(n, np.int64)
         self._present = np.zeros((n, MAX_OBJECTS), np.bool_)
         self._start = np.zeros((n, MAX_OBJECTS))  # height of the objects' centres at the start [m]
-        self._fixed = np.zeros((n, MAX_OBJECTS, len(_FIELDS)))
+        self._fixed = np.zeros((n, MAX_OBJECTS, len(OBJECT_FIELDS)))
         self._best, self._height = np.zeros(n), np.zeros(n)
         self._held, self._frame = np.zeros(n, np.int64), np.zeros(n, np.int64)
 
