@@ -15,8 +15,9 @@ from bhd_lerobot.sim.engine import mujoco
 TABLE_BIT, ARM_BIT, OBJECT_BIT = 1, 2, 4  # contact bits; those of the arm are in its MJCF
 HANDLE_PARTS = 3
 PADS = ("pad_left", "pad_right")
-# Absent objects float, without weight, far below the floor and far from each other: the broad phase drops them at once.
-PARKED = tuple((3.0 * number, 0.0, -100.0) for number in range(MAX_OBJECTS))
+# Absent objects float, without weight, far above the table and far from each other, where they are dropped at once from
+# the search for contacts. Below it they would touch it: a plane is solid all the way down.
+PARKED = tuple((3.0 * number, 0.0, 100.0) for number in range(MAX_OBJECTS))
 FLOOR = -0.75  # [m]
 _TABLE = (-0.35, 1.05, 0.70)  # edges behind and before the base, half the width [m]
 

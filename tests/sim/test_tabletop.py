@@ -1,0 +1,511 @@
+"""The table and what lies on it: every simulation has its own, and nobody else's."""
+
+import itertools
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene, Variation
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.errors import SimulationError
+from bhd_lerobot.sim.plant import SimulatedPlant
+from bhd_lerobot.sim.tabletop import Tabletop
+from bhd_lerobot.sim.world import World
+
+BODY = ur5()
+HOME = np.array(BODY.home)
+LAG = np.array(BODY.servo_damping) / np.array(BODY.servo_stiffness)
+SPOTS = ((0.55, 0.28), (0.45, -0.20), (0.75, -0.05), (0.62, 0.05), (0.38, 0.33))
+
+
+def random_scene(seed: int, count: int | None = None) -> TableScene:
+    rng = np.random.default_rng([7, seed])
+    colours = rng.permutation(list(COLOURS))
+    things = []
+    for number in range(rng.integers(1, MAX_OBJECTS + 1) if count is None else count):
+        cup = bool(rng.integers(2))
+        a, b = rng.uniform(0.02, 0.04, 2)
+        things.append(
+            TableObject(
+                kind="cup" if cup else "box",
+                colour=str(colours[number]),
+                size_x=a,
+                size_y=a if cup else b,
+                height=rng.uniform(0.05, 0.12),
+                x=SPOTS[number][0],
+                y=SPOTS[number][1],
+                yaw=rng.uniform(-3, 3),
+                mass=rng.uniform(0.05, 0.5),
+                friction=rng.uniform(0.5, 1.1),
+                shade=tuple(rng.uniform(-0.1, 0.1, 3)),
+            )
+        )
+    posture = (*(HOME[:6] + rng.uniform(-0.1, 0.1, 6)), rng.uniform(0, 0.085))
+    variation = Variation(
+        light=rng.uniform(0.5, 1.5),
+        light_direction=tuple(rng.uniform(-0.3, 0.3, 2)),
+        camera_shift=tuple(rng.uniform(-0.05, 0.05, 3)),
+        finger_friction=rng.uniform(0.5, 1.5),
+    )
+    return TableScene("random", tuple(things), posture, variation=variation)
+
+
+def laid(n: int, first: int = 0, count: int | None = None, threads: int | None = None) -> tuple[World, Tabletop]:
+    world = World(BODY, n, threads=threads)
+    table = Tabletop(world)
+    table.place([random_scene(seed, count) for seed in range(first, first + n)])
+    return world, table
+
+
+def sweep(world: World, first: int = 0, steps: int = 40) -> None:
+    """Swing each arm through its objects and table, by commands of its own."""
+    generators = [np.random.default_rng([5, sim]) for sim in range(first, first + world.n)]
+    for _ in range(steps):
+        for row, generator in enumerate(generators):
+            target = HOME.copy()
+            target[:6] += generator.uniform((-0.6, 0.0, 0.0, -1, -1, -1), (0.6, 0.5, 0.5, 1, 1, 1))
+            target[6] = generator.uniform(0, 0.085)
+            world.ctrl[row] += 0.3 * (target - world.ctrl[row])
+        world.step(10)
+
+
+def everything(world: World, table: Tabletop, sim: int) -> bytes:
+    snapshot = world.snapshot(np.array([sim]))
+    flags = (table.arm_on_table, table.self_contact, table.arm_on_object, table.finger_on_object)
+    seen = [flag[sim] for flag in flags] + [table.tool_pose[sim], table.object_poses[sim]]
+    parts = [snapshot.state, *snapshot.fields.values(), *seen]
+    return b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+
+
+# --- determinism -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def five() -> list[bytes]:
+    world, table = laid(5, threads=2)
+    sweep(world)
+    world.check()
+    return [everything(world, table, sim) for sim in range(5)]
+
+
+@pytest.mark.parametrize(("n", "first", "threads"), [(1, 0, None), (1, 4, None), (3, 1, 1), (5, 0, 3)])
+def test_results_do_not_depend_on_the_other_simulations_or_on_threads(
+    n: int, first: int, threads: int | None, five: list[bytes]
+) -> None:
+    assert len(set(five)) == 5
+    world, table = laid(n, first, threads=threads)
+    sweep(world, first)
+    assert [everything(world, table, sim) for sim in range(n)] == five[first : first + n]
+
+
+def test_an_episode_does_not_depend_on_the_one_before(five: list[bytes]) -> None:
+    world, table = laid(3, 20, count=5)
+    sweep(world, 20, 10)
+    table.place([random_scene(seed) for seed in range(3)])
+    sweep(world)
+    states = [world.snapshot(np.array([sim])).state.tobytes() for sim in range(3)]
+    assert all(expected.startswith(state) for state, expected in zip(states, five, strict=False))
+
+
+def test_a_restored_snapshot_goes_on_bit_exactly() -> None:
+    world, table = laid(3)
+    sweep(world, steps=15)
+    snapshot = world.snapshot()
+    sweep(world, 50, 10)
+    expected = [everything(world, table, sim) for sim in range(3)]
+    table.place([random_scene(seed) for seed in range(30, 33)])
+    elsewhere = World(BODY, 3, threads=1)
+    for target, at in ((world, table), (elsewhere, Tabletop(elsewhere))):
+        target.restore(snapshot)
+        sweep(target, 50, 10)
+        assert [everything(target, at, sim) for sim in range(3)] == expected
+
+
+def test_placing_some_leaves_the_others_alone() -> None:
+    world, table = laid(4)
+    sweep(world, steps=5)
+    before = [world.snapshot(np.array([sim])).state.tobytes() for sim in range(4)]
+    table.place([random_scene(40), random_scene(41)], np.array([1, 2]))
+    after = [world.snapshot(np.array([sim])).state.tobytes() for sim in range(4)]
+    assert [a == b for a, b in zip(after, before, strict=True)] == [True, False, False, True]
+
+
+# --- objects ---------------------------------------------------------------------------------------------------------
+
+
+def test_each_simulation_has_objects_of_its_own() -> None:
+    scenes = [random_scene(seed) for seed in range(6)]
+    world, _ = laid(6)
+    for sim, scene in enumerate(scenes):
+        model = world.copy_model(sim)
+        for number, thing in enumerate(scene.objects):
+            name = f"object_{number}"
+            a, b, h = thing.size_x, thing.size_y, thing.height
+            kind, size = ("CYLINDER", (a, h / 2, 0)) if thing.kind == "cup" else ("BOX", (a, b, h / 2))
+            geom, body = model.geom(name), model.body(name)
+            assert geom.type[0] == getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")
+            np.testing.assert_array_equal(geom.size, size)
+            np.testing.assert_allclose(geom.rgba[:3], np.clip(np.add(COLOURS[thing.colour], thing.shade), 0, 1), 1e-6)
+            assert geom.friction[0] == thing.friction
+            assert body.mass[0] == thing.mass
+            # MuJoCo's own compiler is the oracle for the inertia.
+            text = f'<geom type="{kind.lower()}" size="{size[0]} {size[1]} {size[2] or 1}" mass="{thing.mass}"/>'
+            spec = f"<mujoco><compiler balanceinertia='false'/><worldbody><body><freejoint/>{text}</body></worldbody>"
+            other = mujoco.MjModel.from_xml_string(spec + "</mujoco>")
+            np.testing.assert_allclose(np.sort(body.inertia), np.sort(other.body_inertia[1]), rtol=1e-6)
+            assert body.inertia[2] == pytest.approx(
+                thing.mass * (a * a / 2 if thing.kind == "cup" else (a * a + b * b) / 3)
+            )
+            for pair in range(model.npair):
+                if geom.id in (model.pair_geom1[pair], model.pair_geom2[pair]):
+                    assert model.pair_friction[pair, 0] == thing.friction * scene.variation.finger_friction
+
+
+def test_objects_stay_where_they_were_put() -> None:
+    world, table = laid(4)
+    start = table.object_poses
+    for sim in range(4):
+        things = random_scene(sim).objects
+        for number, thing in enumerate(things):
+            np.testing.assert_array_equal(start[sim, number, :3], (thing.x, thing.y, thing.height / 2))
+            w, _, _, z = start[sim, number, 3:]
+            assert 2 * math.atan2(z, w) == pytest.approx(thing.yaw, abs=1e-12)
+        absent = start[sim, len(things) :]
+        np.testing.assert_array_equal(absent, np.broadcast_to((0, 0, 0, 1, 0, 0, 0), absent.shape))
+    world.step(1000)
+    end = table.object_poses
+    assert np.abs(end[..., :2] - start[..., :2]).max() < 1e-5
+    assert np.abs(end[..., 2] - start[..., 2]).max() < 3e-4
+    assert np.abs(end[..., 3:] - start[..., 3:]).max() < 1e-3
+    assert not table.finger_on_object.any()
+
+
+def test_absent_objects_touch_nothing_and_stay_absent() -> None:
+    world = World(BODY, 2)
+    table = Tabletop(world)
+    touching = world._batch.bind("ncon")
+    for scene in (random_scene(1, 3), random_scene(1, 0)):
+        table.place([scene] * 2)
+        before = world.qpos[:, 8 + 7 * len(scene.objects) :].copy()
+        world.step(500)
+        np.testing.assert_array_equal(world.qpos[:, 8 + 7 * len(scene.objects) :], before)
+    assert not np.asarray(touching).any()
+
+
+def test_a_reset_puts_the_arm_home_and_clears_the_table() -> None:
+    world, table = laid(3, count=5)
+    sweep(world, steps=5)
+    world.reset([0, 2])
+    np.testing.assert_array_equal(world.qpos[0, :6], HOME[:6])
+    np.testing.assert_array_equal(world.qpos[2, 6:8], HOME[6] / 2)
+    np.testing.assert_array_equal(world.ctrl[[0, 2]], [HOME, HOME])
+    gone = table.object_poses[[0, 2]]
+    world.step(500)
+    np.testing.assert_array_equal(table.object_poses[[0, 2]], gone)
+    np.testing.assert_array_equal(gone[..., :3], 0)
+    np.testing.assert_allclose(world.qpos[[0, 2], :6], [HOME[:6]] * 2, atol=1e-5)
+    assert table.object_poses[1, :, 0].all()
+
+
+def test_friction_decides_whether_a_push_moves_an_object() -> None:
+    """On a tilted table, which is what sideways gravity is, an object slides where its friction is too small."""
+    scenes = []
+    for friction in (0.3, 0.45, 0.55, 0.9):
+        box = TableObject("box", "red", 0.04, 0.04, 0.04, 0.5, 0.3, friction=friction)
+        scenes.append(TableScene("", (box,), BODY.home))
+    world = World(BODY, 4)
+    table = Tabletop(world)
+    table.place(scenes)
+    world.model_field("opt.gravity")[:] = (0.5 * 9.81, 0, -9.81)
+    world.step(250)
+    assert (np.abs(table.object_poses[:, 0, 0] - 0.5) > 0.01).tolist() == [True, True, False, False]
+
+
+# --- surroundings ----------------------------------------------------------------------------------------------------
+
+
+def test_variations_reach_light_camera_and_fingers() -> None:
+    scenes = [random_scene(seed) for seed in range(3)]
+    world, table = laid(3)
+    nominal = world.model
+    for _ in range(2):  # a second time is not on top of the first
+        for sim, scene in enumerate(scenes):
+            model, variation = world.copy_model(sim), scene.variation
+            np.testing.assert_allclose(model.light_diffuse, nominal.light_diffuse * variation.light, rtol=1e-6)
+            shift = model.camera("scene").pos - nominal.camera("scene").pos
+            np.testing.assert_allclose(shift, variation.camera_shift, atol=1e-12)
+            np.testing.assert_array_equal(model.camera("wrist").pos, nominal.camera("wrist").pos)
+            turned = nominal.light("main").dir + np.array([*variation.light_direction, 0])
+            np.testing.assert_allclose(model.light("main").dir, turned / np.linalg.norm(turned), atol=1e-6)
+            pads = [world_model.geom("pad_left").friction[0] for world_model in (model, nominal)]
+            assert pads[0] == pytest.approx(pads[1] * variation.finger_friction)
+        table.place(scenes)
+
+
+def test_the_target_is_drawn_where_it_is_wanted_and_touches_nothing() -> None:
+    pose = (0.4, -0.2, 0.1, math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
+    world = World(BODY, 2)
+    table = Tabletop(world)
+    table.place([TableScene("", (), BODY.home, target_pose=each) for each in (pose, None)])
+    for sim in range(2):
+        model = world.copy_model(sim)
+        data = mujoco.MjData(model)
+        world.copy_into(sim, model, data)
+        mujoco.mj_forward(model, data)
+        at = np.concatenate([data.body("target").xpos, data.body("target").xquat])
+        if sim == 0:
+            np.testing.assert_allclose(at, pose, atol=1e-12)
+        else:
+            assert np.abs(at).max() > 50  # out of sight
+        assert not any(
+            model.geom_contype[i] for i in range(model.ngeom) if model.geom_bodyid[i] == model.body("target").id
+        )
+
+
+# --- touch -----------------------------------------------------------------------------------------------------------
+
+
+def touches(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[bool, bool, bool, list[bool]]:
+    """The flags of one simulation from its list of contacts: arm on table, on itself, on an object; gripper on each."""
+    mujoco.mj_forward(model, data)
+    table = own = link = False
+    grip = [False] * MAX_OBJECTS
+    hand = ("gripper", "finger_left_link", "finger_right_link")
+    for contact in data.contact[: data.ncon]:
+        names = [model.body(model.geom_bodyid[geom]).name for geom in contact.geom]
+        ours = [name for name in names if name != "table" and not name.startswith("object_")]
+        things = [int(name[-1]) for name in names if name.startswith("object_")]
+        own |= len(ours) == 2
+        table |= len(ours) == 1 and "table" in names
+        if ours and things:
+            if ours[0] in hand:
+                grip[things[0]] = True
+            else:
+                link = True
+    return table, own, link, grip
+
+
+def test_the_flags_say_what_the_list_of_contacts_says() -> None:
+    world, table = laid(16, count=5)
+    rng = np.random.default_rng(2)
+    models = [world.copy_model(sim) for sim in range(16)]
+    datas = [mujoco.MjData(model) for model in models]
+    seen = []
+    for _ in range(80):
+        # Anywhere at all: in the table, in the objects, in itself.
+        world.qpos[:, :6] = HOME[:6] + rng.uniform(-1.5, 1.5, (16, 6))
+        world.qpos[:, 6:8] = rng.uniform(0, 0.0425, (16, 1))
+        for number in range(MAX_OBJECTS):
+            at = 8 + 7 * number
+            world.qpos[:, at : at + 3] = rng.uniform((0.2, -0.3, 0.0), (0.7, 0.4, 0.5), (16, 3))
+        world.forward()
+        for sim in range(16):
+            world.copy_into(sim, models[sim], datas[sim])
+            flags = (table.arm_on_table[sim], table.self_contact[sim], table.arm_on_object[sim])
+            found = (*map(bool, flags), table.finger_on_object[sim].tolist())
+            assert found == touches(models[sim], datas[sim])
+            seen.append((*flags, table.finger_on_object[sim].any()))
+    share = np.mean(seen, axis=0)
+    assert ((share > 0.005) & (share < 0.9)).all(), share  # the test has seen each flag in both states
+
+
+def gap(a: np.ndarray, b: np.ndarray) -> float:
+    """Distance of two segments, each of shape (2, 3) [m], to a fraction of a millimetre."""
+    share = np.linspace(0, 1, 61)[:, None]
+    first, second = (each[0] + share * (each[1] - each[0]) for each in (a, b))
+    return float(np.linalg.norm(first[:, None] - second[None], axis=2).min())
+
+
+def test_the_arm_touches_itself_where_the_collision_checks_capsules_meet() -> None:
+    world = World(BODY, 300)
+    table = Tabletop(world)
+    rng = np.random.default_rng(4)
+    world.qpos[:, :6] = rng.uniform(-math.pi, math.pi, (300, 6))
+    world.qpos[:, 6:8] = 0.0425  # the fingers' capsules are those of an open gripper
+    world.forward()
+    both = np.zeros(2, int)
+    for sim in range(300):
+        frames = chain_frames(world.qpos[sim, :6])
+        segments = {
+            c.name: np.array([c.start, c.end]) @ frames[c.frame][:3, :3].T + frames[c.frame][:3, 3]
+            for c in BODY.chain.capsules
+        }
+        radius = {c.name: c.radius for c in BODY.chain.capsules}
+        gaps = {(a, b): gap(segments[a], segments[b]) - radius[a] - radius[b] for a, b in BODY.chain.disjoint}
+        # The fingers' capsules hold boxes that are a little slimmer, and stand out at the corners.
+        solid = min(value for pair, value in gaps.items() if not any(name.startswith("finger") for name in pair))
+        if table.self_contact[sim]:
+            assert min(gaps.values()) < BODY.chain.min_distance
+        else:
+            assert solid > -0.001
+        both[int(table.self_contact[sim])] += 1
+    assert both.min() > 20
+
+
+def test_closed_fingers_and_a_fold_at_home_touch_nothing() -> None:
+    world = World(BODY)
+    table = Tabletop(world)
+    for opening in (0.0, 0.085):
+        table.place([TableScene("", (), (*HOME[:6], opening))])
+        world.ctrl[0, 6] = 0.0
+        world.step(300)
+        assert not (table.arm_on_table | table.self_contact | table.arm_on_object).any()
+
+
+def test_the_tool_pushed_down_stops_at_the_table() -> None:
+    world = World(BODY)
+    table = Tabletop(world)
+    table.place([TableScene("", (), tuple(HOME))])
+    felt = None
+    for _ in range(1500):
+        world.ctrl[0, 1] += 5e-4
+        world.step()
+        if felt is None and table.arm_on_table[0]:
+            felt = table.tool_pose[0, 2]
+        if world.ctrl[0, 1] > HOME[1] + 0.7:
+            break
+    assert felt is not None
+    assert 0.005 < felt < 0.05  # the fingertips reach beyond the tool
+    assert table.tool_pose[0, 2] > 0.0
+
+
+# --- grasp -----------------------------------------------------------------------------------------------------------
+
+
+def chain_frames(q: np.ndarray) -> list[np.ndarray]:
+    """The Denavit-Hartenberg frames 0 to 6 in the base frame, each of shape (4, 4)."""
+    frames, frame = [np.eye(4)], np.eye(4)
+    for angle, a, d, alpha in zip(q, BODY.chain.a, BODY.chain.d, BODY.chain.alpha, strict=True):
+        c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
+        frame = frame @ [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
+        frames.append(frame)
+    return frames
+
+
+def chain(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tool pose, shape (4, 4), and its Jacobian, shape (6, 6), in the base frame."""
+    frames = chain_frames(q)
+    tool = frames[6].copy()
+    tool[:3, 3] += tool[:3, :3] @ BODY.chain.tool
+    axes = [(np.cross(f[:3, 2], tool[:3, 3] - f[:3, 3]), f[:3, 2]) for f in frames[:6]]
+    return tool, np.array([np.concatenate(axis) for axis in axes]).T
+
+
+def reach(position: np.ndarray, rotation: np.ndarray, q: np.ndarray, rounds: int) -> np.ndarray:
+    """Joint angles near q at which the tool is there."""
+    for _ in range(rounds):
+        tool, jacobian = chain(q)
+        turn = sum(np.cross(tool[:3, i], rotation[:, i]) for i in range(3)) / 2
+        q = q + np.linalg.solve(jacobian, np.concatenate([position - tool[:3, 3], turn]))
+    return q
+
+
+def test_what_is_gripped_does_not_slip() -> None:
+    """0.3 kg lifted 0.15 m, moved at 0.5 m/s and held for two seconds."""
+    spot, forces = (0.5, 0.05), (40, 60, 40, 60)
+    things = (
+        TableObject("cup", "red", 0.025, 0.025, 0.10, *spot, mass=0.3),
+        TableObject("cup", "red", 0.035, 0.035, 0.10, *spot, mass=0.3),
+        TableObject("box", "red", 0.030, 0.025, 0.10, *spot, mass=0.3),
+        TableObject("box", "red", 0.035, 0.035, 0.10, *spot, mass=0.3),
+    )
+    down = chain(HOME[:6])[0][:3, :3]
+    way = [np.array([*spot, 0.05]), np.array([*spot, 0.20]), np.array([0.5, -0.20, 0.20])]
+    q = reach(way[0], down, HOME[:6], 20)
+    world = World(BODY, 4)
+    table = Tabletop(world)
+    table.place([TableScene("", (thing,), (*q, 0.085)) for thing in things])
+    closed = np.array([2 * t.size_x - f / BODY.servo_stiffness[6] for t, f in zip(things, forces, strict=True)])
+    for _ in range(300):
+        world.ctrl[:, 6] = np.maximum(world.ctrl[:, 6] - 3e-4, closed)
+        world.step()
+    force = world._batch.bind("actuator_force")
+    world.forward()
+    np.testing.assert_allclose(-force[:, 6], forces, rtol=0.12)
+    assert table.finger_on_object[:, 0].all()
+
+    def offset() -> np.ndarray:
+        world.forward()
+        return np.array([table.object_poses[sim, 0, :3] - table.tool_pose[sim, :3] for sim in range(4)])
+
+    start, slips = offset(), []
+    speed, acceleration, dt = 0.5, 2.5, 1 / BODY.physics_hz
+    for here, there in itertools.pairwise(way):
+        length, ramp = np.linalg.norm(there - here), speed / acceleration
+        seconds = length / speed + ramp
+        for k in range(1, math.ceil(seconds / dt) + 1):
+            t, left = k * dt, max(seconds - k * dt, 0.0)
+            if t < ramp:
+                done = acceleration * t * t / 2
+            else:
+                done = length - acceleration * left * left / 2 if left < ramp else speed * (t - ramp / 2)
+            before, q = q, reach(here + (there - here) * done / length, down, q, 2)
+            world.ctrl[:, :6] = q + LAG[:6] * (q - before) / dt
+            world.step()
+            if k % 20 == 0:
+                slips.append(np.linalg.norm(offset() - start, axis=1))
+    world.ctrl[:, :6] = q
+    world.step(2 * BODY.physics_hz)
+    slips.append(np.linalg.norm(offset() - start, axis=1))
+    assert np.max(slips) < 0.002
+    assert np.max(slips[-1]) < 0.0005
+    assert (table.object_poses[:, 0, 2] > 0.19).all()
+    assert table.finger_on_object[:, 0].all()
+    assert not (table.arm_on_object | table.arm_on_table).any()
+
+
+# --- the plant, and what is for bases only ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("actuation", ["position", "torque"])
+def test_the_plant_reads_six_joints_and_the_opening(actuation: str) -> None:
+    world = World(ur5(actuation=actuation), 3)  # type: ignore[arg-type]
+    table = Tabletop(world)
+    plant = SimulatedPlant(world)
+    scenes = [random_scene(seed, 0) for seed in range(3)]
+    table.place(scenes)
+
+    class Reading:
+        position = np.zeros((3, 7))
+        velocity = np.zeros((3, 7))
+
+    plant.read(Reading)  # type: ignore[arg-type]
+    np.testing.assert_allclose(Reading.position, [scene.posture for scene in scenes], atol=1e-15)
+    np.testing.assert_array_equal(Reading.velocity, 0)
+    command = np.arange(21.0).reshape(3, 7) / 100
+    plant.write(command)
+    for number, name in enumerate(world.body.actuators):  # type: ignore[attr-defined]
+        np.testing.assert_array_equal(world.ctrl[:, world.model.actuator(name).id], command[:, number])
+    world.step(5)
+    plant.read(Reading)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(Reading.velocity[:, 6], world.qvel[:, 6] + world.qvel[:, 7])
+    assert np.abs(Reading.velocity[:, 6]).min() > 0
+
+
+def test_what_is_for_bases_is_refused_to_arms_and_the_reverse() -> None:
+    arm, base = World(BODY), World(turtlebot3_burger())
+    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
+        _ = arm.base_pose
+    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
+        arm.place([()])
+    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
+        arm.rays("tool", np.array([[1.0, 0.0, 0.0]]))
+    with pytest.raises(SimulationError, match="'ur5' is a Arm"):
+        arm.reset(poses=np.zeros((1, 3)))
+    with pytest.raises(SimulationError, match="is a MobileBase"):
+        Tabletop(base)
+    with pytest.raises(SimulationError, match="is a MobileBase"):
+        base.hold()
+
+
+def test_scenes_that_do_not_fit_are_refused() -> None:
+    table = Tabletop(World(BODY, 2))
+    with pytest.raises(SimulationError, match="1 scenes were given for 2"):
+        table.place([random_scene(0)])
+    with pytest.raises(SimulationError, match="posture"):
+        table.place([TableScene("short", (), (0.0,) * 6)], [0])
+    with pytest.raises(SimulationError, match="Did you mean 'tool'"):
+        table.world.site("toool")
