@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Arm, Body, MobileBase, Shape
 from bhd_lerobot.errors import SimulationError, unknown_name
 from bhd_lerobot.sim.engine import mujoco, mujoco_batch
+from bhd_lerobot.sim.rays import rays_in_world
 from bhd_lerobot.sim.scene import PARKED_GROUP, PARKED_Z, POOL_SIZE, build_model, shape_fields
 
 # Sorted and without repetition, or a mask of shape (n,); all if None.
@@ -101,7 +102,7 @@ class World:
         Raises:
             SimulationError: the poses do not fit, or the body is an arm and there are poses.
         """
-        ids = self._ids(ids)
+        ids = self.selected(ids)
         if isinstance(self.body, Arm):
             if poses is not None:
                 self._need_base("Start poses")
@@ -133,7 +134,7 @@ class World:
         Raises:
             SimulationError: the body is no arm.
         """
-        ids = self._ids(ids)
+        ids = self.selected(ids)
         if not isinstance(self.body, Arm):
             raise SimulationError(f"hold() is for arms; {self.body.name!r} is a {type(self.body).__name__}.")
         joints = len(self.body.chain.joints)
@@ -141,7 +142,7 @@ class World:
         self.ctrl[ids, :joints] = self.qpos[ids, :joints] if self.body.actuation == "position" else 0.0
         self.ctrl[ids, joints] = self.qpos[ids, fingers.start] + self.qpos[ids, fingers.start + 1]
         if self.body.actuation == "torque":
-            bias = self._batch.bind("qfrc_bias")
+            bias = self.derived("qfrc_bias")
             self._batch.forward(ids)
             self.ctrl[ids, :joints] = bias[ids, :joints]
         self._batch.forward(ids)
@@ -153,13 +154,13 @@ class World:
             SimulationError: MuJoCo could not step a simulation. That the physics diverged is reported by `check`.
         """
         try:
-            self._batch.step(None if ids is None else self._ids(ids), nstep=k)
+            self._batch.step(None if ids is None else self.selected(ids), nstep=k)
         except mujoco_batch.SimulationError as error:
             raise SimulationError(f"{error}. The simulations named kept the state they had before the step.") from error
 
     def forward(self, ids: Ids = None) -> None:
         """Compute everything that derives from the state, without advancing time: sensors for example."""
-        self._batch.forward(None if ids is None else self._ids(ids))
+        self._batch.forward(None if ids is None else self.selected(ids))
 
     def check(self) -> None:
         """Raise if the physics of any simulation diverged since its last reset.
@@ -178,7 +179,7 @@ class World:
 
     def snapshot(self, ids: Ids = None) -> Snapshot:
         """Return a copy of everything that decides how simulations go on."""
-        ids = self._ids(ids)
+        ids = self.selected(ids)
         fields = {name: values[ids].copy() for name, values in self._fields.items()}
         return Snapshot(self._batch.state[ids].copy(), fields, self._constants)
 
@@ -192,7 +193,7 @@ class World:
         Raises:
             SimulationError: the snapshot is of another model or of another number of simulations.
         """
-        ids = self._ids(ids)
+        ids = self.selected(ids)
         expected = (len(ids), self._batch.state.shape[1])
         if snapshot.state.shape != expected:
             raise SimulationError(f"The snapshot's state has shape {snapshot.state.shape}; {expected} is needed.")
@@ -241,21 +242,39 @@ class World:
         view.flags.writeable = False
         return view
 
+    def derived(self, name: str) -> NDArray[np.float64]:
+        """Return a live field of `mujoco.MjData` that derives from the state, shape (n, ...), as of the last step.
+
+        It is computed from now on: it is valid after the next `step`, `forward`, `reset` or `restore`.
+
+        Args:
+            name: the field, for example ``"qfrc_actuator"``.
+
+        Raises:
+            SimulationError: there is no such field.
+        """
+        if name not in mujoco_batch.DATA_FIELDS:
+            raise SimulationError(unknown_name("field", name, mujoco_batch.DATA_FIELDS))
+        return self._batch.bind(name)
+
     def site(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the live position [m] and orientation of a named site, as of the last physics step.
+        """Return the live pose of a named site, like `derived`.
 
         Returns:
-            Positions in the world frame, shape (n, 3), and quaternions w, x, y, z, shape (n, 4); read-only. They are
-            computed from now on: they are valid after the next `step`, `forward`, `reset` or `restore`.
+            Positions in the world frame [m], shape (n, 3), and quaternions w, x, y, z, shape (n, 4).
 
         Raises:
             SimulationError: there is no such site; the message lists the valid names.
         """
+        number = self._site_number(name)
+        return self.derived("site_xpos")[:, number], self.derived("site_xquat")[:, number]
+
+    def _site_number(self, name: str) -> int:
         number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, name)
         if number < 0:
             names = [self.model.site(i).name for i in range(self.model.nsite)]
             raise SimulationError(unknown_name("site", name, names))
-        return self._batch.bind("site_xpos")[:, number], self._batch.bind("site_xquat")[:, number]
+        return int(number)
 
     def joint_slice(self, names: Sequence[str]) -> tuple[slice, slice]:
         """Return where the named one-dimensional joints lie in `qpos` and `qvel`; they must be neighbours, in order."""
@@ -287,29 +306,13 @@ class World:
             SimulationError: the body is no base, or there is no such site.
         """
         self._need_base("A ray from the root body")
-        ids = self._ids(ids)
-        q = self.qpos[ids]
-        rotation = _rotation_matrices(q[:, 3:7])
-        offset = self._site_in_root(site)
-        # Sums written out: a matrix product may round differently for different numbers of simulations.
-        origin = q[:, None, 0:3] + (
-            rotation[:, None, :, 0] * offset[0]
-            + rotation[:, None, :, 1] * offset[1]
-            + rotation[:, None, :, 2] * offset[2]
-        )
-        heading = (
-            rotation[:, None, :, 0] * directions[None, :, 0:1]
-            + rotation[:, None, :, 1] * directions[None, :, 1:2]
-            + rotation[:, None, :, 2] * directions[None, :, 2:3]
-        )
+        ids = self.selected(ids)
+        origin, heading = rays_in_world(self.qpos[ids], self._site_in_root(site), directions)
         distance, _ = self._batch.ray(origin, heading, geomgroup=_SCENE_GROUPS, bodyexclude=self._root, ids=ids)
         return np.where(distance < 0, np.inf, distance), ids
 
     def _site_in_root(self, site: str) -> NDArray[np.float64]:
-        number = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, site)
-        if number < 0:
-            names = [self.model.site(i).name for i in range(self.model.nsite)]
-            raise SimulationError(unknown_name("site", site, names))
+        number = self._site_number(site)
         offset = self.model.site_pos[number].copy()
         body = int(self.model.site_bodyid[number])
         while body != self._root:
@@ -332,7 +335,7 @@ class World:
             SimulationError: a simulation would have more obstacles than the pool holds, or the body is no base.
         """
         self._need_base("An obstacle")
-        ids = self._ids(ids)
+        ids = self.selected(ids)
         if len(shapes) != len(ids):
             raise SimulationError(f"{len(shapes)} scenes were given for {len(ids)} simulations.")
         kind, size, pos, quat, radius, group = (self.model_field(name) for name in _POOL_FIELDS)
@@ -371,7 +374,7 @@ class World:
     def update_constants(self, ids: Ids = None) -> None:
         """Recompute what MuJoCo derives from the model fields."""
         self._constants = True
-        self._batch.set_const(None if ids is None else self._ids(ids))
+        self._batch.set_const(None if ids is None else self.selected(ids))
 
     def copy_model(self, sim: int) -> mujoco.MjModel:
         """Return a copy of one simulation's model, with its own values of the per-simulation fields."""
@@ -399,9 +402,6 @@ class World:
 
     def selected(self, ids: Ids) -> NDArray[np.intp]:
         """Return the numbers of the simulations that `ids` names."""
-        return self._ids(ids)
-
-    def _ids(self, ids: Ids) -> NDArray[np.intp]:
         if ids is None:
             return self._all
         ids = np.asarray(ids)
@@ -410,19 +410,3 @@ class World:
                 raise SimulationError(f"A mask of simulations has shape ({self.n},), got {ids.shape}.")
             return np.flatnonzero(ids)
         return ids.astype(np.intp, copy=False)
-
-
-def _rotation_matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation matrices of unit quaternions wxyz: shape (k, 4) gives (k, 3, 3)."""
-    w, x, y, z = quaternions.T
-    matrix = np.empty((len(quaternions), 3, 3))
-    matrix[:, 0, 0] = 1 - 2 * (y * y + z * z)
-    matrix[:, 0, 1] = 2 * (x * y - w * z)
-    matrix[:, 0, 2] = 2 * (x * z + w * y)
-    matrix[:, 1, 0] = 2 * (x * y + w * z)
-    matrix[:, 1, 1] = 1 - 2 * (x * x + z * z)
-    matrix[:, 1, 2] = 2 * (y * z - w * x)
-    matrix[:, 2, 0] = 2 * (x * z - w * y)
-    matrix[:, 2, 1] = 2 * (y * z + w * x)
-    matrix[:, 2, 2] = 1 - 2 * (x * x + y * y)
-    return matrix

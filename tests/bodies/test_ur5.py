@@ -211,7 +211,7 @@ def loaded_world(q: np.ndarray) -> tuple[World, Tabletop, np.ndarray]:
     table = Tabletop(world)
     table.place([TableScene("", (), (*row, 0.05)) for row in q])
     world.model_field("body_gravcomp")[:, world.model.body("payload").id] = 0.0
-    return world, table, world._batch.bind("qfrc_actuator")
+    return world, table, world.derived("qfrc_actuator")
 
 
 def test_the_servos_hold_a_payload_within_half_a_millimetre(clear: np.ndarray) -> None:
@@ -259,7 +259,7 @@ def test_a_small_step_is_answered_at_once_and_without_ringing(clear: np.ndarray)
 
 def test_no_command_drives_a_joint_beyond_its_torque() -> None:
     world = World(BODY)
-    torque = world._batch.bind("qfrc_actuator")
+    torque = world.derived("qfrc_actuator")
     rng, largest = np.random.default_rng(0), np.zeros(8)
     for _ in range(100):
         world.ctrl[0] = rng.uniform(BODY.limits.lower, BODY.limits.upper)

@@ -186,7 +186,7 @@ def test_objects_stay_where_they_were_put() -> None:
 def test_absent_objects_touch_nothing_and_stay_absent() -> None:
     world = World(BODY, 2)
     table = Tabletop(world)
-    touching = world._batch.bind("ncon")
+    touching = world.derived("ncon")
     for scene in (random_scene(1, 3), random_scene(1, 0)):
         table.place([scene] * 2)
         before = world.qpos[:, 8 + 7 * len(scene.objects) :].copy()
@@ -422,7 +422,7 @@ def test_what_is_gripped_does_not_slip() -> None:
     for _ in range(300):
         world.ctrl[:, 6] = np.maximum(world.ctrl[:, 6] - 3e-4, closed)
         world.step()
-    force = world._batch.bind("actuator_force")
+    force = world.derived("actuator_force")
     world.forward()
     np.testing.assert_allclose(-force[:, 6], forces, rtol=0.12)
     assert table.finger_on_object[:, 0].all()
