@@ -39,17 +39,16 @@ class CollisionModel:
         ends = np.array([capsule.end for capsule in chain.capsules]).reshape(-1, 3)
         radii = np.array([capsule.radius for capsule in chain.capsules])
         pairs = np.array([(capsules[a], capsules[b]) for a, b in chain.disjoint], np.intp).reshape(-1, 2)
-        self._frame = np.array([capsule.frame for capsule in chain.capsules], np.intp)
-        # Segments in their frames: starts are points, the ways from start to end are directions.
-        self._start, self._way = starts.T[:, :, None], (ends - starts).T[:, :, None]
+        # Segments in their frames: first the starts, which are points, then the ways to the ends, which are directions.
+        self._count = len(capsules)
+        self._frame = np.array([capsule.frame for capsule in chain.capsules] * 2, np.intp)
+        self._segments = np.concatenate((starts, ends - starts)).T[:, :, None]
         self._first, self._second = pairs.T
         squares = np.maximum(np.sum((ends - starts) ** 2, axis=1), _TINY)[:, None]
         self._square1, self._square2 = squares[self._first], squares[self._second]
         self._radii = (radii[self._first] + radii[self._second])[:, None]
-        lifted = [(i, end) for i, c in enumerate(chain.capsules) for end in (0, 1) if _is_lifted(chain, c, end)]
-        self._lifted = np.array([i for i, _ in lifted], np.intp)
-        self._lifted_end = np.array([end for _, end in lifted], np.float64)[:, None]
-        self._lifted_radius = radii[self._lifted][:, None]
+        below = [[c.radius if _is_lifted(chain, c, end) else -np.inf for c in chain.capsules] for end in (0, 1)]
+        self._below_start, self._below_end = np.array(below)[:, :, None]
 
     def distances(self, q: Array) -> tuple[Array, Array]:
         """Return the smallest self distance and the smallest table distance of postures.
@@ -71,16 +70,18 @@ class CollisionModel:
 
     def lowest(self, q: Array) -> str:
         """Return the name of the capsule that is closest to the table in a posture of shape (6,)."""
-        return self.chain.capsules[self._lifted[int(self._distances(q)[1].argmin())]].name
+        return self.chain.capsules[int(self._distances(q)[1].argmin())].name
 
     def _distances(self, q: Array) -> tuple[Array, Array]:
-        """Return the distances of every pair and of every end from the table, shapes (pairs, n) and (ends, n)."""
+        """Return the distances of pairs, and of capsules from the table, shapes (pairs, n) and (capsules, n)."""
         frames = self._forward.components(np.reshape(q, (-1, self._forward.dof))).transpose(1, 2, 0, 3)
-        frames = frames[:3, :, self._frame]  # shape (3, 4, capsules, n)
-        x, y, z, origin = frames[:, 0], frames[:, 1], frames[:, 2], frames[:, 3]
-        start = x * self._start[0] + y * self._start[1] + z * self._start[2] + origin
-        way = x * self._way[0] + y * self._way[1] + z * self._way[2]
-        heights = start[2, self._lifted] + self._lifted_end * way[2, self._lifted] - self._lifted_radius
+        frames = frames[:3, :, self._frame]  # shape (3, 4, 2 capsules, n)
+        segments = frames[:, 0] * self._segments[0]
+        segments += frames[:, 1] * self._segments[1]
+        segments += frames[:, 2] * self._segments[2]
+        start, way = segments[:, : self._count], segments[:, self._count :]
+        start += frames[:, 3, : self._count]
+        heights = np.minimum(start[2] - self._below_start, start[2] + way[2] - self._below_end)
         way1, way2 = way[:, self._first], way[:, self._second]
         apart = start[:, self._first] - start[:, self._second]
         return _segment_distance(apart, way1, way2, self._square1, self._square2) - self._radii, heights

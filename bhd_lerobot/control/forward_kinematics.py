@@ -100,20 +100,21 @@ class ForwardKinematics:
         frames[2:4, 2, 1] = c[1:3]
         np.multiply(s[3], ahead, out=frames[4, :2, 2])
         frames[4, 2, 2] = -c[3]
-        x4, y4, z4 = frames[4, :3, 0], frames[4, :3, 1], frames[4, :3, 2]
-        x5, y5, z5 = frames[5, :3, 0], frames[5, :3, 1], frames[5, :3, 2]
-        np.add(c[4] * x4, s[4] * y4, out=x5)
-        np.negative(z4, out=y5)
-        np.subtract(c[4] * y4, s[4] * x4, out=z5)
-        np.add(c[5] * x5, s[5] * y5, out=frames[6, :3, 0])
-        np.subtract(c[5] * y5, s[5] * x5, out=frames[6, :3, 1])
-        frames[6, :3, 2] = z5
+        xy = frames[4, :3, :2]
+        along, across = c[4] * xy, s[4] * xy
+        np.add(along[:, 0], across[:, 1], out=frames[5, :3, 0])
+        np.negative(frames[4, :3, 2], out=frames[5, :3, 1])
+        np.subtract(along[:, 1], across[:, 0], out=frames[5, :3, 2])
+        xy = frames[5, :3, :2]
+        along, across = c[5] * xy, s[5] * xy
+        np.add(along[:, 0], across[:, 1], out=frames[6, :3, 0])
+        np.subtract(along[:, 1], across[:, 0], out=frames[6, :3, 1])
+        frames[6, :3, 2] = frames[5, :3, 2]
         steps = (-1, 1, *(1,) * len(rest))
         np.multiply(self._along_x.reshape(steps), frames[2:4, :3, 0], out=frames[2:4, :3, 3])
         np.multiply(self._along_z.reshape(steps), frames[3:6, :3, 2], out=frames[4:7, :3, 3])
         origins = frames[1:, :3, 3]
-        for frame in range(1, DOF):
-            origins[frame] += origins[frame - 1]
+        np.add.accumulate(origins, axis=0, out=origins)
         return frames
 
 

@@ -20,7 +20,8 @@ _AT_LIMIT = 1e-9  # a joint this far beyond its limit is at its limit [rad]
 _ROTATION_ERROR = 1e-6  # how far the columns of a rotation may be from orthonormal
 _START_ERROR = 1e-3  # how far a line may start from the posture that it is to start from [rad]
 _LARGEST_STEP = 1.0  # a joint that turns further between two poses of a line has changed its branch [rad]
-_IDENTITY, _LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
+_ADMISSIBLE = int(ResultCode.SUCCEEDED)
+_IDENTITY = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class ArmKinematics(ForwardKinematics):
             raise ConfigError(f"There are limits for {len(limits.names)} commands; the arm has {DOF} joints.")
         self.collision = CollisionModel(chain)
         self.lower, self.upper = np.array(limits.lower[:DOF]), np.array(limits.upper[:DOF])
+        self._lowest, self._highest = self.lower - _AT_LIMIT, self.upper + _AT_LIMIT
 
     def solutions(self, pose: Array, last: Array | float = 0.0) -> Array:
         """Return every posture that reaches a pose, in closed form, whether it may be taken or not.
@@ -82,14 +84,16 @@ class ArmKinematics(ForwardKinematics):
         Returns:
             JOINT_LIMIT, SELF_COLLISION, TABLE_COLLISION, SINGULAR or SUCCEEDED as numbers, shape (...).
         """
-        beyond = np.logical_or(q < self.lower - _AT_LIMIT, q > self.upper + _AT_LIMIT).any(axis=-1)
         self_distance, table_distance = self.collision.distances(q)
-        codes = np.where(
-            self.manipulability(q) < self.chain.min_manipulability, int(ResultCode.SINGULAR), int(ResultCode.SUCCEEDED)
+        failures = (  # the last that is written is the first check
+            (ResultCode.SINGULAR, self.manipulability(q) < self.chain.min_manipulability),
+            (ResultCode.TABLE_COLLISION, table_distance < self.chain.min_distance),
+            (ResultCode.SELF_COLLISION, self_distance < self.chain.min_distance),
+            (ResultCode.JOINT_LIMIT, ((q < self._lowest) | (q > self._highest)).any(axis=-1)),
         )
-        codes[table_distance < self.chain.min_distance] = ResultCode.TABLE_COLLISION
-        codes[self_distance < self.chain.min_distance] = ResultCode.SELF_COLLISION
-        codes[beyond] = ResultCode.JOINT_LIMIT
+        codes = np.full(np.shape(q)[:-1], _ADMISSIBLE)
+        for code, failed in failures:
+            np.copyto(codes, int(code), where=failed)
         return codes
 
     def explain(self, q: Array) -> str:
@@ -145,9 +149,9 @@ class ArmKinematics(ForwardKinematics):
         change = np.abs(found - posture)
         found = found[np.lexsort((change.sum(axis=1), change.max(axis=1)))]
         codes = self.check(found)
-        admissible = found[codes == ResultCode.SUCCEEDED]
+        admissible = found[codes == _ADMISSIBLE]
         if len(admissible):
-            return IkResult(ResultCode.SUCCEEDED, np.clip(admissible, self.lower, self.upper))
+            return IkResult(ResultCode.SUCCEEDED, np.minimum(np.maximum(admissible, self.lower), self.upper))
         # The checks are numbered in their order, so the largest number is the check that removed the last posture.
         worst = int(codes.argmax())
         return _failed(ResultCode(int(codes[worst])), self.explain(found[worst]))
@@ -183,7 +187,7 @@ class ArmKinematics(ForwardKinematics):
             path = path[: int(missing.argmax())]
         codes = self.check(path)
         codes[1:][np.abs(np.diff(path, axis=0)).max(axis=1) > _LARGEST_STEP] = ResultCode.SINGULAR
-        bad = codes != ResultCode.SUCCEEDED
+        bad = codes != _ADMISSIBLE
         if bad.any():
             index = int(bad.argmax())
             message = (
@@ -192,13 +196,13 @@ class ArmKinematics(ForwardKinematics):
             return _failed(ResultCode(int(codes[index])), message, index)
         if missing.any():
             return _failed(ResultCode.UNREACHABLE, self._why_unreachable(poses[len(path)], path[-1]), len(path))
-        return IkResult(ResultCode.SUCCEEDED, np.clip(path, self.lower, self.upper))
+        return IkResult(ResultCode.SUCCEEDED, np.minimum(np.maximum(path, self.lower), self.upper))
 
     def _nearest_turns(self, q: Array, posture: Array) -> Array:
         """Return postures with each joint in that turn within its limits which is nearest to `posture`."""
         turns = np.rint((posture - q) / TURN)
-        turns = np.minimum(turns, np.floor((self.upper + _AT_LIMIT - q) / TURN))
-        turns = np.maximum(turns, np.ceil((self.lower - _AT_LIMIT - q) / TURN))
+        turns = np.minimum(turns, np.floor((self._highest - q) / TURN))
+        turns = np.maximum(turns, np.ceil((self._lowest - q) / TURN))
         return q + TURN * turns
 
     def _why_unreachable(self, pose: Array, posture: Array) -> str:
@@ -221,17 +225,21 @@ def _check_poses(poses: Array, posture: Array) -> IkResult | None:
     """Return why the numbers themselves are refused, or None; `poses` has shape (K, 4, 4)."""
     if not np.isfinite(posture).all():
         return _failed(ResultCode.NON_FINITE, f"The posture is {posture.tolist()}; all must be finite.")
-    finite = np.isfinite(poses).all(axis=(1, 2))
+    finite = np.isfinite(poses)
     if not finite.all():
-        index = int(finite.argmin())
+        index = int(finite.all(axis=(1, 2)).argmin())
         return _failed(ResultCode.NON_FINITE, f"The pose is {poses[index].tolist()}; all must be finite.", index)
     rotations = poses[:, :3, :3]
-    error = np.abs((rotations[:, :, :, None] * rotations[:, :, None, :]).sum(axis=1) - _IDENTITY).max(axis=(1, 2))
-    np.maximum(error, np.abs(poses[:, 3] - _LAST_ROW).max(axis=1), out=error)
-    error[np.linalg.det(rotations) < 0.0] = 2.0  # mirrored
-    if (error > _ROTATION_ERROR).any():
-        index = int((error > _ROTATION_ERROR).argmax())
-        message = f"The pose is {error[index]:.2e} from a rotation and a translation; {_ROTATION_ERROR} is the most."
+    error = np.zeros((len(poses), 5, 3))
+    error[:, :3] = (rotations[:, :, :, None] * rotations[:, :, None, :]).sum(axis=1) - _IDENTITY
+    error[:, 3] = poses[:, 3, :3]
+    error[:, 4, 0] = poses[:, 3, 3] - 1.0
+    error[:, 4, 1] = np.linalg.det(rotations) < 0.0  # mirrored
+    wrong = np.abs(error) > _ROTATION_ERROR
+    if wrong.any():
+        index = int(wrong.any(axis=(1, 2)).argmax())
+        largest = float(np.abs(error[index]).max())
+        message = f"The pose is {largest:.2e} from a rotation and a translation; {_ROTATION_ERROR} is the most."
         return _failed(ResultCode.NOT_NORMALISED, f"{message} Normalise the orientation.", index)
     return None
 
