@@ -43,7 +43,7 @@ class ArmController(Controller):
         self._largest_error = np.asarray(limits.effort) / self._stiffness
         self._flat_command, self._zeros = self.command.reshape(-1), np.zeros(n * width)
         self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-        self._work, self._centre = np.zeros((n, width)), np.zeros((n, width))
+        self._work = np.zeros((n, width))
 
     # --- motion ------------------------------------------------------------------------------------------------------
 
@@ -77,18 +77,18 @@ class ArmController(Controller):
         np.logical_or(phase == GoalPhase.CONVERTING, phase == GoalPhase.EXECUTING, out=self.following)
         if (self.goals.following & self.setpoints.active).any():
             self.setpoints.drop(self.goals.following)
-        actuators, centre, work = self.actuators, self._centre, self._work
-        np.multiply(self.velocity, self._lead, out=actuators)
-        actuators += self.command
-        # The servo's force is stiffness * (command - position) - damping * speed: keep it within the effort limit.
-        np.multiply(reading.velocity, self._lead, out=centre)
-        centre += reading.position
-        np.subtract(actuators, centre, out=work)
+        np.multiply(self.velocity, self._lead, out=self.actuators)
+        self.actuators += self.command
+        # A servo that is asked for more than it can give gives what it can: that is noted, and the command left alone.
+        # Holding the command near the joint, to ask for no more, would be a second loop around the servo, which a few
+        # milliseconds of latency turn into a brake.
+        work = self._work
+        np.multiply(reading.velocity, self._lead, out=work)
+        work += reading.position
+        work -= self.actuators
         np.abs(work, out=work)
         if (work > self._largest_error).any():
             self._limited_effort |= (work > self._largest_error)[:, : self.width - 1].any(axis=1)
-            np.maximum(actuators, centre - self._largest_error, out=actuators)
-            np.minimum(actuators, centre + self._largest_error, out=actuators)
 
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each arm is commanded to be at rest, shape (n,)."""

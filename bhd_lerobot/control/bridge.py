@@ -91,7 +91,7 @@ class LockstepBridge:
         return self.cerebellum.submit(sim, command)
 
     def cancel(self, task_id: str, sim: int = 0) -> ResultCode:
-        """Cancel a goal: the arm decelerates and holds. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""
+        """Cancel a goal: decelerate, then hold. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""
         return self.cerebellum.cancel(sim, task_id)
 
     def take_results(self, sim: int = 0) -> list[CommandResult]:

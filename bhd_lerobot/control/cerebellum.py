@@ -193,7 +193,7 @@ class Cerebellum:
         return self.controller.submit(sim, command, _GOAL_REFUSAL.get(int(self._mode_reasons()[sim])))
 
     def cancel(self, sim: int, task_id: str) -> ResultCode:
-        """Cancel a goal: the arm decelerates and holds. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""
+        """Cancel a goal: decelerate, then hold. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""
         return self.controller.cancel(sim, task_id)
 
     def offer(self, setpoint: Setpoint, mask: NDArray[np.bool_] | None = None) -> SendResult:

@@ -85,7 +85,7 @@ class Controller(ABC):
         """Return where the robots really are in the space of the commands, shape (n, width)."""
         return reading.position.copy()
 
-    # --- goals: robots that take none refuse them ----------------------------------------------------------------------
+    # --- goals: robots that take none refuse them --------------------------------------------------------------------
 
     def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
         """Take a goal.

@@ -86,7 +86,7 @@ class Limit(IntFlag):
     ACCELERATION = 4
     """Slowed to the acceleration limit."""
     EFFORT = 8
-    """Clipped so that the servo does not ask for more than the largest effort."""
+    """The servo is asked for more than its largest effort: a wheel's command is clipped, an arm's servo saturates."""
     POSITION = 16
     """Clipped to the range of the joint."""
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -17,6 +17,9 @@ _LOWEST = 0.024  # [m] the tool centre point above the table: the finger tips re
 _ROOM = 0.026  # [m] by which the gripper is opened wider than the object
 _ENOUGH = 0.025  # [m] more room than this beside the fingers is of no use
 _CUP_YAWS = 12
+# [rad] Direction from the right to the left finger, beside that from the base to the tool, when the wrist is turned as
+# at home, where the fingers stand one behind the other.
+_NEUTRAL = math.pi - math.atan2(0.10915, 0.48690)
 
 
 @dataclass(frozen=True)
@@ -111,8 +114,16 @@ def plan_grasp(target: SeenObject, others: Sequence[SeenObject], max_opening: fl
         grasps.append(Grasp(x, y, z, yaw, opening, width, min(gaps, default=_ENOUGH)))
     if not grasps:
         return None
-    across = math.atan2(y, x) + math.pi / 2  # the fingers beside the arm's own direction: the wrist need not turn
-    return max(grasps, key=lambda grasp: (min(grasp.room, _ENOUGH), -_turn(grasp.yaw, across)))
+    neutral = neutral_yaw(x, y)
+    best = max(grasps, key=lambda grasp: (min(grasp.room, _ENOUGH), -_turn(grasp.yaw, neutral)))
+    # Fingers are alike: of the two ways to stand on that line, the one with the smaller turn of the wrist.
+    away = (best.yaw - neutral + math.pi / 2) % math.pi - math.pi / 2
+    return replace(best, yaw=neutral + away)
+
+
+def neutral_yaw(x: float, y: float) -> float:
+    """Return the direction of the line through the fingers for which the wrist need not turn [rad]."""
+    return math.atan2(y, x) + _NEUTRAL
 
 
 def _sides(target: SeenObject) -> list[tuple[float, float]]:

@@ -15,7 +15,7 @@ from bhd_lerobot.errors import ConfigError, InstructionError
 from bhd_lerobot.policies.brain import Observation, find_columns
 from bhd_lerobot.policies.config_brain import BrainConfig
 from bhd_lerobot.policies.goal_brain import GoalBrain
-from bhd_lerobot.policies.grasp import Grasp, SeenObject, plan_grasp, pointing_down, read_objects
+from bhd_lerobot.policies.grasp import Grasp, SeenObject, neutral_yaw, plan_grasp, pointing_down, read_objects
 from bhd_lerobot.policies.planner import Plan, Skill, make_plan
 from bhd_lerobot.policies.scene_objects import scene_object
 
@@ -196,7 +196,7 @@ class PickBrain(GoalBrain):
             work.stage = "hand_over"
             command = BrainCommand(
                 self._name(sim, "hand_over"),
-                target_pose=pointing_down(*_HAND_OVER, yaw=math.atan2(_HAND_OVER[1], _HAND_OVER[0]) + math.pi / 2),
+                target_pose=pointing_down(*_HAND_OVER, yaw=neutral_yaw(*_HAND_OVER[:2])),
                 max_velocity=config.max_velocity / 2,
                 max_acceleration=config.max_acceleration / 2,
             )

@@ -224,7 +224,7 @@ def _draw_objects(
         change = draw_object_changes(config, rng)
         # One side of each fits between the fingers, also when it is made larger.
         if kind == "cup":
-            length = width = rng.uniform(0.050, 0.072)
+            length = width = rng.uniform(0.050, 0.068)
             height = rng.uniform(0.07, 0.12)
         else:
             length, width = rng.uniform(0.045, 0.090), rng.uniform(0.035, 0.065)
