@@ -11,6 +11,7 @@ from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, Table
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import SimulationError
+from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
@@ -263,6 +264,23 @@ def test_the_target_is_drawn_where_it_is_wanted_and_touches_nothing() -> None:
         assert not any(
             model.geom_contype[i] for i in range(model.ngeom) if model.geom_bodyid[i] == model.body("target").id
         )
+
+
+def test_a_camera_sees_each_table_as_it_is_laid_now() -> None:
+    world = World(BODY, 2)
+    camera = Camera(world, 160, 120)
+    table = Tabletop(world)
+    try:
+        empty = camera.render(0, "scene")
+        full, dim = random_scene(3, 5), TableScene("", (), tuple(HOME), variation=Variation(light=0.5))
+        table.place([full, dim])
+        assert (camera.render(0, "scene") != empty).any(axis=2).mean() > 0.02
+        assert camera.render(1, "scene").mean() < 0.7 * empty.mean()
+        table.place([TableScene("", (), tuple(HOME))], [1])
+        np.testing.assert_array_equal(camera.render(1, "scene"), empty)
+        assert camera.render(0, "wrist").std() > 10
+    finally:
+        camera.close()
 
 
 # --- touch -----------------------------------------------------------------------------------------------------------
