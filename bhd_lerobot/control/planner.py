@@ -116,11 +116,13 @@ class GoalPlanner:
     def _plan_joints(self, command: BrainCommand, target: Array, state: State) -> Trajectory | PlanFailure:
         limits = self.limits[self._arm]
         speed, change = command.max_velocity, command.max_acceleration
-        limits = limits.scaled(
+        scaled = limits.scaled(
             1.0 if speed is None else speed / limits.velocity.max(),
             1.0 if change is None else change / limits.acceleration.max(),
         )
-        trajectory = to_target(state, target, limits, self.hz)
+        # An arm that is already faster than the goal permits may need more than the goal's deceleration at an end of
+        # the joints' range.
+        trajectory = to_target(state, target, scaled, self.hz, limits)
         return trajectory if isinstance(trajectory, PlanFailure) else self._checked(trajectory, state)
 
     def _plan_pose(self, command: BrainCommand, pose: Pose, state: State) -> Trajectory | PlanFailure:

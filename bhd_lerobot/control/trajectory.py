@@ -145,7 +145,9 @@ class Trajectory:
         )
 
 
-def to_target(start: State, target: ArrayLike, limits: MotionLimits, hz: int) -> Trajectory | PlanFailure:
+def to_target(
+    start: State, target: ArrayLike, limits: MotionLimits, hz: int, brake_limits: MotionLimits | None = None
+) -> Trajectory | PlanFailure:
     """Return the quickest trajectory to rest at a target on which all dimensions arrive together.
 
     The start may be any state: what exceeds the limits is first brought within them, as fast as they allow. Where the
@@ -156,13 +158,14 @@ def to_target(start: State, target: ArrayLike, limits: MotionLimits, hz: int) ->
         target: the end [rad or m], within the position limits, shape (dof,).
         limits: the limits.
         hz: ticks a second [Hz].
+        brake_limits: the limits to brake with if gentler ones do not suffice; `limits` if None.
     """
     goal = np.asarray(target, np.float64)
     first = _calculate(start, goal, limits, hz, ruckig.Synchronization.Phase)
     if isinstance(first, Trajectory) and _stays_within(first, start, limits):
         return first
     # Rounding may have put a state a hair outside of what Ruckig takes; or it came too close to a position limit.
-    brake = to_rest(start, limits, hz)
+    brake = to_rest(start, limits if brake_limits is None else brake_limits, hz)
     if isinstance(brake, PlanFailure):
         return first if isinstance(first, PlanFailure) else brake
     second = _calculate(State.at_rest(brake.target), goal, limits, hz, ruckig.Synchronization.Phase)
@@ -219,6 +222,9 @@ def _calculate(
 ) -> Trajectory | PlanFailure:
     """Let Ruckig calculate a trajectory to a target, or to rest where the target is None."""
     dof = len(start.position)
+    numbers = (start.position, start.velocity, start.acceleration, *(() if target is None else (target,)))
+    if not np.isfinite(numbers).all():
+        return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory from or to what is not finite: {numbers}.")
     request = ruckig.InputParameter(dof)
     request.synchronization = synchronization
     request.current_position = start.position

@@ -1,0 +1,95 @@
+"""Whatever is asked for and whenever: the reference keeps every limit, and every goal ends in exactly one result."""
+
+from collections import Counter
+
+import numpy as np
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from bhd_lerobot.control.commands import ResultCode
+from tests.control.goal_rig import HOME, Rig, moved
+
+share = st.floats(-1, 1)
+targets = st.one_of(
+    st.builds(
+        lambda a, b, c, last: {"joint_target": (*(HOME[:5] + [1.2 * a, 0.3 * b, -0.3 * b, 0.2 * a, 0.5 * c]), last)},
+        share, share, share, st.sampled_from((-2 * np.pi, 2 * np.pi, 0.0, 0.5)),
+    ),
+    st.builds(lambda a, b, c, d: {"target_pose": moved(0.2 * a, 0.3 * b, 0.15 * c, 2 * d)}, share, share, share, share),
+    st.builds(
+        lambda a, b, c, d: {"target_pose": moved(0.2 * a, 0.3 * b, 0.15 * c, d), "motion": "line"},
+        share, share, share, share,
+    ),
+    st.just({"target_pose": moved(2.0)}),
+    st.just({}),
+)  # fmt: skip
+grippers = st.just({}) | st.floats(0, 0.085).map(lambda opening: {"gripper": opening})
+goals = st.builds(
+    lambda target, gripper, most, change, preempt: (
+        "goal", {**target, **gripper, "preempt": preempt, "max_velocity": most, "max_acceleration": change}
+    ),
+    targets, grippers, st.none() | st.floats(0.6, 1.0), st.none() | st.floats(0.5, 5.0), st.booleans(),
+)  # fmt: skip
+others = st.one_of(
+    st.tuples(st.just("cancel"), st.integers(0, 12)),
+    st.tuples(st.just("again"), st.integers(0, 12)),
+    st.tuples(st.just("stop"), st.booleans()),
+)
+actions = st.tuples(st.one_of(goals, goals, goals, others), st.integers(0, 5) | st.integers(0, 400))
+
+
+def follow(rig: Rig, sim: int, script: list) -> Counter:
+    """Do what the script says; return how many results are due for each name."""
+    due: Counter = Counter()
+    for number, ((kind, value), ticks) in enumerate(script):
+        name = str(number)
+        if kind == "goal":
+            rig.go(name, sim, **value)
+            due[name] += 1
+        elif kind == "cancel":
+            rig.manager.cancel(sim, str(value))
+        elif kind == "again" and due[str(value)]:
+            before = len(due) and rig.manager.feedback(sim)
+            answer = rig.go(str(value), sim, gripper=0.01)
+            assert answer is not None
+            assert answer.code == ResultCode.DUPLICATE_ID
+            assert rig.manager.feedback(sim) == before
+            taken = rig.manager.take_results(sim)
+            rig.taken.extend(taken)
+            due[str(value)] += bool(taken) and taken[-1] is answer
+        elif kind == "stop":
+            mask = np.zeros(rig.n, np.bool_)
+            mask[sim] = True
+            rig.stop(ResultCode.ESTOP if value else ResultCode.CANCELLED, value, mask)
+        rig.tick(ticks)
+    return due
+
+
+@settings(max_examples=300)
+@given(st.lists(actions, min_size=1, max_size=6))
+@example([(("goal", {"joint_target": tuple(HOME[:6] + 0.3), "preempt": False}), 3), (("goal", {"gripper": 0.0}), 0)])
+def test_limits_hold_and_every_goal_has_one_result(script: list) -> None:
+    rig = Rig()
+    due = follow(rig, 0, script)
+    rig.run()
+    results = rig.taken + rig.manager.take_results(0)
+    assert Counter(result.task_id for result in results) == +due
+    assert all(result.success == (result.code == ResultCode.SUCCEEDED) for result in results)
+    assert all(result.message for result in results)
+    assert not rig.velocity.any()
+    assert not rig.acceleration.any()
+    assert rig.manager.feedback(0) is None
+
+
+@settings(max_examples=40)
+@given(st.lists(actions, min_size=1, max_size=4), st.lists(actions, min_size=1, max_size=3))
+def test_an_arm_moves_the_same_whatever_the_others_do(script: list, other: list) -> None:
+    alone, crowd = Rig(), Rig(5)
+    for sim in (0, 1, 4):
+        for number, ((kind, value), _) in enumerate(other):
+            if kind == "goal":
+                crowd.go(f"other {number}", sim, **value)
+    follow(alone, 0, script)
+    follow(crowd, 3, script)
+    assert np.array_equal(alone.history[:, :, 0], crowd.history[:, :, 3])
+    assert alone.results() == crowd.results(3)
