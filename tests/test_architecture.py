@@ -25,7 +25,7 @@ EVERYTHING = ("",)
 ARROWS: dict[str, tuple[str, ...]] = {
     "errors": (),
     "bodies": (),
-    "sim": ("bodies.body",),
+    "sim": ("bodies.body", "bodies.tabletop"),
     "control": ("bodies.body",),
     "tasks": ("bodies", "control.commands", "control.kinematics", "control.poses"),
     "policies": ("bodies", "control.messages", "control.commands", "control.poses"),

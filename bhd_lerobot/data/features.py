@@ -39,7 +39,7 @@ SCALARS: dict[str, tuple[str, str]] = {
     COMMAND_AGE: ("float32", "age of the command in force at the end of the frame [s]"),
     LATENESS: ("float32", "largest lateness of a control tick in the frame [s]"),
     OVERRUNS: ("int64", "control ticks of the frame that ended after the next was due"),
-    LIMITS: ("int64", "what the safety filter changed: 1 not finite, 2 velocity, 4 acceleration, 8 effort, 16 position; sum"),
+    LIMITS: ("int64", "what the limits changed: 1 not finite, 2 velocity, 4 acceleration, 8 effort, 16 position; sum"),
     WATCHDOG: ("int64", "what the watchdogs noticed: 1 command too old; sum"),
     MODE: (
         "int64",
