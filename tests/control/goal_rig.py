@@ -123,7 +123,9 @@ class Rig:
         """Position, velocity and acceleration at each tick, shape (T, 3, n, 7)."""
         return np.array(self._rows)
 
-    def go(self, task_id: str, sim: int = 0, blocked: ResultCode | None = None, **fields: object) -> CommandResult | None:
+    def go(
+        self, task_id: str, sim: int = 0, blocked: ResultCode | None = None, **fields: object
+    ) -> CommandResult | None:
         return self.manager.submit(sim, BrainCommand(task_id, **fields), blocked)  # type: ignore[arg-type]
 
     def stop(self, code: ResultCode, hard: bool, mask: NDArray[np.bool_] | None = None) -> None:

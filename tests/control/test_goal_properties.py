@@ -3,16 +3,17 @@
 from collections import Counter
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.control.commands import ResultCode
-from tests.control.goal_rig import HOME, Rig, moved
+from tests.control.goal_rig import HOME, HZ, LIMITS, Rig, broken_limit, joints, moved
 
 share = st.floats(-1, 1)
 targets = st.one_of(
     st.builds(
-        lambda a, b, c, last: {"joint_target": (*(HOME[:5] + [1.2 * a, 0.3 * b, -0.3 * b, 0.2 * a, 0.5 * c]), last)},
+        lambda a, b, c, last: {"joint_target": (*np.add(HOME[:5], (1.2 * a, 0.3 * b, -0.3 * b, a / 5, c / 2)), last)},
         share, share, share, st.sampled_from((-2 * np.pi, 2 * np.pi, 0.0, 0.5)),
     ),
     st.builds(lambda a, b, c, d: {"target_pose": moved(0.2 * a, 0.3 * b, 0.15 * c, 2 * d)}, share, share, share, share),
@@ -65,7 +66,7 @@ def follow(rig: Rig, sim: int, script: list) -> Counter:
     return due
 
 
-@settings(max_examples=300)
+@settings(max_examples=500)
 @given(st.lists(actions, min_size=1, max_size=6))
 @example([(("goal", {"joint_target": tuple(HOME[:6] + 0.3), "preempt": False}), 3), (("goal", {"gripper": 0.0}), 0)])
 def test_limits_hold_and_every_goal_has_one_result(script: list) -> None:
@@ -93,3 +94,17 @@ def test_an_arm_moves_the_same_whatever_the_others_do(script: list, other: list)
     follow(crowd, 3, script)
     assert np.array_equal(alone.history[:, :, 0], crowd.history[:, :, 3])
     assert alone.results() == crowd.results(3)
+
+
+@pytest.mark.parametrize("kind", range(3), ids=("position", "velocity", "acceleration"))
+def test_the_check_of_the_limits_catches_a_step_of_each_kind(kind: int) -> None:
+    rig = Rig()
+    rig.go("a", joint_target=joints(1.0))
+    rig.run()
+    rows, never = rig.history, np.zeros((len(rig.history) - 1, 1), np.bool_)
+    assert broken_limit(rows, never) == ""
+    # A tenth more than what one tick may change; in the middle of the motion the fourth joint stands still.
+    rows[len(rows) // 2, kind, 0, 3] += (
+        1.1 * (LIMITS.velocity / HZ, LIMITS.acceleration / HZ, LIMITS.jerk / HZ)[kind][3]
+    )
+    assert broken_limit(rows, never) != ""

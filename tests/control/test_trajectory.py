@@ -99,7 +99,7 @@ def test_samples_agree_with_ruckig(start: State, target: Array, share: float) ->
     answer = ruckig.Trajectory(6)
     assert ruckig.Ruckig(6).calculate(request, answer) == ruckig.Result.Working
     samples = sample(answer, HZ)
-    assert samples.ticks - 1 < answer.duration * HZ <= samples.ticks + 1e-6
+    assert samples.ticks == 1 or samples.ticks - 1 < answer.duration * HZ <= samples.ticks + 1e-6
     for row in range(0, samples.ticks, 5):
         own = np.array(answer.at_time((row + 1) / HZ))
         mine = np.array([samples.position[row], samples.velocity[row], samples.acceleration[row]])

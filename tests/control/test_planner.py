@@ -1,0 +1,262 @@
+"""What is refused and why, and what a plan keeps to."""
+
+import dataclasses
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
+from bhd_lerobot.control.kinematics import ArmKinematics, IkResult
+from bhd_lerobot.control.planner import GoalPlanner, Plan, PlanFailure
+from bhd_lerobot.control.trajectory import State
+from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, LIMITS, ZEROS, joints, moved
+
+PLANNER = GoalPlanner(ARM, HZ, KINEMATICS)
+NAN, INF = float("nan"), float("inf")
+DOWN = (0.0, 0.7071067811865476, 0.7071067811865476, 0.0)
+
+
+def plan(start: State | None = None, opening: float | None = None, **fields: Any) -> Plan | PlanFailure:
+    state = State.at_rest(HOME) if start is None else start
+    command = BrainCommand("a", **fields)
+    return PLANNER.plan(command, state.position, state.velocity, state.acceleration, opening=opening)
+
+
+def made(start: State | None = None, opening: float | None = None, **fields: Any) -> Plan:
+    answer = plan(start, opening, **fields)
+    assert isinstance(answer, Plan), answer
+    return answer
+
+
+def moving_start(tick: int = 150, **fields: Any) -> State:
+    trajectory = made(joint_target=joints(1.5, -0.2, 0.1), gripper=0.0, **fields).trajectory
+    return State(trajectory.position[tick], trajectory.velocity[tick], trajectory.acceleration[tick])
+
+
+REFUSALS: list[tuple[dict[str, Any], ResultCode, str]] = [
+    ({}, ResultCode.BAD_TARGET, "no target"),
+    ({"target_pose": moved(), "joint_target": joints()}, ResultCode.BAD_TARGET, "Both"),
+    ({"joint_target": joints(), "motion": "line"}, ResultCode.BAD_TARGET, "line"),
+    ({"joint_target": joints(), "motion": "lime"}, ResultCode.BAD_TARGET, "'line'"),
+    ({"joint_target": (0.0,) * 7}, ResultCode.BAD_TARGET, "6 numbers"),
+    ({"joint_target": "abcdef"}, ResultCode.BAD_TARGET, "abcdef"),
+    ({"joint_target": ((0.0,), (0.0, 1.0), 0, 0, 0, 0)}, ResultCode.BAD_TARGET, "6 numbers"),
+    ({"target_pose": Pose((0.1, 0.2), DOWN)}, ResultCode.BAD_TARGET, "3 numbers"),  # type: ignore[arg-type]
+    ({"gripper": "open"}, ResultCode.BAD_TARGET, "open"),
+    ({"joint_target": joints(NAN)}, ResultCode.NON_FINITE, "nan"),
+    ({"target_pose": Pose((0.4, INF, 0.3), DOWN)}, ResultCode.NON_FINITE, "inf"),
+    ({"target_pose": Pose((0.4, 0.1, 0.3), (NAN, 0, 0, 1))}, ResultCode.NON_FINITE, "nan"),
+    ({"gripper": NAN}, ResultCode.NON_FINITE, "nan"),
+    ({"target_pose": Pose((0.4, 0.1, 0.3), (0.0, 0.71, 0.71, 0.0))}, ResultCode.NOT_NORMALISED, "1.00409"),
+    ({"target_pose": Pose((0.4, 0.1, 0.3), (0.0, 0.0, 0.0, 0.0))}, ResultCode.NOT_NORMALISED, "norm"),
+    ({"joint_target": joints(4.0)}, ResultCode.JOINT_LIMIT, "shoulder_pan"),
+    ({"gripper": 0.09}, ResultCode.JOINT_LIMIT, "0.09"),
+    ({"gripper": -0.001}, ResultCode.JOINT_LIMIT, "-0.001"),
+    ({"joint_target": joints(), "max_velocity": 0.0}, ResultCode.BAD_VELOCITY, "0.0"),
+    ({"joint_target": joints(), "max_velocity": 3.2}, ResultCode.BAD_VELOCITY, "3.14159 rad/s"),
+    ({"joint_target": joints(), "max_velocity": NAN}, ResultCode.BAD_VELOCITY, "nan"),
+    ({"joint_target": joints(), "max_velocity": "fast"}, ResultCode.BAD_VELOCITY, "fast"),
+    ({"target_pose": moved(0.1), "motion": "line", "max_velocity": 1.1}, ResultCode.BAD_VELOCITY, "1 m/s"),
+    ({"joint_target": joints(), "max_acceleration": -1.0}, ResultCode.BAD_ACCELERATION, "-1.0"),
+    ({"joint_target": joints(), "max_acceleration": 16.0}, ResultCode.BAD_ACCELERATION, "15 rad/s^2"),
+    ({"target_pose": moved(0.1), "motion": "line", "max_acceleration": 6.0}, ResultCode.BAD_ACCELERATION, "5 m/s^2"),
+    ({"joint_target": joints(), "timeout_s": 0.0}, ResultCode.BAD_TIMEOUT, "0.0"),
+    ({"joint_target": joints(), "timeout_s": INF}, ResultCode.BAD_TIMEOUT, "inf"),
+    ({"joint_target": joints(), "timeout_s": NAN}, ResultCode.BAD_TIMEOUT, "nan"),
+]
+
+
+@pytest.mark.parametrize(("fields", "code", "words"), REFUSALS)
+def test_what_is_wrong_with_a_goal_is_named(fields: dict[str, Any], code: ResultCode, words: str) -> None:
+    failure = PLANNER.check(BrainCommand("a", **fields))
+    assert failure is not None
+    assert (failure.code, plan(**fields)) == (code, failure)
+    assert words in failure.message
+
+
+@pytest.mark.parametrize("task_id", ["", None, 7])
+def test_a_goal_needs_a_name(task_id: Any) -> None:
+    failure = PLANNER.check(BrainCommand(task_id, gripper=0.0))
+    assert failure is not None
+    assert failure.code == ResultCode.BAD_TARGET
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"joint_target": joints(), "max_velocity": 3.1415, "max_acceleration": 15.0},
+        {"joint_target": [0, 0, 0, 0, 0, 1]},
+        {"joint_target": np.zeros(6)},
+        {"target_pose": Pose((0.4, 0.1, 0.3), (0.0, 0.7075, 0.7075, 0.0))},
+        {"target_pose": moved(0.1), "motion": "line", "max_velocity": 1.0, "max_acceleration": 5.0},
+        {"gripper": 0, "motion": "line"},
+        {"gripper": np.float32(0.05)},
+    ],
+)
+def test_what_is_within_the_ranges_is_accepted(fields: dict[str, Any]) -> None:
+    assert PLANNER.check(BrainCommand("a", **fields)) is None
+
+
+def test_a_plan_goes_where_the_goal_says() -> None:
+    assert made(joint_target=joints(0.5)).target.tolist() == [*joints(0.5), HOME[6]]
+    for motion in ("joint", "line"):
+        planned = made(target_pose=moved(0.1, 0.1, -0.05, 0.3), motion=motion, gripper=0.02)
+        tool = KINEMATICS.tool(planned.target[:6])
+        assert np.abs(tool - moved(0.1, 0.1, -0.05, 0.3).matrix()).max() < 1e-9
+        assert planned.target[6] == 0.02
+
+
+def test_the_fastest_joint_is_as_fast_as_the_goal_permits() -> None:
+    trajectory = made(joint_target=joints(2.0, -0.1), max_velocity=0.5, max_acceleration=1.5).trajectory
+    assert np.abs(trajectory.velocity).max() == pytest.approx(0.5)
+    assert (np.abs(trajectory.acceleration[:, :6]) <= LIMITS.acceleration[:6] / 10 + 1e-9).all()
+
+
+@pytest.mark.parametrize("fields", [{"joint_target": joints(0.5)}, {"target_pose": moved(0.1), "motion": "line"}])
+def test_the_gripper_takes_its_own_time_and_keeps_its_target(fields: dict[str, Any]) -> None:
+    start = moving_start(50)
+    assert start.velocity[6] < 0
+    assert made(start, 0.0, **fields).target[6] == 0.0
+    stopped = made(start, None, **fields)
+    assert 0.0 < stopped.target[6] < start.position[6]
+    alone = made(gripper=0.0).trajectory
+    both = made(gripper=0.0, joint_target=joints(2.0), max_velocity=0.3).trajectory
+    assert both.ticks > alone.ticks
+    assert np.array_equal(both.position[: alone.ticks, 6], alone.position[:, 6])
+    assert (alone.position[:, :6] == HOME[:6]).all()
+
+
+def test_a_goal_for_the_gripper_brings_a_moving_arm_to_rest() -> None:
+    start = moving_start()
+    planned = made(start, gripper=0.05)
+    brake = PLANNER.brake(start, hard=False)
+    assert np.allclose(planned.target[:6], brake.target[:6])
+
+
+def test_a_line_from_a_moving_start_begins_where_the_arm_stops() -> None:
+    start = moving_start()
+    planned = made(start, target_pose=moved(0.05, 0.0, 0.1), motion="line")
+    stop = made(start, gripper=0.05)
+    tools = KINEMATICS.tool(planned.trajectory.position[:, :6])[:, :3, 3]
+    begin, end = KINEMATICS.tool(stop.target[:6])[:3, 3], tools[-1]
+    brake = int(np.argmin(np.linalg.norm(tools - begin, axis=1)))
+    way = (end - begin) / np.linalg.norm(end - begin)
+    after = tools[brake:] - begin
+    assert np.linalg.norm(after - np.outer(after @ way, way), axis=1).max() < 5e-5
+    steps = np.diff(np.concatenate((start.position[None], planned.trajectory.position)), axis=0)
+    assert (np.abs(steps) * HZ <= LIMITS.velocity + 1e-6).all()
+
+
+def test_a_gentle_goal_does_not_carry_a_fast_arm_past_its_range() -> None:
+    fast = made(joint_target=(*joints()[:5], 2 * np.pi)).trajectory
+    tick = int(0.8 * fast.ticks)
+    start = State(fast.position[tick], fast.velocity[tick], fast.acceleration[tick])
+    assert start.velocity[5] > 1.0
+    gentle = made(start, joint_target=joints(), max_acceleration=0.5).trajectory
+    assert np.abs(gentle.position).max() <= 2 * np.pi + 1e-9
+
+
+# --- the way ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fields", "code"),
+    [
+        ({"target_pose": moved(2.0)}, ResultCode.UNREACHABLE),
+        ({"target_pose": moved(2.0), "motion": "line"}, ResultCode.UNREACHABLE),
+        ({"joint_target": joints(0.0, 1.2)}, ResultCode.TABLE_COLLISION),
+        ({"target_pose": moved(dz=-0.3)}, ResultCode.TABLE_COLLISION),
+        ({"joint_target": joints(0.0, 0.0, 1.5)}, ResultCode.SELF_COLLISION),
+    ],
+)
+def test_a_way_that_cannot_be_gone_is_refused(fields: dict[str, Any], code: ResultCode) -> None:
+    failure = plan(**fields)
+    assert isinstance(failure, PlanFailure)
+    assert failure.code == code
+    assert len(failure.message) > 20
+
+
+def test_the_whole_way_is_checked_and_not_only_its_end() -> None:
+    # A full turn of the shoulder ends in the posture that it starts in, and goes through the table.
+    failure = plan(joint_target=joints(0.0, 2 * np.pi))
+    assert isinstance(failure, PlanFailure)
+    assert failure.code in (ResultCode.TABLE_COLLISION, ResultCode.SELF_COLLISION)
+    assert KINEMATICS.check(np.array([joints(0.0, 2 * np.pi)])).tolist() == [ResultCode.SUCCEEDED]
+
+
+def test_an_arm_that_starts_too_close_may_only_move_straight_away() -> None:
+    close = HOME.copy()
+    for lift in np.arange(0.0, 1.2, 0.005):
+        close[:6] = joints(0.0, lift)
+        if KINEMATICS.collision.distances(close[:6])[1] < 0.002:
+            break
+    start = State.at_rest(close)
+    assert isinstance(plan(start, joint_target=joints(0.0, 0.0)), Plan)
+    down = plan(start, joint_target=joints(0.0, lift + 0.01))
+    beside = plan(start, joint_target=joints(0.5, lift))
+    for failure in (down, beside):
+        assert isinstance(failure, PlanFailure)
+        assert failure.code == ResultCode.TABLE_COLLISION
+        assert "starts" in failure.message
+
+
+class Choosy(ArmKinematics):
+    """Offers given postures, whatever the pose."""
+
+    offered: np.ndarray = np.empty((0, 6))
+
+    def solve(self, pose: np.ndarray, posture: np.ndarray) -> IkResult:
+        return IkResult(ResultCode.SUCCEEDED, self.offered)
+
+
+def test_the_first_posture_with_an_admissible_way_wins_and_at_most_eight_are_tried() -> None:
+    kinematics = Choosy(ARM.chain, ARM.limits)
+    planner = GoalPlanner(ARM, HZ, kinematics)
+    command = BrainCommand("a", target_pose=moved())
+    into_itself, into_the_table = joints(0.0, 0.0, 1.5), joints(0.0, 1.2)
+    kinematics.offered = np.array([into_itself, into_the_table, joints(0.3), joints(0.6)])
+    answer = planner.plan(command, HOME, ZEROS, ZEROS)
+    assert isinstance(answer, Plan)
+    assert tuple(answer.target[:6]) == joints(0.3)
+    kinematics.offered = np.array([into_itself, *(into_the_table,) * 7, joints(0.3)])
+    answer = planner.plan(command, HOME, ZEROS, ZEROS)
+    assert isinstance(answer, PlanFailure)
+    assert answer.code == ResultCode.SELF_COLLISION  # what the closest one fails by
+
+
+def test_a_singular_posture_ends_neither_a_pose_nor_lies_on_a_line_but_joints_may_pass_it() -> None:
+    chain = dataclasses.replace(ARM.chain, min_manipulability=1.0)
+    strict = GoalPlanner(dataclasses.replace(ARM, chain=chain), HZ)
+    for motion in ("joint", "line"):
+        answer = strict.plan(BrainCommand("a", target_pose=moved(0.05), motion=motion), HOME, ZEROS, ZEROS)
+        assert isinstance(answer, PlanFailure)
+        assert answer.code == ResultCode.SINGULAR
+    assert isinstance(strict.plan(BrainCommand("a", joint_target=joints(0.5)), HOME, ZEROS, ZEROS), Plan)
+    through = [
+        KINEMATICS.manipulability(row) for row in made(joint_target=joints(0, 0, 0, 0, 2.5)).trajectory.position[:, :6]
+    ]
+    assert min(through) < ARM.chain.min_manipulability
+
+
+def test_the_same_goal_gives_the_same_plan() -> None:
+    start = moving_start()
+    first, second = made(start, target_pose=moved(0.1, 0.2)), made(start, target_pose=moved(0.1, 0.2))
+    assert np.array_equal(first.trajectory.position, second.trajectory.position)
+
+
+def test_a_pose_is_planned_within_twenty_milliseconds() -> None:
+    best = np.inf
+    for _ in range(5):
+        begin = time.perf_counter()
+        made(target_pose=moved(0.1, 0.2), motion="line")
+        best = min(best, time.perf_counter() - begin)
+    assert best < 0.02
+
+
+def test_a_state_that_nothing_can_brake_stands_still() -> None:
+    brake = PLANNER.brake(State(HOME, np.full(7, NAN), ZEROS), hard=True)
+    assert brake.ticks == 1
+    assert np.array_equal(brake.target, HOME)
+    assert not brake.velocity.any()
