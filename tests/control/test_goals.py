@@ -188,6 +188,39 @@ def test_a_goal_that_preempts_a_brake_takes_over_but_never_a_hard_one() -> None:
     assert rig.results() == [("a", ResultCode.ESTOP), ("b", ResultCode.SUCCEEDED)]
 
 
+def test_a_goal_that_does_not_preempt_waits_until_the_brake_is_over() -> None:
+    rig = started()
+    rig.stop(ResultCode.CANCELLED, hard=False)
+    rig.go("b", joint_target=NEAR)
+    while not at_rest(rig):
+        assert rig.phase == GoalPhase.CONVERTING
+        rig.tick()
+    rig.run()
+    assert rig.results() == [("a", ResultCode.CANCELLED), ("b", ResultCode.SUCCEEDED)]
+
+
+def test_a_goal_that_cannot_be_planned_brakes_what_others_moved() -> None:
+    rig = Rig()
+    rig.velocity[0, 2] = 1.0
+    rig.go("a", target_pose=moved(2.0))
+    rig.tick()
+    assert rig.manager.following.all()
+    while rig.manager.busy.any():
+        rig.tick()
+    assert at_rest(rig)
+
+
+def test_a_gripper_that_was_stopped_stays_where_it_stopped() -> None:
+    rig = started(ticks=50, gripper=0.01)
+    rig.manager.cancel(0, "a")
+    rig.run()
+    stopped = rig.position[0, 6]
+    assert 0.02 < stopped < 0.08
+    rig.go("b", joint_target=NEAR)
+    rig.run()
+    assert rig.position[0, 6] == stopped
+
+
 def test_a_goal_that_preempts_but_cannot_be_planned_leaves_a_braking_arm() -> None:
     rig = started()
     rig.go("b", target_pose=moved(2.0), preempt=True)
@@ -408,6 +441,17 @@ def test_a_goal_that_takes_too_long_is_braked() -> None:
     assert not at_rest(rig)
     rig.run()
     assert at_rest(rig)
+
+
+def test_the_time_of_a_goal_starts_with_its_motion() -> None:
+    alone = Rig()
+    alone.go("a", joint_target=FAR)
+    needed = alone.run() / HZ
+    rig = Rig()
+    for name, target in (("a", FAR), ("b", joints()), ("c", FAR)):
+        rig.go(name, joint_target=target, timeout_s=1.1 * needed)
+    rig.run()
+    assert rig.results() == [(name, ResultCode.SUCCEEDED) for name in "abc"]
 
 
 # --- stops, setpoints, restarts --------------------------------------------------------------------------------------

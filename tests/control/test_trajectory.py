@@ -1,5 +1,6 @@
 """Trajectories: limits, ends, agreement with Ruckig's own evaluation, straightness of lines, and playing them back."""
 
+import dataclasses
 import time
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bhd_lerobot.control import line as line_module
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.line import Line, ToolLimits, along_line
 from bhd_lerobot.control.player import TrajectoryPlayer
@@ -186,6 +188,34 @@ def test_the_tool_stays_on_the_line_and_turns_evenly(x: float, y: float, z: floa
     speed = np.diff(along, prepend=0.0) * HZ
     assert speed.max() <= TOOL_LIMITS.velocity + 1e-6
     assert np.abs(np.diff(speed, prepend=0.0)).max() * HZ <= TOOL_LIMITS.acceleration * 1.01 + 1e-3
+
+
+def test_a_line_keeps_the_jerk_of_joints_that_must_move_gently() -> None:
+    gentle = dataclasses.replace(ARM, jerk=ARM.jerk / 5)
+    random = np.random.default_rng(0)
+    made = 0
+    for _ in range(40):
+        goal = KINEMATICS.tool(HOME[:6] + random.uniform(-1, 1, 6) * (2.0, 0.3, 0.6, 0.8, 1.2, 1.0))
+        answer = along_line(HOME[:6], goal, KINEMATICS, (gentle, TOOL_LIMITS), HZ)
+        if isinstance(answer, Trajectory):
+            made += 1
+            assert excess(State.at_rest(HOME[:6]), answer, gentle) < 1e-9
+    assert made > 20
+
+
+def test_a_line_takes_as_many_poses_as_it_needs_to_be_straight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(line_module, "_STEP", 1.0)
+    monkeypatch.setattr(line_module, "_TURN", 10.0)
+    line = Line(TOOL, moved(0.05, 0.25, 0.1, 1.0).matrix())
+    tools = KINEMATICS.tool(planned(along_line(HOME[:6], line.goal, KINEMATICS, (ARM, TOOL_LIMITS), HZ)).position)
+    way = (line.goal - line.start)[:3, 3] / line.length
+    beside = tools[:, :3, 3] - TOOL[:3, 3]
+    assert np.linalg.norm(beside - np.outer(beside @ way, way), axis=1).max() < 5e-5
+    # Where no number of poses suffices, the line is refused.
+    monkeypatch.setattr(line_module, "_DEVIATION", 0.0)
+    answer = along_line(HOME[:6], line.goal, KINEMATICS, (ARM, TOOL_LIMITS), HZ)
+    assert isinstance(answer, PlanFailure)
+    assert answer.code == ResultCode.SINGULAR
 
 
 def test_a_slow_line_keeps_the_speed_of_the_tool() -> None:
