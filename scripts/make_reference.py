@@ -18,14 +18,19 @@ from typing import Any
 
 import draccus
 
+from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
+from bhd_lerobot.control.commands import GoalPhase, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.simulation import observation_names
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.turtlebot3_simulation import observation_names
+from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, OBSERVED
 from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.replay import ReplayConfig
+from bhd_lerobot.tasks import pick, reach
 from bhd_lerobot.tasks.task import Event
 
 FILE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
@@ -72,6 +77,10 @@ def reference() -> str:
         _members(Event),
         "### Reasons of refusal\n\nIn `SendResult.reasons`, and in the message of a `CommandRefusedError`.\n",
         _table(("value", "name", "meaning"), ((r.value, f"`{r.name}`", r.explanation) for r in Reason)),
+        "### How goals end\n\nIn `CommandResult.code`, and by name in the episode's `bhd/results`.\n",
+        _members(ResultCode),
+        "### Phases of a goal\n\nIn `Feedback.phase`.\n",
+        _members(GoalPhase),
     ]
     return "\n".join(parts)
 
@@ -169,7 +178,11 @@ def _type_name(kind: Any) -> str:
 _VECTORS = {
     keys.OBSERVATION_STATE: "the robot's floats in the order of its observation features; named in `meta/info.json`",
     f"{keys.OBSERVATION_IMAGES}.front": "the front camera, RGB; only with `robot.camera=true`",
-    keys.ACTION: "what the brain asked for over the coming frame",
+    f"{keys.OBSERVATION_IMAGES}.scene": "the camera beside the table, RGB; only with `robot.camera=true`",
+    f"{keys.OBSERVATION_IMAGES}.wrist": "the camera at the gripper, RGB; only with `robot.camera=true`",
+    keys.ENVIRONMENT_STATE: "what the task tells the brain; see below",
+    keys.SUBTASK: "what the brain is doing, in words; only of brains with a plan",
+    keys.ACTION: "what the brain asked for over the coming frame; for goals, where the reference is at its end",
     keys.APPLIED_ACTION: "what the cerebellum commanded at the end of the frame, after all limits",
     keys.PHYSICS_STATE: "the simulator's generalised positions, then velocities, when the observation was measured",
 }
@@ -187,18 +200,48 @@ def _columns() -> str:
     config = TurtleBot3Config(camera=True)
     image = (config.camera_height, config.camera_width, 3)
     # The state of a free body (7 positions, 6 velocities) and of two wheels.
-    features = keys.dataset_features(
+    base = keys.dataset_features(
         observation_names(config), ("x.vel", "theta.vel"), {"front": image}, [str(i) for i in range(17)]
     )
+    arm_config = UR5Config(camera=True)
+    image = (arm_config.camera_height, arm_config.camera_width, 3)
+    # Six joints and two fingers, and five free bodies.
+    physics = [str(i) for i in range(8 + 5 * 7 + 8 + 5 * 6)]
+    cameras = {"scene": image, "wrist": image}
+    arm = keys.dataset_features(OBSERVED, JOINT_ACTIONS, cameras, physics, pick.ENVIRONMENT, subtask=True)
+    environment = (
+        "What a task tells the brain, in `observation.environment_state`.\n\n"
+        f"`reach`, {len(reach.ENVIRONMENT)} numbers: {_names(reach.ENVIRONMENT)}: the target pose of the tool in the "
+        "base frame, position [m] and unit quaternion.\n\n"
+        f"`pick`, {len(pick.ENVIRONMENT)} numbers: for each of five places `object_0` to `object_4` the "
+        f"{len(OBJECT_FIELDS)} numbers {_names(OBJECT_FIELDS)}: whether there is an object, whether it is the one asked "
+        "for, whether it is a box; its pose in the base frame; its measures [m]; its colour.\n"
+    )
+    return "\n".join(
+        (
+            "### TurtleBot3\n\nAs `bhd-record` writes them for a TurtleBot3 with its defaults and a camera. "
+            "[dataset.md](dataset.md) says more about each.\n",
+            _feature_table({**base, **DEFAULT_FEATURES}),
+            "### UR5\n\nAs `bhd-record` writes them for a UR5 in the pick task with cameras; those that are like the "
+            "TurtleBot3's are left out.\n",
+            _feature_table({key: one for key, one in arm.items() if base.get(key) != one}),
+            "### Environment state\n",
+            environment,
+        )
+    )
+
+
+def _feature_table(features: dict[str, dict[str, Any]]) -> str:
     rows = []
-    for key, feature in {**features, **DEFAULT_FEATURES}.items():
+    for key, feature in features.items():
         meaning = keys.SCALARS[key][1] if key in keys.SCALARS else {**_VECTORS, **_DEFAULTS}[key]
         shape = " × ".join(str(size) for size in feature["shape"])
         rows.append((f"`{key}`", feature["dtype"], shape, meaning))
-    return (
-        "As `bhd-record` writes them for a TurtleBot3 with its defaults and a camera. [dataset.md](dataset.md) says "
-        "more about each.\n\n" + _table(("key", "type", "size", "meaning"), rows)
-    )
+    return _table(("key", "type", "size", "meaning"), rows)
+
+
+def _names(names: tuple[str, ...]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
 
 
 def _members(kind: type[Enum]) -> str:

@@ -30,5 +30,5 @@ def test_a_divergence_of_zero_is_drawn_as_such(tmp_path):
     path = tmp_path / "d.png"
     curves = {"position [m]": np.zeros(5)}
     time = np.arange(5) / 10
-    plots.draw_divergence(arena=arena, recorded=xy, replayed=xy, time=time, curves=curves, heading="same", path=path)
+    plots.draw_divergence(scene=arena, recorded=xy, replayed=xy, time=time, curves=curves, heading="same", path=path)
     assert np.asarray(Image.open(path)).std() > 1

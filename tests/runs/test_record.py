@@ -253,7 +253,7 @@ def test_a_camera_is_recorded_frame_by_frame(tmp_path):
 
 def test_episodes_come_in_order_and_are_dropped_when_told_to_stop(tmp_path):
     config = parse(RecordConfig, options(tmp_path / "d", dataset__num_episodes=4))
-    simulation = record_module.TurtleBot3Simulation(config.robot, 3)
+    simulation = record_module.make_simulation(config.robot, 3)
     task = record_module.make_task(config.task, 3, 10)
     loop = EpisodeLoop(simulation, task, record_module.make_brain(config.brain))
     specs = [record_module.EpisodeSpec(i, 2 * i) for i in (3, 0, 2, 1)]
@@ -276,7 +276,7 @@ def test_episodes_come_in_order_and_are_dropped_when_told_to_stop(tmp_path):
         ({"n_envs": -3}, "n_envs is -3"),
         ({"seed": -1}, "seed is -1"),
         ({"split": "trian"}, "split is 'trian'"),
-        ({"robot__fps": 20}, "leave robot.fps out"),
+        ({"robot__fps": 20, "dataset__fps": 10}, "leave robot.fps out"),
         ({"dataset__fps": 7}, "valid values of fps"),
         ({"dataset__episode_time_s": 0}, "episode_time_s is 0"),
         ({"dataset__episode_time_s": ".nan"}, "episode_time_s is nan"),

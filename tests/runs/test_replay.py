@@ -55,13 +55,13 @@ def test_a_changed_action_diverges_from_its_frame_on(recorded):
     assert replay.state_exact().identical  # the states were not touched
 
 
-def test_yaw_differences_wrap(recorded):
+def test_a_quaternion_and_its_negative_are_the_same_orientation(recorded):
     replay = Replay(recorded, 1)
     states = replay.columns["simulation.state"].copy()
     turned = states.copy()
     turned[:, 3:7] *= -1  # the same rotation
     replay.columns["simulation.state"] = turned
-    assert replay.open_loop().yaw_rad.max() == pytest.approx(0, abs=1e-12)
+    assert replay.open_loop().angle_rad.max() == pytest.approx(0, abs=1e-12)
 
 
 def test_the_command_draws_and_reports(recorded, tmp_path, capsys):
