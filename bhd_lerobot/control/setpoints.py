@@ -83,10 +83,8 @@ class SetpointFilter:
         closing = np.minimum(_GAIN * size, np.sqrt(2 * _APPROACH * self._acceleration * size))
         wanted = feed + np.copysign(closing, error)
         # Near an end of a range, no faster than what can still be stopped before it.
-        room = np.sqrt(2 * _APPROACH * self._acceleration * np.maximum(self._upper - position, 0.0))
-        wanted = np.minimum(wanted, room)
-        room = np.sqrt(2 * _APPROACH * self._acceleration * np.maximum(position - self._lower, 0.0))
-        wanted = np.maximum(wanted, -room)
+        wanted = np.minimum(wanted, self._stoppable(np.maximum(self._upper - position, 0.0)))
+        wanted = np.maximum(wanted, -self._stoppable(np.maximum(position - self._lower, 0.0)))
         speed = np.minimum(np.maximum(wanted, -self._speed), self._speed)
         change = (speed - velocity) * self._hz
         allowed = np.minimum(np.maximum(change, -self._acceleration), self._acceleration)
@@ -96,6 +94,15 @@ class SetpointFilter:
         np.copyto(acceleration, allowed, where=active)
         np.copyto(velocity, velocity + allowed / self._hz, where=active)
         np.copyto(position, position + velocity / self._hz, where=active)
+
+    def _stoppable(self, room: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the largest speed of the next tick that leaves enough room to stop in, tick by tick.
+
+        In continuous time that is the square root of 2 a x; a tick's motion at the full speed makes it a little less.
+        """
+        slowing = _APPROACH * self._acceleration
+        half = slowing / (2 * self._hz)
+        return np.minimum(np.sqrt(half * half + 2 * slowing * room) - half, room * self._hz)
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget robots that were put somewhere else."""

@@ -1,0 +1,228 @@
+"""From setpoints to a reference: whatever the setpoints are, every limit holds at every tick."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.setpoints import SetpointFilter
+
+LIMITS = ur5().limits
+LOWER, UPPER = np.array(LIMITS.lower), np.array(LIMITS.upper)
+SPEED, ACCELERATION = np.array(LIMITS.velocity), np.array(LIMITS.acceleration)
+HOME = np.array(ur5().home)
+HZ, FRAME = 500, 20
+SLACK = 1e-9
+
+
+class Stream:
+    """Setpoints for n arms, and the reference that follows them, with all that it did before."""
+
+    def __init__(self, n: int = 1, start: np.ndarray = HOME, frame: int = FRAME) -> None:
+        self.n, self.frame_ticks = n, frame
+        self.filter = SetpointFilter(LIMITS, n, HZ, frame)
+        self.position = np.broadcast_to(start, (n, 7)).copy()
+        self.velocity, self.acceleration = np.zeros((n, 7)), np.zeros((n, 7))
+        self.rows: list[np.ndarray] = [np.stack([self.position, self.velocity, self.acceleration])]
+
+    def tick(self, ticks: int = 1) -> None:
+        for _ in range(ticks):
+            self.filter.run(self.position, self.velocity, self.acceleration)
+            self.rows.append(np.stack([self.position, self.velocity, self.acceleration]))
+
+    def check(self) -> None:
+        """Assert that every limit was kept at every tick."""
+        p, v, a = np.moveaxis(np.array(self.rows), 1, 0)
+        assert np.isfinite(self.rows).all()
+        assert (p - UPPER).max() <= SLACK
+        assert (LOWER - p).max() <= SLACK
+        assert (np.abs(v) - SPEED).max() <= SLACK
+        assert (np.abs(a) - ACCELERATION).max() <= SLACK
+        assert np.allclose(np.diff(v, axis=0), a[1:] / HZ, atol=1e-12)
+        assert np.allclose(np.diff(p, axis=0), v[1:] / HZ, atol=1e-12)
+
+    @property
+    def history(self) -> np.ndarray:
+        """Positions at each tick, shape (ticks, n, 7)."""
+        return np.array(self.rows)[:, 0]
+
+    def head_for(self, values: np.ndarray, mask: np.ndarray | None = None) -> None:
+        mask = np.ones(self.n, np.bool_) if mask is None else mask
+        self.filter.head_for(np.broadcast_to(values, (self.n, 7)).copy(), mask, self.position)
+
+    def frame(self, values: np.ndarray, frames: int = 1) -> None:
+        for _ in range(frames):
+            self.head_for(values)
+            self.tick(self.frame_ticks)
+
+
+def off(**changes: float) -> np.ndarray:
+    """Return the home posture with some joints moved."""
+    values = HOME.copy()
+    for name, change in changes.items():
+        values[int(name[1:])] += change
+    return values
+
+
+wild = st.lists(
+    st.tuples(
+        st.lists(st.floats(-1.5, 1.5), min_size=7, max_size=7),  # share of the range; beyond 1 is outside
+        st.integers(1, 45),  # ticks until the next one: early, on time, late
+        st.sampled_from(["all", "first", "none", "repeat"]),
+    ),
+    min_size=1,
+    max_size=12,
+)
+
+
+@given(wild, st.integers(1, 40))
+def test_no_stream_of_setpoints_breaks_a_limit(script: list, frame: int) -> None:
+    stream = Stream(2, frame=frame)
+    middle, half = (UPPER + LOWER) / 2, (UPPER - LOWER) / 2
+    values = HOME
+    for shares, ticks, kind in script:
+        values = values if kind == "repeat" else middle + half * np.array(shares)
+        if kind != "none":
+            stream.head_for(values, np.array([True, kind != "first"]))
+        stream.tick(ticks)
+    stream.tick(200)
+    stream.check()
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_no_jitter_near_the_ends_of_the_range_breaks_a_limit(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stream = Stream(start=np.where(rng.random(7) < 0.5, LOWER, UPPER))
+    for _ in range(30):
+        stream.frame(np.where(rng.random(7) < 0.5, LOWER, UPPER) + rng.normal(0, 0.02, 7))
+    stream.check()
+
+
+@pytest.mark.parametrize("value", [1e9, -1e9, 1e300, -1e300])
+def test_setpoints_from_another_world_lead_to_the_end_of_the_range(value: float) -> None:
+    stream = Stream()
+    stream.frame(np.full(7, value), 150)
+    assert np.allclose(stream.position, UPPER if value > 0 else LOWER, atol=1e-6)
+    assert np.abs(stream.velocity).max() < 1e-3
+    stream.check()
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.5, -1.0, 2.5])
+def test_a_steady_motion_is_followed_without_a_lag(speed: float) -> None:
+    stream = Stream()
+    setpoint = HOME.copy()
+    for frame in range(60):
+        setpoint[:6] += speed * FRAME / HZ / 2
+        stream.frame(setpoint)
+        if frame > 45:
+            # A tick's worth is what the grid of ticks leaves open.
+            assert np.abs(stream.position[0, :6] - setpoint[:6]).max() <= abs(speed) / 2 / HZ + 1e-6
+            assert np.allclose(stream.velocity[0, :6], speed / 2, atol=1e-6)
+
+
+@pytest.mark.parametrize("change", [1e-4, 0.01, -0.3, 2.0])
+def test_a_setpoint_that_stays_is_reached_exactly_and_passed_by_a_braking_distance_at_most(change: float) -> None:
+    stream = Stream()
+    goal = off(j0=change, j4=-change, j6=-abs(change) / 100)
+    stream.frame(goal, 75)
+    assert np.allclose(stream.position, goal, atol=1e-9)
+    assert np.allclose(stream.velocity, 0, atol=1e-7)
+    # The stream might have gone on: a target that moves evenly to where it ends is not slowed down for.
+    fastest = np.minimum(np.abs(goal - HOME) * HZ / FRAME, SPEED) * 1.5
+    beyond = ((stream.history[:, 0] - goal) * np.sign(goal - HOME)).max(axis=0)
+    assert (beyond <= fastest**2 / (2 * ACCELERATION) + fastest / HZ + 1e-12).all()
+    assert beyond.max() <= 0.01
+    stream.check()
+
+
+def test_after_a_moving_stream_the_last_setpoint_is_reached_exactly_too() -> None:
+    stream = Stream()
+    for frame in range(20):
+        stream.frame(off(j1=0.03 * (frame + 1)))
+    stream.tick(1000)  # no setpoint any more: the last one counts
+    assert np.allclose(stream.position, off(j1=0.6), atol=1e-9)
+
+
+def test_at_the_goal_nothing_moves() -> None:
+    stream = Stream()
+    stream.frame(HOME, 10)
+    assert (stream.history == HOME).all()
+
+
+def test_what_was_limited_is_flagged_and_nothing_else() -> None:
+    stream = Stream(3)
+    values = np.tile(HOME, (3, 1))
+    values[1, 0], values[2, 0] = HOME[0] + 7.0, HOME[0] - 2.0
+    stream.head_for(values)
+    assert stream.filter.limited_position.tolist() == [False, True, False]  # beyond 2 pi
+    stream.tick(200)
+    assert stream.filter.limited_velocity.tolist() == [False, True, True]
+    assert stream.filter.limited_acceleration.tolist() == [False, True, True]
+
+
+def test_a_range_s_ends_are_inside() -> None:
+    stream = Stream(2)
+    stream.head_for(np.stack([LOWER, UPPER]))
+    assert not stream.filter.limited_position.any()
+    stream.head_for(np.stack([np.nextafter(LOWER, -10), HOME]))
+    assert stream.filter.limited_position.tolist() == [True, False]
+
+
+def test_an_arm_without_setpoints_is_left_alone() -> None:
+    stream = Stream(2)
+    stream.head_for(off(j0=1.0), np.array([True, False]))
+    stream.velocity[1, 2] = 0.1  # another writes it
+    before = stream.position[1].copy()
+    for _ in range(50):
+        stream.filter.run(stream.position, stream.velocity, stream.acceleration)
+    assert np.array_equal(stream.position[1], before)
+    assert stream.velocity[1, 2] == 0.1
+    assert stream.position[0, 0] > HOME[0]
+
+
+def test_dropped_setpoints_are_not_followed_and_the_next_start_from_the_reference() -> None:
+    stream = Stream()
+    stream.frame(off(j0=1.0), 5)
+    stream.filter.drop(np.array([True]))
+    before = stream.position.copy()
+    stream.filter.run(stream.position, stream.velocity, stream.acceleration)
+    assert np.array_equal(stream.position, before)
+    stream.velocity[:] = 0  # somebody else brought it to rest, somewhere else
+    stream.position[:] = HOME
+    stream.rows.clear()
+    stream.frame(off(j0=0.001), 50)
+    assert np.abs(stream.history[:, 0, 0] - HOME[0]).max() < 0.0011
+
+
+def test_a_restarted_arm_knows_nothing_of_its_past() -> None:
+    used, fresh = Stream(2), Stream(2)
+    used.frame(off(j0=9.0, j1=-1.0), 7)
+    used.filter.restart(np.array([0, 1]))
+    assert not (used.filter.limited_position | used.filter.limited_velocity | used.filter.limited_acceleration).any()
+    used.position[:], used.velocity[:], used.acceleration[:] = HOME, 0, 0
+    for stream in (used, fresh):
+        stream.rows.clear()
+        stream.tick(10)
+        stream.frame(off(j0=0.5), 10)
+    assert np.array_equal(used.history, fresh.history)
+
+
+def test_arms_are_independent() -> None:
+    rng = np.random.default_rng(3)
+    streams = rng.normal(0, 0.2, (20, 3, 7)).cumsum(axis=0) + HOME
+    together, alone = Stream(3), [Stream() for _ in range(3)]
+    for values in streams:
+        together.frame(values)
+        for arm, one in enumerate(alone):
+            one.frame(values[arm])
+    assert np.array_equal(together.history, np.concatenate([one.history for one in alone], axis=1))
+
+
+def test_setpoints_that_come_more_often_than_frames_are_followed_too() -> None:
+    stream = Stream()
+    for step in range(400):
+        stream.head_for(off(j0=0.001 * (step + 1)))
+        stream.tick(1)
+    # Each setpoint would take a frame; the newest counts, so the reference is at most that frame behind.
+    assert stream.position[0, 0] - HOME[0] == pytest.approx(0.4, abs=0.001 * (FRAME + 1))
