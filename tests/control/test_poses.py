@@ -1,0 +1,87 @@
+"""Poses as numbers: agreement with scipy, and a sign that does not flip where tools are."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from bhd_lerobot.control.commands import Pose
+from bhd_lerobot.control.poses import pose_vectors
+
+DOWN = np.array([0.0, 1.0, 0.0, 0.0])  # wxyz: half a turn about x
+
+
+def matrices(rotations: Rotation, positions: np.ndarray | None = None) -> np.ndarray:
+    rows = np.atleast_3d(rotations.as_matrix()).reshape(-1, 3, 3)
+    result = np.tile(np.eye(4), (len(rows), 1, 1))
+    result[:, :3, :3] = rows
+    if positions is not None:
+        result[:, :3, 3] = positions
+    return result
+
+
+def wxyz(rotations: Rotation) -> np.ndarray:
+    return np.roll(np.atleast_2d(rotations.as_quat()), 1, axis=1)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_numbers_and_matrices_are_the_same_pose(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rotations = Rotation.random(50, rng=rng)
+    positions = rng.normal(0, 1, (50, 3))
+    vectors = pose_vectors(matrices(rotations, positions))
+    assert np.array_equal(vectors[:, :3], positions)
+    assert np.allclose(np.linalg.norm(vectors[:, 3:], axis=1), 1, atol=1e-12)
+    assert np.abs((vectors[:, 3:] * wxyz(rotations)).sum(axis=1)) == pytest.approx(np.ones(50), abs=1e-12)
+    for vector, matrix in zip(vectors, matrices(rotations, positions), strict=True):
+        assert np.allclose(Pose(tuple(vector[:3]), tuple(vector[3:])).matrix(), matrix, atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (0, 1, 1), (1, 1, 1), (1, -1, 0)])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-4, np.pi - 1e-9, np.pi, 2 * np.pi - 1e-9])
+def test_no_turn_loses_precision(axis: tuple[int, int, int], angle: float) -> None:
+    """Also turns of next to nothing and of next to half a turn, where a single formula fails."""
+    rotation = Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis))
+    vector = pose_vectors(matrices(rotation))[0]
+    back = Pose((0.0, 0.0, 0.0), tuple(vector[3:])).matrix()[:3, :3]
+    assert np.allclose(back, rotation.as_matrix(), atol=1e-12)
+
+
+def test_of_the_two_quaternions_it_is_the_one_on_the_side_of_the_tool_that_points_down() -> None:
+    rng = np.random.default_rng(0)
+    assert (pose_vectors(matrices(Rotation.random(500, rng=rng)))[:, 3:] @ DOWN >= 0).all()
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_near_the_tool_that_points_down_the_numbers_do_not_jump(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # Anywhere within a right angle of it: half of the quaternion's angle, so far from where the sign flips.
+    ends = rng.normal(0, 1, (2, 3))
+    ends *= (rng.uniform(0, np.pi / 2, 2) / np.linalg.norm(ends, axis=1))[:, None]
+    path = Rotation.from_rotvec(ends[0] + np.linspace(0, 1, 500)[:, None] * (ends[1] - ends[0]))
+    vectors = pose_vectors(matrices(Rotation.from_euler("x", np.pi) * path))
+    assert np.abs(np.diff(vectors[:, 3:], axis=0)).max() < 0.01
+
+
+def test_a_whole_turn_of_the_tool_that_points_down_flips_the_sign_once_half_a_turn_away() -> None:
+    yaw = np.linspace(-np.pi + 1e-3, np.pi - 1e-3, 1001)
+    path = Rotation.from_euler("z", yaw[:, None]) * Rotation.from_euler("x", np.pi)
+    assert np.abs(np.diff(pose_vectors(matrices(path))[:, 3:], axis=0)).max() < 0.01
+
+
+def test_orientations_on_the_border_have_one_sign_only() -> None:
+    for rotation in (Rotation.identity(), Rotation.from_euler("z", np.pi), Rotation.from_euler("y", np.pi)):
+        for noise in (0.0, -0.0):
+            vector = pose_vectors(matrices(rotation) + noise)[0]
+            assert np.linalg.norm(vector[3:]) == pytest.approx(1)
+    assert pose_vectors(np.eye(4)).tolist() == [0, 0, 0, 1, 0, 0, 0]
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3), (0,)])
+def test_any_number_of_leading_axes(shape: tuple[int, ...]) -> None:
+    rotations = matrices(Rotation.random(6, rng=np.random.default_rng(1)))
+    count = int(np.prod(shape))
+    several = rotations[:count].reshape(*shape, 4, 4)
+    assert pose_vectors(several).shape == (*shape, 7)
+    assert np.array_equal(pose_vectors(several).reshape(-1, 7), pose_vectors(rotations)[:count])
