@@ -31,30 +31,55 @@ class ResultCode(IntEnum):
     """How a goal ended, or why it was refused."""
 
     SUCCEEDED = 0
+    """The target is reached, or the gripper holds something."""
     CANCELLED = 1
+    """`cancel` was called, or the arm is being stopped or deactivated."""
     PREEMPTED = 2
+    """A goal with `preempt` took its place."""
     TIMEOUT = 3
+    """Not reached within `timeout_s` of the start of its motion."""
     PATH_TOLERANCE = 4
+    """A joint was measured too far from its reference."""
     GOAL_TOLERANCE = 5
+    """Not within the tolerances in time after the end of the motion."""
     UNREACHABLE = 6
+    """No posture reaches the pose, or a pose of the line."""
     JOINT_LIMIT = 7
+    """A target out of range, or every posture for the pose has a joint out of range."""
     SELF_COLLISION = 8
+    """The arm would come too close to itself, at the end or on the way."""
     TABLE_COLLISION = 9
+    """The arm would come too close to the table, at the end or on the way."""
     SINGULAR = 10
+    """The pose, or a part of the line, needs a singular posture."""
     NON_FINITE = 11
+    """NaN or an infinity in a target."""
     NOT_NORMALISED = 12
+    """The quaternion is not of unit length."""
     BAD_TARGET = 13
+    """No target or two, a line without a pose, a wrong number of values, an unknown motion, or no name."""
     BAD_VELOCITY = 14
+    """`max_velocity` is not positive, or above the range."""
     BAD_ACCELERATION = 15
+    """`max_acceleration` is not positive, or above the range."""
     BAD_TIMEOUT = 16
+    """`timeout_s` is not positive and finite."""
     DUPLICATE_ID = 17
+    """The episode already had a goal of this name."""
     UNKNOWN_ID = 18
+    """No goal of this name is followed or waits."""
     QUEUE_FULL = 19
+    """Too many goals wait."""
     NOT_ACTIVE = 20
+    """The arm is not active."""
     ESTOP = 21
+    """The emergency stop is latched, or was pressed while the goal was live."""
     FAULT = 22
+    """A plant fault is latched, or happened while the goal was live."""
     PLANNING_FAILED = 23
+    """No trajectory was found although everything is in range."""
     REPLACED_BY_SETPOINT = 24
+    """A setpoint came, and the newer command counts."""
 
 
 @dataclass(frozen=True)
