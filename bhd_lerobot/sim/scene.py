@@ -1,6 +1,7 @@
 """The model that a world simulates: a base among obstacles that each simulation places, or an arm on a table."""
 
 import math
+from collections.abc import Sequence
 
 from bhd_lerobot.bodies.body import Arm, Body, MobileBase, Shape
 from bhd_lerobot.errors import ConfigError
@@ -17,13 +18,16 @@ _FLOOR_BIT, _SCENE_BIT = 1, 2
 _PLACED = ("obstacle_", "object_")  # how the names of geometries begin that simulations place themselves
 
 
-def build_model(body: Body, physics_hz: int, pool_size: int = POOL_SIZE) -> mujoco.MjModel:
+def build_model(
+    body: Body, physics_hz: int, pool_size: int = POOL_SIZE, fixtures: Sequence[Shape] = ()
+) -> mujoco.MjModel:
     """Compile the model.
 
     Args:
         body: the robot.
         physics_hz: physics steps a second [Hz].
         pool_size: number of obstacles a simulation of a base can have at the most.
+        fixtures: what stands immovable on an arm's table.
 
     Raises:
         ConfigError: the body's MJCF does not compile, or there is no stage for this kind of body.
@@ -35,7 +39,7 @@ def build_model(body: Body, physics_hz: int, pool_size: int = POOL_SIZE) -> mujo
     spec.option.timestep = 1.0 / physics_hz
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     if isinstance(body, Arm):
-        add_table_stage(spec, body)
+        add_table_stage(spec, body, fixtures)
     elif isinstance(body, MobileBase):
         _add_arena_stage(spec, body, pool_size)
     else:

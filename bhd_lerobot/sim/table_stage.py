@@ -4,11 +4,12 @@ World frame and base frame are one; the table's top is the plane z = 0.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, Shape
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
 from bhd_lerobot.sim.engine import mujoco
 
@@ -22,8 +23,12 @@ FLOOR = -0.75  # [m]
 _TABLE = (-0.35, 1.05, 0.70)  # edges behind and before the base, half the width [m]
 
 
-def add_table_stage(spec: mujoco.MjSpec, arm: Arm) -> None:
-    """Add everything around an arm, and the arm's actuators, to the specification of its body."""
+def add_table_stage(spec: mujoco.MjSpec, arm: Arm, fixtures: Sequence[Shape] = ()) -> None:
+    """Add everything around an arm, and the arm's actuators, to the specification of its body.
+
+    Fixtures stand on the table and do not give way; sensor ``force_fixture_<k>`` is the force that the k-th puts on the
+    arm, in the base frame [N].
+    """
     _add_servos(spec, arm)
     _add_options(spec)
     _add_room(spec)
@@ -38,6 +43,8 @@ def add_table_stage(spec: mujoco.MjSpec, arm: Arm) -> None:
         _add_object(spec, number)
     _add_target(spec)
     _add_touch_sensors(spec, arm)
+    for number, shape in enumerate(fixtures):
+        _add_fixture(spec, arm, number, shape)
     _add_start(spec, arm)
 
 
@@ -222,6 +229,31 @@ def _add_touch_sensors(spec: mujoco.MjSpec, arm: Arm) -> None:
             intprm=[1, 0, 1],  # data: found; reduce: none; num: one slot
             **reference,
         )
+
+
+def _add_fixture(spec: mujoco.MjSpec, arm: Arm, number: int, shape: Shape) -> None:
+    """Add something immovable to lean on, and the sensor of the force between it and the arm."""
+    name, half, box = f"fixture_{number}", shape.height / 2, shape.kind == "box"
+    body = spec.worldbody.add_body(
+        name=name, pos=[shape.x, shape.y, half], quat=[math.cos(shape.yaw / 2), 0, 0, math.sin(shape.yaw / 2)]
+    )
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX if box else mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[shape.size_x, shape.size_y, half] if box else [shape.size_x, half, 0],
+        contype=TABLE_BIT,
+        conaffinity=0,
+        rgba=[0.62, 0.66, 0.70, 1.0],
+    )
+    spec.add_sensor(
+        name=f"force_{name}",
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        objname=name,
+        reftype=mujoco.mjtObj.mjOBJ_XBODY,
+        refname=arm.root,
+        intprm=[2, 3, 1],  # data: force; reduce: net force, in the world frame; num: one slot
+    )
 
 
 def _add_start(spec: mujoco.MjSpec, arm: Arm) -> None:

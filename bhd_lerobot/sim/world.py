@@ -51,6 +51,8 @@ class World:
         threads: threads that step the simulations; as many as there are processors, and at most n, if None.
         pool_size: number of obstacles that one simulation of a base can have at the most; an arm has a table instead,
             which `Tabletop` lays.
+        fixtures: what stands immovable on an arm's table, in every simulation; none for a base. Sensor
+            ``force_fixture_<k>`` is the force that the k-th puts on the arm, in the base frame [N].
     """
 
     def __init__(
@@ -61,14 +63,17 @@ class World:
         physics_hz: int | None = None,
         threads: int | None = None,
         pool_size: int = POOL_SIZE,
+        fixtures: Sequence[Shape] = (),
     ) -> None:
         if n < 1:
             raise SimulationError(f"A world needs at least one simulation, got n = {n}.")
+        if fixtures and not isinstance(body, Arm):
+            raise SimulationError(f"Fixtures stand on an arm's table; {body.name!r} is a {type(body).__name__}.")
         self.body = body
         self.n = n
         self.physics_hz = physics_hz or body.physics_hz
         self.pool_size = pool_size = pool_size if isinstance(body, MobileBase) else 0
-        self.model = build_model(body, self.physics_hz, pool_size)
+        self.model = build_model(body, self.physics_hz, pool_size, fixtures)
         # One simulation is stepped by the calling thread; more threads would only add hand-overs.
         self._batch = mujoco_batch.Batch(self.model, n, nthread=1 if n == 1 else threads or 0)
         self.qpos: NDArray[np.float64] = self._batch.bind("qpos")

@@ -1,0 +1,86 @@
+"""How a tool gives way to forces: stiffness and damping, checked, and the damping that lets nothing ring."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bhd_lerobot.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+# Estimates of what a 500 Hz torque loop on an arm of this size is asked for; natural frequencies stay below 10 Hz, far
+# from the 80 Hz at which a damped loop with one tick of delay starts to ring.
+MAX_STIFFNESS = 5000.0  # [N/m]
+MAX_TURN_STIFFNESS = 300.0  # [N m/rad]
+# [rad/s] Where there is no spring there is no natural frequency to damp: damping is that of a spring of this one.
+_LEAST_FREQUENCY = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Compliance:
+    """The spring and the damper between a tool and its equilibrium, in the base frame; linear first, then angular.
+
+    Attributes:
+        stiffness: [N/m, N m/rad], shape (6, 6), symmetric without negative eigenvalues; or its diagonal, shape (6,).
+        damping_ratio: 1 for critical damping of the inertia that the tool has in its posture.
+        damping: a damping matrix to use in place of the ratio [N s/m, N m s/rad], shape (6, 6) or (6,); None for none.
+        max_force: largest force of spring and feed-forward together [N].
+        max_moment: largest moment of both together [N m].
+    """
+
+    stiffness: ArrayLike = (500.0, 500.0, 500.0, 40.0, 40.0, 40.0)
+    damping_ratio: float = 1.0
+    damping: ArrayLike | None = None
+    max_force: float = 80.0
+    max_moment: float = 15.0
+
+    def __post_init__(self) -> None:
+        stiffness = _matrix("stiffness", self.stiffness)
+        for block, largest, unit in ((slice(3), MAX_STIFFNESS, "N/m"), (slice(3, 6), MAX_TURN_STIFFNESS, "N m/rad")):
+            value = float(np.linalg.eigvalsh(stiffness[block, block])[-1])
+            if value > largest * (1 + 1e-9):
+                raise ConfigError(f"The stiffness is {value:.6g} {unit}; at most {largest:.6g} {unit} is allowed.")
+        if not 0.1 <= self.damping_ratio <= 2.0:
+            raise ConfigError(f"damping_ratio is {self.damping_ratio}; it must be between 0.1 and 2.")
+        for name in ("max_force", "max_moment"):
+            if not 0.0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"{name} is {getattr(self, name)}; it must be positive and finite.")
+        object.__setattr__(self, "stiffness", stiffness)
+        if self.damping is not None:
+            object.__setattr__(self, "damping", _matrix("damping", self.damping))
+
+
+def critical_damping(mobility: Array, stiffness: Array, ratio: Array) -> Array:
+    """Return damping matrices with which every mode of mass and spring has the same damping ratio.
+
+    Mass and stiffness are brought to diagonal form together; with 1 = Q^T mass Q and w^2 = Q^T stiffness Q the damping
+    is that of 2 ratio w. It is symmetric and positive definite.
+
+    Args:
+        mobility: inverse of the mass matrix, positive definite, shape (n, 6, 6).
+        stiffness: shape (n, 6, 6).
+        ratio: shape (n,).
+    """
+    root = np.linalg.cholesky(mobility)
+    square, modes = np.linalg.eigh(np.swapaxes(root, 1, 2) @ stiffness @ root)
+    frequency = np.sqrt(np.maximum(square, _LEAST_FREQUENCY**2))
+    # What takes modes to forces: root^-T modes.
+    forces = np.linalg.solve(np.swapaxes(root, 1, 2), modes)
+    return np.asarray((forces * (2.0 * ratio[:, None] * frequency)[:, None, :]) @ np.swapaxes(forces, 1, 2))
+
+
+def _matrix(name: str, values: ArrayLike) -> Array:
+    """Return a checked, read-only matrix of shape (6, 6)."""
+    array = np.array(values, np.float64)
+    matrix = np.diag(array) if array.shape == (6,) else array
+    if matrix.shape != (6, 6) or not np.isfinite(matrix).all():
+        raise ConfigError(f"The {name} is {array.tolist()}; it must be 6 finite numbers, or 6 x 6.")
+    if not np.allclose(matrix, matrix.T, rtol=0.0, atol=1e-9 * max(1.0, np.abs(matrix).max())):
+        raise ConfigError(f"The {name} is {array.tolist()}; it must be symmetric, or the tool gains energy in circles.")
+    least = float(np.linalg.eigvalsh(matrix)[0])
+    if least < -1e-9 * max(1.0, np.abs(matrix).max()):
+        raise ConfigError(f"The {name} has the eigenvalue {least:.6g}; none may be negative.")
+    matrix = 0.5 * (matrix + matrix.T)
+    matrix.setflags(write=False)
+    return matrix

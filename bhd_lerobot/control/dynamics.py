@@ -1,0 +1,117 @@
+"""Rigid-body dynamics of an arm: what torques do to it, and what a tool sees of its inertia."""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+TOOL_SITE = "tool"
+
+
+@dataclass(frozen=True)
+class DynamicsTerms:
+    """The dynamics of n arms in one state: mass @ acceleration + coriolis @ velocity + gravity = torque.
+
+    Lengths, angles and torques are those of the arm's six joints, the gripper's fingers are held. Frames are given in
+    the base frame.
+
+    Attributes:
+        mass: joint-space mass matrix with the rotors' inertia [kg m^2], shape (n, 6, 6).
+        coriolis: the Coriolis matrix for which d(mass)/dt = coriolis + coriolis^T [N m s/rad], shape (n, 6, 6).
+        gravity: torques that carry the arm's weight [N m], shape (n, 6).
+        jacobian: geometric Jacobian at the tool centre point, linear velocity first, shape (n, 6, 6).
+        tool: the tool frame, shape (n, 4, 4).
+    """
+
+    mass: Array
+    coriolis: Array
+    gravity: Array
+    jacobian: Array
+    tool: Array
+
+    def mobility(self, damping: float = 0.0) -> Array:
+        """Return the inverse of the inertia that a wrench on the tool moves, shape (n, 6, 6).
+
+        It is singular where the Jacobian is, and its inverse then infinite: what cannot move weighs for ever.
+
+        Args:
+            damping: what is added to its diagonal [1/kg, 1/(kg m^2)], so that it can be inverted near a singularity.
+        """
+        transposed = np.swapaxes(self.jacobian, 1, 2)
+        mobility = self.jacobian @ np.linalg.solve(self.mass, transposed)
+        mobility += damping * np.eye(6)
+        return 0.5 * (mobility + np.swapaxes(mobility, 1, 2))
+
+
+class ArmDynamics:
+    """The rigid-body model of an arm, from the same MJCF that is simulated.
+
+    Args:
+        arm: the arm.
+        opening: opening of the gripper that its inertia is computed for [m]; the arm's at home if None. The centre of
+            mass does not depend on it, because the fingers move as one.
+
+    Raises:
+        ConfigError: the MJCF has other joints than the arm's chain and gripper, no tool, or the opening is impossible.
+    """
+
+    def __init__(self, arm: Arm, opening: float | None = None) -> None:
+        opening = arm.home[-1] if opening is None else opening
+        if not 0.0 <= opening <= arm.gripper.max_opening:
+            raise ConfigError(
+                f"The gripper's opening is {opening} m; it must be between 0 and {arm.gripper.max_opening} m."
+            )
+        whole = _parse(arm)
+        joints, wanted = tuple(whole.names)[1:], (*arm.chain.joints, *arm.gripper.joints)
+        if joints != wanted or not whole.existFrame(TOOL_SITE):
+            raise ConfigError(
+                f"The MJCF of {arm.name!r} has the joints {joints}; it needs {wanted} and a site {TOOL_SITE!r}."
+            )
+        posture = pinocchio.neutral(whole)
+        posture[-2:] = opening / 2
+        locked = [whole.getJointId(name) for name in arm.gripper.joints]
+        self.model = pinocchio.buildReducedModel(whole, locked, posture)
+        self.dof = self.model.nv
+        self._data = self.model.createData()
+        self._tool = self.model.getFrameId(TOOL_SITE)
+
+    def terms(self, position: Array, velocity: Array) -> DynamicsTerms:
+        """Return the dynamics in a state of n arms.
+
+        Args:
+            position: joint positions [rad], shape (n, 6).
+            velocity: joint speeds [rad/s], shape (n, 6).
+        """
+        n, dof, model, data = len(position), self.dof, self.model, self._data
+        mass, coriolis, jacobian = (np.empty((n, dof, dof)) for _ in range(3))
+        gravity, tool = np.empty((n, dof)), np.empty((n, 4, 4))
+        for sim in range(n):
+            q, v = position[sim], velocity[sim]
+            pinocchio.computeJointJacobians(model, data, q)
+            pinocchio.updateFramePlacements(model, data)
+            jacobian[sim] = pinocchio.getFrameJacobian(model, data, self._tool, pinocchio.LOCAL_WORLD_ALIGNED)
+            tool[sim] = data.oMf[self._tool].homogeneous
+            upper = np.triu(pinocchio.crba(model, data, q))
+            mass[sim] = upper + np.triu(upper, 1).T
+            coriolis[sim] = pinocchio.computeCoriolisMatrix(model, data, q, v)
+            gravity[sim] = pinocchio.computeGeneralizedGravity(model, data, q)
+        return DynamicsTerms(mass, coriolis, gravity, jacobian, tool)
+
+
+def _parse(arm: Arm) -> pinocchio.Model:
+    """Return the model of the whole MJCF; the parser reads files only."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{arm.name}.xml"
+        path.write_text(arm.mjcf, encoding="utf-8")
+        try:
+            return pinocchio.buildModelFromMJCF(str(path))
+        except (ValueError, RuntimeError) as error:
+            raise ConfigError(f"The MJCF of {arm.name!r} is not valid: {error}") from error

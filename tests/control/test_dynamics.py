@@ -1,0 +1,95 @@
+"""The rigid-body model beside two oracles: the closed-form kinematics, and the engine that simulates the same MJCF."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.control.dynamics import ArmDynamics
+from bhd_lerobot.control.kinematics import ArmKinematics
+from bhd_lerobot.errors import ConfigError
+
+ARM = ur5(actuation="torque")
+DYNAMICS = ArmDynamics(ARM)
+RNG = np.random.default_rng(3)
+POSTURES = RNG.uniform(-3, 3, (40, 6))
+SPEEDS = RNG.uniform(-2, 2, (40, 6))
+TERMS = DYNAMICS.terms(POSTURES, SPEEDS)
+ENGINE = mujoco.MjModel.from_xml_string(ARM.mjcf)
+
+
+def engine_at(q: NDArray[np.float64], v: NDArray[np.float64], opening: float) -> mujoco.MjData:
+    data = mujoco.MjData(ENGINE)
+    data.qpos[:6], data.qpos[6:], data.qvel[:6] = q, opening / 2, v
+    mujoco.mj_forward(ENGINE, data)
+    return data
+
+
+@pytest.mark.parametrize("opening", [0.0, 0.03, MAX_OPENING])
+def test_it_agrees_with_the_engine(opening: float) -> None:
+    terms = ArmDynamics(ARM, opening).terms(POSTURES, SPEEDS)
+    still = ArmDynamics(ARM, opening).terms(POSTURES, 0 * SPEEDS)
+    for k in range(len(POSTURES)):
+        data = engine_at(POSTURES[k], SPEEDS[k], opening)
+        mass = np.zeros((8, 8))
+        mujoco.mj_fullM(ENGINE, data, mass)
+        np.testing.assert_allclose(terms.mass[k], mass[:6, :6], atol=1e-12)
+        np.testing.assert_allclose(terms.coriolis[k] @ SPEEDS[k] + terms.gravity[k], data.qfrc_bias[:6], atol=1e-10)
+        np.testing.assert_allclose(
+            terms.gravity[k], engine_at(POSTURES[k], 0 * SPEEDS[k], opening).qfrc_bias[:6], atol=1e-10
+        )
+    np.testing.assert_array_equal(still.coriolis @ np.ones(6), np.zeros((40, 6)))
+
+
+def test_it_agrees_with_the_closed_form_kinematics() -> None:
+    kinematics = ArmKinematics(ARM.chain, ARM.limits)
+    np.testing.assert_allclose(TERMS.tool, kinematics.tool(POSTURES), atol=1e-12)
+    np.testing.assert_allclose(TERMS.jacobian, kinematics.jacobian(POSTURES), atol=1e-12)
+
+
+def test_the_mass_matrix_is_symmetric_and_heavier_than_the_rotors() -> None:
+    np.testing.assert_array_equal(TERMS.mass, TERMS.mass.swapaxes(1, 2))
+    links = TERMS.mass - np.diag([0.5, 0.5, 0.5, 0.15, 0.15, 0.15])
+    assert np.linalg.eigvalsh(links).min() > 0
+
+
+def test_the_coriolis_matrix_is_half_of_how_the_mass_matrix_changes() -> None:
+    """What the momentum observer rests on."""
+    step = 1e-6
+    later = DYNAMICS.terms(POSTURES + step * SPEEDS, SPEEDS).mass
+    earlier = DYNAMICS.terms(POSTURES - step * SPEEDS, SPEEDS).mass
+    np.testing.assert_allclose(
+        TERMS.coriolis + TERMS.coriolis.swapaxes(1, 2), (later - earlier) / (2 * step), atol=1e-6
+    )
+
+
+def test_the_mobility_is_what_a_wrench_on_the_tool_does() -> None:
+    wrench = RNG.uniform(-10, 10, (40, 6))
+    torque = np.einsum("kji,kj->ki", TERMS.jacobian, wrench)
+    acceleration = np.linalg.solve(TERMS.mass, torque[..., None])
+    np.testing.assert_allclose(
+        TERMS.mobility() @ wrench[..., None], TERMS.jacobian @ acceleration, rtol=1e-9, atol=1e-9
+    )
+
+
+def test_the_damped_mobility_has_an_inverse_in_a_singular_posture() -> None:
+    stretched = np.array([[0.0, -1.0, 0.0, -1.0, 0.0, 0.0]])
+    terms = DYNAMICS.terms(stretched, np.zeros((1, 6)))
+    assert abs(np.linalg.eigvalsh(terms.mobility()).min()) < 1e-9
+    assert np.linalg.eigvalsh(terms.mobility(1e-3)).min() == pytest.approx(1e-3, rel=1e-3)
+
+
+@pytest.mark.parametrize("opening", [-0.01, 0.1, float("nan")])
+def test_an_impossible_opening_is_refused(opening: float) -> None:
+    with pytest.raises(ConfigError, match="opening"):
+        ArmDynamics(ARM, opening)
+
+
+def test_a_body_that_does_not_fit_its_chain_is_refused() -> None:
+    with pytest.raises(ConfigError, match="it needs"):
+        ArmDynamics(replace(ARM, mjcf=ARM.mjcf.replace('name="elbow" class="large"', 'name="knee" class="large"')))
+    with pytest.raises(ConfigError, match="not valid"):
+        ArmDynamics(replace(ARM, mjcf="<mujoco"))
