@@ -1,0 +1,138 @@
+"""Tool poses as actions: the numbers, and a UR5 that follows them or says why not."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.control.messages import Limit, Mode, Reason
+from bhd_lerobot.control.poses import pose_vectors
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.tool_space import TOOL_NAMES, pose_matrices
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+
+DOWN = [0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0]
+
+
+def test_an_action_is_a_pose_and_an_opening() -> None:
+    assert [name.split(".")[0] for name in TOOL_NAMES] == [
+        *("tool_x", "tool_y", "tool_z", "tool_qw", "tool_qx", "tool_qy", "tool_qz", "gripper")
+    ]
+
+
+def test_poses_agree_with_scipy() -> None:
+    rng = np.random.default_rng(0)
+    for rotation in Rotation.random(50, rng=rng):
+        x, y, z, w = rotation.as_quat()
+        sign = rng.choice([-1, 1])  # a quaternion and its negative are one orientation
+        matrix, problem = pose_matrices(np.array([1.0, 2.0, 3.0, *(sign * np.array([w, x, y, z]))]))
+        assert problem is None
+        assert matrix[:3, 3].tolist() == [1, 2, 3]
+        assert np.allclose(matrix[:3, :3], rotation.as_matrix(), atol=1e-12)
+        assert matrix[3].tolist() == [0, 0, 0, 1]
+
+
+@pytest.mark.parametrize("length", [0.81, 0.999, 1.0, 1.19])
+def test_a_network_s_quaternion_need_not_be_quite_of_unit_length(length: float) -> None:
+    quaternion = length * np.array([0.5, 0.5, -0.5, 0.5])
+    matrix, problem = pose_matrices(np.array([0, 0, 0, *quaternion]))
+    assert problem is None
+    assert np.allclose(matrix, pose_matrices(np.array([0, 0, 0, 0.5, 0.5, -0.5, 0.5]))[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("length", [0.0, 0.79, 1.21, 1e9, np.nan, np.inf])
+def test_what_is_no_orientation_is_not_guessed_at(length: float) -> None:
+    quaternion = length * np.array([0.5, 0.5, -0.5, 0.5])
+    _, problem = pose_matrices(np.array([0, 0, 0, *quaternion]))
+    assert problem is not None
+    assert "length" in problem
+    assert "must be near 1" in problem
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return UR5Simulation(UR5Config(action_space="tool"), 3, threads=1)
+
+
+def start(simulation: UR5Simulation) -> np.ndarray:
+    """Put all arms home; return the action that keeps them there."""
+    ids = np.arange(simulation.n)
+    scenes = [TableScene("empty", (), simulation.body.home)] * simulation.n
+    simulation.reset(ids, scenes, [0] * simulation.n)
+    return simulation._applied()
+
+
+def test_the_command_comes_back_as_the_pose_that_was_asked_for(simulation) -> None:
+    action = start(simulation)
+    pose = simulation.truth().tool_pose
+    assert np.allclose(action[:, :3], pose[:, :3], atol=1e-3)
+    assert np.abs((pose[:, 3:] * action[:, 3:7]).sum(axis=1)).min() > 1 - 1e-5
+    goal = action.copy()
+    goal[:, :3] += [[0.05, 0.0, -0.05], [0.0, 0.1, 0.0], [0.0, 0.0, 0.0]]
+    goal[2, 3:7] = pose_vectors(
+        pose_matrices(action[2, :7])[0]
+        @ np.block([[Rotation.from_euler("z", 0.5).as_matrix(), np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+    )[3:]
+    goal[:, 7] = 0.05
+    for _ in range(40):
+        report = simulation.act(goal)
+        assert report.sent.accepted.all()
+        assert not report.refusals
+    assert np.allclose(report.applied, goal, atol=1e-6)
+    pose = simulation.truth().tool_pose
+    assert np.abs(pose[:, :3] - goal[:, :3]).max() < 1e-3
+    assert np.abs((pose[:, 3:] * goal[:, 3:7]).sum(axis=1)).min() > 1 - 1e-5
+
+
+def test_one_arm_s_impossible_pose_is_refused_in_words_and_the_others_go_on(simulation) -> None:
+    action = start(simulation)
+    action[0, 0] = 3.0  # three metres away
+    action[1, 3:7] = 0.0
+    action[2, 2] += 0.05
+    for _ in range(15):
+        report = simulation.act(action)
+        assert report.sent.reasons.tolist() == [Reason.NO_POSTURE, Reason.NO_POSTURE, Reason.ACCEPTED]
+    assert set(report.refusals) == {0, 1}
+    assert "length 0" in report.refusals[1]
+    assert report.mode.tolist() == [Mode.HOLD, Mode.HOLD, Mode.TRACKING]
+    assert report.applied[2, 2] == pytest.approx(action[2, 2], abs=1e-4)
+
+
+@pytest.mark.parametrize("column", [0, 5, 7])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_is_refused_and_nothing_moves(simulation, column: int, value: float) -> None:
+    before = start(simulation)
+    action = before.copy()
+    action[1, column] = value
+    action[0, 2] += 0.02
+    report = simulation.act(action)
+    assert report.sent.accepted.tolist() == [True, False, True]
+    assert np.array_equal(report.applied[1], before[1])
+    assert report.mode[1] == Mode.HOLD
+
+
+def test_an_arm_whose_poses_are_refused_stops_like_one_that_hears_nothing(simulation) -> None:
+    action = start(simulation)
+    for _ in range(10):
+        action[:, 1] += 0.01
+        moving = simulation.act(action)
+    assert moving.mode.tolist() == [Mode.TRACKING] * 3
+    bad = action.copy()
+    bad[0, 0] = 3.0
+    for _ in range(15):
+        report = simulation.act(bad)
+        assert report.sent.reasons[0] == Reason.NO_POSTURE
+    assert report.mode.tolist() == [Mode.HOLD, Mode.TRACKING, Mode.TRACKING]
+    assert not report.limits[0] & Limit.NON_FINITE
+
+
+def test_the_arm_takes_the_posture_nearest_to_where_it_is(simulation) -> None:
+    action = start(simulation)
+    joints = simulation.cerebellum.command[0, :6].copy()
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        action[:, :3] += rng.uniform(-0.01, 0.01, 3)
+        simulation.act(action)
+        now = simulation.cerebellum.command[0, :6].copy()
+        assert np.abs(now - joints).max() < 0.15  # no other branch of the inverse kinematics
+        joints = now
