@@ -12,6 +12,7 @@ from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.commands import CommandResult
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
 from bhd_lerobot.robots.simulation import Simulation
@@ -41,6 +42,7 @@ class SimulatedRobot(Robot):
         self.config = config
         self._simulation: Simulation | None = None
         self._last_observation: dict[str, Any] | None = None
+        self._results: list[CommandResult] = []
         # lerobot-record asks for its length, with or without cameras.
         self.cameras: dict[str, Any] = dict.fromkeys(self.camera_shapes)
 
@@ -120,6 +122,7 @@ class SimulatedRobot(Robot):
             self._simulation.close()
             self._simulation = None
         self._last_observation = None
+        self._results = []
         _connected.discard(self)
 
     def calibrate(self) -> None:
@@ -185,6 +188,7 @@ class SimulatedRobot(Robot):
         simulation = self.simulation
         values = self.action_array(action)
         report = simulation.act(values)
+        self._results += report.results.get(0, ())
         reason = Reason(int(report.sent.reasons[0]))
         if reason != Reason.ACCEPTED:
             mode = Mode(int(report.mode[0])).name
@@ -232,6 +236,16 @@ class SimulatedRobot(Robot):
     def instruction(self) -> str:
         """What a person would ask for in the robot's scene; empty if nothing."""
         return ""
+
+    def take_results(self) -> list[CommandResult]:
+        """Return the results of goals, sent by `simulation.bridge`, that nobody has taken yet, in their order.
+
+        Raises:
+            DeviceNotConnectedError: the robot is not connected.
+        """
+        results = self._results + self.simulation.bridge.take_results()
+        self._results = []
+        return results
 
     def estop(self) -> None:
         """Latch the emergency stop: from the next tick the robot brakes as hard as it can, and refuses commands.

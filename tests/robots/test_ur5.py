@@ -1,0 +1,293 @@
+"""The UR5 as LeRobot sees it: features, bad actions, stops, goals beside setpoints, tool space, noise, options."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.tabletop import TableScene, Variation
+from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
+from bhd_lerobot.control.messages import Mode, Reason
+from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError, RenderingError
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.conformance import check_robot
+from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, UR5Simulation
+
+FIRST = np.zeros(1, np.intp)
+DOWN = (0.0, 1.0, 0.0, 0.0)
+
+
+def make(tmp_path, **options) -> UR5:
+    return UR5(UR5Config(calibration_dir=tmp_path, **options))
+
+
+@pytest.fixture
+def robot(tmp_path):
+    with make(tmp_path) as robot:
+        yield robot
+
+
+def stay(robot) -> dict[str, float]:
+    """Return the action that leaves the robot where it is commanded to be."""
+    return dict(zip(robot.action_names, robot.simulation._applied()[0].tolist(), strict=True))
+
+
+@pytest.mark.parametrize("space", ["joint", "tool"])
+@pytest.mark.parametrize("scene", ["empty", "pick"])
+def test_it_keeps_the_contract_of_a_lerobot_robot(tmp_path, space, scene):
+    with make(tmp_path, action_space=space) as robot:
+        action = stay(robot)
+    check_robot(lambda: make(tmp_path, action_space=space, scene=scene), action)
+
+
+def test_features_are_the_joints_and_the_gripper(robot):
+    assert list(robot.action_features) == [
+        "shoulder_pan.pos", "shoulder_lift.pos", "elbow.pos", "wrist_1.pos", "wrist_2.pos", "wrist_3.pos",
+        "gripper.pos",
+    ]  # fmt: skip
+    names = list(robot.observation_features)
+    assert names[:7] == list(robot.action_features)
+    assert names[7:] == [name.replace(".pos", ".vel") for name in names[:7]]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"elbow.pos": None}, "not a number"),
+        ({"elbow.pos": math.nan}, "'elbow.pos' is nan"),
+        ({"gripper.pos": math.inf}, "'gripper.pos' is inf"),
+        ({"elbo.pos": 1.0}, "Did you mean 'elbow.pos'"),
+    ],
+)
+def test_a_bad_action_is_refused_and_nothing_happens(robot, change, message):
+    before, now = robot.simulation.physics_state, robot.simulation.bridge.now_ns
+    with pytest.raises(ActionError, match=message):
+        robot.send_action({**stay(robot), **change})
+    assert np.array_equal(robot.simulation.physics_state, before)
+    assert robot.simulation.bridge.now_ns == now
+
+
+def test_a_setpoint_is_approached_within_the_limits_and_reached(robot):
+    target = stay(robot)
+    target["elbow.pos"] += 0.5
+    target["gripper.pos"] = 0.02
+    speeds = []
+    for _ in range(40):
+        applied = robot.send_action(target)
+        speeds.append(abs(robot.get_observation()["elbow.vel"]))
+    assert applied == pytest.approx(target, abs=1e-6)
+    seen = robot.get_observation()
+    assert seen["elbow.pos"] == pytest.approx(target["elbow.pos"], abs=1e-3)
+    assert seen["gripper.pos"] == pytest.approx(0.02, abs=1e-3)
+    assert 0.5 < max(speeds) < math.pi
+
+
+def test_a_stream_of_small_steps_is_followed_without_a_lag(robot):
+    start = stay(robot)
+    for frame in range(1, 26):
+        action = {**start, "shoulder_pan.pos": start["shoulder_pan.pos"] + 0.02 * frame}
+        applied = robot.send_action(action)
+    assert applied["shoulder_pan.pos"] == pytest.approx(action["shoulder_pan.pos"], abs=1e-3)
+    assert robot.get_observation()["shoulder_pan.vel"] == pytest.approx(0.02 * 25, rel=0.05)
+
+
+def test_out_of_range_is_clipped_to_the_range_and_no_faster_than_the_limits(robot):
+    before = stay(robot)
+    applied = robot.send_action({**before, "gripper.pos": 99.0, "elbow.pos": 1e9})
+    assert applied["gripper.pos"] == 0.085
+    # 20 ticks of 2 ms at 10 rad/s^2, each tick's speed being that of its end.
+    assert 0 < applied["elbow.pos"] - before["elbow.pos"] <= 10 * 0.002**2 * 20 * 21 / 2 + 1e-9
+
+
+def test_without_new_setpoints_it_decelerates_and_holds(robot):
+    start = stay(robot)
+    for frame in range(1, 6):
+        robot.send_action({**start, "shoulder_pan.pos": start["shoulder_pan.pos"] + 0.04 * frame})
+    bridge = robot.simulation.bridge
+    modes = []
+    for _ in range(25):
+        bridge.advance_frame()
+        modes.append(Mode(int(bridge.state().mode[0])))
+    # The frame of the last setpoint is over when the first of these begins; 100 ms after that its age is too much.
+    assert modes[:2] == [Mode.TRACKING] * 2
+    assert Mode.STOPPING in modes or Mode.HOLD in modes[2:5]
+    assert modes[-1] == Mode.HOLD
+    assert not bridge.state().is_moving[0]
+
+
+def test_an_emergency_stop_ends_a_goal_and_refuses_everything_until_reset_and_activate(robot):
+    bridge = robot.simulation.bridge
+    home = robot.simulation.body.home
+    goal = BrainCommand("a", joint_target=(home[0] - 1.0, *home[1:6]))
+    assert bridge.submit(goal) is None
+    for _ in range(10):
+        bridge.advance_frame()
+    assert bridge.state().is_moving[0]
+    robot.estop()
+    for _ in range(15):
+        bridge.advance_frame()
+    (result,) = bridge.take_results()
+    assert (result.task_id, result.success, result.code) == ("a", False, ResultCode.ESTOP)
+    state = bridge.state()
+    assert state.emergency_stop[0]
+    assert not state.is_moving[0]
+    refusal = bridge.submit(BrainCommand("b", joint_target=home[:6]))
+    assert refusal is not None
+    assert refusal.code == ResultCode.ESTOP
+    assert "reset()" in refusal.message
+    with pytest.raises(CommandRefusedError, match="emergency stop is latched"):
+        robot.send_action(stay(robot))
+    robot.reset()
+    refusal = bridge.submit(BrainCommand("c", joint_target=home[:6]))
+    assert refusal is not None
+    assert refusal.code == ResultCode.NOT_ACTIVE
+    robot.activate()
+    bridge.take_results()
+    assert bridge.submit(BrainCommand("d", joint_target=home[:6])) is None
+    for _ in range(60):
+        bridge.advance_frame()
+    assert [one.code for one in bridge.take_results()] == [ResultCode.SUCCEEDED]
+    assert bridge.state().joint_positions[0] == pytest.approx(home, abs=1e-3)
+
+
+def test_a_goal_tracks_then_holds_and_a_setpoint_takes_over(robot):
+    bridge = robot.simulation.bridge
+    assert bridge.submit(BrainCommand("a", target_pose=Pose((0.4, 0.1, 0.3), DOWN))) is None
+    bridge.advance_frame()
+    assert bridge.state().mode[0] == Mode.TRACKING
+    for _ in range(40):
+        bridge.advance_frame()
+    assert bridge.state().mode[0] == Mode.HOLD
+    assert bridge.take_results()[0].success
+    tool = robot.simulation.truth().tool_pose[0]
+    assert tool[:3] == pytest.approx((0.4, 0.1, 0.3), abs=5e-4)
+    bridge.submit(BrainCommand("b", target_pose=Pose((0.5, -0.2, 0.3), DOWN)))
+    for _ in range(8):
+        bridge.advance_frame()
+    before = bridge.state().command[0]
+    applied = robot.send_action(stay(robot))
+    assert [one.code for one in robot.take_results()] == [ResultCode.REPLACED_BY_SETPOINT]
+    assert robot.take_results() == []
+    moved = np.abs(np.array(list(applied.values())) - before)
+    assert (moved[:6] < math.pi * 0.04).all()
+
+
+def test_tool_actions_are_solved_by_the_bridge(tmp_path):
+    with make(tmp_path, action_space="tool") as robot:
+        action = stay(robot)
+        assert list(action) == list(robot.action_features)
+        action["tool_x.pos"] += 0.05
+        action["tool_z.pos"] -= 0.05
+        for _ in range(25):
+            applied = robot.send_action(action)
+        assert applied == pytest.approx(action, abs=1e-5)
+        tool = robot.simulation.truth().tool_pose[0]
+        assert tool[:3] == pytest.approx([action[f"tool_{axis}.pos"] for axis in "xyz"], abs=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tool_x.pos": 2.0}, "short of the pose"),
+        ({"tool_z.pos": -0.2}, "table"),
+        ({"tool_qw.pos": 3.0}, "length"),
+    ],
+)
+def test_a_tool_pose_that_cannot_be_taken_is_refused_with_the_reason(tmp_path, change, message):
+    with make(tmp_path, action_space="tool") as robot:
+        before = robot.simulation.cerebellum.command.copy()
+        with pytest.raises(CommandRefusedError, match=message):
+            robot.send_action({**stay(robot), **change})
+        assert np.array_equal(robot.simulation.cerebellum.command, before)
+
+
+def test_one_refused_arm_does_not_hinder_the_others():
+    simulation = UR5Simulation(UR5Config(action_space="tool"), 3)
+    scene = TableScene("empty", (), simulation.body.home)
+    simulation.reset(np.arange(3), [scene] * 3, [0, 1, 2])
+    action = simulation._applied()
+    action[1, 0] = 5.0
+    action[:, 2] += 0.001
+    report = simulation.act(action)
+    assert report.sent.reasons.tolist() == [Reason.ACCEPTED, Reason.NO_POSTURE, Reason.ACCEPTED]
+    assert list(report.refusals) == [1]
+    assert np.array_equal(report.applied[0], report.applied[2])
+
+
+def test_noise_and_latency_belong_to_the_episode(tmp_path):
+    simulation = UR5Simulation(UR5Config(), 2)
+    home = simulation.body.home
+    wild = TableScene("empty", (), home, variation=Variation(sensor_noise=0.001, latency_ticks=10))
+    simulation.reset(np.arange(2), [wild, TableScene("empty", (), home)], [7, 7])
+    seen = np.array([simulation.observe().state for _ in range(200)])
+    assert np.array_equal(seen[:, 1], np.broadcast_to(seen[0, 1], seen[:, 1].shape))
+    assert seen[:, 0, :6].std() > 0
+    assert seen[:, 0, :6].std(axis=0) == pytest.approx(np.full(6, 0.001), rel=0.25)
+    assert (seen[:, 0, 6] == seen[0, 0, 6]).all()  # the gripper's encoder has none
+    simulation.reset(FIRST, [wild], [7])
+    assert np.array_equal(simulation.observe().state[0], seen[0, 0])  # the same seed, the same noise
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fps": 7}, "valid values of fps"),
+        ({"physics_hz": 300}, "control_hz"),
+        ({"clock": "lockstop"}, "Did you mean 'lockstep'"),
+        ({"action_space": "joints"}, "Did you mean 'joint'"),
+        ({"scene": "pik"}, "Did you mean 'pick'"),
+        ({"stale_after_s": 0}, "does not mean 'off'"),
+        ({"stale_after_s": math.nan}, "stale_after_s is nan"),
+        ({"camera_width": 0}, "must be positive"),
+        ({"seed": -1}, "seeds start at 0"),
+    ],
+)
+def test_options_that_cannot_be_honoured(options, message):
+    with pytest.raises(ConfigError, match=message):
+        UR5Config(**options)
+
+
+def test_scenes_bring_their_objects_and_their_instruction(tmp_path):
+    with make(tmp_path, scene="pick", seed=5) as robot:
+        names, values = robot.environment
+        assert len(names) == len(values) == 80
+        assert robot.instruction
+        assert values[names.index("object_0_present")] == 1.0
+        height = values[names.index("object_0_height")]
+        assert values[names.index("object_0_z")] == pytest.approx(height / 2, abs=1e-3)
+    with make(tmp_path, scene="reach") as robot:
+        assert len(robot.environment[1]) == 7
+    with make(tmp_path) as robot:
+        assert robot.environment[0] == ()
+        assert robot.instruction == ""
+
+
+def test_lerobot_finds_it_through_its_plugin_mechanism():
+    code = (
+        "from lerobot.utils.import_utils import register_third_party_plugins as r; r();"
+        "from lerobot.robots import RobotConfig, make_robot_from_config as m;"
+        "print(type(m(RobotConfig.get_choice_class('ur5')())).__name__)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["UR5"]
+
+
+def test_camera_images_where_there_is_opengl(tmp_path):
+    robot = make(tmp_path, camera=True, camera_width=64, camera_height=48, scene="pick")
+    try:
+        robot.connect()
+    except RenderingError:
+        pytest.skip("no OpenGL here; the message is tested in tests/sim")
+    seen = robot.get_observation()
+    robot.disconnect()
+    assert seen["scene"].shape == seen["wrist"].shape == (48, 64, 3)
+    assert seen["scene"].std() > 1
+    assert seen["wrist"].std() > 1
+    assert not np.array_equal(seen["scene"], seen["wrist"])
+
+
+def test_joint_actions_and_the_body_agree():
+    assert UR5Config().body().limits.names == JOINT_ACTIONS
