@@ -69,10 +69,14 @@ def info(root: Path, console: Console, as_json: bool = False) -> None:
         features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), escape(_meaning(key, feature)))
     console.print(features)
     episodes = Table(title="Episodes", title_justify="left")
-    for heading in ("episode", "frames", "seconds", "outcome", "score", "seed", "overruns", "late p99 / ms"):
-        episodes.add_column(heading, justify="left" if heading == "outcome" else "right")
+    told = len({episode.task for episode in summary.episodes}) > 1
+    headings = ["episode", "frames", "seconds", "outcome", "score", "seed", "overruns", "late p99 / ms"]
+    for heading in headings + ["instruction"] * told:
+        left = heading in ("outcome", "instruction")
+        episodes.add_column(heading, justify="left" if left else "right", no_wrap=heading == "instruction")
     for episode in summary.episodes:
-        episodes.add_row(*_episode_row(episode, summary.fps))
+        row = _episode_row(episode, summary.fps)
+        episodes.add_row(*row, *[escape(episode.task)] * told)
     console.print(episodes)
 
 
@@ -104,6 +108,7 @@ def _meaning(key: str, feature: dict[str, Any]) -> str:
 
 
 _LEROBOT_COLUMNS = {
+    keys.SUBTASK: "what the brain was doing, in words",
     "timestamp": "frame_index / fps [s]",
     "frame_index": "number of the frame in its episode",
     "episode_index": "number of the episode in the dataset",

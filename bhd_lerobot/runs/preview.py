@@ -1,4 +1,4 @@
-"""An MP4 of a recorded episode, rendered from its recorded physics states."""
+"""A film and a picture of a recorded episode, rendered from its recorded physics states."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -12,6 +12,7 @@ from bhd_lerobot.sim.camera import Camera
 
 WIDTH, HEIGHT = 640, 480
 FPS = 20
+STRIP = 2, 3  # rows and columns of the picture
 
 
 class Preview:
@@ -56,6 +57,24 @@ class Preview:
                 image = self._camera.render(0, self._simulation.view)
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
             container.mux(stream.encode())
+
+    def write_strip(self, scene: Any, states: NDArray[np.float64], path: Path) -> None:
+        """Write a picture of an episode: some of its frames, evenly spaced, in rows.
+
+        Args:
+            scene: where it was.
+            states: recorded physics states, shape (frames, nq + nv).
+            path: the PNG file.
+        """
+        from matplotlib.image import imsave
+
+        self._simulation.place(np.zeros(1, np.intp), [scene])
+        images = []
+        for index in np.linspace(0, len(states) - 1, STRIP[0] * STRIP[1]).round().astype(int):
+            self._show(states[index])
+            images.append(self._camera.render(0, self._simulation.view))
+        rows = [np.concatenate(images[row : row + STRIP[1]], axis=1) for row in range(0, len(images), STRIP[1])]
+        imsave(path, np.concatenate(rows))
 
     def _show(self, state: NDArray[np.float64]) -> None:
         world = self._simulation.world

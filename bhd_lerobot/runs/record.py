@@ -101,7 +101,9 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         heading = f"{task.name}, {brain.name}: {result.successes} of {result.recorded} episodes succeeded"
         draw_trajectories(trajectories, output_dir / "trajectories.png", heading)
     if first is not None and preview is not None:
-        preview.write(first.scene, first.columns[PHYSICS_STATE], config.dataset.fps, output_dir / "episode.mp4")
+        states = first.columns[PHYSICS_STATE]
+        preview.write(first.scene, states, config.dataset.fps, output_dir / "episode.mp4")
+        preview.write_strip(first.scene, states, output_dir / "episode.png")
         preview.close()
     _summary(console, config, result, preview is not None and first is not None)
     if config.dataset.push_to_hub and not stop:
@@ -255,7 +257,11 @@ def _summary(console: Console, config: RecordConfig, result: RecordResult, film:
         table.add_row("outcomes", ", ".join(f"{name} {count}" for name, count in result.outcomes.most_common()))
         table.add_row("mean score", f"{np.mean(result.scores):.3f}")
         table.add_row("speed", f"{result.real_time_factor:.0f} x real time, n_envs = {config.n_envs}")
-    files = ["config.yaml", *(["trajectories.png"] if result.recorded else []), *(["episode.mp4"] if film else [])]
+    files = [
+        "config.yaml",
+        *(["trajectories.png"] if result.recorded else []),
+        *(["episode.mp4", "episode.png"] if film else []),
+    ]
     table.add_row("run folder", f"{result.output_dir}: {', '.join(files)}")
     console.print(table)
     if result.stopped_by:

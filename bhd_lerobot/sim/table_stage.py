@@ -36,7 +36,7 @@ def add_table_stage(spec: mujoco.MjSpec, arm: Arm, fixtures: Sequence[Shape] = (
     _add_lights(spec)
     for name, position, target, fovy in (
         ("scene", (1.22, -0.62, 0.78), (0.37, 0.02, 0.15), 48.0),
-        ("overview", (1.75, -1.30, 0.95), (0.27, 0.0, 0.03), 40.0),
+        ("overview", (1.75, -1.30, 0.95), (0.30, 0.0, 0.20), 29.0),
     ):
         spec.worldbody.add_camera(name=name, pos=position, xyaxes=_towards(position, target), fovy=fovy)
     for number in range(MAX_OBJECTS):
