@@ -55,7 +55,8 @@ class ArmController(Controller):
             self._limited_finite |= bad
             self.stop(bad, Mode.FAULT)
             mask = mask & ~bad
-        if (self.busy & mask).any():
+        # Not `self.busy`, which is of the last tick: a goal may have come since.
+        if (self.goals.busy & mask).any():
             self.goals.drop_for_setpoint(mask)
         self.setpoints.head_for(values, mask, self.command)
 
@@ -63,20 +64,20 @@ class ArmController(Controller):
         """Decelerate to rest; all goals of these arms end, with the cause as their result."""
         if cause not in _STOP_CODES:
             return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
-        self.setpoints.drop(mask)
+        self._leave_setpoints(mask)
         hard = cause in (Mode.ESTOP, Mode.FAULT)
         self.goals.stop(mask, _STOP_CODES[cause], hard, self.command, self.velocity, self.acceleration)
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
         if self.setpoints.active.any():
+            # A goal that came after them takes over; both in one tick would move the reference twice.
+            self._leave_setpoints(self.goals.busy)
             self.setpoints.run(self.command, self.velocity, self.acceleration)
         self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
         np.copyto(self.busy, self.goals.busy)
         phase = self.goals.phase
         np.logical_or(phase == GoalPhase.CONVERTING, phase == GoalPhase.EXECUTING, out=self.following)
-        if (self.goals.following & self.setpoints.active).any():
-            self.setpoints.drop(self.goals.following)
         np.multiply(self.velocity, self._lead, out=self.actuators)
         self.actuators += self.command
         # A servo that is asked for more than it can give gives what it can: that is noted, and the command left alone.
@@ -89,6 +90,17 @@ class ArmController(Controller):
         np.abs(work, out=work)
         if (work > self._largest_error).any():
             self._limited_effort |= (work > self._largest_error)[:, : self.width - 1].any(axis=1)
+
+    def _leave_setpoints(self, mask: NDArray[np.bool_]) -> None:
+        """Follow no setpoints any more; what comes next starts without speeding up.
+
+        Goals and brakes change their acceleration gradually, setpoints do not: one that went on from the acceleration
+        of a setpoint near the limit of speed would exceed it.
+        """
+        left = mask & self.setpoints.active
+        if left.any():
+            np.copyto(self.acceleration, 0.0, where=left[:, None] & (self.acceleration * self.velocity > 0))
+            self.setpoints.drop(left)
 
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each arm is commanded to be at rest, shape (n,)."""

@@ -32,6 +32,8 @@ class SetpointFilter:
         self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
         self._speed = np.asarray(limits.velocity)
         self._acceleration = np.asarray(limits.acceleration)
+        # [rad/s, m/s] by which a speed changes while a brake's acceleration rises to its limit
+        self._ramp = self._acceleration**2 / (2 * np.asarray(limits.jerk))
         self._hz, self._frame_ticks = control_hz, frame_ticks
         self._target, self._step = np.zeros((n, width)), np.zeros((n, width))
         self._goal, self._left = np.zeros((n, width)), np.zeros(n, np.int64)
@@ -96,13 +98,16 @@ class SetpointFilter:
         np.copyto(position, position + velocity / self._hz, where=active)
 
     def _stoppable(self, room: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest speed of the next tick that leaves enough room to stop in, tick by tick.
+        """Return the largest speed of the next tick that leaves enough room to stop in.
 
-        In continuous time that is the square root of 2 a x; a tick's motion at the full speed makes it a little less.
+        In continuous time and at once that is the square root of 2 a x. A tick's motion at the full speed makes it a
+        little less, and a brake that changes its acceleration gradually a little more: both fit.
         """
         slowing = _APPROACH * self._acceleration
         half = slowing / (2 * self._hz)
-        return np.minimum(np.sqrt(half * half + 2 * slowing * room) - half, room * self._hz)
+        tick_by_tick = np.minimum(np.sqrt(half * half + 2 * slowing * room) - half, room * self._hz)
+        gradually = np.sqrt(self._ramp * self._ramp + 2 * self._acceleration * room) - self._ramp
+        return np.asarray(np.minimum(tick_by_tick, gradually))
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget robots that were put somewhere else."""
