@@ -139,7 +139,7 @@ def _turn(first: float, second: float) -> float:
 
 
 def read_objects(values: NDArray[np.float64]) -> list[SeenObject]:
-    """Return the objects that an environment state of the pick task tells about.
+    """Return the objects that an environment state of the pick task tells about; not those with a NaN or an infinity.
 
     Args:
         values: 16 numbers for each place, shape (places, 16).
@@ -147,8 +147,8 @@ def read_objects(values: NDArray[np.float64]) -> list[SeenObject]:
     objects = []
     for index, row in enumerate(values.tolist()):
         present, target, box, x, y, z, qw, qx, qy, qz, length, width, height, red, green, blue = row
-        if present < 0.5:
-            continue
+        if not present >= 0.5 or not all(math.isfinite(value) for value in row):
+            continue  # what is not a number was not seen
         yaw = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
         objects.append(
             SeenObject(

@@ -60,7 +60,6 @@ class _Work:
 
     instruction: str = ""
     plan: Plan | None = None
-    names: dict[int, str] | None = None
     step: int = 0
     stage: str = ""
     attempts: int = 0
@@ -138,7 +137,6 @@ class PickBrain(GoalBrain):
                 work.plan = self._make_plan(work, objects)
             except InstructionError as error:
                 return self._give_up(sim, str(error))
-            work.names = {one.index: scene_object(one).name for one in objects}
             work.step = 1  # what it needs to know about the object, it has just been told
             work.stage = ""
         target = next((one for one in objects if one.index == work.plan.target), None)
@@ -163,6 +161,8 @@ class PickBrain(GoalBrain):
             if work.step == len(steps):
                 self._doing[sim] = "done"
                 return None
+        if steps[work.step].skill == Skill.HOLD and work.step + 1 < len(steps):
+            work.step += 1  # between two goals nothing moves: it was held
         step = steps[work.step]
         self._doing[sim] = step.text
         if step.skill == Skill.APPROACH and work.stage != "above":
@@ -210,6 +210,8 @@ class PickBrain(GoalBrain):
     def _retry(self, sim: int, target: SeenObject, objects: Sequence[SeenObject], problem: str) -> BrainCommand | None:
         """Go back to before the grasp, or give up."""
         work = self._work[sim]
+        if work.stage == "back":
+            work.attempts += 1  # the way back failed: without an end it would be tried for ever
         if work.plan is None or work.attempts >= self.config.attempts:
             return self._give_up(sim, problem)
         work.problem = problem

@@ -87,11 +87,14 @@ class ReachBrain(GoalBrain):
                 return self._goal(sim, "home", joint_target=self._home[:-1])
         if seen.environment_state is None:
             raise AssertionError("The brain was bound to a target.")
-        self._tries[sim] += 1
-        self._doing[sim] = "move the tool to the target"
         x, y, z, *quaternion = seen.environment_state[sim, self._columns].tolist()
         # Observations are rounded to single precision, and so is the quaternion's length.
         length = math.sqrt(sum(value * value for value in quaternion))
+        if not (0.5 < length < 2 and math.isfinite(x + y + z)):
+            self._doing[sim] = "give up: there is no target pose"
+            return None
+        self._tries[sim] += 1
+        self._doing[sim] = "move the tool to the target"
         w, i, j, k = (value / length for value in quaternion)
         return self._goal(sim, "reach", target_pose=Pose((x, y, z), (w, i, j, k)))
 

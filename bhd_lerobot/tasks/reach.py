@@ -105,7 +105,10 @@ class ReachTask:
 
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
         """Start episodes in some simulations."""
-        self._target[ids] = [scene.target_pose for scene in scenes]
+        for sim, scene in zip(ids, scenes, strict=True):
+            if scene.target_pose is None:
+                raise ConfigError(f"The scene {scene.name!r} has no target pose to reach.")
+            self._target[sim] = scene.target_pose
         self._within[ids] = self._frame[ids] = 0
         self._started[ids] = False
 
