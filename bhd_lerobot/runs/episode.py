@@ -80,7 +80,6 @@ class EpisodeLoop:
         simulation: the robots.
         task: what is to be achieved.
         brain: what drives them.
-        open_images: called at the start of every episode of a robot with cameras; returns where its images go.
     """
 
     def __init__(
@@ -88,10 +87,9 @@ class EpisodeLoop:
         simulation: Simulation,
         task: Task,
         brain: Brain,
-        open_images: Callable[[], Any] | None = None,
     ) -> None:
         self.simulation, self.task, self.brain = simulation, task, brain
-        self._open_images = open_images
+        self._open_images: Callable[[], Any] | None = None
         self._frames = round(task.duration_s * simulation.rates.fps)
         self._columns: dict[str, NDArray] = {}
         self._length = np.zeros(simulation.n, np.int64)
@@ -100,13 +98,20 @@ class EpisodeLoop:
         environment = task.environment_names
         brain.bind(simulation.observation_names, simulation.action_names, simulation.rates.fps, environment)
 
-    def run(self, specs: Sequence[EpisodeSpec], stop: Callable[[], bool] = lambda: False) -> Iterator[Episode]:
+    def run(
+        self,
+        specs: Sequence[EpisodeSpec],
+        stop: Callable[[], bool] = lambda: False,
+        open_images: Callable[[], Any] | None = None,
+    ) -> Iterator[Episode]:
         """Run episodes and yield them in their order, each as soon as it and all before it are done.
 
         Args:
             specs: the episodes.
             stop: asked between frames; when it says yes, the episodes that run are dropped and the loop ends.
+            open_images: called at the start of every episode of a robot with cameras; returns where its images go.
         """
+        self._open_images = open_images
         waiting = list(reversed(specs))
         done: dict[int, Episode] = {}
         order = [spec.index for spec in specs]

@@ -85,6 +85,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     simulation = make_simulation(config.robot, min(config.n_envs, config.dataset.num_episodes), config.threads)
     task = make_task(config.task, simulation.n, config.dataset.fps)
     brain = make_brain(config.brain)
+    loop = EpisodeLoop(simulation, task, brain)  # a brain that does not fit the robot fails here, likewise
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
     with closing(simulation), stop_on_signals() as stop:
         preview = _make_preview(config, simulation, console)
@@ -95,7 +96,6 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         with _open_recorder(config, root, simulation, task, brain) as recorder:
             if recorder.repair_report:
                 console.print(f"Mended before resuming: {recorder.repair_report}")
-            loop = EpisodeLoop(simulation, task, brain, recorder.begin_episode)
             trajectories, first = _run(config, recorder, loop, result, console)
     if trajectories:
         heading = f"{task.name}, {brain.name}: {result.successes} of {result.recorded} episodes succeeded"
@@ -125,7 +125,7 @@ def _run(
     with _progress(console) as progress:
         bar = progress.add_task("recording", total=len(specs), success="", speed="")
         started = time.perf_counter()
-        for episode in loop.run(specs, lambda: bool(result.stopped_by)):
+        for episode in loop.run(specs, lambda: bool(result.stopped_by), recorder.begin_episode):
             metadata = episode_metadata(episode, split=config.split, task=task.parameters(), brain=brain.parameters())
             _save(recorder, episode, metadata)
             _count(result, episode, config.dataset.fps)

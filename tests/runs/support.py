@@ -12,7 +12,7 @@ from bhd_lerobot.runs.record import RecordResult, record
 
 
 def options(root: Path, **overrides: object) -> list[str]:
-    """Return a short recording's command line; overrides are written with `__` for dots."""
+    """Return a short recording's command line; overrides are written with `__` for dots, None leaves an option out."""
     values: dict[str, object] = {
         "robot.type": "turtlebot3",
         "brain.type": "avoidance",
@@ -26,7 +26,7 @@ def options(root: Path, **overrides: object) -> list[str]:
         "robot.beams": 36,
         **{key.replace("__", "."): value for key, value in overrides.items()},
     }
-    return [f"--{key}={value}" for key, value in values.items()]
+    return [f"--{key}={value}" for key, value in values.items() if value is not None]
 
 
 def run_record(root: Path, **overrides: object) -> tuple[RecordResult, str]:
