@@ -1,0 +1,237 @@
+"""The reach task: scenes that can be done, and its judge on made-up truth."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene, Variation
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.commands import Pose, ResultCode
+from bhd_lerobot.control.kinematics import ArmKinematics
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
+from bhd_lerobot.tasks.task import ArmTruth, Event
+from bhd_lerobot.tasks.variation import RandomisationConfig
+
+FPS = 20
+ARM = ur5()
+KINEMATICS = ArmKinematics(ARM.chain, ARM.limits)
+TARGET = (0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0)
+SCENE = TableScene("reach", (), ARM.home, target_pose=TARGET)
+
+
+class Run:
+    """n episodes to the same target, and what came of them."""
+
+    def __init__(self, config: ReachConfig | None = None, n: int = 1) -> None:
+        self.n, self.task = n, ReachTask(config or ReachConfig(), n, FPS)
+        self.task.begin(np.arange(n), [SCENE] * n)
+        self.running = np.ones(n, np.bool_)
+        self.rewards, self.events = np.zeros(n), np.zeros(n, int)
+        self.frames = np.zeros(n, int)
+
+    def frame(self, away: float | np.ndarray = 0.0, degrees: float = 0.0, **touched: bool) -> np.ndarray:
+        """Judge a frame with the tool this far from the target [m, deg]."""
+        pose = np.tile(TARGET, (self.n, 1))
+        pose[:, 0] += away
+        turned = Rotation.from_euler("y", degrees, degrees=True) * Rotation.from_euler("x", 180, degrees=True)
+        x, y, z, w = turned.as_quat()
+        pose[:, 3:] = w, x, y, z
+        flags = {
+            name: np.full(self.n, touched.get(name, False))
+            for name in ("arm_on_table", "arm_on_object", "self_contact")
+        }
+        truth = ArmTruth(
+            tool_pose=pose,
+            object_poses=np.zeros((self.n, MAX_OBJECTS, 7)),
+            opening=np.zeros(self.n),
+            fingers_on_object=np.zeros((self.n, MAX_OBJECTS), np.bool_),
+            **flags,
+        )
+        reward, event = self.task.judge(truth, self.running.copy())
+        assert (reward[~self.running] == 0).all()
+        assert (event[~self.running] == Event.NOTHING).all()
+        self.rewards += reward
+        self.events = np.where(self.running, event, self.events)
+        self.frames += self.running
+        self.running &= event == Event.NOTHING
+        return reward
+
+    def outcome(self, sim: int = 0):
+        return self.task.outcome(sim, Event(int(self.events[sim])))
+
+
+# --- scenes ----------------------------------------------------------------------------------------------------------
+
+
+def test_equal_seeds_give_equal_episodes_and_others_others() -> None:
+    task = ReachTask(ReachConfig(), 1, FPS)
+    scenes = [task.sample(seed) for seed in (0, 1, 2**62 + 1)]
+    assert scenes == [ReachTask(ReachConfig(), 4, 10).sample(seed) for seed in (0, 1, 2**62 + 1)]
+    assert len({scene.target_pose for scene in scenes}) == len({scene.posture for scene in scenes}) == 3
+
+
+def test_every_target_can_be_reached_and_every_start_is_free() -> None:
+    task = ReachTask(ReachConfig(), 1, FPS)
+    places = []
+    for seed in range(60):
+        scene = task.sample(seed)
+        start = np.array(scene.posture[:6])
+        assert np.abs(start - ARM.home[:6]).max() <= 0.3
+        assert scene.posture[6] == ARM.home[6]
+        assert KINEMATICS.check(start) == ResultCode.SUCCEEDED
+        assert scene.target_pose is not None
+        x, y, z, *quaternion = scene.target_pose
+        pose = Pose((x, y, z), tuple(quaternion))
+        for posture in (start, np.array(ARM.home[:6])):
+            found = KINEMATICS.solve(pose.matrix(), posture)
+            assert found.code == ResultCode.SUCCEEDED
+        assert np.allclose(KINEMATICS.tool(found.postures[0]), pose.matrix(), atol=1e-6)
+        places.append((x, y, z))
+    spread = np.ptp(places, axis=0)
+    assert (spread > [0.4, 0.7, 0.4]).all()  # all over the box, not in one corner of it
+
+
+def test_randomisation_changes_the_world_and_not_the_task() -> None:
+    plain = ReachTask(ReachConfig(), 1, FPS)
+    wild = ReachTask(ReachConfig(randomisation=RandomisationConfig(enabled=True)), 1, FPS)
+    for seed in range(5):
+        one, two = plain.sample(seed), wild.sample(seed)
+        assert (one.target_pose, one.posture) == (two.target_pose, two.posture)
+        assert one.variation == Variation() != two.variation
+
+
+def test_without_spread_it_starts_at_home() -> None:
+    assert ReachTask(ReachConfig(start_spread_rad=0.0), 1, FPS).sample(3).posture == ARM.home
+
+
+def test_the_brain_is_told_the_target() -> None:
+    task = ReachTask(ReachConfig(), 2, FPS)
+    scenes = [task.sample(seed) for seed in (1, 2)]
+    task.begin(np.array([1, 0]), scenes)
+    state = task.environment_state(None)  # type: ignore[arg-type]
+    assert state.tolist() == [list(scenes[1].target_pose or ()), list(scenes[0].target_pose or ())]
+    assert state.shape[1] == len(task.environment_names)
+    state[:] = 0  # a copy
+    assert task.environment_state(None).any()  # type: ignore[arg-type]
+
+
+def test_a_scene_without_a_target_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no target pose"):
+        ReachTask(ReachConfig(), 1, FPS).begin(np.array([0]), [TableScene("empty", (), ARM.home)])
+
+
+# --- judging ---------------------------------------------------------------------------------------------------------
+
+
+def test_success_needs_the_whole_hold_time() -> None:
+    run = Run(ReachConfig(hold_s=0.25))
+    run.frame(0.1)
+    for _ in range(4):
+        run.frame(0.001)
+        assert run.running[0]
+    run.frame(0.001)
+    assert run.events[0] == Event.SUCCESS
+    assert run.frames[0] == 6
+    assert run.outcome().success
+    assert run.outcome().score == 1.0
+
+
+@pytest.mark.parametrize(("away", "degrees"), [(0.0051, 0.0), (0.0, 2.01), (0.0051, 2.01)])
+def test_a_break_starts_the_hold_time_anew(away: float, degrees: float) -> None:
+    run = Run(ReachConfig(hold_s=0.25))
+    for _ in range(4):
+        run.frame()
+    run.frame(away, degrees)
+    for _ in range(4):
+        run.frame()
+        assert run.running[0]
+    run.frame(0.0049, 1.99)  # just within both
+    assert run.events[0] == Event.SUCCESS
+
+
+def test_orientation_counts_and_its_quaternion_s_sign_does_not() -> None:
+    run = Run(ReachConfig(hold_s=0.05))
+    for degrees in (90, 180, 5, -5):
+        run.frame(0.0, degrees)
+        assert run.running[0]
+        assert run.outcome().details["error_rad"] == pytest.approx(math.radians(abs(degrees)), abs=1e-6)
+    run.frame(0.0, 360)
+    assert run.events[0] == Event.SUCCESS
+
+
+def test_too_late_is_a_time_out_and_the_last_frame_is_not_too_late() -> None:
+    run, late = Run(ReachConfig(duration_s=2.0, hold_s=0.5)), Run(ReachConfig(duration_s=2.0, hold_s=0.5))
+    for frame in range(1, 41):
+        run.frame(0.0 if frame > 30 else 0.2)
+        late.frame(0.0 if frame > 31 else 0.2)
+    assert (run.events[0], run.frames[0]) == (Event.SUCCESS, 40)
+    assert (late.events[0], late.frames[0]) == (Event.TIMEOUT, 40)
+    assert not late.outcome().success
+
+
+@pytest.mark.parametrize("touch", ["arm_on_table", "self_contact"])
+@pytest.mark.parametrize("when", [1, 7, 40])
+def test_a_touch_is_a_collision_at_once_even_in_the_last_frame_or_that_of_success(touch: str, when: int) -> None:
+    run = Run(ReachConfig(duration_s=2.0, hold_s=0.35))
+    for frame in range(1, when + 1):
+        run.frame(0.0 if when == 7 else 0.2, **{touch: frame == when})
+    assert (run.events[0], run.frames[0]) == (Event.COLLISION, when)
+    assert not run.outcome().success
+
+
+def test_without_objects_there_is_nothing_else_to_touch() -> None:
+    run = Run()
+    run.frame(0.2, arm_on_object=True)
+    assert run.running[0]
+
+
+@given(st.lists(st.floats(0.006, 0.5), min_size=1, max_size=30))
+def test_the_rewards_sum_to_the_share_of_the_way(path: list[float]) -> None:
+    run = Run()
+    for away in path:
+        run.frame(away)
+    assert run.rewards[0] == pytest.approx(1 - path[-1] / path[0], abs=1e-9)
+    assert run.outcome().score == pytest.approx(min(1.0, max(0.0, run.rewards[0])), abs=1e-9)
+    assert run.outcome().details["error_m"] == pytest.approx(path[-1])
+
+
+def test_episodes_are_independent_and_start_from_nothing() -> None:
+    run = Run(ReachConfig(hold_s=0.25), n=3)
+    for _ in range(3):
+        run.frame(np.array([0.0, 0.3, 0.1]))
+    run.task.begin(np.array([0]), [SCENE])
+    fresh = Run(ReachConfig(hold_s=0.25))
+    for away in (0.2, 0.1, 0.0, 0.0, 0.0, 0.0):
+        reward = run.frame(np.array([away, 0.3, 0.0]))
+        assert reward[0] == fresh.frame(away)[0]
+        assert run.running[0] == fresh.running[0]
+    assert run.events.tolist() == [Event.NOTHING, Event.NOTHING, Event.SUCCESS]
+
+
+# --- configuration ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["duration_s", "tolerance_m", "tolerance_deg", "hold_s"])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_impossible_values_are_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=f"task.{name} is {value}; it must be positive and finite"):
+        ReachConfig(**{name: value})
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, math.nan])
+def test_a_start_too_far_from_home_is_refused(value: float) -> None:
+    with pytest.raises(ConfigError, match=f"task.start_spread_rad is {value}; it must be between 0 and 1"):
+        ReachConfig(start_spread_rad=value)
+
+
+def test_parameters_are_plain_values_that_define_the_task() -> None:
+    config = ReachConfig(hold_s=0.5, randomisation=RandomisationConfig(enabled=True))
+    parameters = ReachTask(config, 1, FPS).parameters()
+    assert parameters.pop("type") == "reach"
+    randomisation = RandomisationConfig(**parameters.pop("randomisation"))
+    assert ReachConfig(**parameters, randomisation=randomisation) == config
