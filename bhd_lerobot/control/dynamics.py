@@ -106,6 +106,11 @@ class ArmDynamics:
         return DynamicsTerms(mass, coriolis, gravity, jacobian, tool)
 
 
+def product(matrices: Array, vectors: Array) -> Array:
+    """Return each matrix, shape (n, i, j), times its vector, shape (n, j); the same bits whatever n is."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
 def _parse(arm: Arm) -> pinocchio.Model:
     """Return the model of the whole MJCF; the parser reads files only."""
     with tempfile.TemporaryDirectory() as folder:

@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.compliance import Compliance, critical_damping
 from bhd_lerobot.control.controller import Controller
-from bhd_lerobot.control.dynamics import ArmDynamics, DynamicsTerms
+from bhd_lerobot.control.dynamics import ArmDynamics, DynamicsTerms, product
 from bhd_lerobot.control.equilibrium import Equilibrium, EquilibriumLimits
 from bhd_lerobot.control.messages import Limit, Mode
 from bhd_lerobot.control.plant import PlantReading
@@ -247,7 +247,7 @@ class ImpedanceController(Controller):
         error = np.empty((self.n, 6))
         error[:, :3] = self.equilibrium.position - terms.tool[:, :3, 3]
         error[:, 3:] = rotation_vectors(self.equilibrium.rotation @ np.swapaxes(terms.tool[:, :3, :3], 1, 2))
-        push = np.einsum("nij,nj->ni", self._stiffness, error) + self.wrench
+        push = product(self._stiffness, error) + self.wrench
         for number, part in enumerate((push[:, :3], push[:, 3:])):
             size, largest = np.linalg.norm(part, axis=1), self._largest[:, number]
             self._limits[size > largest] |= int(Limit.EFFORT)
@@ -256,12 +256,10 @@ class ImpedanceController(Controller):
         if not self._is_fixed.all():
             designed = critical_damping(terms.mobility(_MOBILITY_DAMPING), self._stiffness, self._ratio)
             np.copyto(damping, designed, where=~self._is_fixed[:, None, None])
-        slip = self.equilibrium.speed - np.einsum("nij,nj->ni", terms.jacobian, velocity)
-        push += np.einsum("nij,nj->ni", damping, slip)
-        own = np.einsum("nij,nj->ni", terms.coriolis, velocity) + terms.gravity
-        return np.asarray(
-            np.einsum("nji,nj->ni", terms.jacobian, push) + own - _JOINT_DAMPING * self._effort * velocity
-        )
+        slip = self.equilibrium.speed - product(terms.jacobian, velocity)
+        push += product(damping, slip)
+        own = product(terms.coriolis, velocity) + terms.gravity
+        return product(np.swapaxes(terms.jacobian, 1, 2), push) + own - _JOINT_DAMPING * self._effort * velocity
 
     def _advance_wrench(self) -> None:
         """Move the feed-forward wrench towards what is wanted; none without setpoints, none at once if held."""

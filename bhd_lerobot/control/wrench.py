@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.dynamics import DynamicsTerms
+from bhd_lerobot.control.dynamics import DynamicsTerms, product
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -53,8 +53,8 @@ class ContactObserver:
             velocity: joint speeds that were read [rad/s], shape (n, 6).
             applied: torques that the motors gave since the tick before [N m], shape (n, 6).
         """
-        momentum = np.einsum("nij,nj->ni", terms.mass, velocity)
-        rate = np.einsum("nji,nj->ni", terms.coriolis, velocity) - terms.gravity
+        momentum = product(terms.mass, velocity)
+        rate = product(np.swapaxes(terms.coriolis, 1, 2), velocity) - terms.gravity
         if self._fresh.any():
             np.copyto(self._expected, momentum, where=self._fresh[:, None])
             np.copyto(self._rate, rate, where=self._fresh[:, None])
