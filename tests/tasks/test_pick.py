@@ -1,0 +1,379 @@
+"""The pick task: tables that can be cleared, instructions that name one object, and a judge on made-up truth."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
+from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.grasp import plan_grasp, read_objects
+from bhd_lerobot.policies.language import RulePlanner
+from bhd_lerobot.policies.scene_objects import scene_object
+from bhd_lerobot.tasks.pick import PickConfig, PickTask
+from bhd_lerobot.tasks.task import ArmTruth, Event
+from bhd_lerobot.tasks.variation import RandomisationConfig
+
+FPS = 10
+WILD = RandomisationConfig(enabled=True)
+SCENE = TableScene(
+    name="pick",
+    objects=(
+        TableObject("cup", "red", 0.03, 0.03, 0.10, 0.5, 0.0),
+        TableObject("box", "blue", 0.04, 0.03, 0.06, 0.4, 0.2, yaw=0.7, shade=(0.05, -0.2, 0.5)),
+        TableObject("box", "green", 0.03, 0.02, 0.08, 0.6, -0.2),
+    ),
+    posture=ur5().home,
+    target_object=1,
+    instruction="pick up the blue box",
+)
+TARGET, OTHER = 1, 0
+
+
+def truth_of(scenes: list[TableScene], **flags: bool) -> ArmTruth:
+    """Return the truth when everything stands where the scenes put it and nothing is touched."""
+    n = len(scenes)
+    poses = np.zeros((n, MAX_OBJECTS, 7))
+    poses[..., 3] = 1.0
+    for sim, scene in enumerate(scenes):
+        for number, one in enumerate(scene.objects):
+            poses[sim, number] = (one.x, one.y, one.height / 2, math.cos(one.yaw / 2), 0, 0, math.sin(one.yaw / 2))
+    return ArmTruth(
+        tool_pose=np.tile([0.5, 0.1, 0.3, 0, 1, 0, 0], (n, 1)),
+        object_poses=poses,
+        opening=np.full(n, MAX_OPENING),
+        fingers_on_object=np.zeros((n, MAX_OBJECTS), np.bool_),
+        **{name: np.full(n, flags.get(name, False)) for name in ("arm_on_table", "arm_on_object", "self_contact")},
+    )
+
+
+class Run:
+    """Episodes with one scene, and what came of them."""
+
+    def __init__(self, config: PickConfig | None = None, n: int = 1) -> None:
+        self.n, self.scenes = n, [SCENE] * n
+        self.task = PickTask(config or PickConfig(), n, FPS)
+        self.task.begin(np.arange(n), self.scenes)
+        self.running = np.ones(n, np.bool_)
+        self.rewards, self.events, self.frames = np.zeros(n), np.zeros(n, int), np.zeros(n, int)
+
+    def frame(
+        self,
+        lift: float | np.ndarray = 0.0,
+        gripped: bool = True,
+        other: float = 0.0,
+        at: tuple[float, float] | None = None,
+        **flags: bool,
+    ) -> np.ndarray:
+        """Judge a frame with the target and another object lifted by so much [m]."""
+        truth = truth_of(self.scenes, **flags)
+        truth.object_poses[:, TARGET, 2] += lift
+        truth.object_poses[:, OTHER, 2] += other
+        if at is not None:
+            truth.object_poses[:, TARGET, :2] = at
+        truth.fingers_on_object[:, TARGET] = gripped
+        reward, event = self.task.judge(truth, self.running.copy())
+        assert (reward[~self.running] == 0).all()
+        assert (event[~self.running] == Event.NOTHING).all()
+        self.rewards += reward
+        self.events = np.where(self.running, event, self.events)
+        self.frames += self.running
+        self.running &= event == Event.NOTHING
+        return reward
+
+    def outcome(self, sim: int = 0):
+        return self.task.outcome(sim, Event(int(self.events[sim])))
+
+
+# --- scenes ----------------------------------------------------------------------------------------------------------
+
+
+def corners(one: TableObject) -> np.ndarray:
+    """Return points on the outline of an object, shape (k, 2)."""
+    if one.kind == "cup":
+        angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+        points = one.size_x * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    else:
+        side = np.linspace(-1, 1, 15)
+        edges = [np.stack([side, np.full(15, s)], 1) for s in (-1, 1)]
+        edges += [np.stack([np.full(15, s), side], 1) for s in (-1, 1)]
+        points = np.concatenate(edges) * (one.size_x, one.size_y)
+        c, s = math.cos(one.yaw), math.sin(one.yaw)
+        points = points @ np.array([[c, s], [-s, c]])
+    return points + np.array([one.x, one.y])
+
+
+@pytest.mark.parametrize("randomisation", [RandomisationConfig(), WILD], ids=["nominal", "randomised"])
+def test_objects_stand_apart_in_reach_differ_and_fit_the_gripper(randomisation: RandomisationConfig) -> None:
+    task = PickTask(PickConfig(randomisation=randomisation), 1, FPS)
+    counts = set()
+    for seed in range(150):
+        scene = task.sample(seed)
+        counts.add(len(scene.objects))
+        assert len({one.name for one in scene.objects}) == len(scene.objects)
+        for one in scene.objects:
+            assert 0.35 <= one.x <= 0.65
+            assert -0.30 <= one.y <= 0.30
+            assert 2 * min(one.size_x, one.size_y) + 0.008 <= MAX_OPENING
+            if one.kind == "cup":
+                assert one.size_x == one.size_y
+        for one, two in itertools.combinations(scene.objects, 2):
+            apart = np.linalg.norm(corners(one)[:, None] - corners(two)[None], axis=2).min()
+            assert apart >= 0.05 - 1e-9
+    assert counts == {1, 2, 3, 4, 5}
+
+
+@pytest.mark.parametrize("randomisation", [RandomisationConfig(), WILD], ids=["nominal", "randomised"])
+def test_every_object_can_be_grasped_without_touching_another(randomisation: RandomisationConfig) -> None:
+    task = PickTask(PickConfig(randomisation=randomisation), 1, FPS)
+    for seed in range(80):
+        task.begin(np.array([0]), [task.sample(seed)])
+        state = task.environment_state(truth_of([task.sample(seed)]))
+        objects = read_objects(state.reshape(MAX_OBJECTS, len(OBJECT_FIELDS)))
+        for one in objects:
+            grasp = plan_grasp(one, [other for other in objects if other.index != one.index], MAX_OPENING)
+            assert grasp is not None
+            assert grasp.room > 0
+
+
+def test_equal_seeds_give_equal_episodes_and_others_others() -> None:
+    for config in (PickConfig(), PickConfig(language="any", randomisation=WILD)):
+        scenes = [PickTask(config, 1, FPS).sample(seed) for seed in (0, 1, 2**62 + 1)]
+        assert scenes == [PickTask(config, 3, 25).sample(seed) for seed in (0, 1, 2**62 + 1)]
+        assert len({scene.objects for scene in scenes}) == 3
+
+
+@pytest.mark.parametrize(("least", "most"), [(1, 1), (3, 3), (2, 5)])
+def test_the_number_of_objects_is_as_asked_for(least: int, most: int) -> None:
+    task = PickTask(PickConfig(min_objects=least, max_objects=most), 1, FPS)
+    assert {len(task.sample(seed).objects) for seed in range(60)} == set(range(least, most + 1))
+
+
+@pytest.mark.parametrize("randomisation", [RandomisationConfig(), WILD], ids=["nominal", "randomised"])
+@pytest.mark.parametrize("language", ["en", "zh", "any"])
+def test_the_instruction_means_the_target_and_nothing_else(language: str, randomisation: RandomisationConfig) -> None:
+    """Also by the colours that a brain sees, which randomisation has changed."""
+    task = PickTask(PickConfig(language=language, randomisation=randomisation), 1, FPS)
+    chinese = 0
+    for seed in range(220):
+        scene = task.sample(seed)
+        task.begin(np.array([0]), [scene])
+        state = task.environment_state(truth_of([scene]))
+        seen = [scene_object(one) for one in read_objects(state.reshape(MAX_OBJECTS, len(OBJECT_FIELDS)))]
+        assert [one.name for one in seen] == [one.name for one in scene.objects]
+        assert RulePlanner().plan(task.instruction(scene), seen).target == scene.target_object
+        chinese += not scene.instruction.isascii()
+    assert chinese == {"en": 0, "zh": 220}.get(language, chinese)
+    if language == "any":
+        assert 70 < chinese < 150
+
+
+# --- what the brain is told ------------------------------------------------------------------------------------------
+
+
+def test_the_environment_state_is_what_its_names_say() -> None:
+    task = PickTask(PickConfig(), 2, FPS)
+    empty = TableScene("pick", SCENE.objects[:1], SCENE.posture, target_object=0)
+    task.begin(np.array([0, 1]), [SCENE, empty])
+    truth = truth_of([SCENE, empty])
+    truth.object_poses[0, 1, :3] = 0.45, 0.21, 0.15  # lifted, in the base frame
+    state = task.environment_state(truth)
+    assert state.shape == (2, len(task.environment_names)) == (2, MAX_OBJECTS * len(OBJECT_FIELDS))
+    told = [dict(zip(task.environment_names, row.tolist(), strict=True)) for row in state]
+
+    def of(sim: int, number: int, *names: str) -> list[float]:
+        return [told[sim][f"object_{number}_{name}"] for name in names]
+
+    assert of(0, 0, "present", "target", "box") == [1, 0, 0]
+    assert of(0, 1, "present", "target", "box") == [1, 1, 1]
+    assert of(0, 3, "present", "target", "box") == [0, 0, 0]
+    assert of(0, 1, "x", "y", "z") == [0.45, 0.21, 0.15]
+    assert of(0, 1, "qw", "qx", "qy", "qz") == pytest.approx([math.cos(0.35), 0, 0, math.sin(0.35)])
+    assert of(0, 1, "length", "width", "height") == pytest.approx([0.08, 0.06, 0.06])
+    red, green, _ = COLOURS["blue"]
+    assert of(0, 1, "red", "green", "blue") == pytest.approx([red + 0.05, green - 0.2, 1.0])  # at most 1
+    for sim, number in ((0, 3), (0, 4), (1, 1), (1, 4)):
+        assert of(sim, number, *OBJECT_FIELDS) == [0] * 6 + [1] + [0] * 9
+    assert of(1, 0, "present", "target") == [1, 1]
+
+
+def test_a_smaller_table_leaves_nothing_of_a_larger_one() -> None:
+    used, fresh = PickTask(PickConfig(), 1, FPS), PickTask(PickConfig(), 1, FPS)
+    small = TableScene("pick", SCENE.objects[2:], SCENE.posture, target_object=0)
+    used.begin(np.array([0]), [SCENE])
+    for task in (used, fresh):
+        task.begin(np.array([0]), [small])
+    assert np.array_equal(used.environment_state(truth_of([small])), fresh.environment_state(truth_of([small])))
+
+
+def test_a_scene_without_a_target_is_refused() -> None:
+    with pytest.raises(ConfigError, match="names no object"):
+        PickTask(PickConfig(), 1, FPS).begin(np.array([0]), [TableScene("empty", (), SCENE.posture)])
+
+
+# --- judging ---------------------------------------------------------------------------------------------------------
+
+
+def test_success_needs_the_whole_hold_time() -> None:
+    run = Run(PickConfig(hold_s=1.0))
+    run.frame(0.05)
+    for _ in range(9):
+        run.frame(0.11)
+        assert run.running[0]
+    run.frame(0.11)
+    assert (run.events[0], run.frames[0]) == (Event.SUCCESS, 11)
+    assert run.outcome().success
+    assert run.outcome().score == 1.0
+    assert run.rewards[0] == pytest.approx(1.0)
+    assert run.outcome().details == {"lifted_m": pytest.approx(0.11), "objects": 3.0}
+
+
+@pytest.mark.parametrize("frame", [{"lift": 0.099}, {"lift": 0.11, "gripped": False}])
+def test_a_break_starts_the_hold_time_anew(frame: dict) -> None:
+    run = Run(PickConfig(hold_s=1.0))
+    for _ in range(9):
+        run.frame(0.11)
+    run.frame(**frame)
+    for _ in range(9):
+        run.frame(0.11)
+        assert run.running[0]
+    run.frame(0.11)
+    assert run.events[0] == Event.SUCCESS
+
+
+def test_thrown_into_the_air_it_is_not_held() -> None:
+    run = Run(PickConfig(hold_s=0.5))
+    for _ in range(20):
+        run.frame(0.3, gripped=False)
+    assert run.events[0] == Event.NOTHING
+
+
+def test_what_was_up_and_is_down_again_was_dropped() -> None:
+    run = Run()
+    for lift in (0.0, 0.03, 0.051, 0.03, 0.016):
+        run.frame(lift)
+        assert run.running[0]  # on its way down it may be carried
+    run.frame(0.014)
+    assert run.events[0] == Event.DROPPED
+    assert run.outcome().score == pytest.approx(0.9 * 0.51)
+    assert not run.outcome().success
+
+
+def test_what_was_hardly_lifted_may_be_put_down_to_try_again() -> None:
+    run = Run()
+    for lift in (0.0, 0.049, 0.0, 0.049, 0.0):
+        run.frame(lift)
+    assert run.events[0] == Event.NOTHING
+
+
+def test_to_lift_another_object_is_wrong_whatever_else_happens_and_to_brush_it_is_not() -> None:
+    run = Run()
+    run.frame(0.0, other=0.029)
+    assert run.running[0]
+    run.frame(0.0, other=0.031)
+    assert run.events[0] == Event.WRONG_OBJECT
+    both = Run(PickConfig(hold_s=0.1))
+    both.frame(0.2, other=0.2)
+    assert both.events[0] == Event.WRONG_OBJECT
+    assert not both.outcome().success
+
+
+@pytest.mark.parametrize("touch", ["arm_on_table", "arm_on_object", "self_contact"])
+@pytest.mark.parametrize("when", [1, 10, 50])
+def test_a_touch_is_a_collision_at_once_even_in_the_last_frame_or_that_of_success(touch: str, when: int) -> None:
+    run = Run(PickConfig(duration_s=5.0, hold_s=1.0))
+    for frame in range(1, when + 1):
+        run.frame(0.11 if when == 10 else 0.0, **{touch: frame == when})
+    assert (run.events[0], run.frames[0]) == (Event.COLLISION, when)
+    assert not run.outcome().success
+    assert run.outcome().score <= 0.9
+
+
+@pytest.mark.parametrize("at", [(0.81, 0.0), (0.58, 0.58), (-0.4, -0.7)])
+def test_pushed_out_of_reach_is_unreachable(at: tuple[float, float]) -> None:
+    run = Run()
+    run.frame(at=(0.79, 0.0))
+    assert run.running[0]
+    run.frame(at=at)
+    assert run.events[0] == Event.UNREACHABLE
+
+
+def test_off_the_table_is_unreachable() -> None:
+    run = Run()
+    run.frame(-0.2, at=(0.5, 0.5))
+    assert run.events[0] == Event.UNREACHABLE
+
+
+def test_too_late_is_a_time_out_and_the_last_frame_is_not_too_late() -> None:
+    run, late = Run(PickConfig(duration_s=3.0)), Run(PickConfig(duration_s=3.0))
+    for frame in range(1, 31):
+        run.frame(0.11 if frame > 20 else 0.0)
+        late.frame(0.11 if frame > 21 else 0.0)
+    assert (run.events[0], run.frames[0]) == (Event.SUCCESS, 30)
+    assert (late.events[0], late.frames[0]) == (Event.TIMEOUT, 30)
+
+
+@given(st.lists(st.tuples(st.floats(-0.02, 0.2), st.booleans(), st.integers(0, 30)), max_size=40))
+def test_the_rewards_sum_to_the_score_and_never_take_away(frames: list[tuple[float, bool, int]]) -> None:
+    run = Run(PickConfig(hold_s=0.3, duration_s=3.0))
+    for lift, gripped, luck in frames:
+        reward = run.frame(lift, gripped, other=0.1 if luck == 0 else 0.0, arm_on_table=luck == 1)
+        assert reward[0] >= 0
+    assert run.rewards[0] == pytest.approx(run.outcome().score, abs=1e-12)
+    assert 0 <= run.outcome().score <= 1
+    assert (run.outcome().score == 1) == run.outcome().success
+
+
+def test_places_without_an_object_lie_at_the_origin_and_are_nobody_s_business() -> None:
+    run = Run()
+    truth = truth_of(run.scenes)
+    truth.object_poses[:, 3:, 2] = 5.0
+    _, event = run.task.judge(truth, run.running)
+    assert event[0] == Event.NOTHING
+
+
+def test_episodes_are_independent_and_start_from_nothing() -> None:
+    run = Run(n=3)
+    for _ in range(5):
+        run.frame(np.array([0.08, 0.0, 0.12]))
+    run.task.begin(np.array([0]), [SCENE])
+    fresh = Run()
+    for lift in (0.0, 0.02, *(0.12,) * 10):
+        reward = run.frame(np.array([lift, 0.0, 0.12]))
+        assert reward[0] == fresh.frame(lift)[0]
+        assert run.running[0] == fresh.running[0]
+    assert run.events.tolist() == [Event.SUCCESS, Event.NOTHING, Event.SUCCESS]
+    assert run.frames.tolist() == [17, 17, 10]
+
+
+# --- configuration ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["duration_s", "lift_m", "hold_s"])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_impossible_values_are_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=f"task.{name} is {value}; it must be positive and finite"):
+        PickConfig(**{name: value})
+
+
+@pytest.mark.parametrize(("least", "most"), [(0, 3), (1, 6), (3, 2), (-1, -1)])
+def test_an_impossible_number_of_objects_is_refused(least: int, most: int) -> None:
+    with pytest.raises(ConfigError, match=f"min_objects is {least} and task.max_objects is {most}.*between 1 and 5"):
+        PickConfig(min_objects=least, max_objects=most)
+
+
+def test_an_unknown_language_is_an_error_with_the_valid_ones() -> None:
+    with pytest.raises(ConfigError, match=r"task.language 'de'.*Valid: any, en, zh"):
+        PickConfig(language="de")
+
+
+def test_parameters_are_plain_values_that_define_the_task() -> None:
+    config = PickConfig(lift_m=0.2, language="any", randomisation=WILD)
+    parameters = PickTask(config, 1, FPS).parameters()
+    assert parameters.pop("type") == "pick"
+    randomisation = RandomisationConfig(**parameters.pop("randomisation"))
+    assert PickConfig(**parameters, randomisation=randomisation) == config
