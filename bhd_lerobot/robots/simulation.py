@@ -152,9 +152,9 @@ class Simulation(ABC):
         """Do what a tick brings with it: sensors with a rhythm of their own."""
         return
 
-    def _applied(self) -> NDArray[np.float64]:
-        """Return the command in the space of the actions, shape (n, actions)."""
-        return self.cerebellum.command.copy()
+    def to_action(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return commands of the cerebellum, shape (n, width), in the space of the actions, shape (n, actions)."""
+        return command.copy()
 
     def _setpoints(
         self, action: NDArray[np.float64], mask: NDArray[np.bool_]
@@ -252,7 +252,7 @@ class Simulation(ABC):
             if done:
                 results[sim] = done
         return FrameReport(
-            applied=self._applied(),
+            applied=self.to_action(self.cerebellum.command),
             sent=sent,
             limits=limits,
             watchdog=watchdog,

@@ -106,8 +106,8 @@ class UR5Simulation(Simulation):
 
     # --- tool space ---------------------------------------------------------------------------------------------------
 
-    def _applied(self) -> NDArray[np.float64]:
-        command = self.cerebellum.command
+    def to_action(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return joint positions and openings as actions: as they are, or as tool poses."""
         if self.config.action_space == "joint":
             return command.copy()
         tool = pose_vectors(self.kinematics.tool(command[:, :-1]))

@@ -1,6 +1,5 @@
 """Any brain as a LeRobot teleoperator, so that the stock command lines can be driven by it."""
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from bhd_lerobot.policies.brain import Brain, Goals, Observation
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
 from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
 from bhd_lerobot.runs.goal_streamer import GoalStreamer
-from bhd_lerobot.runs.registry import action_names_of, make_brain
+from bhd_lerobot.runs.registry import action_names_of, make_brain, robot_of_brain
 
 
 class BhdBrain(Teleoperator):
@@ -40,10 +39,14 @@ class BhdBrain(Teleoperator):
         self._streamer: GoalStreamer | None = None
         self._results: list[CommandResult] = []
 
-    @cached_property
+    @property
     def action_features(self) -> dict[str, type]:
-        """The actions that it gives: those of the robots that the brain is for."""
-        return dict.fromkeys(action_names_of(self.config.brain), float)
+        """The actions that it gives: those of the robot that it drives, if that is connected already."""
+        names = action_names_of(self.config.brain)
+        robots = connected_robots()
+        if len(robots) == 1 and robots[0].name == robot_of_brain(self.config.brain):
+            names = robots[0].action_names
+        return dict.fromkeys(names, float)
 
     @property
     def feedback_features(self) -> dict[str, type]:
@@ -109,15 +112,13 @@ class BhdBrain(Teleoperator):
     def _stream(self, robot: SimulatedRobot, goals: Goals) -> tuple[NDArray[np.float64], list[CommandResult]]:
         """Return the setpoint that goals mean for the coming frame, and the goals that ended."""
         body, rates = robot.simulation.body, robot.simulation.rates
-        if not isinstance(body, Arm) or robot.action_names != body.limits.names:
-            raise ConfigError(
-                f"The brain {self._brain_name!r} gives goals, which become joint positions; {robot} takes "
-                f"{', '.join(robot.action_names)}. Use a ur5 with robot.action_space = joint."
-            )
+        if not isinstance(body, Arm):
+            raise ConfigError(f"The brain {self._brain_name!r} gives goals; {robot} takes none. Use a ur5.")
         if self._streamer is None:
             self._streamer = GoalStreamer(body, rates, robot.simulation.cerebellum.command[0])
         reading = robot.simulation.bridge.state()
-        return self._streamer.frame(goals.commands.get(0, ()), reading.joint_positions[0])
+        reference, results = self._streamer.frame(goals.commands.get(0, ()), reading.joint_positions[0])
+        return robot.simulation.to_action(reference[None])[0], results
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Do nothing: a brain feels no feedback."""

@@ -49,4 +49,6 @@ class GoalStreamer:
             reading.velocity[0] = controller.velocity[0]
             reading.position[0] = controller.command[0] + behind
             controller.run(reading)
-        return controller.command[0].copy(), refused + controller.take_results(0)
+        # A refusal is among the results, too, unless another goal has its name.
+        ended = controller.take_results(0)
+        return controller.command[0].copy(), [one for one in refused if one not in ended] + ended

@@ -57,10 +57,15 @@ def make_brain(config: BrainConfig) -> Brain:
 
 def action_names_of(config: BrainConfig) -> tuple[str, ...]:
     """Return the names of the actions of the robots that a brain is for."""
-    brain: Any = _BRAINS[type(config)]
     simulations = {kind.get_choice_name(kind): simulation for kind, simulation in _SIMULATIONS.items()}
-    simulation: Any = simulations[brain.robot_type]
+    simulation: Any = simulations[robot_of_brain(config)]
     return tuple(simulation.action_names)
+
+
+def robot_of_brain(config: BrainConfig) -> str:
+    """Return the type of the robot that a brain is for."""
+    brain: Any = _BRAINS[type(config)]
+    return str(brain.robot_type)
 
 
 def robot_of_task(config: TaskConfig) -> str:

@@ -32,7 +32,11 @@ def robot(tmp_path):
 
 def stay(robot) -> dict[str, float]:
     """Return the action that leaves the robot where it is commanded to be."""
-    return dict(zip(robot.action_names, robot.simulation._applied()[0].tolist(), strict=True))
+    return dict(
+        zip(
+            robot.action_names, robot.simulation.to_action(robot.simulation.cerebellum.command)[0].tolist(), strict=True
+        )
+    )
 
 
 @pytest.mark.parametrize("space", ["joint", "tool"])
@@ -208,7 +212,7 @@ def test_one_refused_arm_does_not_hinder_the_others():
     simulation = UR5Simulation(UR5Config(action_space="tool"), 3)
     scene = TableScene("empty", (), simulation.body.home)
     simulation.reset(np.arange(3), [scene] * 3, [0, 1, 2])
-    action = simulation._applied()
+    action = simulation.to_action(simulation.cerebellum.command)
     action[1, 0] = 5.0
     action[:, 2] += 0.001
     report = simulation.act(action)

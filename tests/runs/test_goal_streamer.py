@@ -1,0 +1,122 @@
+"""Goals as setpoints: what a brain that gives goals does to a robot that takes setpoints only."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.language_brain import LanguageBrainConfig
+from bhd_lerobot.policies.pick import PickBrainConfig
+from bhd_lerobot.policies.reach import ReachBrainConfig
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.runs.bhd_brain import BhdBrain
+from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
+from bhd_lerobot.runs.goal_streamer import GoalStreamer
+
+CONFIG = UR5Config()
+ARM, RATES = CONFIG.body(), CONFIG.rates
+HOME = np.array(ARM.home)
+
+
+def drive(tmp_path, brain, frames=125, **options):
+    """Let a brain drive a robot as lerobot-record does; return the robot's truth, its scene and the brain."""
+    config = BhdBrainConfig(calibration_dir=tmp_path, brain=brain)
+    with UR5(UR5Config(calibration_dir=tmp_path, **options)) as robot, BhdBrain(config) as teleop:
+        assert list(teleop.action_features) == list(robot.action_features)
+        for _ in range(frames):
+            robot.get_observation()
+            asked = teleop.get_action()
+            applied = robot.send_action(asked)
+            assert applied == pytest.approx(asked, abs=5e-3)  # goals never ask for more than the limits
+        return robot.simulation.truth(), robot._scene, teleop._brain
+
+
+@pytest.mark.parametrize(
+    ("brain", "seed", "space"), [(PickBrainConfig(), 0, "joint"), (LanguageBrainConfig(), 1, "tool")]
+)
+def test_a_pick_brain_picks_through_setpoints(tmp_path, brain, seed, space):
+    truth, scene, _ = drive(tmp_path, brain, scene="pick", seed=seed, action_space=space)
+    target = scene.target_object
+    assert truth.object_poses[0, target, 2] > scene.objects[target].height / 2 + 0.1
+    assert truth.fingers_on_object[0].tolist() == [number == target for number in range(5)]
+
+
+def test_a_reach_brain_reaches_through_setpoints(tmp_path):
+    truth, scene, _ = drive(tmp_path, ReachBrainConfig(), frames=80, scene="reach", seed=3)
+    assert truth.tool_pose[0, :3] == pytest.approx(scene.target_pose[:3], abs=1e-3)
+
+
+def test_a_goal_that_fails_is_told_to_the_brain(tmp_path):
+    _, _, brain = drive(tmp_path, LanguageBrainConfig(instruction="pick up the elephant"), frames=3, scene="pick")
+    assert "elephant" in brain.plan(0)["problem"]
+
+
+def test_a_brain_without_its_scene_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="object_0_present"):
+        drive(tmp_path, PickBrainConfig(), scene="empty")
+
+
+def drain(streamer, commands, frames=100, behind=0.0):
+    """Feed goals, then let frames go by; return the reference at the end of every frame and the results."""
+    references, results = [], []
+    measured = HOME.copy()
+    for frame in range(frames):
+        reference, ended = streamer.frame(commands if frame == 0 else (), measured)
+        references.append(reference)
+        results += ended
+        measured = reference - behind
+    return np.array(references), results
+
+
+def test_the_stream_is_the_trajectory_of_the_goal():
+    goal = BrainCommand("a", target_pose=Pose((0.4, 0.1, 0.3), (0.0, 1.0, 0.0, 0.0)), gripper=0.03)
+    references, results = drain(GoalStreamer(ARM, RATES, HOME), [goal])
+    assert [(one.task_id, one.code) for one in results] == [("a", ResultCode.SUCCEEDED)]
+    speed = np.abs(np.diff(references, axis=0)) * RATES.fps
+    assert (speed <= np.array(ARM.limits.velocity) + 1e-9).all()
+    assert references[-1, 6] == pytest.approx(0.03)
+    assert np.array_equal(references[-1], references[-5])
+
+
+def test_refusals_and_tolerances_come_back():
+    bad = BrainCommand("a", target_pose=Pose((0.4, 0.1, 0.3), (0.0, 2.0, 0.0, 0.0)))
+    assert [one.code for one in drain(GoalStreamer(ARM, RATES, HOME), [bad], 2)[1]] == [ResultCode.NOT_NORMALISED]
+    far = BrainCommand("a", joint_target=tuple(HOME[:6] + 0.5))
+    stuck = np.full(7, 0.2)  # the arm stays behind: something is in its way
+    assert [one.code for one in drain(GoalStreamer(ARM, RATES, HOME), [far], 60, stuck)[1]] == [
+        ResultCode.PATH_TOLERANCE
+    ]
+
+
+def test_stock_record_and_replay_work(tmp_path):
+    """`lerobot-record` and `lerobot-replay`, in one process because importing LeRobot takes seconds."""
+    root = tmp_path / "stock"
+    code = f"""
+import sys
+from lerobot.scripts import lerobot_record, lerobot_replay
+common = ["--robot.type=ur5", "--robot.scene=pick", "--play_sounds=false", "--dataset.root={root}"]
+sys.argv = ["lerobot-record", *common, "--dataset.repo_id=test/stock", "--teleop.type=bhd_brain",
+            "--teleop.brain.type=pick", "--dataset.single_task=Pick it up.", "--dataset.fps=25",
+            "--dataset.num_episodes=1", "--dataset.episode_time_s=1", "--dataset.reset_time_s=0",
+            "--dataset.push_to_hub=false"]
+lerobot_record.main()
+from lerobot.datasets import LeRobotDataset
+dataset = LeRobotDataset("test/stock", root="{root}")
+assert dataset.meta.robot_type == "ur5", dataset.meta.robot_type
+assert dataset[0]["observation.state"].shape == (14,)
+print("FRAMES", dataset.num_frames, dataset[dataset.num_frames - 1]["action"].tolist())
+sys.argv = ["lerobot-replay", *common, "--dataset.repo_id=test/stock", "--dataset.episode=0"]
+lerobot_replay.main()
+print("REPLAYED")
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert result.returncode == 0, result.stderr[-3000:]
+    line = next(line for line in result.stdout.splitlines() if line.startswith("FRAMES"))
+    assert 5 <= int(line.split()[1]) <= 26
+    assert not np.allclose(json.loads(line.split(" ", 2)[2]), HOME, atol=0.05)  # it was on its way
+    assert "REPLAYED" in result.stdout
