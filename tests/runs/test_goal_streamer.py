@@ -86,7 +86,7 @@ def test_the_stream_is_the_trajectory_of_the_goal():
 def test_refusals_and_tolerances_come_back():
     bad = BrainCommand("a", target_pose=Pose((0.4, 0.1, 0.3), (0.0, 2.0, 0.0, 0.0)))
     assert [one.code for one in drain(GoalStreamer(ARM, RATES, HOME), [bad], 2)[1]] == [ResultCode.NOT_NORMALISED]
-    far = BrainCommand("a", joint_target=tuple(HOME[:6] + 0.5))
+    far = BrainCommand("a", joint_target=(HOME[0] - 0.5, *HOME[1:6]))
     stuck = np.full(7, 0.2)  # the arm stays behind: something is in its way
     assert [one.code for one in drain(GoalStreamer(ARM, RATES, HOME), [far], 60, stuck)[1]] == [
         ResultCode.PATH_TOLERANCE
