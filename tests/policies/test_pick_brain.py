@@ -1,0 +1,315 @@
+"""The scripted pick: its goals one by one on a made-up table, and a few picks in the simulator."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.tabletop import TableObject
+from bhd_lerobot.bodies.ur5 import MAX_OPENING
+from bhd_lerobot.control.commands import CommandResult, ResultCode
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import Goals, Observation
+from bhd_lerobot.policies.pick import PickBrain, PickBrainConfig
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+from bhd_lerobot.runs.episode import Episode, EpisodeLoop, EpisodeSpec
+from bhd_lerobot.tasks.pick import PickConfig, PickTask
+from bhd_lerobot.tasks.task import Event, episode_seed
+from tests.policies.arm_desk import BOX, CUP, OBSERVED, Desk, scene
+
+GRASPED = 0.06  # [m] the opening when the cup is between the fingers
+
+
+def grasp(desk: Desk, sim: int = 0, opening: float = GRASPED) -> None:
+    """Let a simulation get to the end of its grasp."""
+    while desk.steps(sim)[-1] != "close":
+        assert desk.end(sim) is not None
+    desk.state[sim, 1] = opening
+
+
+# --- the sequence ----------------------------------------------------------------------------------------------------
+
+
+def test_above_down_close_lift_and_done() -> None:
+    desk = Desk(PickBrain(), [scene(CUP, BOX)])
+    above = desk.look()[0]
+    assert above.target_pose is not None
+    assert above.target_pose.position[:2] == pytest.approx((CUP.x, CUP.y))
+    assert above.target_pose.position[2] > CUP.height + 0.1  # an open hand passes over all objects
+    assert 2 * CUP.size_x < (above.gripper or 0) <= MAX_OPENING
+    down = desk.end()
+    assert down is not None
+    assert down.target_pose is not None
+    assert (down.motion, down.gripper) == ("line", None)
+    assert 0 < down.target_pose.position[2] < CUP.height
+    assert down.target_pose.quaternion == above.target_pose.quaternion
+    close = desk.end()
+    assert close is not None
+    assert close.target_pose is None
+    assert 0 <= (close.gripper or 0) < 2 * CUP.size_x
+    desk.state[0, 1] = GRASPED
+    lift = desk.end()
+    assert lift is not None
+    assert lift.target_pose is not None
+    assert lift.gripper is None  # it stays closed
+    assert lift.motion == "line"
+    assert lift.target_pose.position == pytest.approx(
+        (*down.target_pose.position[:2], down.target_pose.position[2] + 0.15)
+    )
+    desk.lift(0)
+    assert desk.end() is None
+    assert desk.steps() == ["above", "down", "close", "lift"]
+    for _ in range(3):
+        assert desk.look() == {}
+    plan = desk.brain.plan(0)
+    assert (plan["target"], plan["problem"], plan["attempts"]) == (0, "", 1)
+    assert [skill for skill, _ in plan["steps"]] == ["locate", "approach", "grasp", "lift", "hold"]
+
+
+def test_it_says_what_it_is_doing() -> None:
+    desk = Desk(PickBrain(), [scene(CUP)])
+    said = []
+    desk.look()
+    for _ in range(3):
+        said.append(desk.brain.subtasks()[0])
+        desk.state[0, 1] = GRASPED
+        desk.end()
+    said.append(desk.brain.subtasks()[0])
+    assert said == ["move the gripper to the red cup"] * 2 + ["close the gripper on the red cup", "lift the red cup"]
+
+
+def test_it_picks_the_object_that_the_task_marks() -> None:
+    desk = Desk(PickBrain(), [scene(CUP, BOX, target=1)])
+    above = desk.look()[0]
+    assert above.target_pose is not None
+    assert above.target_pose.position[:2] == pytest.approx((BOX.x, BOX.y))
+
+
+def test_one_goal_at_a_time() -> None:
+    desk = Desk(PickBrain(), [scene(CUP)])
+    assert set(desk.look()) == {0}
+    for _ in range(5):
+        assert desk.look() == {}
+
+
+def test_results_of_other_goals_are_not_its_own() -> None:
+    desk = Desk(PickBrain(), [scene(CUP), scene(CUP)])
+    desk.look()
+    stray = [CommandResult(name, ok, ResultCode.SUCCEEDED, "") for name in ("", "1", "above") for ok in (True, False)]
+    assert desk.look({0: stray}) == {}
+    mine = CommandResult(desk.given[0][0].task_id, True, ResultCode.SUCCEEDED, "")
+    new = desk.look({0: [*stray, mine], 7: [mine]})
+    assert set(new) == {0}
+    assert desk.steps(0) == ["above", "down"]
+
+
+# --- what goes wrong -------------------------------------------------------------------------------------------------
+
+
+def test_a_missed_grasp_is_tried_exactly_once_more() -> None:
+    desk = Desk(PickBrain(), [scene(CUP)])
+    desk.look()
+    grasp(desk, opening=0.031)  # closed to where it was sent: nothing between the fingers
+    back = desk.end()
+    assert back is not None
+    assert back.target_pose is not None
+    assert back.gripper == MAX_OPENING
+    assert back.target_pose.position[2] > CUP.height + 0.1
+    desk.put(0, 0, dataclasses.replace(CUP, x=0.55), True)  # it was pushed
+    desk.end()
+    assert desk.given[0][-1].target_pose.position[0] == pytest.approx(0.55)  # where it is now
+    grasp(desk, opening=0.031)
+    assert desk.end() is None
+    assert desk.steps() == ["above", "down", "close", "back", "above", "down", "close"]
+    assert desk.look() == {}
+    assert "31 mm and holds nothing" in desk.brain.plan(0)["problem"]
+    assert desk.brain.subtasks()[0].startswith("cannot: the gripper closed to 31 mm")
+    assert desk.brain.plan(0)["attempts"] == 2
+
+
+def test_after_a_second_attempt_that_holds_it_goes_on() -> None:
+    desk = Desk(PickBrain(), [scene(CUP)])
+    desk.look()
+    grasp(desk, opening=0.031)
+    desk.end()
+    grasp(desk)
+    desk.end()
+    desk.lift(0)
+    assert desk.end() is None
+    assert desk.steps()[-4:] == ["above", "down", "close", "lift"]
+    assert desk.brain.subtasks()[0] == "hold the red cup still"
+
+
+def test_what_slipped_out_on_the_way_up_is_tried_again() -> None:
+    desk = Desk(PickBrain(), [scene(CUP)])
+    desk.look()
+    grasp(desk)
+    desk.end()
+    desk.lift(0, by=0.04)
+    desk.end()
+    assert desk.steps()[-1] == "back"
+    assert desk.brain.plan(0)["problem"] == "the object was not lifted"
+
+
+@pytest.mark.parametrize("when", ["above", "down", "close", "lift"])
+def test_a_failed_goal_is_tried_again(when: str) -> None:
+    desk = Desk(PickBrain(), [scene(CUP)])
+    desk.look()
+    desk.state[0, 1] = GRASPED
+    while desk.steps()[-1] != when:
+        desk.end()
+    desk.end(success=False, message="something is in its way")
+    assert desk.steps()[-1] == "back"
+    assert desk.brain.plan(0)["problem"] == "something is in its way"
+    desk.end()
+    assert desk.steps()[-1] == "above"
+
+
+@pytest.mark.parametrize("attempts", [1, 2, 5])
+def test_when_every_goal_fails_it_gives_up_in_the_end(attempts: int) -> None:
+    desk = Desk(PickBrain(PickBrainConfig(attempts=attempts)), [scene(CUP)])
+    desk.look()
+    for _ in range(2 * attempts):
+        if desk.end(success=False, message="no way") is None:
+            break
+    assert desk.look() == {}
+    assert desk.brain.subtasks()[0] == "cannot: no way"
+    assert desk.steps().count("above") <= attempts
+    assert len(desk.steps()) <= 2 * attempts
+
+
+@pytest.mark.parametrize("what", ["absent", "unmarked", "nan"])
+def test_without_a_target_it_does_nothing_and_says_why(what: str) -> None:
+    desk = Desk(PickBrain(), [scene(CUP, BOX), scene(CUP)])
+    if what == "nan":
+        desk.table[0, 0, 4] = np.nan
+    else:
+        desk.table[0, 0, 0 if what == "absent" else 1] = 0
+    assert set(desk.look()) == {1}
+    assert desk.brain.subtasks()[0].startswith("cannot: No object on the table")
+    assert desk.brain.plan(0)["target"] is None
+
+
+@pytest.mark.parametrize("column", [0, 3])
+def test_a_target_that_vanishes_is_given_up(column: int) -> None:
+    desk = Desk(PickBrain(), [scene(CUP)])
+    desk.look()
+    desk.table[0, 0, column] = np.nan if column else 0.0
+    assert desk.end() is None
+    assert desk.brain.subtasks()[0] == "cannot: the object is gone"
+
+
+def test_what_does_not_fit_between_the_fingers_is_not_tried() -> None:
+    desk = Desk(PickBrain(), [scene(TableObject("box", "green", 0.05, 0.05, 0.1, 0.5, 0.0))])
+    assert desk.look() == {}
+    assert "green box does not fit" in desk.brain.plan(0)["problem"]
+
+
+# --- many, again -----------------------------------------------------------------------------------------------------
+
+
+def test_simulations_do_not_influence_each_other() -> None:
+    """Three at once, each with a story of its own, and the same three alone."""
+    scenes = [scene(CUP), scene(BOX, CUP), scene(CUP, BOX, target=1)]
+    together, alone = Desk(PickBrain(), scenes), [Desk(PickBrain(), [one]) for one in scenes]
+    together.look()
+    for desk in alone:
+        desk.look()
+    rng = np.random.default_rng(0)
+    for _ in range(25):
+        sim = int(rng.integers(3))
+        if alone[sim].brain.subtasks()[0].startswith(("hold", "cannot")):
+            continue
+        opening, success = float(rng.choice([0.02, 0.06])), bool(rng.random() < 0.8)
+        together.state[sim, 1] = alone[sim].state[0, 1] = opening
+        assert together.end(sim, success, "x") == alone[sim].end(0, success, "x")
+        assert together.brain.plan(sim) == alone[sim].brain.plan(0)
+    assert [together.given[sim] for sim in range(3)] == [desk.given[0] for desk in alone]
+
+
+def test_simulations_that_do_not_run_get_no_goals() -> None:
+    desk = Desk(PickBrain(), [scene(CUP), scene(CUP)])
+    desk.table[0] = np.nan  # what the others see means nothing
+    assert set(desk.look(running=np.array([False, True]))) == {1}
+
+
+def test_a_new_episode_starts_from_nothing() -> None:
+    desk = Desk(PickBrain(), [scene(CUP), scene(CUP)])
+    desk.look()
+    grasp(desk, 0, opening=0.02)
+    desk.end(0)
+    old = CommandResult(desk.given[0][-1].task_id, True, ResultCode.SUCCEEDED, "")
+    desk.brain.reset(np.array([0]), [1], 2, ["again"])
+    desk.given[0].clear()
+    assert desk.look({0: [old]})[0].task_id == "1-above"
+    assert desk.brain.plan(0)["attempts"] == 1
+    assert desk.brain.plan(0)["instruction"] == "again"
+    assert desk.steps(1) == ["above"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("max_velocity", 0.0), ("line_velocity", -1.0), ("lift_m", math.nan), ("max_acceleration", math.inf)],
+)
+def test_impossible_parameters_are_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=f"brain.{name} is {value}; it must be positive and finite"):
+        PickBrainConfig(**{name: value})
+    with pytest.raises(ConfigError, match=r"brain\.attempts is 0; it must be at least 1"):
+        PickBrainConfig(attempts=0)
+
+
+def test_a_task_that_tells_nothing_of_objects_is_refused() -> None:
+    with pytest.raises(ConfigError, match="'pick' needs the environment feature"):
+        PickBrain().bind(OBSERVED, OBSERVED, 25, ())
+
+
+# --- in the simulator ------------------------------------------------------------------------------------------------
+
+
+def episodes(brain, seeds: list[int], config: PickConfig, simulation: UR5Simulation | None = None) -> list[Episode]:
+    simulation = simulation or UR5Simulation(UR5Config(), len(seeds), threads=1)
+    task = PickTask(config, simulation.n, simulation.config.fps)
+    return list(EpisodeLoop(simulation, task, brain).run([EpisodeSpec(k, seed) for k, seed in enumerate(seeds)]))
+
+
+def test_it_picks() -> None:
+    seeds = [episode_seed(11, episode, "train") for episode in range(4)]
+    for episode in episodes(PickBrain(), seeds, PickConfig()):
+        assert episode.outcome.success, episode.plan
+        assert episode.plan["attempts"] == 1
+        assert [result.task_id for _, result in episode.results] == [command.task_id for _, command in episode.commands]
+
+
+class Thief(PickBrain):
+    """Moves the object away when the gripper comes down for the first time, across the line of its fingers."""
+
+    def __init__(self, simulation: UR5Simulation) -> None:
+        super().__init__()
+        self.simulation, self.moved = simulation, False
+
+    def act(self, observation: Observation) -> Goals:
+        goals = super().act(observation)
+        for commands in goals.commands.values():
+            if commands[0].task_id.endswith("-down") and not self.moved:
+                assert commands[0].target_pose is not None
+                world = self.simulation.world
+                at = int(world.model.joint("object_0").qposadr[0])
+                world.qpos[0, at : at + 2] += 0.05 * commands[0].target_pose.matrix()[:2, 0]
+                world.forward(np.array([0]))
+                self.moved = True
+        return goals
+
+
+def test_an_object_that_moves_away_under_the_gripper_is_picked_at_the_second_attempt() -> None:
+    simulation = UR5Simulation(UR5Config(), 1, threads=1)
+    brain = Thief(simulation)
+    config = PickConfig(max_objects=1, duration_s=30.0)
+    episode = episodes(brain, [episode_seed(5, 0, "train")], config, simulation)[0]
+    assert brain.moved
+    steps = [command.task_id.split("-")[1] for _, command in episode.commands]
+    assert steps[:5] == ["above", "down", "close", "back", "above"]
+    assert episode.plan["attempts"] == 2
+    assert "holds nothing" in episode.plan["problem"]
+    assert episode.outcome.event == Event.SUCCESS
