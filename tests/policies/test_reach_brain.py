@@ -1,0 +1,164 @@
+"""The scripted reach: its goals on a made-up target, and a few reaches in the simulator."""
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import Goals, Observation
+from bhd_lerobot.policies.reach import ReachBrain, ReachBrainConfig
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+from bhd_lerobot.runs.episode import EpisodeLoop, EpisodeSpec
+from bhd_lerobot.tasks.reach import ENVIRONMENT, ReachConfig, ReachTask
+from bhd_lerobot.tasks.task import episode_seed
+from bhd_lerobot.tasks.variation import RandomisationConfig
+
+TARGET = np.array([0.5, 0.1, 0.3, 0.0, 0.6, 0.8, 0.0])
+
+
+class Desk:
+    """n targets, a brain, and the goals that it gives."""
+
+    def __init__(self, n: int = 1, **options: float) -> None:
+        self.n, self.brain = n, ReachBrain(ReachBrainConfig(**options))  # type: ignore[arg-type]
+        self.targets = np.tile(TARGET, (n, 1))
+        self.last: dict[int, BrainCommand] = {}
+        self.names: list[tuple[int, str]] = []
+        self.brain.bind(("a",), ("a",), 25, ENVIRONMENT)
+        self.brain.reset(np.arange(n), [0] * n, n)
+
+    def look(self, results: dict[int, list[CommandResult]] | None = None) -> dict[int, BrainCommand]:
+        goals = self.brain.act(Observation(("a",), np.zeros((self.n, 1)), {}, self.targets, results or {}))
+        assert isinstance(goals, Goals)
+        new = {sim: commands[0] for sim, commands in goals.commands.items()}
+        for sim, command in new.items():
+            assert (sim, command.task_id) not in self.names
+            self.names.append((sim, command.task_id))
+        self.last |= new
+        return new
+
+    def end(self, success: bool = True, sim: int = 0) -> BrainCommand | None:
+        code = ResultCode.SUCCEEDED if success else ResultCode.UNREACHABLE
+        return self.look({sim: [CommandResult(self.last[sim].task_id, success, code, "no way")]}).get(sim)
+
+
+def test_it_asks_for_the_target_once_and_holds() -> None:
+    desk = Desk(max_velocity=1.5, max_acceleration=5.0)
+    goal = desk.look()[0]
+    assert goal.target_pose is not None
+    assert goal.target_pose.position == tuple(TARGET[:3])
+    assert goal.target_pose.quaternion == pytest.approx(tuple(TARGET[3:]))
+    assert (goal.max_velocity, goal.max_acceleration, goal.gripper) == (1.5, 5.0, None)
+    assert desk.brain.subtasks()[0] == "move the tool to the target"
+    assert desk.look() == {}
+    assert desk.end() is None
+    assert desk.brain.subtasks()[0] == "hold"
+    assert desk.look() == {}
+
+
+def test_a_quaternion_in_single_precision_is_made_a_unit_again() -> None:
+    desk = Desk()
+    desk.targets[0, 3:] = np.array([0.1, 0.7, 0.7, 0.1]).astype(np.float32)
+    goal = desk.look()[0]
+    assert goal.target_pose is not None
+    assert np.linalg.norm(goal.target_pose.quaternion) == pytest.approx(1, abs=1e-15)
+
+
+@pytest.mark.parametrize("attempts", [1, 2, 3])
+def test_where_no_way_leads_it_goes_by_way_of_home_and_gives_up_in_the_end(attempts: int) -> None:
+    desk = Desk(attempts=attempts)
+    desk.look()
+    for _ in range(attempts - 1):
+        home = desk.end(success=False)
+        assert home is not None
+        assert home.joint_target == ur5().home[:6]
+        again = desk.end()
+        assert again is not None
+        assert again.target_pose is not None
+    assert desk.end(success=False) is None
+    assert desk.brain.subtasks()[0] == "give up: no way"
+    assert desk.look() == {}
+
+
+def test_when_even_the_way_home_fails_it_ends_too() -> None:
+    desk = Desk(attempts=3)
+    desk.look()
+    goals = 1
+    while desk.end(success=False) is not None:
+        goals += 1
+        assert goals < 10
+    assert desk.brain.subtasks()[0].startswith("give up")
+
+
+def test_a_second_attempt_may_succeed() -> None:
+    desk = Desk()
+    desk.look()
+    desk.end(success=False)
+    desk.end()
+    assert desk.end() is None
+    assert desk.brain.subtasks()[0] == "hold"
+
+
+@pytest.mark.parametrize("target", [[np.nan] * 7, [0] * 7, [0.5, np.nan, 0.3, 0, 1, 0, 0], [np.inf, 0, 0, 0, 1, 0, 0]])
+def test_what_is_no_pose_is_not_reached_for(target: list[float]) -> None:
+    desk = Desk(2)
+    desk.targets[0] = target
+    assert set(desk.look()) == {1}
+    assert desk.brain.subtasks()[0] == "give up: there is no target pose"
+    assert desk.look() == {}
+
+
+def test_simulations_do_not_influence_each_other_and_strange_results_are_ignored() -> None:
+    desk = Desk(3)
+    desk.targets[1, 0] = 0.4
+    goals = desk.look()
+    assert [goals[sim].target_pose.position[0] for sim in range(3)] == [0.5, 0.4, 0.5]  # type: ignore[union-attr]
+    stray = CommandResult("7-reach", False, ResultCode.FAULT, "")
+    assert desk.look({0: [stray], 1: [stray], 9: [stray]}) == {}
+    home = desk.end(success=False, sim=1)
+    assert home is not None
+    assert home.joint_target is not None
+    assert list(desk.brain.subtasks()) == ["move the tool to the target", "go home", "move the tool to the target"]
+
+
+def test_a_new_episode_starts_from_nothing() -> None:
+    desk = Desk(attempts=1)
+    desk.look()
+    desk.end(success=False)
+    desk.brain.reset(np.array([0]), [0], 1)
+    desk.names.clear()
+    assert desk.look()[0].task_id == "1-reach"
+    assert desk.end() is None
+    assert desk.brain.subtasks()[0] == "hold"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"max_velocity": 0.0}, {"max_acceleration": float("nan")}, {"max_velocity": float("inf")}, {"attempts": 0}],
+)
+def test_impossible_parameters_are_refused_by_name(change: dict[str, float]) -> None:
+    name, value = next(iter(change.items()))
+    with pytest.raises(ConfigError, match=f"brain.{name} is {value}; it must be"):
+        ReachBrainConfig(**change)  # type: ignore[arg-type]
+
+
+def test_a_task_without_a_target_is_refused() -> None:
+    with pytest.raises(ConfigError, match="'reach' needs the environment feature"):
+        ReachBrain().bind(("a",), ("a",), 25, ())
+
+
+# --- in the simulator ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("randomised", [False, True])
+def test_it_reaches(randomised: bool) -> None:
+    config = ReachConfig(randomisation=RandomisationConfig(enabled=randomised))
+    simulation = UR5Simulation(UR5Config(), 4, threads=1)
+    loop = EpisodeLoop(simulation, ReachTask(config, 4, simulation.config.fps), ReachBrain())
+    specs = [EpisodeSpec(index, episode_seed(3, index, "train")) for index in range(8)]
+    for episode in loop.run(specs):
+        assert episode.outcome.success, episode.results
+        assert episode.outcome.details["error_m"] <= config.tolerance_m
+        assert [result.task_id for _, result in episode.results] == ["1-reach"]
