@@ -21,6 +21,7 @@ _APART = 0.05  # [m] free space between the circles around two objects: an open 
 _LIFTED, _FALLEN = 0.05, 0.015  # [m] above and below which an object counts as in the gripper, and as back on the table
 _STRAY = 0.03  # [m] an object that nobody asked for and that is lifted this far was picked up, not brushed
 _REACH = 0.80  # [m] horizontal distance from the base beyond which a tool that points down does not get
+_WIDEST = 0.076  # [m] the narrow side of an object fits between the fingers, however it is randomised
 _TRIES = 1000
 
 ENVIRONMENT = tuple(f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS)
@@ -230,7 +231,8 @@ def _draw_objects(
             length, width = rng.uniform(0.045, 0.090), rng.uniform(0.035, 0.065)
             height = rng.uniform(0.05, 0.10)
         factor = change["size"]
-        size_x, size_y = length / 2 * factor[0], width / 2 * factor[0 if kind == "cup" else 1]
+        size_x, size_y = length / 2 * factor[0], min(width / 2 * factor[0 if kind == "cup" else 1], _WIDEST / 2)
+        size_x = size_y if kind == "cup" else size_x
         place = _draw_place(math.hypot(size_x, size_y) if kind == "box" else size_x, objects, rng)
         if place is None:
             break

@@ -9,6 +9,8 @@ import numpy as np
 from bhd_lerobot.bodies.tabletop import Variation
 from bhd_lerobot.errors import ConfigError
 
+MAX_LATENCY_S = 0.05  # [s] what a `LatePlant` can delay by, at the control rate
+
 
 @dataclass
 class RandomisationConfig:
@@ -25,7 +27,7 @@ class RandomisationConfig:
         camera_m: up to this is added to each coordinate of the scene camera's position [m].
         sensor_noise_rad: noise on observed joint positions has a standard deviation of up to this [rad], on speeds ten
             times that [rad/s].
-        latency_s: the servos get their commands up to this late [s].
+        latency_s: the servos get their commands up to this late, at most 0.05 [s].
     """
 
     enabled: bool = False
@@ -43,6 +45,8 @@ class RandomisationConfig:
         for name, value in asdict(self).items():
             if name != "enabled" and not 0 <= value < math.inf:
                 raise ConfigError(f"randomisation.{name} is {value}; it must be 0 (off) or positive, and finite.")
+        if self.latency_s > MAX_LATENCY_S:
+            raise ConfigError(f"randomisation.latency_s is {self.latency_s}; it must be at most {MAX_LATENCY_S}.")
         for name in ("size", "light"):
             if getattr(self, name) >= 1:
                 raise ConfigError(f"randomisation.{name} is {getattr(self, name)}; it must be below 1.")

@@ -107,7 +107,10 @@ def corners(one: TableObject) -> np.ndarray:
     return points + np.array([one.x, one.y])
 
 
-@pytest.mark.parametrize("randomisation", [RandomisationConfig(), WILD], ids=["nominal", "randomised"])
+HUGE = RandomisationConfig(enabled=True, size=0.6)
+
+
+@pytest.mark.parametrize("randomisation", [RandomisationConfig(), WILD, HUGE], ids=["nominal", "randomised", "huge"])
 def test_objects_stand_apart_in_reach_differ_and_fit_the_gripper(randomisation: RandomisationConfig) -> None:
     task = PickTask(PickConfig(randomisation=randomisation), 1, FPS)
     counts = set()

@@ -10,10 +10,12 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.tabletop import Variation
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.latency import MAX_LATENCY
 from bhd_lerobot.runs.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
-from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
+from bhd_lerobot.tasks.variation import MAX_LATENCY_S, RandomisationConfig, draw_object_changes, draw_variation
 
 ON = RandomisationConfig(enabled=True)
 RANGES = [field.name for field in dataclasses.fields(RandomisationConfig) if field.name != "enabled"]
@@ -21,7 +23,7 @@ RANGES = [field.name for field in dataclasses.fields(RandomisationConfig) if fie
 
 def test_off_is_exactly_nominal_and_draws_nothing() -> None:
     rng, untouched = np.random.default_rng(0), np.random.default_rng(0)
-    wild = RandomisationConfig(enabled=False, mass=9.0, latency_s=1.0)
+    wild = RandomisationConfig(enabled=False, mass=9.0, latency_s=0.05)
     assert draw_variation(wild, rng) == Variation()
     changes = draw_object_changes(wild, rng)
     assert changes == {"mass": 1.0, "friction": 1.0, "size": (1.0, 1.0, 1.0), "shade": (0.0, 0.0, 0.0)}
@@ -103,3 +105,9 @@ def test_impossible_ranges_are_refused_by_name(name: str, value: float) -> None:
 def test_nothing_shrinks_to_nothing(name: str) -> None:
     with pytest.raises(ConfigError, match=rf"randomisation.{name} is 1.0; it must be below 1"):
         RandomisationConfig(**{name: 1.0})
+
+
+def test_a_latency_that_no_plant_can_delay_by_is_refused_before_anything_runs() -> None:
+    with pytest.raises(ConfigError, match=r"randomisation.latency_s is 0.051; it must be at most 0.05"):
+        RandomisationConfig(latency_s=0.051)
+    assert MAX_LATENCY_S * UR5Config().control_hz <= MAX_LATENCY
