@@ -70,7 +70,7 @@ class ArmController(Controller):
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
-        if self.setpoints.active.any():
+        if np.count_nonzero(self.setpoints.active):
             # A goal that came after them takes over; both in one tick would move the reference twice.
             self._leave_setpoints(self.goals.busy)
             self.setpoints.run(self.command, self.velocity, self.acceleration)
@@ -88,8 +88,9 @@ class ArmController(Controller):
         work += reading.position
         work -= self.actuators
         np.abs(work, out=work)
-        if (work > self._largest_error).any():
-            self._limited_effort |= (work > self._largest_error)[:, : self.width - 1].any(axis=1)
+        beyond = work > self._largest_error
+        if np.count_nonzero(beyond):
+            self._limited_effort |= beyond[:, : self.width - 1].any(axis=1)
 
     def _leave_setpoints(self, mask: NDArray[np.bool_]) -> None:
         """Follow no setpoints any more; what comes next starts without speeding up.

@@ -204,6 +204,11 @@ class Tabletop:
         return np.concatenate([self._tool_pos, self._tool_quat], axis=1)
 
     @property
+    def is_touching(self) -> bool:
+        """Whether any arm touches anything; if not, none of the flags below is set."""
+        return bool(np.count_nonzero(self._any))
+
+    @property
     def arm_on_table(self) -> NDArray[np.bool_]:
         """Whether any part of the arm or its gripper touches the table, shape (n,)."""
         return self._table > 0
