@@ -192,7 +192,12 @@ class Cerebellum:
         Returns:
             None if it was accepted, otherwise the refusal, which is then the goal's one result.
         """
-        return self.controller.submit(sim, command, _GOAL_REFUSAL.get(int(self._mode_reasons()[sim])))
+        refusal = self.controller.submit(sim, command, _GOAL_REFUSAL.get(int(self._mode_reasons()[sim])))
+        if refusal is None and self.mode[sim] == Mode.TRACKING and not self._by_goal[sim]:
+            # The goal takes over from setpoints, whose age means nothing any more.
+            self._by_goal[sim] = True
+            self._update_deadline()
+        return refusal
 
     def cancel(self, sim: int, task_id: str) -> ResultCode:
         """Cancel a goal: decelerate, then hold. Return `SUCCEEDED`, or `UNKNOWN_ID` if there is no such goal."""

@@ -226,7 +226,6 @@ def test_a_setpoint_replaces_a_goal() -> None:
     rig.check()
 
 
-@pytest.mark.xfail(reason="Cerebellum: a goal that takes over from setpoints is still stopped by their time-out")
 def test_a_goal_replaces_setpoints_and_is_finished_though_none_comes_any_more() -> None:
     rig = Rig()
     values = HOME.copy()

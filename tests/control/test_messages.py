@@ -22,7 +22,9 @@ def test_numbers_that_are_recorded_stay_what_they_are() -> None:
         "UNCONFIGURED", "INACTIVE", "HOLD", "TRACKING", "STOPPING", "SAFE_OFF", "ESTOP", "FAULT",
     ]  # fmt: skip
     assert [int(mode) for mode in Mode] == list(range(8))
-    assert {flag.name: int(flag) for flag in Limit} == {"NON_FINITE": 1, "VELOCITY": 2, "ACCELERATION": 4, "EFFORT": 8}
+    assert {flag.name: int(flag) for flag in Limit} == {
+        "NON_FINITE": 1, "VELOCITY": 2, "ACCELERATION": 4, "EFFORT": 8, "POSITION": 16,
+    }  # fmt: skip
     assert {flag.name: int(flag) for flag in Watchdog} == {"COMMAND_AGE": 1}
 
 
