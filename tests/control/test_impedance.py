@@ -95,6 +95,28 @@ def test_a_wrench_needs_setpoints_and_ends_with_them() -> None:
     assert not rig.controller.wrench.any()  # it has to be asked for again
 
 
+def test_a_hard_stop_ends_a_wrench_at_once() -> None:
+    rig = StuckRig()
+    rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
+    rig.send(10)
+    assert rig.controller.wrench[0, 0] == 10
+    rig.cerebellum.estop_word[0] = 1
+    rig.tick()
+    assert not rig.controller.wrench.any()
+
+
+def test_without_spring_and_damper_the_motors_carry_the_arms_own_dynamics() -> None:
+    rig = StuckRig()
+    rig.controller.set_compliance(Compliance(np.zeros(6), damping=np.zeros(6)))
+    rig.plant.velocity[:6] = (0.5, -1.0, 1.5, 1.0, -1.0, 2.0)
+    rig.tick(100)
+    speeds = rig.plant.velocity[None, :6]
+    terms = rig.controller.dynamics.terms(HOME[None, :6], speeds)
+    own = terms.coriolis[0] @ speeds[0] + terms.gravity[0]
+    assert np.abs(terms.coriolis[0] @ speeds[0]).max() > 0.1
+    np.testing.assert_allclose(rig.plant.written[-1][:6], own - 0.01 * EFFORT * speeds[0], atol=1e-9)
+
+
 def test_a_wrench_comes_and_goes_gradually() -> None:
     rig = StuckRig()
     rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
