@@ -181,6 +181,8 @@ _VECTORS = {
     f"{keys.OBSERVATION_IMAGES}.scene": "the camera beside the table, RGB; only with `robot.camera=true`",
     f"{keys.OBSERVATION_IMAGES}.wrist": "the camera at the gripper, RGB; only with `robot.camera=true`",
     keys.ENVIRONMENT_STATE: "what the task tells the brain; see below",
+    keys.LANGUAGE: "the plan and the subtasks as LeRobot's language rows, each with the time from which it was valid; "
+    "the same in every frame of an episode; only of brains with a plan",
     keys.SUBTASK: "what the brain is doing, in words; only of brains with a plan",
     keys.ACTION: "what the brain asked for over the coming frame; for goals, where the reference is at its end",
     keys.APPLIED_ACTION: "what the cerebellum commanded at the end of the frame, after all limits",

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bhd_lerobot.data.disk import Disk, write_errors
-from bhd_lerobot.data.schema import Column, Schema
+from bhd_lerobot.data.schema import LANGUAGE, Column, Schema
 from bhd_lerobot.data.video import CameraEncoder, VideoSettings
 from bhd_lerobot.errors import FrameError, unknown_name
 
@@ -184,6 +185,8 @@ class EpisodeWriter:
 
 
 def _converted(column: Column, value: ArrayLike) -> np.ndarray | str:
+    if column.key == LANGUAGE:
+        return value  # type: ignore[return-value]  # what it holds is checked when it is written
     if column.dtype == object:
         return _text(column.key, value)
     array = np.asarray(value)
@@ -194,6 +197,11 @@ def _converted(column: Column, value: ArrayLike) -> np.ndarray | str:
 
 
 def _converted_column(column: Column, values: ArrayLike) -> np.ndarray:
+    if column.key == LANGUAGE:
+        frames: list[Any] = list(values)  # type: ignore[arg-type]
+        rows = np.empty(len(frames), dtype=object)
+        rows[:] = frames  # np.array would make a matrix of lists of equal length
+        return rows
     array = np.asarray(values, dtype=object if column.dtype == object else None)
     if column.shape == () and array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]

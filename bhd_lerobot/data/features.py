@@ -29,6 +29,7 @@ DONE = "next.done"
 EVENT = "event"
 
 SUBTASK = "subtask"
+LANGUAGE = "language_persistent"  # LeRobot's own name
 
 PHYSICS_STATE = "simulation.state"
 
@@ -91,6 +92,7 @@ def dataset_features(
         features[key] = {"dtype": dtype, "shape": (1,), "names": None}
     if subtask:
         features[SUBTASK] = {"dtype": "string", "shape": (1,), "names": None}
+        features[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
     features[PHYSICS_STATE] = _vector("float64", physics_names)
     return features
 

@@ -43,6 +43,10 @@ def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
 
 def _to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray:
     array = column.combine_chunks()
+    if pa.types.is_list(array.type) and pa.types.is_struct(array.type.value_type):
+        rows = np.empty(len(array), dtype=object)  # language: a list of rows for every frame
+        rows[:] = array.to_pylist()
+        return rows
     if pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type):
         return array.flatten().to_numpy(zero_copy_only=False).reshape(len(array), *shape)
     return np.asarray(array.to_numpy(zero_copy_only=False))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.errors import ConfigError, FrameError, unknown_name
 
 DEFAULT_FEATURES: dict[str, dict[str, Any]] = {
     "timestamp": {"dtype": "float32", "shape": (1,), "names": None},
@@ -19,6 +19,9 @@ DEFAULT_FEATURES: dict[str, dict[str, Any]] = {
 }
 """Columns that every LeRobot dataset has and that the recorder fills in."""
 
+LANGUAGE = "language_persistent"
+"""LeRobot's column for what is said in an episode and stays valid; its values are lists of rows."""
+
 _ARROW = {
     "float32": pa.float32(),
     "float64": pa.float64(),
@@ -26,6 +29,7 @@ _ARROW = {
     "bool": pa.bool_(),
     "string": pa.string(),
 }
+_OBJECTS = ("string", "language")  # kept as Python objects until they are written
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ class Schema:
             raise ConfigError("A dataset needs at least one feature of its own; none was given.")
         self.features: dict[str, dict[str, Any]] = {**own, **{k: dict(v) for k, v in DEFAULT_FEATURES.items()}}
         self.columns = tuple(
-            Column(key, np.dtype(object if ft["dtype"] == "string" else ft["dtype"]), _row_shape(ft["shape"]))
+            Column(key, np.dtype(object if ft["dtype"] in _OBJECTS else ft["dtype"]), _row_shape(ft["shape"]))
             for key, ft in own.items()
             if ft["dtype"] != "video"
         )
@@ -69,7 +73,7 @@ class Schema:
             key: (ft["shape"][0], ft["shape"][1]) for key, ft in own.items() if ft["dtype"] == "video"
         }
         self.arrow = _arrow_schema(self.features)
-        self.float_keys = [k for k, ft in self.features.items() if ft["dtype"] not in ("string", "video")]
+        self.float_keys = [k for k, ft in self.features.items() if ft["dtype"] not in (*_OBJECTS, "video")]
 
     def table(self, columns: Mapping[str, np.ndarray]) -> pa.Table:
         """Return an Arrow table over the memory of `columns`.
@@ -81,11 +85,35 @@ class Schema:
         arrays = []
         for field in self.arrow:
             values = columns[field.name]
-            if values.ndim == 2:
+            if field.name == LANGUAGE:
+                arrays.append(_language_array(values, field.type))
+            elif values.ndim == 2:
                 arrays.append(pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1]))
             else:
                 arrays.append(pa.array(values, type=field.type))
         return pa.Table.from_arrays(arrays, schema=self.arrow)
+
+
+def _language_array(values: np.ndarray, kind: pa.ListType) -> pa.ListArray:
+    """Return the rows of every frame as Arrow's nested arrays, which Arrow itself cannot make with JSON inside.
+
+    Raises:
+        FrameError: a row does not hold what LeRobot's rows hold, or a tool call.
+    """
+    rows = [row for frame in values for row in frame]
+    names = [kind.value_type.field(index).name for index in range(kind.value_type.num_fields)]
+    for row in rows:
+        if set(row) != set(names) or row["tool_calls"] is not None:
+            raise FrameError(f"A row of {LANGUAGE!r} holds {', '.join(names)}, and no tool calls; got {row!r}.")
+    parts = [
+        pa.nulls(len(rows), field.type)
+        if field.name == "tool_calls"
+        else pa.array([row[field.name] for row in rows], type=field.type)
+        for field in kind.value_type
+    ]
+    offsets = np.concatenate([[0], np.cumsum([len(frame) for frame in values])]).astype(np.int32)
+    structs = pa.StructArray.from_arrays(parts, fields=list(kind.value_type))
+    return pa.ListArray.from_arrays(offsets, structs, type=kind)
 
 
 def as_numpy(column: pa.ChunkedArray) -> np.ndarray:
@@ -105,8 +133,10 @@ def _checked(key: str, feature: Mapping[str, Any]) -> dict[str, Any]:
     if not key or "/" in key:
         raise ConfigError(f"Feature name {key!r} is not valid: it must not be empty or contain '/'.")
     dtype = feature.get("dtype")
-    if dtype not in _ARROW and dtype != "video":
-        raise ConfigError(f"Feature {key!r}: {unknown_name('dtype', dtype, [*_ARROW, 'video'])}")
+    if dtype not in _ARROW and dtype not in ("video", "language"):
+        raise ConfigError(f"Feature {key!r}: {unknown_name('dtype', dtype, [*_ARROW, 'video', 'language'])}")
+    if (dtype == "language") != (key == LANGUAGE):
+        raise ConfigError(f"Feature {key!r}: dtype 'language' is for {LANGUAGE!r} and for nothing else.")
     try:
         shape = tuple(int(size) for size in feature["shape"])
     except (KeyError, TypeError, ValueError):
@@ -119,8 +149,8 @@ def _checked(key: str, feature: Mapping[str, Any]) -> dict[str, Any]:
                 f"Feature {key!r}: height and width must be even, because video encoders store colour at half the "
                 f"resolution; got {shape[0]} x {shape[1]}."
             )
-    elif len(shape) != 1 or shape[0] < 1 or (dtype == "string" and shape != (1,)):
-        wanted = "(1,)" if dtype == "string" else "(size,)"
+    elif len(shape) != 1 or shape[0] < 1 or (dtype in _OBJECTS and shape != (1,)):
+        wanted = "(1,)" if dtype in _OBJECTS else "(size,)"
         raise ConfigError(f"Feature {key!r}: dtype {dtype} needs the shape {wanted}; got {shape}. Flatten it.")
     checked = {**feature, "dtype": dtype, "shape": shape}
     checked.setdefault("names", None)
@@ -130,10 +160,23 @@ def _checked(key: str, feature: Mapping[str, Any]) -> dict[str, Any]:
     return checked
 
 
+def _language() -> tuple[pa.DataType, Any]:
+    """Return Arrow's type of LeRobot's column for what is said and stays valid, and its description for `datasets`."""
+    from datasets import Features
+    from lerobot.datasets import language  # seconds to import, and rarely needed
+
+    described = Features({"column": language.language_persistent_column_feature()}).to_dict()["column"]
+    return language.language_persistent_arrow_type(), described
+
+
 def _arrow_schema(features: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
     fields, described = [], {}
     for key, feature in features.items():
         if feature["dtype"] == "video":
+            continue
+        if feature["dtype"] == "language":
+            arrow, described[key] = _language()
+            fields.append(pa.field(key, arrow))
             continue
         value = {"dtype": feature["dtype"], "_type": "Value"}
         arrow = _ARROW[feature["dtype"]]

@@ -274,6 +274,9 @@ class EpisodeLoop:
         length = int(self._length[sim])
         columns = {key: column[sim, :length].copy() for key, column in self._columns.items()}
         outcome = self.task.outcome(sim, event)
+        plan = self.brain.plan(sim) if self.brain.has_plan else {}
+        if self.brain.has_plan:
+            columns[keys.LANGUAGE] = _said(plan, columns[keys.SUBTASK], self.simulation.rates.fps)
         last = np.arange(length) == length - 1
         columns[keys.DONE] = last
         columns[keys.SUCCESS] = last & outcome.success
@@ -295,5 +298,31 @@ class EpisodeLoop:
             writer=sink,
             commands=self._commands[sim],
             results=self._ends[sim],
-            plan=self.brain.plan(sim) if self.brain.has_plan else {},
+            plan=plan,
         )
+
+
+def _said(plan: dict[str, Any], subtasks: NDArray, fps: int) -> NDArray:
+    """Return LeRobot's column of what is said and stays valid: the plan, and every subtask from when it began.
+
+    Every frame of an episode holds the same rows.
+
+    Args:
+        plan: the plan.
+        subtasks: what the brain was doing in each frame, shape (frames,).
+        fps: frames a second [Hz].
+    """
+    rows: list[dict[str, Any]] = []
+
+    def say(style: str, content: str, frame: int) -> None:
+        when = {"timestamp": frame / fps, "camera": None, "tool_calls": None}
+        rows.append({"role": "assistant", "content": content, "style": style, **when})
+
+    if plan.get("steps"):
+        say("plan", "\n".join(f"{number}. {text}" for number, (_, text) in enumerate(plan["steps"], 1)), 0)
+    for frame, text in enumerate(subtasks):
+        if frame == 0 or text != subtasks[frame - 1]:
+            say("subtask", str(text), frame)
+    column = np.empty(len(subtasks), dtype=object)
+    column[:] = [rows] * len(subtasks)
+    return column

@@ -411,3 +411,40 @@ def test_bad_settings_are_refused(tmp_path: Path) -> None:
         DatasetRecorder.create("t/t", 0, support.FEATURES, robot_type="t", root=tmp_path / "e")
     with pytest.raises(ConfigError, match="JSON"):
         DatasetRecorder.create("t/t", 1, support.FEATURES, robot_type="t", root=tmp_path / "e", recording={"x": {1}})
+
+
+def test_language_rows_are_lerobots_and_bad_ones_are_refused(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    features = {
+        "action": {"dtype": "float32", "shape": (2,), "names": None},
+        "language_persistent": {"dtype": "language", "shape": (1,), "names": None},
+    }
+    row = {"role": "assistant", "style": "subtask", "timestamp": 0.0, "camera": None, "tool_calls": None}
+    first, second = ({**row, "content": text} for text in ("one", "两"))
+    root = tmp_path / "d"
+    with DatasetRecorder.create("test/said", 10, features, root=root, robot_type="r") as recorder:
+        for rows in ([[], [first]], [[first, second]] * 3):
+            writer = recorder.begin_episode()
+            writer.set_columns(
+                {"action": np.zeros((len(rows), 2), np.float32), "language_persistent": np.array(rows, dtype=object)}
+                if rows[0] == []
+                else {"action": np.zeros((3, 2), np.float32), "language_persistent": rows}
+            )
+            recorder.save(writer, task="t", metadata={})
+        writer = recorder.begin_episode()
+        writer.set_columns({"action": np.zeros((1, 2), np.float32), "language_persistent": [[{"content": "no"}]]})
+        with pytest.raises(FrameError, match="role, content, style"):
+            recorder.save(writer, task="t", metadata={})
+        writer.discard()
+        recorder.finalize()
+    dataset = LeRobotDataset("test/said", root=root, video_backend="pyav")
+    assert [one["content"] for one in dataset[4]["language_persistent"]] == ["one", "两"]
+    assert dataset[0]["language_persistent"] == []
+
+
+@pytest.mark.parametrize(("key", "dtype"), [("said", "language"), ("language_persistent", "string")])
+def test_the_language_column_has_its_own_name(tmp_path, key, dtype):
+    features = {key: {"dtype": dtype, "shape": (1,), "names": None}}
+    with pytest.raises(ConfigError, match="is for 'language_persistent' and for nothing else"):
+        DatasetRecorder.create("test/said", 10, features, root=tmp_path / "d", robot_type="r")

@@ -114,6 +114,15 @@ def test_stock_lerobot_reads_it(recorded):
     assert item["subtask"] == columns["subtask"][7]
     assert item["task"] == dataset_info(recorded).episodes[0].task
     assert item["observation.environment_state"].shape == (80,)
+    # LeRobot's own reading of its language column: what was being done at that time.
+    from lerobot.datasets.language_render import active_at
+
+    for index in (0, 7, 60, len(dataset) - 1):
+        item = dataset[index]
+        said = active_at(float(item["timestamp"]), persistent=item["language_persistent"], style="subtask")
+        assert said["content"] == item["subtask"] == columns["subtask"][index]
+        plan = active_at(float(item["timestamp"]), persistent=item["language_persistent"], style="plan")
+        assert plan["content"].startswith("1. find the ")
     assert set(dataset.meta.stats) >= {"observation.environment_state", "action"}
 
 
