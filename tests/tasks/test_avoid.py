@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.arenas import make_arena, random_arena
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
-from bhd_lerobot.tasks.task import Event, BaseTruth
+from bhd_lerobot.tasks.task import BaseTruth, Event
 
 FPS = 10
 EMPTY = make_arena("empty", 0)  # 6 m by 6 m, start in the middle
