@@ -85,7 +85,7 @@ class Variation:
         camera_shift: what is added to the scene camera's position [m].
         sensor_noise: standard deviation of the noise on observed joint positions [rad], on speeds ten times that
             [rad/s].
-        latency_ticks: control ticks by which what the cerebellum commands reaches the servos late.
+        latency_s: time by which what the cerebellum commands reaches the servos late, in whole control ticks [s].
         finger_friction: factor on the fingers' friction.
     """
 
@@ -93,7 +93,7 @@ class Variation:
     light_direction: tuple[float, float] = (0.0, 0.0)
     camera_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sensor_noise: float = 0.0
-    latency_ticks: int = 0
+    latency_s: float = 0.0
     finger_friction: float = 1.0
 
 

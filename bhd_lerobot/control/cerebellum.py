@@ -193,9 +193,10 @@ class Cerebellum:
             None if it was accepted, otherwise the refusal, which is then the goal's one result.
         """
         refusal = self.controller.submit(sim, command, _GOAL_REFUSAL.get(int(self._mode_reasons()[sim])))
-        if refusal is None and self.mode[sim] == Mode.TRACKING and not self._by_goal[sim]:
-            # The goal takes over from setpoints, whose age means nothing any more.
-            self._by_goal[sim] = True
+        if refusal is None:
+            # The newer command counts: setpoints that still wait are dropped, and the age of the last means nothing.
+            self.fifo.drop(np.array([sim]))
+            self._by_goal[sim] |= self.mode[sim] == Mode.TRACKING
             self._update_deadline()
         return refusal
 

@@ -101,7 +101,7 @@ def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: st
         names: the features there are, in order.
         wanted: the features to find.
         who: name of the brain, for the message.
-        what: ``"observation"`` or ``"action"``, for the message.
+        what: ``"observation"``, ``"action"`` or ``"environment"``, for the message.
 
     Raises:
         ConfigError: some are missing; the message names them.
@@ -109,9 +109,10 @@ def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: st
     index = {name: column for column, name in enumerate(names)}
     missing = [name for name in wanted if name not in index]
     if missing:
+        whose = "task or scene does not tell" if what == "environment" else "robot does not have"
         raise ConfigError(
-            f"The brain {who!r} needs the {what} feature(s) {', '.join(missing)}, which this robot does not have. "
-            f"It has: {', '.join(names[:8])}{', …' if len(names) > 8 else ''}."
+            f"The brain {who!r} needs the {what} feature(s) {', '.join(missing)}, which this {whose}. "
+            f"There is: {', '.join(names[:8]) or 'nothing'}{', …' if len(names) > 8 else ''}."
         )
     return np.array([index[name] for name in wanted], np.intp)
 

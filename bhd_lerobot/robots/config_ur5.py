@@ -9,6 +9,7 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, unknown_name
 
 CLOCKS = ("lockstep",)
+CONTROLS = ("servo", "impedance")
 ACTION_SPACES = ("joint", "tool")
 SCENES = ("empty", "reach", "pick")
 
@@ -23,6 +24,8 @@ class UR5Config(RobotConfig):
         clock: ``"lockstep"``: simulated time, advanced by `send_action`, as fast as the machine can.
         control_hz: cerebellum ticks a second [Hz], a multiple of fps.
         physics_hz: physics steps a second [Hz], a multiple of control_hz.
+        control: ``"servo"``: position servos, stiff and precise, with goals; ``"impedance"``: joint torques that make
+            the tool a damped spring, for contact; needs `action_space = "tool"` and takes no goals.
         action_space: ``"joint"``: joint positions; ``"tool"``: a tool pose, from which the bridge computes them.
         scene: what is on the table when the robot is used by itself: ``"empty"``, ``"reach"`` (a target pose) or
             ``"pick"`` (objects). In a task the task decides.
@@ -37,6 +40,7 @@ class UR5Config(RobotConfig):
     clock: str = "lockstep"
     control_hz: int = 500
     physics_hz: int = 500
+    control: str = "servo"
     action_space: str = "joint"
     scene: str = "empty"
     seed: int = 0
@@ -52,9 +56,19 @@ class UR5Config(RobotConfig):
             ConfigError: names the value and the valid ones.
         """
         super().__post_init__()
-        for name, valid in (("clock", CLOCKS), ("action_space", ACTION_SPACES), ("scene", SCENES)):
+        for name, valid in (
+            ("clock", CLOCKS),
+            ("control", CONTROLS),
+            ("action_space", ACTION_SPACES),
+            ("scene", SCENES),
+        ):
             if getattr(self, name) not in valid:
                 raise ConfigError(unknown_name(name, getattr(self, name), valid))
+        if self.control == "impedance" and self.action_space != "tool":
+            raise ConfigError(
+                f"robot.control is 'impedance' and robot.action_space is {self.action_space!r}; "
+                "an impedance is commanded by tool poses: use --robot.action_space=tool."
+            )
         if self.seed < 0:
             raise ConfigError(f"robot.seed is {self.seed}; seeds start at 0.")
         if not 0 < self.stale_after_s < float("inf"):
@@ -73,6 +87,7 @@ class UR5Config(RobotConfig):
     def body(self) -> Arm:
         """Return the hardware that this configuration describes."""
         return ur5(
+            actuation="torque" if self.control == "impedance" else "position",
             command_timeout_s=1 / self.fps + self.stale_after_s,
             camera_width=self.camera_width,
             camera_height=self.camera_height,

@@ -10,7 +10,7 @@ from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.plant import SimulatedPlant
 
-MAX_LATENCY = 25  # [ticks]
+MAX_LATENCY = 25  # [ticks] 0.05 s at 500 Hz
 
 
 class LatePlant:
@@ -19,15 +19,17 @@ class LatePlant:
     Args:
         plant: the plant.
         arm: the robot.
+        max_ticks: largest latency [ticks].
     """
 
-    def __init__(self, plant: SimulatedPlant, arm: Arm) -> None:
+    def __init__(self, plant: SimulatedPlant, arm: Arm, max_ticks: int = MAX_LATENCY) -> None:
         self.n = plant.n
         self._plant = plant
         self._latency = np.zeros(plant.n, np.int64)
         self._late = False
         self._sims = np.arange(plant.n)
-        self._ring = np.zeros((MAX_LATENCY + 1, plant.n, len(arm.actuators)))
+        self._largest = max_ticks
+        self._ring = np.zeros((max_ticks + 1, plant.n, len(arm.actuators)))
         self._ticks = 0
         self._waiting = np.zeros(plant.n, np.int64)  # ticks since the latency was set: before, nothing was commanded
 
@@ -35,11 +37,11 @@ class LatePlant:
         """Set by how many ticks the servos of some simulations get their commands late.
 
         Raises:
-            ConfigError: more than `MAX_LATENCY`, or negative.
+            ConfigError: more than `max_ticks`, or negative.
         """
         for value in ticks:
-            if not 0 <= value <= MAX_LATENCY:
-                raise ConfigError(f"latency_ticks is {value}; it must be between 0 and {MAX_LATENCY}.")
+            if not 0 <= value <= self._largest:
+                raise ConfigError(f"latency_ticks is {value}; it must be between 0 and {self._largest}.")
         self._latency[ids] = ticks
         self._waiting[ids] = 0
         self._late = bool(self._latency.any())

@@ -177,7 +177,8 @@ class SimulatedRobot(Robot):
             action: a number for each action feature. The order of the keys is free, because they are names.
 
         Returns:
-            The command at the end of the frame: the action after the limits of velocity, acceleration and effort.
+            The command at the end of the frame: the action after the limits, those of the reference for an arm and also
+            that of the effort for a base.
 
         Raises:
             DeviceNotConnectedError: the robot is not connected.

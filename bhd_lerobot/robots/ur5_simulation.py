@@ -11,9 +11,11 @@ from bhd_lerobot.control.arm_controller import ArmController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.impedance import ImpedanceController
 from bhd_lerobot.control.kinematics import ArmKinematics
 from bhd_lerobot.control.messages import Reason
 from bhd_lerobot.control.poses import pose_vectors
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.latency import LatePlant
 from bhd_lerobot.robots.simulation import Simulation
@@ -22,14 +24,22 @@ from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
 from bhd_lerobot.tasks.task import ArmTruth
+from bhd_lerobot.tasks.variation import MAX_LATENCY_S
 
 JOINT_ACTIONS = (*(f"{joint}.pos" for joint in JOINTS), "gripper.pos")
 OBSERVED = (*JOINT_ACTIONS, *(f"{joint}.vel" for joint in JOINTS), "gripper.vel")
+_MAX_TORQUE_LATENCY = 0.01  # [s] the default impedance becomes unstable somewhere between 0.02 and 0.05
 _SPEED_NOISE = 10.0  # [1/s] noise on speeds, as a multiple of the noise on positions
 
 
 class UR5Simulation(Simulation):
     """n simulated UR5s, each on a table of its own.
+
+    Attributes:
+        controller: an `ArmController`, or with ``control = "impedance"`` an `ImpedanceController`, whose compliance and
+            feed-forward wrench may be set and whose estimate of the contact wrench may be read.
+        kinematics: the arm's.
+        table: what lies on the tables.
 
     Args:
         config: the robot.
@@ -46,9 +56,12 @@ class UR5Simulation(Simulation):
         body = self.body = config.body()
         self.world = World(body, n, physics_hz=config.physics_hz, threads=threads)
         self.table = Tabletop(self.world)
-        self.plant = LatePlant(SimulatedPlant(self.world), body)
-        self._controller = ArmController(body, n, config.control_hz, self.rates.ticks_per_frame)
-        self.cerebellum = Cerebellum(body, self.plant, config.control_hz, controller=self._controller)
+        self.plant = LatePlant(SimulatedPlant(self.world), body, round(MAX_LATENCY_S * config.control_hz))
+        kind = ImpedanceController if config.control == "impedance" else ArmController
+        self.controller: ArmController | ImpedanceController = kind(
+            body, n, config.control_hz, self.rates.ticks_per_frame
+        )
+        self.cerebellum = Cerebellum(body, self.plant, config.control_hz, controller=self.controller)
         self.bridge = LockstepBridge(self.cerebellum, self.rates, self._advance)
         self.kinematics = ArmKinematics(body.chain, body.limits)
         if config.action_space == "tool":
@@ -60,9 +73,15 @@ class UR5Simulation(Simulation):
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
         """Put the arms and their objects where the scenes want them, at rest."""
+        latency = [scene.variation.latency_s for scene in scenes]
+        if self.config.control == "impedance" and max(latency, default=0.0) > _MAX_TORQUE_LATENCY:
+            raise ConfigError(
+                f"latency_s is {max(latency)}; with robot.control = impedance the torque loop is stable with at most "
+                f"{_MAX_TORQUE_LATENCY} s."
+            )
         self.table.place(scenes, ids)
         self._noise[ids] = [scene.variation.sensor_noise for scene in scenes]
-        self.plant.set_latency(ids, [scene.variation.latency_ticks for scene in scenes])
+        self.plant.set_latency(ids, [round(late * self.rates.control_hz) for late in latency])
         for flags in (self._arm_on_table, self._arm_on_object, self._self_contact):
             flags[ids] = False
 
@@ -110,7 +129,7 @@ class UR5Simulation(Simulation):
 
     def to_action(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return joint positions and openings as actions: as they are, or as tool poses."""
-        if self.config.action_space == "joint":
+        if self.config.action_space == "joint" or self.config.control == "impedance":
             return command.copy()
         tool = pose_vectors(self.kinematics.tool(command[:, :-1]))
         return np.concatenate([tool, command[:, -1:]], axis=1)
@@ -122,10 +141,14 @@ class UR5Simulation(Simulation):
             return action, {}
         command = self.cerebellum.command
         setpoints, refused = command.copy(), {}
+        impedance = self.config.control == "impedance"
         for sim in np.flatnonzero(mask).tolist():
             matrix, problem = pose_matrices(action[sim, :7])
             if problem is not None:
                 refused[sim] = (Reason.NO_POSTURE, problem)
+                continue
+            if impedance:  # where the spring pulls to; whether the arm gets there is for the spring to find out
+                setpoints[sim] = action[sim]
                 continue
             result = self.kinematics.solve(matrix, command[sim, :-1])
             if result.code != ResultCode.SUCCEEDED:

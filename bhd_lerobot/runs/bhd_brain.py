@@ -112,8 +112,10 @@ class BhdBrain(Teleoperator):
     def _stream(self, robot: SimulatedRobot, goals: Goals) -> tuple[NDArray[np.float64], list[CommandResult]]:
         """Return the setpoint that goals mean for the coming frame, and the goals that ended."""
         body, rates = robot.simulation.body, robot.simulation.rates
-        if not isinstance(body, Arm):
-            raise ConfigError(f"The brain {self._brain_name!r} gives goals; {robot} takes none. Use a ur5.")
+        if not isinstance(body, Arm) or body.actuation != "position":
+            raise ConfigError(
+                f"The brain {self._brain_name!r} gives goals; {robot} takes none. Use a ur5 with robot.control = servo."
+            )
         if self._streamer is None:
             self._streamer = GoalStreamer(body, rates, robot.simulation.cerebellum.command[0])
         reading = robot.simulation.bridge.state()

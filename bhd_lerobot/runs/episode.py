@@ -47,7 +47,7 @@ class Episode:
         outcome: how it ended.
         timing: how punctual its control ticks were.
         writer: what was given for the episode's images at its start, or None.
-        commands: the goals that the brain gave, each with the frame in which it gave it.
+        commands: the goals that the brain gave, each with the frame in which it gave it; None if it gave setpoints.
         results: how goals ended, each with the frame in which it did.
         plan: the brain's plan, as plain values, if it has one.
     """
@@ -60,7 +60,7 @@ class Episode:
     outcome: Outcome
     timing: TimingSummary
     writer: Any
-    commands: list[tuple[int, BrainCommand]] = field(default_factory=list)
+    commands: list[tuple[int, BrainCommand]] | None = None
     results: list[tuple[int, CommandResult]] = field(default_factory=list)
     plan: dict[str, Any] = field(default_factory=dict)
 
@@ -94,6 +94,7 @@ class EpisodeLoop:
         self._columns: dict[str, NDArray] = {}
         self._length = np.zeros(simulation.n, np.int64)
         self.frames = 0
+        self._gives_goals = False
         self._results: Mapping[int, Sequence[CommandResult]] = {}
         environment = task.environment_names
         brain.bind(simulation.observation_names, simulation.action_names, simulation.rates.fps, environment)
@@ -220,6 +221,7 @@ class EpisodeLoop:
 
     def _log(self, decision: Any, report: FrameReport) -> None:
         """Remember goals and how they ended, for the episode's metadata and for the brain."""
+        self._gives_goals = isinstance(decision, Goals)
         if isinstance(decision, Goals):
             for sim, commands in decision.commands.items():
                 self._commands[sim] += [(int(self._length[sim]), command) for command in commands]
@@ -296,7 +298,7 @@ class EpisodeLoop:
             outcome=outcome,
             timing=timing.summary(),
             writer=sink,
-            commands=self._commands[sim],
+            commands=self._commands[sim] if self._gives_goals else None,
             results=self._ends[sim],
             plan=plan,
         )

@@ -46,7 +46,7 @@ def _goals(episode: Episode) -> dict[str, Any]:
     columns: dict[str, Any] = {}
     if episode.plan:
         columns["plan"] = _json(episode.plan)
-    if episode.commands:
+    if episode.commands is not None:
         columns["goals"] = _json([[frame, asdict(command)] for frame, command in episode.commands])
         columns["results"] = _json(
             [[frame, one.task_id, one.success, one.code.name.lower(), one.message] for frame, one in episode.results]

@@ -132,9 +132,11 @@ class Replay:
         self.seed = int(metadata["seed"])
         self.fps = summary.fps
         self.simulation = make_simulation(_robot_config(summary.recording["robot"]))
-        self.goals: dict[int, list[BrainCommand]] = {}
-        for frame, fields_ in json.loads(metadata.get("goals") or "[]"):
-            self.goals.setdefault(frame, []).append(command_from_json(fields_))
+        self.goals: dict[int, list[BrainCommand]] | None = None
+        if metadata.get("goals"):
+            self.goals = {}
+            for frame, fields_ in json.loads(metadata["goals"]):
+                self.goals.setdefault(frame, []).append(command_from_json(fields_))
         self._initial = np.asarray(metadata["initial_state"], np.float64)
 
     def changed_versions(self) -> dict[str, tuple[str, str]]:
@@ -155,7 +157,7 @@ class Replay:
         for frame, action in enumerate(actions):
             states.append(simulation.physics_state[0])
             observations.append(simulation.observe().state[0])
-            if self.goals:
+            if self.goals is not None:
                 simulation.pursue({0: self.goals.get(frame, [])})
             else:
                 simulation.act(action[None])

@@ -187,8 +187,8 @@ class PickTask:
         at = truth.object_poses[sims, target]
         event = np.full(len(running), int(Event.NOTHING))
         event[running & (self._frame >= self.frames)] = Event.TIMEOUT
-        event[running & ((np.hypot(at[:, 0], at[:, 1]) > _REACH) | (at[:, 2] < -0.05))] = Event.UNREACHABLE
-        event[running & (self._best >= _LIFTED) & (height < _FALLEN)] = Event.DROPPED
+        event[running & (np.hypot(at[:, 0], at[:, 1]) > _REACH)] = Event.UNREACHABLE
+        event[running & (self._best >= _LIFTED) & (height < _FALLEN) & ~gripped] = Event.DROPPED
         event[running & (self._held >= self._hold)] = Event.SUCCESS
         # What must not happen counts also in the last frame of a success.
         event[running & (others > _STRAY).any(axis=1)] = Event.WRONG_OBJECT

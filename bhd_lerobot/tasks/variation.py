@@ -52,13 +52,12 @@ class RandomisationConfig:
                 raise ConfigError(f"randomisation.{name} is {getattr(self, name)}; it must be below 1.")
 
 
-def draw_variation(config: RandomisationConfig, rng: np.random.Generator, control_hz: int = 500) -> Variation:
+def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Variation:
     """Return the world's variation of one episode.
 
     Args:
         config: the ranges.
         rng: the episode's random numbers.
-        control_hz: ticks a second, of which the latency is a whole number [Hz].
     """
     if not config.enabled:
         return Variation()
@@ -68,7 +67,7 @@ def draw_variation(config: RandomisationConfig, rng: np.random.Generator, contro
         light_direction=_floats(uniform(-1, 1, 2) * config.light_direction),
         camera_shift=_floats(uniform(-1, 1, 3) * config.camera_m),
         sensor_noise=float(uniform(0, config.sensor_noise_rad)),
-        latency_ticks=round(float(uniform(0, config.latency_s)) * control_hz),
+        latency_s=float(uniform(0, config.latency_s)),
         finger_friction=_factor(config.friction, rng),
     )
 

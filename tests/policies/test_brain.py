@@ -24,7 +24,7 @@ def test_columns_are_found_wherever_they_lie() -> None:
 
 
 def test_missing_columns_are_all_named() -> None:
-    with pytest.raises(ConfigError, match=r"'rule' needs the action feature\(s\) y, z.*It has: a, b\."):
+    with pytest.raises(ConfigError, match=r"'rule' needs the action feature\(s\) y, z.*There is: a, b\."):
         find_columns(("a", "b"), ("y", "a", "z"), "rule", "action")
 
 

@@ -241,7 +241,7 @@ def test_in_the_end_the_object_is_where_it_was_to_be(end: str) -> None:
         assert last[2] > 0.2
         assert one.outcome.success
     else:
-        # The pick task ends it when it is nearly down: to it, this is a drop.
+        # The pick task ends it when it is let go: to it, this is a drop.
         assert last == pytest.approx((thing.x, thing.y, thing.height / 2), abs=0.02)
         assert one.outcome.event.cause == "dropped"
-        assert one.commands[-1][1].task_id.endswith("put")
+        assert one.commands[-1][1].task_id.endswith("release")

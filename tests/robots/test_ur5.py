@@ -224,7 +224,7 @@ def test_one_refused_arm_does_not_hinder_the_others():
 def test_noise_and_latency_belong_to_the_episode(tmp_path):
     simulation = UR5Simulation(UR5Config(), 2)
     home = simulation.body.home
-    wild = TableScene("empty", (), home, variation=Variation(sensor_noise=0.001, latency_ticks=10))
+    wild = TableScene("empty", (), home, variation=Variation(sensor_noise=0.001, latency_s=0.02))
     simulation.reset(np.arange(2), [wild, TableScene("empty", (), home)], [7, 7])
     seen = np.array([simulation.observe().state for _ in range(200)])
     assert np.array_equal(seen[:, 1], np.broadcast_to(seen[0, 1], seen[:, 1].shape))
@@ -242,6 +242,8 @@ def test_noise_and_latency_belong_to_the_episode(tmp_path):
         ({"physics_hz": 300}, "control_hz"),
         ({"clock": "lockstop"}, "Did you mean 'lockstep'"),
         ({"action_space": "joints"}, "Did you mean 'joint'"),
+        ({"control": "servos"}, "Did you mean 'servo'"),
+        ({"control": "impedance"}, "action_space=tool"),
         ({"scene": "pik"}, "Did you mean 'pick'"),
         ({"stale_after_s": 0}, "does not mean 'off'"),
         ({"stale_after_s": math.nan}, "stale_after_s is nan"),
@@ -295,3 +297,28 @@ def test_camera_images_where_there_is_opengl(tmp_path):
 
 def test_joint_actions_and_the_body_agree():
     assert UR5Config().body().limits.names == JOINT_ACTIONS
+
+
+def test_an_impedance_robot_keeps_the_contract_and_follows_tool_poses(tmp_path):
+    options = {"control": "impedance", "action_space": "tool"}
+    with make(tmp_path, **options) as robot:
+        action = stay(robot)
+        action["tool_z.pos"] -= 0.05
+        for _ in range(50):
+            applied = robot.send_action(action)
+        assert applied == pytest.approx(action, abs=1e-6)
+        tool = robot.simulation.truth().tool_pose[0]
+        assert tool[:3] == pytest.approx([action[f"tool_{axis}.pos"] for axis in "xyz"], abs=2e-3)
+        refusal = robot.simulation.bridge.submit(BrainCommand("a", gripper=0.0))
+        assert refusal is not None
+        assert not refusal.success
+        with pytest.raises(CommandRefusedError, match="length"):
+            robot.send_action({**action, "tool_qw.pos": 3.0})
+    check_robot(lambda: make(tmp_path, **options), action)
+
+
+def test_an_impedance_with_too_much_latency_is_refused():
+    simulation = UR5Simulation(UR5Config(control="impedance", action_space="tool"))
+    late = TableScene("empty", (), simulation.body.home, variation=Variation(latency_s=0.011))
+    with pytest.raises(ConfigError, match=r"latency_s is 0\.011"):
+        simulation.reset(FIRST, [late], [0])

@@ -98,7 +98,7 @@ def test_replay_repeats_goals_and_states_bit_for_bit(recorded, episode):
 
 def test_the_recorded_reference_replayed_as_setpoints_stays_close(recorded):
     replay = Replay(recorded, 1)
-    replay.goals = {}  # as on a robot that takes setpoints only
+    replay.goals = None  # as on a robot that takes setpoints only
     result = replay.open_loop()
     assert not result.identical
     assert result.position_m.max() < 0.01
@@ -143,7 +143,7 @@ def test_tool_actions_are_recorded_as_tool_poses(tmp_path):
     assert np.abs(np.diff(action[:, 3:7], axis=0)).max() < 0.2  # no flips of the quaternion's sign
     replay = Replay(root, 0)
     assert replay.open_loop().identical
-    replay.goals = {}
+    replay.goals = None
     assert replay.open_loop().position_m.max() < 0.01
 
 
@@ -160,6 +160,8 @@ def test_an_instruction_without_a_matching_object_is_not_carried_out_and_says_wh
     assert data_columns(root)["subtask"][-1].startswith("cannot:")
     state = np.array(data_columns(root)["observation.state"])
     assert np.abs(state[:, 7:]).max() < 0.1  # nothing moved but by the noise
+    assert json.loads(episode.metadata["goals"]) == []
+    assert Replay(root, 0).open_loop().identical
 
 
 def test_killed_and_resumed_is_the_same_as_undisturbed(recorded, tmp_path):
