@@ -216,8 +216,8 @@ def _columns() -> str:
         f"`reach`, {len(reach.ENVIRONMENT)} numbers: {_names(reach.ENVIRONMENT)}: the target pose of the tool in the "
         "base frame, position [m] and unit quaternion.\n\n"
         f"`pick`, {len(pick.ENVIRONMENT)} numbers: for each of five places `object_0` to `object_4` the "
-        f"{len(OBJECT_FIELDS)} numbers {_names(OBJECT_FIELDS)}: whether there is an object, whether it is the one asked "
-        "for, whether it is a box; its pose in the base frame; its measures [m]; its colour.\n"
+        f"{len(OBJECT_FIELDS)} numbers {_names(OBJECT_FIELDS)}: whether there is an object, whether it is the one "
+        "asked for, whether it is a box; its pose in the base frame; its measures [m]; its colour.\n"
     )
     return "\n".join(
         (
