@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from bhd_lerobot.bodies.body import Arm, Body, MobileBase, Shape
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.sim.backdrop import add_backdrop
 from bhd_lerobot.sim.engine import mujoco
 from bhd_lerobot.sim.table_stage import add_table_stage
 
@@ -79,26 +80,11 @@ def _add_arena_stage(spec: mujoco.MjSpec, body: MobileBase, pool_size: int) -> N
 
 def _add_stage(spec: mujoco.MjSpec) -> None:
     """Add floor, sky, light and the cameras that look at the scene from outside."""
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.78, 0.86, 0.95],
-        rgb2=[0.95, 0.97, 1.0],
-        width=64,
-        height=384,
+    add_backdrop(
+        spec,
+        sky=((0.78, 0.86, 0.95), (0.95, 0.97, 1.0)),
+        floor=((0.80, 0.80, 0.78), (0.72, 0.72, 0.70)),
     )
-    spec.add_texture(
-        name="floor",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.80, 0.80, 0.78],
-        rgb2=[0.72, 0.72, 0.70],
-        width=128,
-        height=128,
-    )
-    material = spec.add_material(name="floor", texrepeat=[2, 2], texuniform=True)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
     spec.add_material(name="obstacle", rgba=[0.80, 0.55, 0.30, 1.0], specular=0.1)
     spec.worldbody.add_geom(
         name="floor",

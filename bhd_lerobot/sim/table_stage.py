@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Shape
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
+from bhd_lerobot.sim.backdrop import add_backdrop
 from bhd_lerobot.sim.engine import mujoco
 
 TABLE_BIT, ARM_BIT, OBJECT_BIT = 1, 2, 4  # contact bits; those of the arm are in its MJCF
@@ -80,26 +81,11 @@ def _add_options(spec: mujoco.MjSpec) -> None:
 
 
 def _add_room(spec: mujoco.MjSpec) -> None:
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.86, 0.88, 0.90],
-        rgb2=[0.62, 0.66, 0.70],
-        width=64,
-        height=384,
+    add_backdrop(
+        spec,
+        sky=((0.86, 0.88, 0.90), (0.62, 0.66, 0.70)),
+        floor=((0.46, 0.48, 0.50), (0.42, 0.44, 0.46)),
     )
-    spec.add_texture(
-        name="floor",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.46, 0.48, 0.50],
-        rgb2=[0.42, 0.44, 0.46],
-        width=128,
-        height=128,
-    )
-    floor = spec.add_material(name="floor", texrepeat=[2, 2], texuniform=True, specular=0.1)
-    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
     spec.worldbody.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
