@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict
+from functools import cache
 from importlib import metadata
 from typing import Any
 
@@ -16,6 +17,12 @@ from bhd_lerobot.runs.episode import Episode
 
 def versions() -> dict[str, str]:
     """Return the versions of what decides an episode."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
+    # Read once: looking them up reads the distributions' metadata, which takes longer than saving an episode.
     return {"bhd_lerobot": __version__, **{name: metadata.version(name) for name in ("lerobot", "mujoco", "numpy")}}
 
 
