@@ -31,6 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--timeout", type=float, default=20.0, help="s")
     parser.add_argument("--estop-after", type=float, metavar="SECONDS", help="press the emergency stop at this time")
     args = parser.parse_args(arguments)
+    if args.estop_after is not None and not 0 <= args.estop_after <= args.timeout:
+        parser.error(f"--estop-after is {args.estop_after}; it must be between 0 and the time-out, {args.timeout} s")
     pose = Pose(tuple(args.position), tuple(args.quaternion))
     # Slow enough to see something of it, and to stop it in the middle.
     speed = args.max_velocity if args.max_velocity is not None else 0.2 if args.motion == "line" else 0.5
@@ -61,7 +63,7 @@ def _run(robot: UR5, goal: BrainCommand, estop_after: float | None) -> int:
         print(f"refused  {refusal.code.name}: {refusal.message}")
         return 1
     print("accepted")
-    start, shown, stopped = bridge.now_ns, 0.0, False
+    start, shown, stopped = bridge.now_ns, 0, False
     while True:
         bridge.advance_frame()
         seconds = (bridge.now_ns - start) / 1e9
@@ -70,11 +72,13 @@ def _run(robot: UR5, goal: BrainCommand, estop_after: float | None) -> int:
                 f"{seconds:6.2f} s  {'succeeded' if result.success else 'failed'}  {result.code.name}: {result.message}"
             )
             if not stopped:
-                return 0 if result.success else 1
+                if estop_after is not None:
+                    print("The goal ended before the emergency stop; choose an earlier --estop-after.")
+                return 0 if result.success and estop_after is None else 1
             return _after_stop(robot, goal)
         feedback = bridge.feedback()
-        if feedback is not None and seconds >= shown:
-            shown += FEEDBACK_S
+        if feedback is not None and seconds >= shown * FEEDBACK_S:
+            shown += 1
             position = robot.simulation.kinematics.tool(bridge.state().joint_positions[0, :-1])[:3, 3]
             print(
                 f"{seconds:6.2f} s  feedback  {feedback.phase.name.lower()} {feedback.progress:4.0%}, "

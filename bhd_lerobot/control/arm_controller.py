@@ -11,6 +11,9 @@ from bhd_lerobot.control.messages import Limit, Mode
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.control.setpoints import SetpointFilter
 
+# A joint this far from its reference for so long does not follow it; goals end with PATH_TOLERANCE at that distance.
+BLOCKED_RAD, BLOCKED_S = 0.1, 0.05
+_BLOCKED = f"The arm stayed more than {BLOCKED_RAD} rad from its reference: something is in its way."
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 
 
@@ -37,10 +40,17 @@ class ArmController(Controller):
         self.velocity: NDArray[np.float64] = np.zeros((n, width))
         self.acceleration: NDArray[np.float64] = np.zeros((n, width))
         self.actuators = self.command.copy()
-        self.following, self.busy = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self.following, self.busy, self.blocked = (np.zeros(n, np.bool_) for _ in range(3))
+        self._off_ticks: NDArray[np.int64] = np.zeros(
+            n, np.int64
+        )  # ticks for which a joint has been too far from its reference
+        self._unwatched: NDArray[np.bool_] = np.zeros(n, np.bool_)  # stopped hard, or on the way back already
+        self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
+        self._most_off_ticks = round(BLOCKED_S * control_hz)
         self._lead = np.asarray(arm.servo_damping) / np.asarray(arm.servo_stiffness)
         self._stiffness, self._damping = np.asarray(arm.servo_stiffness), np.asarray(arm.servo_damping)
-        self._largest_error = np.asarray(limits.effort) / self._stiffness
+        self._effort = np.asarray(limits.effort)
+        self._largest_error = self._effort / self._stiffness
         self._flat_command, self._zeros = self.command.reshape(-1), np.zeros(n * width)
         self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._work = np.zeros((n, width))
@@ -64,8 +74,11 @@ class ArmController(Controller):
         """Decelerate to rest; all goals of these arms end, with the cause as their result."""
         if cause not in _STOP_CODES:
             return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
-        self._leave_setpoints(mask)
         hard = cause in (Mode.ESTOP, Mode.FAULT)
+        if hard:
+            mask = mask & ~self.blocked  # they are on their way back, and goals have ended
+            self._unwatched |= mask
+        self._leave_setpoints(mask)
         self.goals.stop(mask, _STOP_CODES[cause], hard, self.command, self.velocity, self.acceleration)
 
     def run(self, reading: PlantReading) -> None:
@@ -78,6 +91,7 @@ class ArmController(Controller):
         np.copyto(self.busy, self.goals.busy)
         phase = self.goals.phase
         np.logical_or(phase == GoalPhase.CONVERTING, phase == GoalPhase.EXECUTING, out=self.following)
+        self._unwatched &= ~self.following
         np.multiply(self.velocity, self._lead, out=self.actuators)
         self.actuators += self.command
         # A servo that is asked for more than it can give gives what it can: that is noted, and the command left alone.
@@ -89,8 +103,32 @@ class ArmController(Controller):
         work -= self.actuators
         np.abs(work, out=work)
         beyond = work > self._largest_error
+        self.blocked[:] = False
         if np.count_nonzero(beyond):
             self._limited_effort |= beyond[:, : self.width - 1].any(axis=1)
+            self._watch(reading)
+        elif np.count_nonzero(self._off_ticks):
+            self._off_ticks[:] = 0
+
+    def _watch(self, reading: PlantReading) -> None:
+        """Find arms that do not go where they are commanded to, and stop pressing on with them.
+
+        A servo goes on with its full torque for as long as its command is out of reach. The command is brought back to
+        where the arm is: what it pressed against is let go of.
+        """
+        dof = self.width - 1
+        off = (np.abs(self.command[:, :dof] - reading.position[:, :dof]) > BLOCKED_RAD).any(axis=1)
+        self._off_ticks = (self._off_ticks + 1) * (off & ~self._unwatched)
+        blocked = self._off_ticks >= self._most_off_ticks
+        if not blocked.any():
+            return
+        np.copyto(self.blocked, blocked)
+        self._off_ticks[blocked] = 0
+        self._unwatched |= blocked
+        self._leave_setpoints(blocked)
+        where = np.minimum(np.maximum(reading.position, self._lower), self._upper)
+        where[:, dof] = self.command[:, dof]  # what is gripped is not let go of
+        self.goals.retreat(blocked, _BLOCKED, (self.command, self.velocity, self.acceleration), where)
 
     def _leave_setpoints(self, mask: NDArray[np.bool_]) -> None:
         """Follow no setpoints any more; what comes next starts without speeding up.
@@ -109,8 +147,7 @@ class ArmController(Controller):
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from the posture that the arms are in."""
-        lower, upper = np.asarray(self.arm.limits.lower), np.asarray(self.arm.limits.upper)
-        self.command[ids] = np.minimum(np.maximum(reading.position[ids], lower), upper)
+        self.command[ids] = np.minimum(np.maximum(reading.position[ids], self._lower), self._upper)
         self.actuators[ids] = self.command[ids]
         self.velocity[ids] = self.acceleration[ids] = 0.0
 
@@ -119,7 +156,9 @@ class ArmController(Controller):
         self.goals.restart(ids)
         self.setpoints.restart(ids)
         self.velocity[ids] = self.acceleration[ids] = 0.0
-        for flags in (self._limited_finite, self._limited_effort, self.busy, self.following):
+        self._off_ticks[ids] = 0
+        self._unwatched[ids] = False
+        for flags in (self._limited_finite, self._limited_effort, self.busy, self.following, self.blocked):
             flags[ids] = False
 
     # --- reports -----------------------------------------------------------------------------------------------------
@@ -145,8 +184,9 @@ class ArmController(Controller):
         return limits
 
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return the torques that the servos are asked for beyond gravity [N m], the gripper's force last [N]."""
-        return (self.actuators - reading.position) * self._stiffness - reading.velocity * self._damping
+        """Return the torques that the servos give beyond gravity [N m], the gripper's force last [N]."""
+        asked = (self.actuators - reading.position) * self._stiffness - reading.velocity * self._damping
+        return np.minimum(np.maximum(asked, -self._effort), self._effort)
 
     # --- goals -------------------------------------------------------------------------------------------------------
 

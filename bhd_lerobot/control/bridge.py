@@ -87,7 +87,12 @@ class LockstepBridge:
 
         Returns:
             None if it was accepted: its one result comes later, by `take_results`. Otherwise the refusal.
+
+        Raises:
+            ConfigError: there is no such simulation.
         """
+        if not 0 <= sim < self.cerebellum.n:
+            raise ConfigError(f"sim is {sim}; there are {self.cerebellum.n} simulations, from 0 on.")
         return self.cerebellum.submit(sim, command)
 
     def cancel(self, task_id: str, sim: int = 0) -> ResultCode:

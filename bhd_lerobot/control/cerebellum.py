@@ -110,7 +110,7 @@ class Cerebellum:
         self._supervise(now_ns)
         self._take_commands(now_ns)
         self.controller.run(self.reading)
-        self._follow_goals()
+        self._follow_controller()
         self.plant.write(self.controller.actuators)
         self._last_position[:] = self.reading.position
         self.ticks += 1
@@ -168,8 +168,16 @@ class Cerebellum:
             self._update_deadline()
             due = self.fifo.next_due()
 
-    def _follow_goals(self) -> None:
-        """Keep the modes in step with the goals: TRACKING while one is followed, HOLD when all are done."""
+    def _follow_controller(self) -> None:
+        """Keep the modes in step with the controller.
+
+        TRACKING while a goal is followed, HOLD when all are done, FAULT for an arm that something is in the way of.
+        """
+        blocked = self.controller.blocked
+        if np.count_nonzero(blocked):
+            # A protective stop: whatever moved it there would go on pressing.
+            self._watchdog[blocked] |= Watchdog.BLOCKED
+            self._set_mode(blocked & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT), Mode.FAULT)
         busy = self.controller.busy
         if not (np.count_nonzero(busy) or np.count_nonzero(self._by_goal)):
             return

@@ -2,16 +2,18 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from bhd_lerobot.bodies.body import Arm
-from bhd_lerobot.control.commands import MOTIONS, BrainCommand, ResultCode
+from bhd_lerobot.control.commands import MOTIONS, BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.trajectory import PlanFailure
 from bhd_lerobot.errors import unknown_name
 
 MAX_TOOL_SPEED = 1.0  # [m/s] on a line; an estimate of what is sensible beside an arm of this size
 MAX_TOOL_ACCELERATION = 5.0  # [m/s^2] on a line; likewise
+MAX_TIMEOUT_S = 600.0  # [s]
 NORM_ERROR = 1e-3  # a quaternion's norm may differ from 1 by this
 
 
@@ -32,11 +34,16 @@ def check(command: BrainCommand, arm: Arm) -> PlanFailure | None:
 
 def _check_form(command: BrainCommand, dof: int) -> PlanFailure | None:
     pose, joints = command.target_pose, command.joint_target
+    untyped: Any = command  # messages from outside may hold anything
     message = None
     if not isinstance(command.task_id, str) or not command.task_id:
         message = f"task_id is {command.task_id!r}; it must be a text that is not empty."
     elif command.motion not in MOTIONS:
         message = unknown_name("motion", command.motion, MOTIONS)
+    elif not isinstance(untyped.preempt, bool):
+        message = f"preempt is {command.preempt!r}; it must be True or False."
+    elif pose is not None and not isinstance(untyped.target_pose, Pose):
+        message = f"target_pose is {pose!r}; it must be a Pose of a position and a quaternion."
     elif pose is not None and joints is not None:
         message = "Both target_pose and joint_target are given; a goal takes one of them."
     elif pose is None and joints is None and command.gripper is None:
@@ -105,9 +112,10 @@ def _check_speed(command: BrainCommand, arm: Arm) -> PlanFailure | None:
             return PlanFailure(
                 code, f"{name} is {value!r}; for this motion it must be above 0 and at most {largest:.6g} {unit_of}."
             )
-    if not (_is_list((command.timeout_s,), 1) and 0.0 < command.timeout_s < math.inf):
+    if not (_is_list((command.timeout_s,), 1) and 0.0 < command.timeout_s <= MAX_TIMEOUT_S):
         return PlanFailure(
-            ResultCode.BAD_TIMEOUT, f"timeout_s is {command.timeout_s!r}; it must be positive and finite [s]."
+            ResultCode.BAD_TIMEOUT,
+            f"timeout_s is {command.timeout_s!r}; it must be above 0 and at most {MAX_TIMEOUT_S:g} s.",
         )
     return None
 

@@ -24,6 +24,7 @@ class Controller(ABC):
         following: whether the robot follows a goal, shape (n,).
         busy: whether it follows one, or brakes after one, shape (n,): it moves without setpoints, and their age says
             nothing about it.
+        blocked: whether it has just been found not to go where it is commanded to, shape (n,): something is in its way.
     """
 
     width: int
@@ -32,6 +33,7 @@ class Controller(ABC):
     actuators: NDArray[np.float64]
     following: NDArray[np.bool_]
     busy: NDArray[np.bool_]
+    blocked: NDArray[np.bool_]
 
     @abstractmethod
     def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:

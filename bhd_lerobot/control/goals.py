@@ -12,7 +12,7 @@ from bhd_lerobot.control.kinematics import ArmKinematics
 from bhd_lerobot.control.planner import GoalPlanner, Plan
 from bhd_lerobot.control.player import TrajectoryPlayer
 from bhd_lerobot.control.supervision import Supervisor
-from bhd_lerobot.control.trajectory import PlanFailure, State
+from bhd_lerobot.control.trajectory import PlanFailure, State, to_target
 
 Array = NDArray[np.float64]
 Reference = tuple[Array, Array, Array]
@@ -151,6 +151,27 @@ class GoalManager:
         for sim in np.flatnonzero(mask).tolist():
             self._end_all(sim, ResultCode.REPLACED_BY_SETPOINT, "A setpoint came, and the newer command counts.")
             self._rest(sim)
+            self._changed(sim)
+
+    def retreat(self, mask: NDArray[np.bool_], message: str, reference: Reference, target: Array) -> None:
+        """End all goals of arms that something is in the way of, and bring their reference to where they are.
+
+        Args:
+            mask: the arms, shape (n,).
+            message: why their goals end, with PATH_TOLERANCE.
+            reference: position, velocity and acceleration, each of shape (n, dof + 1).
+            target: where they are, within the limits, shape (n, dof + 1).
+        """
+        for sim in np.flatnonzero(mask).tolist():
+            self._end_all(sim, ResultCode.PATH_TOLERANCE, message)
+            state = State.of(*(array[sim] for array in reference))
+            way = to_target(state, target[sim], self.planner.limits, self._hz)
+            if isinstance(way, PlanFailure):
+                self._brake(sim, reference, _Motion.BRAKE)
+            else:
+                self._rest(sim)
+                self._player.start(sim, way)
+                self._motion[sim] = _Motion.BRAKE
             self._changed(sim)
 
     def restart(self, ids: NDArray[np.intp]) -> None:

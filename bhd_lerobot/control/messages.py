@@ -34,7 +34,7 @@ class Mode(IntEnum):
     ESTOP = 6
     """Emergency stop, latched."""
     FAULT = 7
-    """The plant reported something impossible, latched."""
+    """The plant reported something impossible, or something was in an arm's way; latched."""
 
 
 class Reason(IntEnum):
@@ -97,6 +97,8 @@ class Watchdog(IntFlag):
     NONE = 0
     COMMAND_AGE = 1
     """The command became older than its time-out; the robot ramps to zero."""
+    BLOCKED = 2
+    """An arm stayed away from where it was commanded to be: a protective stop, mode FAULT."""
 
 
 class Request(IntEnum):

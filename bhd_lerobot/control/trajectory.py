@@ -12,6 +12,7 @@ from bhd_lerobot.control.commands import ResultCode
 
 Array = NDArray[np.float64]
 
+MAX_DURATION_S = 120.0  # [s] a trajectory is kept as a list of ticks; a longer one is a mistake in its limits
 _SLACK = 1e-9  # [rad or m] what rounding may add to a position
 _CODES = {int(code): name for name, code in ruckig.Result.__members__.items()}
 
@@ -240,10 +241,16 @@ def _calculate(
     answer = ruckig.Trajectory(dof)
     try:
         code = int(ruckig.Ruckig(dof).calculate(request, answer))
-    except ruckig.RuckigError as error:
+    except (ruckig.RuckigError, ValueError) as error:  # its bindings do not know all of its own results
         return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory: {error}")
     if code < 0:
         return PlanFailure(ResultCode.PLANNING_FAILED, f"No trajectory: Ruckig returns {_CODES.get(code, code)}.")
+    if not answer.duration <= MAX_DURATION_S:
+        return PlanFailure(
+            ResultCode.PLANNING_FAILED,
+            f"The motion would take {answer.duration:.0f} s; {MAX_DURATION_S:g} s is the most. Give it more speed or "
+            "more acceleration.",
+        )
     trajectory = sample(answer, hz)
     if target is not None:
         trajectory.position[-1] = target

@@ -41,7 +41,7 @@ SCALARS: dict[str, tuple[str, str]] = {
     LATENESS: ("float32", "largest lateness of a control tick in the frame [s]"),
     OVERRUNS: ("int64", "control ticks of the frame that ended after the next was due"),
     LIMITS: ("int64", "what the limits changed: 1 not finite, 2 velocity, 4 acceleration, 8 effort, 16 position; sum"),
-    WATCHDOG: ("int64", "what the watchdogs noticed: 1 command too old; sum"),
+    WATCHDOG: ("int64", "what the watchdogs noticed: 1 command too old, 2 arm blocked; sum"),
     MODE: (
         "int64",
         "cerebellum's mode at the end of the frame: 0 unconfigured, 1 inactive, 2 hold, 3 tracking, 4 stopping, "
@@ -66,6 +66,7 @@ def dataset_features(
     environment_names: Sequence[str] = (),
     *,
     subtask: bool = False,
+    language: bool = False,
 ) -> dict[str, dict[str, Any]]:
     """Return the features of a dataset in LeRobot's form.
 
@@ -76,6 +77,7 @@ def dataset_features(
         physics_names: the simulator's generalised positions and velocities, in order.
         environment_names: what the task tells the brain, in order; no such column if there is nothing.
         subtask: whether the brain says what it is doing.
+        language: whether that is said in LeRobot's language column, too.
     """
     features: dict[str, dict[str, Any]] = {OBSERVATION_STATE: _vector("float32", observation_names)}
     if environment_names:
@@ -92,6 +94,7 @@ def dataset_features(
         features[key] = {"dtype": dtype, "shape": (1,), "names": None}
     if subtask:
         features[SUBTASK] = {"dtype": "string", "shape": (1,), "names": None}
+    if language:
         features[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
     features[PHYSICS_STATE] = _vector("float64", physics_names)
     return features

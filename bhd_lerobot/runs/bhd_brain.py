@@ -14,7 +14,7 @@ from bhd_lerobot.policies.brain import Brain, Goals, Observation
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
 from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
 from bhd_lerobot.runs.goal_streamer import GoalStreamer
-from bhd_lerobot.runs.registry import action_names_of, make_brain, robot_of_brain
+from bhd_lerobot.runs.registry import action_names_of, brains_for, make_brain, robot_of_brain
 
 
 class BhdBrain(Teleoperator):
@@ -90,6 +90,11 @@ class BhdBrain(Teleoperator):
             raise DeviceNotConnectedError(f"{self} is not connected. Call connect() first.")
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
+            if robot_of_brain(self.config.brain) != robot.name:
+                raise ConfigError(
+                    f"The brain {self._brain_name!r} does not drive a {robot.name}. Choose one that does by "
+                    f"--teleop.brain.type: {', '.join(brains_for(robot.name))}."
+                )
             self._brain = make_brain(self.config.brain)
             names, _ = robot.environment
             self._brain.bind(robot.observation_names, robot.action_names, self.config.fps or robot.config.fps, names)

@@ -7,7 +7,7 @@ from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.config_brain import BrainConfig
-from bhd_lerobot.runs.registry import SIMULATED_ROBOTS, robot_of_task
+from bhd_lerobot.runs.registry import SIMULATED_ROBOTS, brains_for, robot_of_brain, robot_of_task
 from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import SPLITS
 
@@ -22,6 +22,9 @@ class DatasetConfig:
         fps: frames a second [Hz]; the robot's own if 0.
         num_episodes: number of episodes that the dataset holds in the end.
         episode_time_s: longest duration of an episode [s]; the task's if nothing.
+        language: also write what the brain was doing, and its plan, into LeRobot's column `language_persistent`, for
+            brains with a plan. Off, because PyTorch's own collating and `lerobot-dataset-viz` fail on that column;
+            LeRobot's training knows it.
         push_to_hub: upload the dataset when it is complete.
         private: whether the uploaded dataset is private.
         tags: tags of the uploaded dataset.
@@ -32,6 +35,7 @@ class DatasetConfig:
     fps: int = 0
     num_episodes: int = 50
     episode_time_s: float | None = None
+    language: bool = False
     push_to_hub: bool = False
     private: bool = False
     tags: list[str] = field(default_factory=list)
@@ -84,6 +88,13 @@ class RecordConfig:
             task = self.task.get_choice_name(type(self.task))
             raise ConfigError(
                 f"task.type is {task!r}, which is for robot.type = {wanted!r}; robot.type is {self.robot.type!r}."
+            )
+        driven = robot_of_brain(self.brain)
+        if driven != self.robot.type:
+            brain = self.brain.get_choice_name(type(self.brain))
+            raise ConfigError(
+                f"brain.type is {brain!r}, which drives a {driven}; robot.type is {self.robot.type!r}. "
+                f"Brains for it: {', '.join(brains_for(self.robot.type))}."
             )
         for name, value in (
             ("dataset.num_episodes", self.dataset.num_episodes),

@@ -41,7 +41,7 @@ class Episode:
     Attributes:
         spec: what was asked for.
         scene: where it was: an `Arena` or a `TableScene`.
-        instruction: what a person would ask for in it.
+        instruction: what was asked for: what the brain was told to do, or what the task asks for.
         initial_state: the simulator's complete state at its start, shape (nstate,).
         columns: the dataset's columns by key, each of shape (frames, ...), images left out.
         outcome: how it ended.
@@ -90,7 +90,7 @@ class EpisodeLoop:
     ) -> None:
         self.simulation, self.task, self.brain = simulation, task, brain
         self._open_images: Callable[[], Any] | None = None
-        self._frames = round(task.duration_s * simulation.rates.fps)
+        self._frames = max(1, round(task.duration_s * simulation.rates.fps))
         self._columns: dict[str, NDArray] = {}
         self._length = np.zeros(simulation.n, np.int64)
         self.frames = 0
@@ -277,8 +277,6 @@ class EpisodeLoop:
         columns = {key: column[sim, :length].copy() for key, column in self._columns.items()}
         outcome = self.task.outcome(sim, event)
         plan = self.brain.plan(sim) if self.brain.has_plan else {}
-        if self.brain.has_plan:
-            columns[keys.LANGUAGE] = _said(plan, columns[keys.SUBTASK], self.simulation.rates.fps)
         last = np.arange(length) == length - 1
         columns[keys.DONE] = last
         columns[keys.SUCCESS] = last & outcome.success
@@ -292,7 +290,7 @@ class EpisodeLoop:
         return Episode(
             spec=spec,
             scene=scene,
-            instruction=self.task.instruction(scene),
+            instruction=plan.get("instruction") or self.task.instruction(scene),
             initial_state=initial,
             columns=columns,
             outcome=outcome,
@@ -302,29 +300,3 @@ class EpisodeLoop:
             results=self._ends[sim],
             plan=plan,
         )
-
-
-def _said(plan: dict[str, Any], subtasks: NDArray, fps: int) -> NDArray:
-    """Return LeRobot's column of what is said and stays valid: the plan, and every subtask from when it began.
-
-    Every frame of an episode holds the same rows.
-
-    Args:
-        plan: the plan.
-        subtasks: what the brain was doing in each frame, shape (frames,).
-        fps: frames a second [Hz].
-    """
-    rows: list[dict[str, Any]] = []
-
-    def say(style: str, content: str, frame: int) -> None:
-        when = {"timestamp": frame / fps, "camera": None, "tool_calls": None}
-        rows.append({"role": "assistant", "content": content, "style": style, **when})
-
-    if plan.get("steps"):
-        say("plan", "\n".join(f"{number}. {text}" for number, (_, text) in enumerate(plan["steps"], 1)), 0)
-    for frame, text in enumerate(subtasks):
-        if frame == 0 or text != subtasks[frame - 1]:
-            say("subtask", str(text), frame)
-    column = np.empty(len(subtasks), dtype=object)
-    column[:] = [rows] * len(subtasks)
-    return column

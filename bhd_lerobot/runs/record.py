@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import yaml
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from bhd_lerobot.data.features import PHYSICS_STATE, dataset_features
+from bhd_lerobot.data.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
@@ -25,6 +26,7 @@ from bhd_lerobot.robots.simulation import Simulation, describe
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import encode, run
 from bhd_lerobot.runs.episode import Episode, EpisodeLoop, EpisodeSpec
+from bhd_lerobot.runs.language_rows import language_column
 from bhd_lerobot.runs.plots import Trajectory, draw_trajectories
 from bhd_lerobot.runs.preview import Preview
 from bhd_lerobot.runs.provenance import episode_metadata
@@ -45,6 +47,7 @@ class RecordResult:
         successes: how many of them were a success.
         outcomes: how many ended how.
         scores: their scores.
+        problems: why brains gave up, in words, of the episodes that were no success.
         frames: frames that this run added.
         simulated_s: simulated time of the episodes that this run added [s].
         wall_s: time that this took [s], from the first observation to the last save.
@@ -58,6 +61,7 @@ class RecordResult:
     successes: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     scores: list[float] = field(default_factory=list)
+    problems: Counter[str] = field(default_factory=Counter)
     frames: int = 0
     simulated_s: float = 0.0
     wall_s: float = 0.0
@@ -127,6 +131,9 @@ def _run(
         started = time.perf_counter()
         for episode in loop.run(specs, lambda: bool(result.stopped_by), recorder.begin_episode):
             metadata = episode_metadata(episode, split=config.split, task=task.parameters(), brain=brain.parameters())
+            if config.dataset.language and brain.has_plan:
+                said = language_column(episode.plan, episode.columns[SUBTASK], config.dataset.fps)
+                episode.columns[LANGUAGE] = said
             _save(recorder, episode, metadata)
             _count(result, episode, config.dataset.fps)
             result.wall_s = time.perf_counter() - started
@@ -159,6 +166,7 @@ def _open_recorder(
         physics,
         task.environment_names,
         subtask=brain.has_plan,
+        language=brain.has_plan and config.dataset.language,
     )
     # What decides the episodes. How many there are, and how many run side by side, does not.
     recording = {
@@ -196,6 +204,8 @@ def _count(result: RecordResult, episode: Episode, fps: int) -> None:
     result.successes += episode.outcome.success
     result.outcomes[episode.outcome.event.cause] += 1
     result.scores.append(episode.outcome.score)
+    if episode.plan.get("problem") and not episode.outcome.success:
+        result.problems[episode.plan["problem"]] += 1
     result.frames += episode.frames
     result.simulated_s += episode.frames / fps
 
@@ -255,6 +265,8 @@ def _summary(console: Console, config: RecordConfig, result: RecordResult, film:
     if result.recorded:
         table.add_row("success", f"{result.successes} of {result.recorded}")
         table.add_row("outcomes", ", ".join(f"{name} {count}" for name, count in result.outcomes.most_common()))
+        for problem, count in result.problems.most_common(3):
+            table.add_row("gave up" if count == 1 else f"gave up {count} times", escape(problem))
         table.add_row("mean score", f"{np.mean(result.scores):.3f}")
         table.add_row("speed", f"{result.real_time_factor:.0f} x real time, n_envs = {config.n_envs}")
     files = [

@@ -68,6 +68,12 @@ def robot_of_brain(config: BrainConfig) -> str:
     return str(brain.robot_type)
 
 
+def brains_for(robot_type: str) -> tuple[str, ...]:
+    """Return the names of the brains for a type of robot."""
+    brains: Any = _BRAINS.values()
+    return tuple(sorted(brain.name for brain in brains if brain.robot_type == robot_type))
+
+
 def robot_of_task(config: TaskConfig) -> str:
     """Return the type of the robot that a task is for."""
     task: Any = _TASKS[type(config)]

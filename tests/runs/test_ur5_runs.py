@@ -25,6 +25,8 @@ PICK = {
     "robot__beams": None,
 }
 
+SPOKEN = {"dataset__num_episodes": 4, "seed": 6, "task__language": "any", "dataset__language": "true"}
+
 
 def record(root, **overrides):
     return run_record(root, **{**PICK, **overrides})
@@ -33,14 +35,14 @@ def record(root, **overrides):
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     root = tmp_path_factory.mktemp("ur5") / "d"
-    record(root, n_envs=3, dataset__num_episodes=4, seed=6, task__language="any")
+    record(root, **SPOKEN, n_envs=3)
     return root
 
 
 def test_same_seed_same_bytes_for_any_number_of_arms(recorded, tmp_path):
     for n_envs, threads in ((1, 1), (4, 2)):
         root = tmp_path / f"n{n_envs}"
-        record(root, n_envs=n_envs, threads=threads, dataset__num_episodes=4, seed=6, task__language="any")
+        record(root, **SPOKEN, n_envs=n_envs, threads=threads)
         one, other = (pq.read_table(folder / "data") for folder in (recorded, root))
         assert one.column_names == other.column_names
         for name in one.column_names:
@@ -166,7 +168,7 @@ def test_an_instruction_without_a_matching_object_is_not_carried_out_and_says_wh
 
 def test_killed_and_resumed_is_the_same_as_undisturbed(recorded, tmp_path):
     root = tmp_path / "killed"
-    many = {**PICK, "dataset__num_episodes": 4, "seed": 6, "task__language": "any", "resume": "true"}
+    many = {**PICK, **SPOKEN, "resume": "true"}
     command = [sys.executable, "-m", "bhd_lerobot.runs.record", *options(root, **many)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE)
     while process.poll() is None:
@@ -178,7 +180,7 @@ def test_killed_and_resumed_is_the_same_as_undisturbed(recorded, tmp_path):
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    record(root, n_envs=2, dataset__num_episodes=4, seed=6, task__language="any", resume="true")
+    record(root, **SPOKEN, n_envs=2, resume="true")
     assert data_columns(root) == data_columns(recorded)
 
 
@@ -205,7 +207,7 @@ def test_cameras_are_recorded(tmp_path):
     ("change", "message"),
     [
         ({"task__type": "avoid", "brain__type": "avoidance"}, "is for robot.type = 'turtlebot3'"),
-        ({"brain__type": "gap_follower"}, "needs a range scan"),
+        ({"brain__type": "gap_follower"}, "Brains for it: language, pick, reach"),
         ({"brain__type": "reach"}, "target_x"),
         ({"task__max_objects": 6}, "max_objects is 6"),
         ({"task__language": "fr"}, "task.language"),
