@@ -9,7 +9,7 @@ import pytest
 
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
-from bhd_lerobot.control.messages import Mode, Reason
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError, RenderingError
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
@@ -322,3 +322,64 @@ def test_an_impedance_with_too_much_latency_is_refused():
     late = TableScene("empty", (), simulation.body.home, variation=Variation(latency_s=0.011))
     with pytest.raises(ConfigError, match=r"latency_s is 0\.011"):
         simulation.reset(FIRST, [late], [0])
+
+
+def test_an_arm_that_presses_on_the_table_stops_and_lets_go(robot):
+    simulation = robot.simulation
+    start = simulation.cerebellum.command.copy()
+    down = start.copy()
+    down[0, 1] += 1.0  # the shoulder lowers the arm into the table
+    reports = []
+    for _ in range(60):
+        reports.append(simulation.act(down))
+        if reports[-1].mode[0] == Mode.FAULT:
+            break
+    assert reports[-1].watchdog[0] & Watchdog.BLOCKED
+    assert reports[-1].limits[0] & Limit.EFFORT
+    assert simulation.truth().arm_on_table[0]
+    for _ in range(40):
+        simulation.bridge.advance_frame()
+    state = simulation.bridge.state()
+    assert np.abs(state.command[0, :6] - state.joint_positions[0, :6]).max() < 0.02  # it does not press any more
+    assert (np.abs(state.joint_efforts[0]) <= np.array(simulation.body.limits.effort) + 1e-9).all()
+    with pytest.raises(CommandRefusedError, match="fault is latched"):
+        robot.send_action(stay(robot))
+    robot.reset()
+    robot.activate()
+    up = dict(zip(JOINT_ACTIONS, start[0].tolist(), strict=True))
+    for _ in range(60):
+        robot.send_action(up)
+    assert simulation.bridge.state().joint_positions[0] == pytest.approx(start[0], abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("goal", "code"),
+    [
+        ({"max_velocity": 1e-7}, ResultCode.PLANNING_FAILED),
+        ({"max_velocity": 1e-5}, ResultCode.PLANNING_FAILED),
+        ({"max_velocity": 1e-3}, ResultCode.PLANNING_FAILED),
+        ({"max_acceleration": 1e-6}, ResultCode.PLANNING_FAILED),
+        ({"max_velocity": 1e-4, "motion": "line"}, ResultCode.PLANNING_FAILED),
+        ({"timeout_s": 1e17}, ResultCode.BAD_TIMEOUT),
+        ({"preempt": "no"}, ResultCode.BAD_TARGET),
+        ({"target_pose": (0.3, 0.2, 0.4)}, ResultCode.BAD_TARGET),
+        ({"target_pose": np.eye(4)}, ResultCode.BAD_TARGET),
+    ],
+)
+def test_a_goal_that_makes_no_sense_ends_with_a_code_and_harms_nothing(robot, goal, code):
+    bridge = robot.simulation.bridge
+    refusal = bridge.submit(BrainCommand(**{"task_id": "a", "target_pose": Pose((0.4, 0.1, 0.3), DOWN), **goal}))
+    bridge.advance_frame()
+    results = bridge.take_results()
+    assert [one.code for one in results] == [code]
+    assert refusal in (None, results[0])
+    assert bridge.submit(BrainCommand("b", gripper=0.05)) is None
+    for _ in range(20):
+        bridge.advance_frame()
+    assert bridge.take_results()[0].success
+
+
+@pytest.mark.parametrize("sim", [-1, 1])
+def test_a_goal_for_an_arm_that_is_not_there_is_refused(robot, sim):
+    with pytest.raises(ConfigError, match=f"sim is {sim}"):
+        robot.simulation.bridge.submit(BrainCommand("a", gripper=0.05), sim)
