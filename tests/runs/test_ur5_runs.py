@@ -226,3 +226,25 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, change, messa
 def test_the_base_is_still_recorded(tmp_path):
     result, _ = run_record(tmp_path / "d", dataset__num_episodes=1)
     assert result.episodes == 1
+
+
+def test_pytorch_collates_its_frames(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from torch.utils.data import DataLoader
+
+    record(tmp_path / "d", dataset__num_episodes=1)
+    dataset = LeRobotDataset("test/avoid", root=tmp_path / "d", video_backend="pyav")
+    batch = next(iter(DataLoader(dataset, batch_size=4)))
+    assert batch["action"].shape == (4, 7)
+    assert len(batch["subtask"]) == len(batch["task"]) == 4
+
+
+def test_why_a_brain_gave_up_is_in_the_summary(tmp_path):
+    _, text = record(
+        tmp_path / "d",
+        brain__instruction="make me a coffee",
+        dataset__num_episodes=2,
+        dataset__episode_time_s=1,
+    )
+    assert "gave up 2 times" in text
+    assert "coffee" in text
