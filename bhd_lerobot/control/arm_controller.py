@@ -51,6 +51,7 @@ class ArmController(Controller):
         self._stiffness, self._damping = np.asarray(arm.servo_stiffness), np.asarray(arm.servo_damping)
         self._effort = np.asarray(limits.effort)
         self._largest_error = self._effort / self._stiffness
+        self._largest_error[-1] = np.inf  # a gripper that grips asks for more than it has, always
         self._flat_command, self._zeros = self.command.reshape(-1), np.zeros(n * width)
         self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._work = np.zeros((n, width))
@@ -105,7 +106,7 @@ class ArmController(Controller):
         beyond = work > self._largest_error
         self.blocked[:] = False
         if np.count_nonzero(beyond):
-            self._limited_effort |= beyond[:, : self.width - 1].any(axis=1)
+            self._limited_effort |= beyond.any(axis=1)
             self._watch(reading)
         elif np.count_nonzero(self._off_ticks):
             self._off_ticks[:] = 0

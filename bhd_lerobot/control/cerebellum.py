@@ -179,7 +179,7 @@ class Cerebellum:
             self._watchdog[blocked] |= Watchdog.BLOCKED
             self._set_mode(blocked & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT), Mode.FAULT)
         busy = self.controller.busy
-        if not (np.count_nonzero(busy) or np.count_nonzero(self._by_goal)):
+        if not np.count_nonzero(busy != self._by_goal):
             return
         starting = busy & (self.mode == Mode.HOLD)
         if self._stopping:

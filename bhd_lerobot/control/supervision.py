@@ -89,8 +89,9 @@ class Supervisor:
         error = np.abs(measured[0][rows, :dof] - reference[0][rows, :dof]).max(axis=1)
         self.error[rows] = error
         self._elapsed[rows] += 1
-        still = (np.abs(measured[1][rows, dof]) < GRIPPER_STILL) & (reference[1][rows, dof] == 0.0)
-        self._still[rows] = (self._still[rows] + 1) * still
+        if np.count_nonzero(self._moves_gripper[rows]):
+            still = (np.abs(measured[1][rows, dof]) < GRIPPER_STILL) & (reference[1][rows, dof] == 0.0)
+            self._still[rows] = (self._still[rows] + 1) * still
         look = (error > PATH_TOLERANCE) | ~playing[rows] | (self._elapsed[rows] >= self._deadline[rows])
         if not np.count_nonzero(look):
             return []
