@@ -83,6 +83,8 @@ class Variation:
         light: factor on the lights' brightness.
         light_direction: what is added to the direction of the main light, x and y.
         camera_shift: what is added to the scene camera's position [m].
+        camera_turn: by what the scene camera is turned, a rotation vector in its own frame [rad].
+        wrist_turn: by what the wrist camera is turned on its mount, likewise [rad].
         sensor_noise: standard deviation of the noise on observed joint positions [rad], on speeds ten times that
             [rad/s].
         latency_s: time by which what the cerebellum commands reaches the servos late, in whole control ticks [s].
@@ -92,6 +94,8 @@ class Variation:
     light: float = 1.0
     light_direction: tuple[float, float] = (0.0, 0.0)
     camera_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    camera_turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    wrist_turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sensor_noise: float = 0.0
     latency_s: float = 0.0
     finger_friction: float = 1.0

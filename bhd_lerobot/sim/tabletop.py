@@ -19,7 +19,7 @@ _HIDDEN, _SEEN, _TOUCHED = 5, 1, 0  # geometry groups: the camera looks at 0 and
 _FIELDS = (
     *("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_group", "geom_rgba", "geom_friction"),
     *("body_mass", "body_inertia", "body_gravcomp", "body_pos", "body_quat"),
-    *("pair_friction", "geom_aabb", "cam_pos", "light_diffuse", "light_ambient", "light_dir"),
+    *("pair_friction", "geom_aabb", "cam_pos", "cam_quat", "light_diffuse", "light_ambient", "light_dir"),
 )
 # The engine counts the bodies with a compensation that is not 0, and all simulations must have the same number.
 _HEAVY = 1e-30
@@ -72,6 +72,7 @@ class Tabletop:
         self._fingers = world.joint_slice(self.arm.gripper.joints)[0]
         self._free = [int(model.joint(f"object_{k}").qposadr[0]) for k in range(MAX_OBJECTS)]
         self._target = model.body("target").id
+        self._wrist = model.camera("wrist").id
         self._scene, self._light = model.camera("scene").id, model.light("main").id
         self._tool_pos, self._tool_quat = world.site("tool")
         self._any = world.sensor("touch_any")[:, 0]
@@ -132,6 +133,9 @@ class Tabletop:
         field["light_dir"][sim, self._light] = direction / math.hypot(*direction)
         field["cam_pos"][sim] = model.cam_pos
         field["cam_pos"][sim, self._scene] += variation.camera_shift
+        field["cam_quat"][sim] = model.cam_quat
+        for camera, turn in ((self._scene, variation.camera_turn), (self._wrist, variation.wrist_turn)):
+            field["cam_quat"][sim, camera] = _turned(model.cam_quat[camera], turn)
         field["geom_friction"][sim, self._pads] = model.geom_friction[self._pads]
         field["geom_friction"][sim, self._pads, 0] *= variation.finger_friction
         pose = (*PARKED[0], *_UPRIGHT) if scene.target_pose is None else scene.target_pose
@@ -232,3 +236,14 @@ class Tabletop:
         for number in range(MAX_OBJECTS):
             known = known + grip[:, number]
         return self._any > known
+
+
+def _turned(quaternion: NDArray[np.float64], turn: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Return an orientation wxyz, turned in its own frame by a rotation vector [rad]."""
+    angle = math.hypot(*turn)
+    if angle == 0.0:
+        return quaternion
+    by = np.array([math.cos(angle / 2), *(math.sin(angle / 2) / angle * part for part in turn)])
+    result = np.empty(4)
+    mujoco.mju_mulQuat(result, quaternion, by)
+    return result

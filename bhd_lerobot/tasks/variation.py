@@ -25,6 +25,7 @@ class RandomisationConfig:
         light: brightness is multiplied by 1 - this to 1 + this.
         light_direction: up to this is added to x and y of the main light's direction.
         camera_m: up to this is added to each coordinate of the scene camera's position [m].
+        camera_rad: both cameras are turned by up to this about each of their axes [rad].
         sensor_noise_rad: noise on observed joint positions has a standard deviation of up to this [rad], on speeds ten
             times that [rad/s].
         latency_s: the servos get their commands up to this late, at most 0.05 [s].
@@ -38,6 +39,7 @@ class RandomisationConfig:
     light: float = 0.4
     light_direction: float = 0.3
     camera_m: float = 0.02
+    camera_rad: float = 0.02
     sensor_noise_rad: float = 0.0005
     latency_s: float = 0.01
 
@@ -66,6 +68,8 @@ def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Var
         light=float(uniform(1 - config.light, 1 + config.light)),
         light_direction=_floats(uniform(-1, 1, 2) * config.light_direction),
         camera_shift=_floats(uniform(-1, 1, 3) * config.camera_m),
+        camera_turn=_floats(uniform(-1, 1, 3) * config.camera_rad),
+        wrist_turn=_floats(uniform(-1, 1, 3) * config.camera_rad),
         sensor_noise=float(uniform(0, config.sensor_noise_rad)),
         latency_s=float(uniform(0, config.latency_s)),
         finger_friction=_factor(config.friction, rng),

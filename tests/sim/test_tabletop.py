@@ -6,6 +6,7 @@ import math
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
@@ -244,6 +245,20 @@ def test_variations_reach_light_camera_and_fingers() -> None:
             pads = [world_model.geom("pad_left").friction[0] for world_model in (model, nominal)]
             assert pads[0] == pytest.approx(pads[1] * variation.finger_friction)
         table.place(scenes)
+
+
+def test_cameras_turn_by_what_the_scene_says_and_the_model_s_other_fields_stay() -> None:
+    world = World(BODY, 2)
+    table = Tabletop(world)
+    turns = {"camera_turn": (0.02, -0.01, 0.03), "wrist_turn": (0.0, 0.05, 0.0)}
+    scenes = [TableScene("", (), BODY.home, variation=Variation(**kind)) for kind in (turns, {})]
+    for _ in range(2):  # a second time is not on top of the first
+        table.place(scenes)
+        for camera, turn in (("scene", turns["camera_turn"]), ("wrist", turns["wrist_turn"])):
+            before = Rotation.from_quat(world.model.camera(camera).quat, scalar_first=True)
+            after = [Rotation.from_quat(world.copy_model(sim).camera(camera).quat, scalar_first=True) for sim in (0, 1)]
+            np.testing.assert_allclose((before.inv() * after[0]).as_rotvec(), turn, atol=1e-6)
+            np.testing.assert_allclose((before.inv() * after[1]).as_rotvec(), 0.0, atol=1e-7)
 
 
 def test_the_target_is_drawn_where_it_is_wanted_and_touches_nothing() -> None:

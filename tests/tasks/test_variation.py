@@ -48,6 +48,7 @@ def test_what_is_drawn_lies_in_the_ranges(seed: int, share: float, factor: float
     assert (1 - share) / slack <= drawn.light <= (1 + share) * slack
     assert max(map(abs, drawn.light_direction)) <= config.light_direction
     assert max(map(abs, drawn.camera_shift)) <= config.camera_m
+    assert max(map(abs, (*drawn.camera_turn, *drawn.wrist_turn))) <= config.camera_rad
     assert 0 <= drawn.sensor_noise <= share
     assert 0 <= drawn.latency_s <= latency
     for value in (drawn.finger_friction, changes["mass"], changes["friction"]):
