@@ -70,12 +70,14 @@ def info(root: Path, console: Console, as_json: bool = False) -> None:
     console.print(features)
     episodes = Table(title="Episodes", title_justify="left")
     told = len({episode.task for episode in summary.episodes}) > 1
-    headings = ["episode", "frames", "seconds", "outcome", "score", "seed", "overruns", "late p99 / ms"]
-    for heading in headings + ["instruction"] * told:
+    headings = ["episode", "frames", "seconds", "outcome", "score"]
+    # The rest where there is room: a table whose every word is cut off tells nothing.
+    rest = ["seed", "overruns", "late p99 / ms"] if console.width >= _WIDE else []
+    for heading in headings + rest + ["instruction"] * told:
         left = heading in ("outcome", "instruction")
-        episodes.add_column(heading, justify="left" if left else "right", no_wrap=heading == "instruction")
+        episodes.add_column(heading, justify="left" if left else "right", no_wrap=left)
     for episode in summary.episodes:
-        row = _episode_row(episode, summary.fps)
+        row = _episode_row(episode, summary.fps)[: len(headings) + len(rest)]
         episodes.add_row(*row, *[escape(episode.task)] * told)
     console.print(episodes)
 
@@ -106,6 +108,8 @@ def _meaning(key: str, feature: dict[str, Any]) -> str:
         return f"{', '.join(map(str, names[:3]))}, … {names[-1]}"
     return ", ".join(map(str, names)) if isinstance(names, list) else ""
 
+
+_WIDE = 110  # columns of a terminal that hold the whole table
 
 _LEROBOT_COLUMNS = {
     keys.SUBTASK: "what the brain was doing, in words",

@@ -95,7 +95,10 @@ def draw_table(axes: Axes, scene: TableScene) -> None:
     axes.add_patch(Circle((0.0, 0.0), 0.075, color=_WALL, linewidth=0))
     for number, one in enumerate(scene.objects):
         edge: dict[str, Any] = {"facecolor": COLOURS[one.colour], "edgecolor": "black"}
-        edge["linewidth"] = 1.6 if number == scene.target_object else 0.3
+        edge["linewidth"] = 0.3
+        if number == scene.target_object:  # a ring beside it, which an object of any colour leaves visible
+            ring = math.hypot(one.size_x, one.size_y) + 0.02
+            axes.add_patch(Circle((one.x, one.y), ring, fill=False, edgecolor="black", linestyle="--", linewidth=1.0))
         if one.kind == "cup":
             axes.add_patch(Circle((one.x, one.y), one.size_x, **edge))
         else:
