@@ -14,6 +14,7 @@ from bhd_lerobot.control.setpoints import SetpointFilter
 # A joint this far from its reference for so long does not follow it; goals end with PATH_TOLERANCE at that distance.
 BLOCKED_RAD, BLOCKED_S = 0.1, 0.05
 _BLOCKED = f"The arm stayed more than {BLOCKED_RAD} rad from its reference: something is in its way."
+_CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)  # numpy compares plain numbers faster
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 
 
@@ -40,7 +41,8 @@ class ArmController(Controller):
         self.velocity: NDArray[np.float64] = np.zeros((n, width))
         self.acceleration: NDArray[np.float64] = np.zeros((n, width))
         self.actuators = self.command.copy()
-        self.following, self.busy, self.blocked = (np.zeros(n, np.bool_) for _ in range(3))
+        self.following, self.blocked = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self.busy = self.goals.busy  # the same array
         self._off_ticks: NDArray[np.int64] = np.zeros(
             n, np.int64
         )  # ticks for which a joint has been too far from its reference
@@ -89,10 +91,10 @@ class ArmController(Controller):
             self._leave_setpoints(self.goals.busy)
             self.setpoints.run(self.command, self.velocity, self.acceleration)
         self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
-        np.copyto(self.busy, self.goals.busy)
         phase = self.goals.phase
-        np.logical_or(phase == GoalPhase.CONVERTING, phase == GoalPhase.EXECUTING, out=self.following)
-        self._unwatched &= ~self.following
+        np.logical_or(phase == _CONVERTING, phase == _EXECUTING, out=self.following)
+        if np.count_nonzero(self._unwatched):
+            self._unwatched &= ~self.following
         np.multiply(self.velocity, self._lead, out=self.actuators)
         self.actuators += self.command
         # A servo that is asked for more than it can give gives what it can: that is noted, and the command left alone.
@@ -159,7 +161,7 @@ class ArmController(Controller):
         self.velocity[ids] = self.acceleration[ids] = 0.0
         self._off_ticks[ids] = 0
         self._unwatched[ids] = False
-        for flags in (self._limited_finite, self._limited_effort, self.busy, self.following, self.blocked):
+        for flags in (self._limited_finite, self._limited_effort, self.following, self.blocked):
             flags[ids] = False
 
     # --- reports -----------------------------------------------------------------------------------------------------

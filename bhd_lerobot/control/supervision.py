@@ -92,9 +92,11 @@ class Supervisor:
         if np.count_nonzero(self._moves_gripper[rows]):
             still = (np.abs(measured[1][rows, dof]) < GRIPPER_STILL) & (reference[1][rows, dof] == 0.0)
             self._still[rows] = (self._still[rows] + 1) * still
-        look = (error > PATH_TOLERANCE) | ~playing[rows] | (self._elapsed[rows] >= self._deadline[rows])
-        if not np.count_nonzero(look):
+        late = self._elapsed[rows] >= self._deadline[rows]
+        off = error > PATH_TOLERANCE
+        if np.count_nonzero(playing[rows]) == len(ids) and not np.count_nonzero(late) and not np.count_nonzero(off):
             return []
+        look = off | late | ~playing[rows]
         verdicts = (self._judge(int(sim), bool(playing[sim]), reference[0], measured) for sim in ids[look])
         return [verdict for verdict in verdicts if verdict is not None]
 

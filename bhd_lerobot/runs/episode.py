@@ -95,6 +95,7 @@ class EpisodeLoop:
         self._length = np.zeros(simulation.n, np.int64)
         self.frames = 0
         self._gives_goals = False
+        self._truth: Any = None
         self._results: Mapping[int, Sequence[CommandResult]] = {}
         environment = task.environment_names
         brain.bind(simulation.observation_names, simulation.action_names, simulation.rates.fps, environment)
@@ -167,6 +168,7 @@ class EpisodeLoop:
             self._commands[sim], self._ends[sim] = [], []
             self._sinks[sim] = self._open_images() if self._open_images and self.simulation.camera_names else None
         self._length[ids] = 0
+        self._truth = None
 
     def _frame(self) -> list[tuple[int, Event]]:
         """Run one frame of all running simulations; return those that ended, and why."""
@@ -177,7 +179,9 @@ class EpisodeLoop:
         values: dict[str, NDArray] = {}
         environment = None
         if task.environment_names:
-            told = task.environment_state(simulation.truth()).astype(np.float32)
+            # What is true at the end of a frame is so at the beginning of the next, unless an episode began in between.
+            truth = simulation.truth() if self._truth is None else self._truth
+            told = task.environment_state(truth).astype(np.float32)
             environment, values[keys.ENVIRONMENT_STATE] = told.astype(np.float64), told
         seen = Observation(
             simulation.observation_names,
@@ -197,7 +201,8 @@ class EpisodeLoop:
             report = simulation.act(action.astype(np.float64))
         self._log(decision, report)
         running = np.flatnonzero(simulation.running)
-        reward, event = task.judge(simulation.truth(), simulation.running)
+        self._truth = simulation.truth()
+        reward, event = task.judge(self._truth, simulation.running)
         if brain.has_plan:
             values[keys.SUBTASK] = np.array(brain.subtasks(), object)
         values |= {

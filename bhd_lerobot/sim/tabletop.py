@@ -230,12 +230,8 @@ class Tabletop:
     @property
     def arm_on_object(self) -> NDArray[np.bool_]:
         """Whether a link of the arm other than the gripper touches an object, shape (n,)."""
-        grip = self._grip
-        # Whatever the arm touches is the table, itself or an object. The counts are whole numbers.
-        known = self._table + self._self
-        for number in range(MAX_OBJECTS):
-            known = known + grip[:, number]
-        return self._any > known
+        # Whatever the arm touches is the table, itself or an object. The counts are whole numbers: their sum is exact.
+        return self._any > self._table + self._self + self._grip.sum(axis=1)
 
 
 def _turned(quaternion: NDArray[np.float64], turn: tuple[float, float, float]) -> NDArray[np.float64]:
