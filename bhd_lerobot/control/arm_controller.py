@@ -43,9 +43,8 @@ class ArmController(Controller):
         self.actuators = self.command.copy()
         self.following, self.blocked = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self.busy = self.goals.busy  # the same array
-        self._off_ticks: NDArray[np.int64] = np.zeros(
-            n, np.int64
-        )  # ticks for which a joint has been too far from its reference
+        # Ticks for which a joint has been too far from its reference.
+        self._off_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
         self._unwatched: NDArray[np.bool_] = np.zeros(n, np.bool_)  # stopped hard, or on the way back already
         self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
         self._most_off_ticks = round(BLOCKED_S * control_hz)
@@ -54,7 +53,6 @@ class ArmController(Controller):
         self._effort = np.asarray(limits.effort)
         self._largest_error = self._effort / self._stiffness
         self._largest_error[-1] = np.inf  # a gripper that grips asks for more than it has, always
-        self._flat_command, self._zeros = self.command.reshape(-1), np.zeros(n * width)
         self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._work = np.zeros((n, width))
 
@@ -68,8 +66,7 @@ class ArmController(Controller):
             self._limited_finite |= bad
             self.stop(bad, Mode.FAULT)
             mask = mask & ~bad
-        # Not `self.busy`, which is of the last tick: a goal may have come since.
-        if (self.goals.busy & mask).any():
+        if (self.busy & mask).any():
             self.goals.drop_for_setpoint(mask)
         self.setpoints.head_for(values, mask, self.command)
 
