@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
-from bhd_lerobot.bodies.ur5 import MAX_OPENING
+from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED, MAX_OPENING
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import ConfigError, InstructionError
 from bhd_lerobot.policies.brain import Observation, find_columns
@@ -50,6 +50,10 @@ class PickBrainConfig(BrainConfig):
         for name in ("max_velocity", "max_acceleration", "line_velocity", "line_acceleration", "lift_m"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"brain.{name} is {getattr(self, name)}; it must be positive and finite.")
+        if self.max_velocity > MAX_JOINT_SPEED:
+            raise ConfigError(
+                f"brain.max_velocity is {self.max_velocity}; the arm's joints turn at {MAX_JOINT_SPEED:.6g} rad/s at most."
+            )
         if self.attempts < 1:
             raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")
 

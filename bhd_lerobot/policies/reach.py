@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, find_columns
@@ -37,6 +37,10 @@ class ReachBrainConfig(BrainConfig):
         for name in ("max_velocity", "max_acceleration"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"brain.{name} is {getattr(self, name)}; it must be positive and finite.")
+        if self.max_velocity > MAX_JOINT_SPEED:
+            raise ConfigError(
+                f"brain.max_velocity is {self.max_velocity}; the arm's joints turn at {MAX_JOINT_SPEED:.6g} rad/s at most."
+            )
         if self.attempts < 1:
             raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")
 
