@@ -52,7 +52,7 @@ class PickBrainConfig(BrainConfig):
                 raise ConfigError(f"brain.{name} is {getattr(self, name)}; it must be positive and finite.")
         if self.max_velocity > MAX_JOINT_SPEED:
             raise ConfigError(
-                f"brain.max_velocity is {self.max_velocity}; the arm's joints turn at {MAX_JOINT_SPEED:.6g} rad/s at most."
+                f"brain.max_velocity is {self.max_velocity}; the joints turn at {MAX_JOINT_SPEED:.4g} rad/s at most."
             )
         if self.attempts < 1:
             raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")

@@ -212,7 +212,7 @@ def test_cameras_are_recorded(tmp_path):
         ({"task__max_objects": 6}, "max_objects is 6"),
         ({"task__language": "fr"}, "task.language"),
         ({"task__randomisation__size": 1.5}, "randomisation.size is 1.5"),
-        ({"brain__max_velocity": 99}, "brain.max_velocity is 99"),
+        ({"brain__max_velocity": 99}, r"brain\.max_velocity is 99"),
         ({"brain__attempts": 0}, "brain.attempts is 0"),
         ({"robot__action_space": "joints"}, "Did you mean 'joint'"),
     ],
