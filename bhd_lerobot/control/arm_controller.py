@@ -41,7 +41,8 @@ class ArmController(Controller):
         self.velocity: NDArray[np.float64] = np.zeros((n, width))
         self.acceleration: NDArray[np.float64] = np.zeros((n, width))
         self.actuators = self.command.copy()
-        self.following, self.blocked = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self.blocked = np.zeros(n, np.bool_)
+        self._any_blocked = False
         self.busy = self.goals.busy  # the same array
         # Ticks for which a joint has been too far from its reference.
         self._off_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
@@ -88,8 +89,6 @@ class ArmController(Controller):
             self._leave_setpoints(self.goals.busy)
             self.setpoints.run(self.command, self.velocity, self.acceleration)
         self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
-        phase = self.goals.phase
-        np.logical_or(phase == _CONVERTING, phase == _EXECUTING, out=self.following)
         if np.count_nonzero(self._unwatched):
             self._unwatched &= ~self.following
         np.multiply(self.velocity, self._lead, out=self.actuators)
@@ -103,7 +102,8 @@ class ArmController(Controller):
         work -= self.actuators
         np.abs(work, out=work)
         beyond = work > self._largest_error
-        self.blocked[:] = False
+        if self._any_blocked:
+            self.blocked[:] = self._any_blocked = False
         if np.count_nonzero(beyond):
             self._limited_effort |= beyond.any(axis=1)
             self._watch(reading)
@@ -123,6 +123,7 @@ class ArmController(Controller):
         if not blocked.any():
             return
         np.copyto(self.blocked, blocked)
+        self._any_blocked = True
         self._off_ticks[blocked] = 0
         self._unwatched |= blocked
         self._leave_setpoints(blocked)
@@ -158,10 +159,16 @@ class ArmController(Controller):
         self.velocity[ids] = self.acceleration[ids] = 0.0
         self._off_ticks[ids] = 0
         self._unwatched[ids] = False
-        for flags in (self._limited_finite, self._limited_effort, self.following, self.blocked):
+        for flags in (self._limited_finite, self._limited_effort, self.blocked):
             flags[ids] = False
 
     # --- reports -----------------------------------------------------------------------------------------------------
+
+    @property
+    def following(self) -> NDArray[np.bool_]:
+        """Whether each arm follows a goal, shape (n,)."""
+        phase = self.goals.phase
+        return np.asarray((phase == _CONVERTING) | (phase == _EXECUTING))
 
     def take_limits(self) -> NDArray[np.int64]:
         """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""

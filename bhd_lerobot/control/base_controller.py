@@ -36,7 +36,7 @@ class BaseController(Controller):
         self.drive = DiffDrive(drive, n)
         self.command = np.zeros((n, width))
         self.actuators = np.zeros((n, self.joints))
-        self.following, self.busy, self.blocked = (np.zeros(n, np.bool_) for _ in range(3))
+        self.busy, self.blocked = (np.zeros(n, np.bool_) for _ in range(2))
         self._servo_gain = drive.servo_gain
         self._velocity = np.asarray(limits.velocity)
         self._change = np.asarray(limits.acceleration) / control_hz

@@ -21,7 +21,6 @@ class Controller(ABC):
         joints: number of joints and of actuators.
         command: what is applied now, after all limits, shape (n, width).
         actuators: what goes to the plant, shape (n, joints).
-        following: whether the robot follows a goal, shape (n,).
         busy: whether it follows one, or brakes after one, shape (n,): it moves without setpoints, and their age says
             nothing about it.
         blocked: whether it has just been found not to go where it is commanded to, shape (n,): something is in its way.
@@ -31,7 +30,6 @@ class Controller(ABC):
     joints: int
     command: NDArray[np.float64]
     actuators: NDArray[np.float64]
-    following: NDArray[np.bool_]
     busy: NDArray[np.bool_]
     blocked: NDArray[np.bool_]
 
@@ -78,6 +76,11 @@ class Controller(ABC):
     @abstractmethod
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
         """Return what the servos are asked for [N m; N for a gripper], shape (n, joints)."""
+
+    @property
+    def following(self) -> NDArray[np.bool_]:
+        """Whether each robot follows a goal, shape (n,)."""
+        return np.zeros(len(self.busy), np.bool_)
 
     def odometry(self) -> NDArray[np.float64]:
         """Return x [m], y [m] and yaw [rad] since the start, shape (n, 3); shape (n, 0) for what does not drive."""

@@ -114,7 +114,7 @@ class GoalManager:
         if book.followed is None:
             return Feedback(book.waiting[0].task_id, phase, 0.0, 0.0, 0.0) if book.waiting else None
         left = self._player.remaining(sim)
-        error = float(self._supervisor.error[sim])
+        error = self._supervisor.error(sim)
         progress = 1.0 - min(1.0, left / int(self._planned[sim]))
         return Feedback(book.followed.task_id, phase, progress, left / self._hz, error)
 
@@ -203,14 +203,16 @@ class GoalManager:
                 self._end(verdict.sim, verdict.code, verdict.message)
                 self._brake(verdict.sim, reference, _Motion.BRAKE)
                 self._changed(verdict.sim)
-        for sim in self._braking[~self._player.active[self._braking]].tolist():
-            self._rest(sim)
-            if self._books[sim].followed is not None:
-                self._end(sim, ResultCode.CANCELLED, "It was cancelled; the arm has come to rest.")
-            self._changed(sim)
-        for sim in sorted(self._waiting):
-            self._serve(sim, reference)
-            self._changed(sim)
+        if len(self._braking):
+            for sim in self._braking[~self._player.active[self._braking]].tolist():
+                self._rest(sim)
+                if self._books[sim].followed is not None:
+                    self._end(sim, ResultCode.CANCELLED, "It was cancelled; the arm has come to rest.")
+                self._changed(sim)
+        if self._waiting:
+            for sim in sorted(self._waiting):
+                self._serve(sim, reference)
+                self._changed(sim)
         self._player.tick(position, velocity, acceleration)
 
     def convert(self, sim: int, command: BrainCommand, reference: Reference) -> Plan | PlanFailure:

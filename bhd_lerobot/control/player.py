@@ -23,8 +23,11 @@ class TrajectoryPlayer:
         self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self._rows = np.zeros((4096, 3, dof))
         self._used = 0
-        self._next, self._end = np.zeros(n, np.intp), np.zeros(n, np.intp)
+        # The row that is next is the number of ticks so far and this.
+        self._offset, self._end = np.zeros(n, np.intp), np.zeros(n, np.intp)
+        self._ticks = 0
         self._ids = np.flatnonzero(self.active)
+        self._only: tuple[int, int] | None = None  # the simulation and its offset, if there is one only
         self._soonest = 0  # ticks until the first of the trajectories ends
 
     def start(self, sim: int, trajectory: Trajectory) -> None:
@@ -35,7 +38,7 @@ class TrajectoryPlayer:
         begin, end = self._used, self._used + trajectory.ticks
         rows = self._rows[begin:end]
         rows[:, 0], rows[:, 1], rows[:, 2] = trajectory.position, trajectory.velocity, trajectory.acceleration
-        self._next[sim], self._end[sim], self._used = begin, end, end
+        self._offset[sim], self._end[sim], self._used = begin - self._ticks, end, end
         self.active[sim] = True
         self._changed()
 
@@ -46,44 +49,45 @@ class TrajectoryPlayer:
 
     def remaining(self, sim: int) -> int:
         """Return how many ticks are left."""
-        return int(self._end[sim] - self._next[sim]) if self.active[sim] else 0
+        return int(self._end[sim] - self._offset[sim]) - self._ticks if self.active[sim] else 0
 
     def tick(
         self, position: NDArray[np.float64], velocity: NDArray[np.float64], acceleration: NDArray[np.float64]
     ) -> None:
         """Write the next row of each trajectory; who plays none keeps what is there. The arrays have shape (n, dof)."""
-        ids = self._ids
-        if not len(ids):
+        if not self._soonest:
             return
-        if len(ids) == 1:
-            sim = ids[0]
-            row = self._rows[self._next[sim]]
-            position[sim], velocity[sim], acceleration[sim] = row
+        if self._only is not None:
+            sim, offset = self._only
+            position[sim], velocity[sim], acceleration[sim] = self._rows[offset + self._ticks]
         else:
-            rows = self._rows[self._next[ids]]
+            ids = self._ids
+            rows = self._rows[self._offset[ids] + self._ticks]
             position[ids], velocity[ids], acceleration[ids] = rows[:, 0], rows[:, 1], rows[:, 2]
-        self._next[ids] += 1
+        self._ticks += 1
         self._soonest -= 1
-        if self._soonest == 0:
-            self.active[ids] = self._next[ids] < self._end[ids]
+        if not self._soonest:
+            ids = self._ids
+            self.active[ids] = self._offset[ids] + self._ticks < self._end[ids]
             self._changed()
 
     def _changed(self) -> None:
         self._ids = ids = np.flatnonzero(self.active)
-        self._soonest = int((self._end[ids] - self._next[ids]).min()) if len(ids) else 0
+        self._soonest = int((self._end[ids] - self._offset[ids]).min()) - self._ticks if len(ids) else 0
+        self._only = (int(ids[0]), int(self._offset[ids[0]])) if len(ids) == 1 else None
         if not len(ids):
             self._used = 0
 
     def _make_room(self, ticks: int) -> None:
         """Move the rows that are still to be played to the front of a block that holds `ticks` more."""
         ids = np.flatnonzero(self.active)
-        lengths = self._end[ids] - self._next[ids]
+        lengths = self._end[ids] - self._offset[ids] - self._ticks
         needed = int(lengths.sum()) + ticks
         # Half of the block stays free, so that rows are moved seldom.
         rows = np.zeros((max(len(self._rows), 2 * needed), *self._rows.shape[1:]))
         used = 0
         for sim, length in zip(ids, lengths, strict=True):
-            rows[used : used + length] = self._rows[self._next[sim] : self._end[sim]]
-            self._next[sim], self._end[sim] = used, used + length
+            rows[used : used + length] = self._rows[self._end[sim] - length : self._end[sim]]
+            self._offset[sim], self._end[sim] = used - self._ticks, used + length
             used += length
         self._rows, self._used = rows, used

@@ -1,5 +1,6 @@
 """Whether a goal that is being followed is on its way, has arrived or has failed."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,9 +39,6 @@ class Verdict:
 class Supervisor:
     """Judges goals of n simulations by what is measured, once a tick.
 
-    Attributes:
-        error: largest distance of a joint from its reference at the last tick [rad], shape (n,).
-
     Args:
         arm: the arm.
         n: number of simulations.
@@ -48,7 +46,6 @@ class Supervisor:
     """
 
     def __init__(self, arm: Arm, n: int, control_hz: int) -> None:
-        self.error: Array = np.zeros(n)
         self._joints, self._dof = arm.chain.joints, len(arm.chain.joints)
         self._stall_ticks = round(GRIPPER_STALL_S * control_hz)
         self._settling_ticks = round(SETTLING_S * control_hz)
@@ -56,17 +53,29 @@ class Supervisor:
         self._hz = control_hz
         self._target = np.zeros((n, self._dof + 1))
         self._moves_arm, self._moves_gripper = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-        self._elapsed, self._deadline = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._tick = 0
+        self._begun, self._deadline = np.zeros(n, np.int64), np.zeros(n, np.int64)  # ticks
+        self._next_deadline = 0  # no goal that is followed has an earlier one
         self._since_end, self._still = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        # How far each joint is from its reference [rad; m]: the gripper's column is there, and is not looked at.
+        self._away = np.zeros((n, self._dof + 1))
+        self._arm_away = self._away[:, : self._dof]
+        self._off = np.zeros((n, self._dof), np.bool_)
 
     def begin(self, sim: int, command: BrainCommand, target: Array) -> None:
         """Forget the last goal; judge a new one, whose trajectory ends at a target of shape (dof + 1,)."""
         self._target[sim] = target
         self._moves_arm[sim] = command.target_pose is not None or command.joint_target is not None
         self._moves_gripper[sim] = command.gripper is not None
-        self._deadline[sim] = np.ceil(command.timeout_s * self._hz - 1e-6)
-        self._elapsed[sim] = self._since_end[sim] = self._still[sim] = 0
-        self.error[sim] = 0.0
+        self._begun[sim] = self._tick
+        self._deadline[sim] = self._tick + math.ceil(command.timeout_s * self._hz - 1e-6)
+        self._next_deadline = min(self._next_deadline, int(self._deadline[sim]))
+        self._since_end[sim] = self._still[sim] = 0
+        self._away[sim] = 0.0
+
+    def error(self, sim: int) -> float:
+        """Return the largest distance of a joint from its reference at the last tick [rad]."""
+        return float(self._arm_away[sim].max())
 
     def judge(
         self,
@@ -83,36 +92,42 @@ class Supervisor:
             reference: what the plant was last told: positions and velocities, each of shape (n, dof + 1).
             measured: what it did: positions and velocities, each of shape (n, dof + 1).
         """
-        dof = self._dof
-        # Views where all simulations follow goals: cheaper than copies of all rows.
-        rows = slice(None) if len(ids) == len(playing) else ids
-        error = np.abs(measured[0][rows, :dof] - reference[0][rows, :dof]).max(axis=1)
-        self.error[rows] = error
-        self._elapsed[rows] += 1
-        if np.count_nonzero(self._moves_gripper[rows]):
-            still = (np.abs(measured[1][rows, dof]) < GRIPPER_STILL) & (reference[1][rows, dof] == 0.0)
-            self._still[rows] = (self._still[rows] + 1) * still
-        late = self._elapsed[rows] >= self._deadline[rows]
-        off = error > PATH_TOLERANCE
-        if np.count_nonzero(playing[rows]) == len(ids) and not np.count_nonzero(late) and not np.count_nonzero(off):
+        # All rows, also of those that follow nothing, and nothing but comparisons: this is asked every tick.
+        np.subtract(measured[0], reference[0], out=self._away)
+        np.abs(self._away, out=self._away)
+        np.greater(self._arm_away, PATH_TOLERANCE, out=self._off)
+        self._tick += 1
+        if np.count_nonzero(self._moves_gripper):
+            self._watch_grippers(ids, reference[1], measured[1])
+        on_time = self._tick < self._next_deadline
+        if on_time and np.count_nonzero(playing[ids]) == len(ids) and not np.count_nonzero(self._off):
             return []
-        look = off | late | ~playing[rows]
-        verdicts = (self._judge(int(sim), bool(playing[sim]), reference[0], measured) for sim in ids[look])
+        look = ids if not on_time else ids[~playing[ids] | self._off[ids].any(axis=1)]
+        verdicts = [self._judge(int(sim), bool(playing[sim]), measured) for sim in look]
+        if not on_time:
+            self._next_deadline = int(self._deadline[ids].min())
         return [verdict for verdict in verdicts if verdict is not None]
 
-    def _judge(self, sim: int, playing: bool, reference: Array, measured: tuple[Array, Array]) -> Verdict | None:
+    def _watch_grippers(self, ids: NDArray[np.intp], reference: Array, measured: Array) -> None:
+        """Count for how long grippers have not moved though they are not to be at rest."""
+        moving = ids[self._moves_gripper[ids]]
+        still = (np.abs(measured[moving, self._dof]) < GRIPPER_STILL) & (reference[moving, self._dof] == 0.0)
+        self._still[moving] = (self._still[moving] + 1) * still
+
+    def _judge(self, sim: int, playing: bool, measured: tuple[Array, Array]) -> Verdict | None:
         position, velocity = measured[0][sim], measured[1][sim]
-        if self.error[sim] > PATH_TOLERANCE:
-            joint = int(np.abs(position - reference[sim])[: self._dof].argmax())
+        error = self.error(sim)
+        if error > PATH_TOLERANCE:
+            joint = int(self._arm_away[sim].argmax())
             return Verdict(
                 sim,
                 ResultCode.PATH_TOLERANCE,
-                f"{self._joints[joint]} is {self.error[sim]:.3f} rad from its reference; {PATH_TOLERANCE} rad is the "
+                f"{self._joints[joint]} is {error:.3f} rad from its reference; {PATH_TOLERANCE} rad is the "
                 "most: something is in its way, or it carries too much.",
             )
         verdict = None if playing else self._judge_end(sim, position, velocity)
-        if verdict is None and self._elapsed[sim] >= self._deadline[sim]:
-            seconds = self._deadline[sim] / self._hz
+        if verdict is None and self._tick >= self._deadline[sim]:
+            seconds = (self._deadline[sim] - self._begun[sim]) / self._hz
             return Verdict(sim, ResultCode.TIMEOUT, f"The goal was not reached within its {seconds:.3g} s.")
         return verdict
 

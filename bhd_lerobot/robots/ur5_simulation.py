@@ -119,7 +119,7 @@ class UR5Simulation(Simulation):
     def _after_tick(self) -> None:
         # Contacts of an arm last longer than a physics step: once a tick is often enough.
         table = self.table
-        if not table.is_touching:
+        if not table.is_touching_more:
             return
         np.logical_or(self._arm_on_table, table.arm_on_table, out=self._arm_on_table)
         np.logical_or(self._arm_on_object, table.arm_on_object, out=self._arm_on_object)

@@ -46,18 +46,26 @@ class SimulatedPlant:
         if actuators != list(range(actuators[0], actuators[0] + len(actuators))):
             raise SimulationError(f"Actuators {list(names)} are not neighbours in the model.")
         self._ctrl = world.ctrl[:, actuators[0] : actuators[-1] + 1]
+        self._out: JointReading | None = None  # where the last reading went
 
     def read(self, out: JointReading) -> None:
         """Write the joints' positions and velocities, each of shape (n, joints), into `out`."""
-        if self._fingers is None:
-            out.position[:] = self._position
-            out.velocity[:] = self._velocity
-            return
-        position, velocity = self._fingers
-        out.position[:, :-1] = self._position
-        out.velocity[:, :-1] = self._velocity
-        np.add(position[:, 0], position[:, 1], out=out.position[:, -1])
-        np.add(velocity[:, 0], velocity[:, 1], out=out.velocity[:, -1])
+        if out is not self._out:
+            self._bind(out)
+        self._to_position[:] = self._position
+        self._to_velocity[:] = self._velocity
+        for one, other, to in self._sums:
+            np.add(one, other, out=to)
+
+    def _bind(self, out: JointReading) -> None:
+        """Make the views into a reading once, not at every tick."""
+        self._out = out
+        self._to_position, self._to_velocity = out.position, out.velocity
+        self._sums: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = []
+        if self._fingers is not None:
+            self._to_position, self._to_velocity = out.position[:, :-1], out.velocity[:, :-1]
+            both = zip(self._fingers, (out.position, out.velocity), strict=True)
+            self._sums = [(fingers[:, 0], fingers[:, 1], to[:, -1]) for fingers, to in both]
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the servos' commands, shape (n, joints)."""

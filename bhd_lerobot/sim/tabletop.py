@@ -80,6 +80,7 @@ class Tabletop:
         self._self = world.sensor("touch_self")[:, 0]
         first, last = (int(model.sensor(f"touch_object_{k}").adr[0]) for k in (0, MAX_OBJECTS - 1))
         self._grip = world.sensors(first, last + 1)
+        self._ones = np.ones(MAX_OBJECTS)
         world.forward()
 
     # --- scenes ------------------------------------------------------------------------------------------------------
@@ -208,9 +209,9 @@ class Tabletop:
         return np.concatenate([self._tool_pos, self._tool_quat], axis=1)
 
     @property
-    def is_touching(self) -> bool:
-        """Whether any arm touches anything; if not, none of the flags below is set."""
-        return bool(np.count_nonzero(self._any))
+    def is_touching_more(self) -> bool:
+        """Whether any arm touches more than objects with its gripper; if not, no other flag below is set."""
+        return bool(np.count_nonzero(self._any - self._grip @ self._ones))
 
     @property
     def arm_on_table(self) -> NDArray[np.bool_]:
