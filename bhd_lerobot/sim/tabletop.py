@@ -71,6 +71,7 @@ class Tabletop:
         self._joints = world.joint_slice(self.arm.chain.joints)[0]
         self._fingers = world.joint_slice(self.arm.gripper.joints)[0]
         self._free = [int(model.joint(f"object_{k}").qposadr[0]) for k in range(MAX_OBJECTS)]
+        self._free_values = np.add.outer(self._free, np.arange(7)).reshape(-1)
         self._target = model.body("target").id
         self._wrist = model.camera("wrist").id
         self._scene, self._light = model.camera("scene").id, model.light("main").id
@@ -194,14 +195,9 @@ class Tabletop:
 
         Shape (n, MAX_OBJECTS, 7). An absent object is at the origin, upright.
         """
-        poses = np.empty((self.world.n, MAX_OBJECTS, 7))
-        for number, at in enumerate(self._free):
-            poses[:, number] = self.world.qpos[:, at : at + 7]
-            poses[self._absent(number), number] = (0.0, 0.0, 0.0, *_UPRIGHT)
+        poses = self.world.qpos[:, self._free_values].reshape(self.world.n, MAX_OBJECTS, 7)
+        poses[self._field["body_gravcomp"][:, self._bodies] > _HEAVY] = (0.0, 0.0, 0.0, *_UPRIGHT)
         return poses
-
-    def _absent(self, number: int) -> NDArray[np.bool_]:
-        return self._field["body_gravcomp"][:, self._bodies[number]] > _HEAVY
 
     @property
     def tool_pose(self) -> NDArray[np.float64]:

@@ -172,28 +172,35 @@ class PickTask:
     def judge(self, truth: ArmTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""
         config, sims, target = self.config, self._sims, self._target
-        lift = np.where(self._present, truth.object_poses[:, :, 2] - self._start, 0.0)
+        lift = truth.object_poses[:, :, 2] - self._start
+        lift *= self._present
         height = lift[sims, target]
-        others = lift.copy()
-        others[sims, target] = 0.0
+        lift[sims, target] = 0.0  # from here on that of the others
         gripped = truth.fingers_on_object[sims, target]
         up = (height >= config.lift_m) & gripped
-        self._held[running] = np.where(up, self._held + 1, 0)[running]
-        self._frame[running] += 1
-        self._height[running] = height[running]
-        before = self._best.copy()
-        self._best[running] = np.maximum(self._best, height)[running]
-        reward = self._share(self._best) - self._share(before)
+        np.copyto(self._held, (self._held + 1) * up, where=running)
+        self._frame += running
+        np.copyto(self._height, height, where=running)
+        best = np.maximum(self._best, height)
+        reward = (self._share(best) - self._share(self._best)) * running
+        before, self._best = self._best, np.where(running, best, self._best)
         at = truth.object_poses[sims, target]
-        event = np.full(len(running), int(Event.NOTHING))
-        event[running & (self._frame >= self.frames)] = Event.TIMEOUT
-        event[running & (np.hypot(at[:, 0], at[:, 1]) > _REACH)] = Event.UNREACHABLE
-        event[running & (self._best >= _LIFTED) & (height < _FALLEN) & ~gripped] = Event.DROPPED
-        event[running & (self._held >= self._hold)] = Event.SUCCESS
-        # What must not happen counts also in the last frame of a success.
-        event[running & (others > _STRAY).any(axis=1)] = Event.WRONG_OBJECT
-        event[running & (truth.arm_on_table | truth.self_contact | truth.arm_on_object)] = Event.COLLISION
-        return np.where(event == Event.SUCCESS, 1.0 - self._share(before), reward), event
+        event = np.zeros(len(running), np.int64)
+        # What must not happen counts also in the last frame of a success: the later of these takes the earlier's place.
+        for name, happened in (
+            (Event.TIMEOUT, self._frame >= self.frames),
+            (Event.UNREACHABLE, np.hypot(at[:, 0], at[:, 1]) > _REACH),
+            (Event.DROPPED, (self._best >= _LIFTED) & (height < _FALLEN) & ~gripped),
+            (Event.SUCCESS, self._held >= self._hold),
+            (Event.WRONG_OBJECT, (lift > _STRAY).any(axis=1)),
+            (Event.COLLISION, truth.arm_on_table | truth.self_contact | truth.arm_on_object),
+        ):
+            if np.count_nonzero(happened):
+                event[running & happened] = name
+        success = event == Event.SUCCESS
+        if np.count_nonzero(success):
+            reward = np.where(success, 1.0 - self._share(before), reward)
+        return reward, event
 
     def outcome(self, sim: int, event: Event) -> Outcome:
         """Return how an episode ended."""
