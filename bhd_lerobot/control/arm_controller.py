@@ -42,7 +42,7 @@ class ArmController(Controller):
         self.acceleration: NDArray[np.float64] = np.zeros((n, width))
         self.actuators = self.command.copy()
         self.blocked = np.zeros(n, np.bool_)
-        self._any_blocked = False
+        self._any_blocked = self._any_bad = False
         self.busy = self.goals.busy  # the same array
         # Ticks for which a joint has been too far from its reference.
         self._off_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
@@ -65,6 +65,7 @@ class ArmController(Controller):
         if bad.any():
             # Commands are checked when they are sent; a queue in shared memory is written by another process.
             self._limited_finite |= bad
+            self._any_bad = True
             self.stop(bad, Mode.FAULT)
             mask = mask & ~bad
         if (self.busy & mask).any():
@@ -173,6 +174,8 @@ class ArmController(Controller):
     def take_limits(self) -> NDArray[np.int64]:
         """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
         setpoints = self.setpoints
+        if not np.count_nonzero(self._limited_effort) and not setpoints.limited and not self._any_bad:
+            return np.zeros(len(self.busy), np.int64)
         limits = np.asarray(
             self._limited_finite * int(Limit.NON_FINITE)
             + setpoints.limited_position * int(Limit.POSITION)
@@ -188,6 +191,7 @@ class ArmController(Controller):
             setpoints.limited_acceleration,
         ):
             flags[:] = False
+        setpoints.limited = self._any_bad = False
         return limits
 
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:

@@ -1,6 +1,7 @@
 """Moves the tool along a straight line, its orientation turning evenly, within the joints' limits and the tool's."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ class Line:
         """How far the tool centre point goes [m]."""
         return float(np.linalg.norm(self.goal[:3, 3] - self.start[:3, 3]))
 
-    @property
+    @cached_property
     def turn(self) -> Array:
         """Axis times angle from the first orientation to the last, in the first tool frame [rad], shape (3,)."""
         return np.asarray(Rotation.from_matrix(self.start[:3, :3].T @ self.goal[:3, :3]).as_rotvec())

@@ -41,6 +41,7 @@ class SetpointFilter:
         self.limited_position: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.limited_velocity: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.limited_acceleration: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self.limited = False  # whether any of them may be set
 
     def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_], position: NDArray[np.float64]) -> None:
         """Head for new setpoints.
@@ -51,6 +52,7 @@ class SetpointFilter:
             position: the reference now, shape (n, width): where the target of a robot starts that had none.
         """
         clipped = np.minimum(np.maximum(values, self._lower), self._upper)
+        self.limited = True
         self.limited_position |= mask & (clipped != values).any(axis=1)
         np.copyto(self._target, position, where=(mask & ~self.active)[:, None])
         np.copyto(self._goal, clipped, where=mask[:, None])
@@ -91,6 +93,7 @@ class SetpointFilter:
         change = (speed - velocity) * self._hz
         allowed = np.minimum(np.maximum(change, -self._acceleration), self._acceleration)
         active = self.active[:, None]
+        self.limited = True
         self.limited_velocity |= self.active & (speed != wanted).any(axis=1)
         self.limited_acceleration |= self.active & (allowed != change).any(axis=1)
         np.copyto(acceleration, allowed, where=active)

@@ -98,7 +98,7 @@ class Supervisor:
         np.greater(self._arm_away, PATH_TOLERANCE, out=self._off)
         self._tick += 1
         if np.count_nonzero(self._moves_gripper):
-            self._watch_grippers(ids, reference[1], measured[1])
+            self._watch_grippers(reference[1], measured[1])
         on_time = self._tick < self._next_deadline
         if on_time and np.count_nonzero(playing[ids]) == len(ids) and not np.count_nonzero(self._off):
             return []
@@ -108,11 +108,12 @@ class Supervisor:
             self._next_deadline = int(self._deadline[ids].min())
         return [verdict for verdict in verdicts if verdict is not None]
 
-    def _watch_grippers(self, ids: NDArray[np.intp], reference: Array, measured: Array) -> None:
+    def _watch_grippers(self, reference: Array, measured: Array) -> None:
         """Count for how long grippers have not moved though they are not to be at rest."""
-        moving = ids[self._moves_gripper[ids]]
-        still = (np.abs(measured[moving, self._dof]) < GRIPPER_STILL) & (reference[moving, self._dof] == 0.0)
-        self._still[moving] = (self._still[moving] + 1) * still
+        still = np.abs(measured[:, self._dof]) < GRIPPER_STILL
+        still &= reference[:, self._dof] == 0.0
+        self._still += 1
+        self._still *= still
 
     def _judge(self, sim: int, playing: bool, measured: tuple[Array, Array]) -> Verdict | None:
         position, velocity = measured[0][sim], measured[1][sim]
