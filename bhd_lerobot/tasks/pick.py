@@ -183,7 +183,8 @@ class PickTask:
         np.copyto(self._height, height, where=running)
         best = np.maximum(self._best, height)
         reward = (self._share(best) - self._share(self._best)) * running
-        before, self._best = self._best, np.where(running, best, self._best)
+        before = self._best.copy()
+        np.copyto(self._best, best, where=running)
         at = truth.object_poses[sims, target]
         event = np.zeros(len(running), np.int64)
         # What must not happen counts also in the last frame of a success: the later of these takes the earlier's place.
