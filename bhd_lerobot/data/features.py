@@ -19,6 +19,9 @@ AGE = "control.age"
 COMMAND_AGE = "control.command_age"
 LATENESS = "control.lateness"
 OVERRUNS = "control.overruns"
+SKIPPED = "control.skipped"
+INFERENCE_TIME = "control.inference_time"
+LATE = "control.late"
 LIMITS = "control.limits"
 WATCHDOG = "control.watchdog"
 MODE = "control.mode"
@@ -40,8 +43,15 @@ SCALARS: dict[str, tuple[str, str]] = {
     COMMAND_AGE: ("float32", "age of the command in force at the end of the frame [s]"),
     LATENESS: ("float32", "largest lateness of a control tick in the frame [s]"),
     OVERRUNS: ("int64", "control ticks of the frame that ended after the next was due"),
+    SKIPPED: ("int64", "control ticks of the frame that were left out because one before them was late"),
+    INFERENCE_TIME: ("float32", "time that the brain took for the decision that drove the frame [s]; 0 in lockstep"),
+    LATE: ("bool", "the frame violates the timing tolerance; false in lockstep"),
     LIMITS: ("int64", "what the limits changed: 1 not finite, 2 velocity, 4 acceleration, 8 effort, 16 position; sum"),
-    WATCHDOG: ("int64", "what the watchdogs noticed: 1 command too old, 2 arm blocked; sum"),
+    WATCHDOG: (
+        "int64",
+        "what the watchdogs noticed: 1 command too old, 2 arm blocked, 4 brain silent, 8 recorder silent, "
+        "16 plant silent, 32 too many missed ticks; sum",
+    ),
     MODE: (
         "int64",
         "cerebellum's mode at the end of the frame: 0 unconfigured, 1 inactive, 2 hold, 3 tracking, 4 stopping, "
@@ -56,6 +66,9 @@ SCALARS: dict[str, tuple[str, str]] = {
         "8 dropped, 9 unreachable",
     ),
 }
+
+# What a simulated clock makes zero: it is never late, and time stands still while the brain thinks.
+PUNCTUALITY = (LATENESS, OVERRUNS, SKIPPED, INFERENCE_TIME, LATE)
 
 
 def dataset_features(

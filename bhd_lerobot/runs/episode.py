@@ -286,8 +286,7 @@ class EpisodeLoop:
         columns[keys.DONE] = last
         columns[keys.SUCCESS] = last & outcome.success
         # A simulated clock is never late.
-        columns[keys.LATENESS] = np.zeros(length, np.float32)
-        columns[keys.OVERRUNS] = np.zeros(length, np.int64)
+        columns |= {key: np.zeros(length, keys.SCALARS[key][0]) for key in keys.PUNCTUALITY}
         rates = self.simulation.rates
         timing = TimingStatistics(NANOSECONDS // rates.control_hz)
         timing.add_punctual(length * rates.ticks_per_frame)
