@@ -33,6 +33,10 @@ class SimulationError(BhdError):
     """The physics diverged, or a simulation was used in a way that it cannot serve."""
 
 
+class RealtimeError(BhdError):
+    """The real-time process cannot be started as asked, has ended, or does not answer."""
+
+
 class RenderingError(BhdError):
     """No image can be rendered on this machine; the message names the remedy."""
 

@@ -50,6 +50,10 @@ class Cerebellum:
         estop_word: n 64-bit integers that any process may set to something else than 0; new memory if None.
         controller: what turns commands into actuator commands; may be left out for a `MobileBase`.
 
+    Attributes:
+        requested: the setpoint that was last taken, before all limits, shape (n, width).
+        setpoints_taken: how many have been taken.
+
     Raises:
         ConfigError: the body cannot do what its limits allow, or it needs a controller and none was given.
     """
@@ -80,6 +84,8 @@ class Cerebellum:
         self.mode = np.full(n, Mode.UNCONFIGURED, np.int8)
         self.refusals = np.zeros((len(Reason), n), np.int64)
         self.reading = PlantReading(n, self.controller.joints)
+        self.requested = np.zeros((n, width))
+        self.setpoints_taken = 0
         self.ticks = 0
 
         self._timeout_ns = round(body.limits.command_timeout_s * NANOSECONDS)
@@ -101,17 +107,20 @@ class Cerebellum:
 
     # --- one tick ----------------------------------------------------------------------------------------------------
 
-    def tick(self, now_ns: int) -> None:
+    def tick(self, now_ns: int, ticks: int = 1) -> None:
         """Run one tick.
 
         Args:
             now_ns: the time that the tick is for [ns].
+            ticks: how many periods have passed since the last tick: more than 1 after ticks that were skipped. The
+                reference advances by all of them, each within the limits, so that it stays in step with time.
         """
         self.plant.read(self.reading)
         self._supervise(now_ns)
         self._take_commands(now_ns)
-        self.controller.run(self.reading)
-        self._follow_controller()
+        for _ in range(ticks):
+            self.controller.run(self.reading)
+            self._follow_controller()
         self.plant.write(self.controller.actuators)
         self._last_position[:] = self.reading.position
         self.ticks += 1
@@ -161,6 +170,8 @@ class Cerebellum:
             take = self._popped_mask & (reasons == Reason.ACCEPTED)
             self._count_refusals(np.where(self._popped_mask, reasons, Reason.ACCEPTED))
             self._last_due[take] = due
+            np.copyto(self.requested, self._popped, where=take[:, None])
+            self.setpoints_taken += int(np.count_nonzero(take))
             starting = take & (self.mode != Mode.TRACKING)
             if starting.any():
                 self._set_mode(starting, Mode.TRACKING)
@@ -192,6 +203,20 @@ class Cerebellum:
         if np.count_nonzero(done):
             self._by_goal &= ~done
             self._set_mode(done & (self.mode == Mode.TRACKING), Mode.HOLD)
+
+    def interrupt(self, cause: Watchdog, mode: Mode) -> None:
+        """Stop moving robots because a watchdog outside of the tick noticed something, and note the cause.
+
+        Args:
+            cause: what it noticed.
+            mode: `STOPPING` (robots that move decelerate, then hold) or `FAULT` (all stop hard and latch it).
+        """
+        if mode == Mode.FAULT:
+            hit = (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT)
+        else:
+            hit = self.mode == Mode.TRACKING
+        self._watchdog[hit] |= cause
+        self._set_mode(hit, mode)
 
     # --- commands ----------------------------------------------------------------------------------------------------
 
@@ -389,6 +414,7 @@ class Cerebellum:
     def _configure(self, mask: NDArray[np.bool_]) -> None:
         self.controller.configure(np.flatnonzero(mask), self.reading)
         self._configured |= mask
+        np.copyto(self.requested, self.command, where=mask[:, None])
 
 
 _MODE_REASON = np.full(len(Mode), Reason.NOT_ACTIVE, np.int8)

@@ -185,13 +185,55 @@ class StateRing:
     def latest(self) -> NDArray | None:
         """Return a copy of the newest state, or None if there is none yet."""
         while True:
-            count = int(self._count[0])
+            count = len(self)
             if count == 0:
                 return None
-            slot = (count - 1) % self.capacity
-            before = int(self._guard[slot])
-            if before % 2:
-                continue
-            state = self._state[slot].copy()
-            if int(self._guard[slot]) == before:
+            state = self.copy(count - 1)
+            if state is not None:
                 return state
+
+    def copy(self, number: int) -> NDArray | None:
+        """Return a copy of one state, or None if it has been overwritten.
+
+        Args:
+            number: how many were published before it; it must have been published.
+        """
+        slot = number % self.capacity
+        complete = 2 * (number // self.capacity + 1)
+        if int(self._guard[slot]) != complete:
+            return None
+        state = self._state[slot].copy()
+        return state if int(self._guard[slot]) == complete else None
+
+
+class RingReader:
+    """Reads every state of a ring once, in order, and counts those that were overwritten before it came to them.
+
+    Attributes:
+        drops: states lost so far.
+
+    Args:
+        ring: the ring; states that were published before are not read.
+    """
+
+    def __init__(self, ring: StateRing) -> None:
+        self._ring = ring
+        self._next = len(ring)
+        self.drops = 0
+
+    def read(self) -> NDArray | None:
+        """Return a copy of the next state, or None if none has been published since the last."""
+        while (published := len(self._ring)) > self._next:
+            number = self._next
+            self._next += 1
+            # The writer may be about to overwrite the oldest: it is not worth a look.
+            oldest = published - self._ring.capacity + 1
+            if number < oldest:
+                self.drops += oldest - number
+                self._next = oldest
+                continue
+            state = self._ring.copy(number)
+            if state is not None:
+                return state
+            self.drops += 1
+        return None

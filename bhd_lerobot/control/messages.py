@@ -99,6 +99,14 @@ class Watchdog(IntFlag):
     """The command became older than its time-out; the robot ramps to zero."""
     BLOCKED = 2
     """An arm stayed away from where it was commanded to be: a protective stop, mode FAULT."""
+    BRAIN = 4
+    """The brain's process showed no sign of life for its time-out; the robot decelerates and holds."""
+    RECORDER = 8
+    """The recorder's process showed no sign of life for its time-out; the robot decelerates and holds."""
+    PLANT = 16
+    """The plant's process showed no sign of life for its time-out: mode FAULT."""
+    MISSES = 32
+    """So many ticks in a row came too late that the loop is no control loop any more: mode FAULT."""
 
 
 class Request(IntEnum):

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.fifo import CommandFifo, StateRing
+from bhd_lerobot.control.fifo import CommandFifo, RingReader, StateRing
 from bhd_lerobot.errors import ConfigError
 from tests.control import support
 
@@ -220,3 +220,50 @@ def test_states_from_another_process_are_never_torn(tmp_path: Path) -> None:
         assert int(latest["number"]) >= last
         last = int(latest["number"])
     assert process.wait() == 0
+
+
+@given(steps=st.lists(st.tuples(st.integers(0, 12), st.integers(0, 12)), max_size=40), capacity=st.integers(2, 7))
+def test_a_reader_gets_every_state_once_in_order_or_counts_it(steps: list[tuple[int, int]], capacity: int) -> None:
+    ring = StateRing(np.dtype([("value", np.int64)]), capacity)
+    published = 0
+    for _ in range(3):  # what is there before a reader is none of its business
+        ring.publish(np.array((-1,), ring_dtype()))
+    reader = RingReader(ring)
+    seen: list[int] = []
+    for writes, reads in steps:
+        for _ in range(writes):
+            ring.publish(np.array((published,), ring_dtype()))
+            published += 1
+        for _ in range(reads):
+            state = reader.read()
+            if state is None:
+                break
+            seen.append(int(state["value"]))
+    while (state := reader.read()) is not None:
+        seen.append(int(state["value"]))
+    assert seen == sorted(set(seen))
+    assert len(seen) + reader.drops == published
+    assert -1 not in seen
+
+
+def test_a_reader_that_keeps_up_loses_nothing() -> None:
+    ring = StateRing(ring_dtype(), 4)
+    reader = RingReader(ring)
+    for value in range(100):
+        ring.publish(np.array((value,), ring_dtype()))
+        state = reader.read()
+        assert state is not None
+        assert int(state["value"]) == value
+    assert reader.read() is None
+    assert reader.drops == 0
+
+
+def test_a_state_that_is_being_written_is_not_read() -> None:
+    ring = StateRing(ring_dtype(), 4)
+    ring.publish(np.array((7,), ring_dtype()))
+    ring._guard[0] += 1  # the writer has begun to overwrite it
+    assert ring.copy(0) is None
+
+
+def ring_dtype() -> np.dtype:
+    return np.dtype([("value", np.int64)])

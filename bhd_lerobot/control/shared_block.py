@@ -1,0 +1,209 @@
+"""A named block of memory that several processes share and that does not outlive them.
+
+It is a file in the memory file system. Every process that uses it holds a shared lock on it, which the kernel releases
+however the process ends: a block that nobody holds is rubbish, and `sweep` removes it. Nothing else is needed to clean
+up after SIGKILL, and no process number is ever trusted.
+"""
+
+import contextlib
+import fcntl
+import json
+import mmap
+import os
+import platform
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+from bhd_lerobot.errors import ConfigError, RealtimeError
+
+FOLDER = Path("/dev/shm")
+PREFIX = "bhd-"
+_MAGIC = b"bhd-blk1"
+_ALIGNMENT = 64  # a cache line: no two sections share one
+_HEADER = 4096  # bytes for the description; it grows in pages
+# Aligned 64-bit stores become visible to other processes in program order on x86 alone; on other processors the
+# counters that guard an entry could be seen before the entry.
+_ORDERED = ("x86_64", "amd64", "i686")
+
+
+def check_platform(machine: str | None = None, system: str | None = None) -> None:
+    """Raise if processes cannot share memory here as this package does.
+
+    Raises:
+        RealtimeError: another system than Linux, or another processor than x86.
+    """
+    machine, system = machine or platform.machine(), system or platform.system()
+    if system != "Linux":
+        raise RealtimeError(f"clock = 'realtime' needs Linux; this is {system}. Use clock = 'lockstep'.")
+    if machine.lower() not in _ORDERED:
+        raise RealtimeError(
+            f"clock = 'realtime' needs a processor that keeps the order of stores ({', '.join(_ORDERED)}); this is "
+            f"{machine}. Use clock = 'lockstep'."
+        )
+
+
+class SharedBlock:
+    """One block: sections of bytes, and a description of them as JSON.
+
+    Attributes:
+        name: its name, unique on this machine.
+        about: what its maker says about it.
+
+    Use `create` or `attach`, and `close` when done.
+    """
+
+    def __init__(self, name: str, descriptor: int, memory: mmap.mmap, sections: dict[str, tuple[int, int]]) -> None:
+        self.name = name
+        self.about: dict[str, Any] = {}
+        self._descriptor, self._memory, self._sections = descriptor, memory, sections
+        self._views: list[memoryview] = []
+
+    @classmethod
+    def create(cls, name: str, sections: Mapping[str, int], about: Mapping[str, Any]) -> Self:
+        """Make a block, all zeros.
+
+        Args:
+            name: letters, digits, ``_``, ``-`` and ``.``.
+            sections: their sizes [bytes] by name.
+            about: what an attaching process is to know, as JSON.
+
+        Raises:
+            RealtimeError: a live block has this name, or there is no room for it.
+        """
+        check_platform()
+        if not re.fullmatch(r"[\w.-]{1,100}", name):
+            raise ConfigError(f"A shared block cannot be called {name!r}; use letters, digits, '_', '-' and '.'.")
+        sweep()
+        places, end = {}, 0
+        for section, size in sections.items():
+            places[section] = (end, size)
+            end += -(-size // _ALIGNMENT) * _ALIGNMENT
+        text = json.dumps({"sections": places, "about": about}).encode()
+        header = -(-(16 + len(text)) // _HEADER) * _HEADER
+        descriptor = cls._make_file(FOLDER / f"{PREFIX}{name}")
+        try:
+            # Not truncate: pages that do not exist would be found out by a bus error later.
+            os.posix_fallocate(descriptor, 0, header + max(end, 1))
+            memory = _map(FOLDER / f"{PREFIX}{name}")
+        except OSError as error:
+            os.unlink(FOLDER / f"{PREFIX}{name}")
+            os.close(descriptor)
+            raise RealtimeError(
+                f"No room for {end / 1e6:.1f} MB of shared memory in {FOLDER}: {error.strerror}. Free some, or give "
+                "the container more (--shm-size=256m)."
+            ) from error
+        memory[8:16] = len(text).to_bytes(8, "little")
+        memory[16 : 16 + len(text)] = text
+        memory[0:8] = _MAGIC  # last: from here on it can be attached to
+        return cls._opened(name, descriptor, memory)
+
+    @classmethod
+    def attach(cls, name: str) -> Self:
+        """Open a block of another process.
+
+        Raises:
+            RealtimeError: there is none; the message lists those that there are.
+        """
+        path = FOLDER / f"{PREFIX}{name}"
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError as error:
+            running = ", ".join(names()) or "none"
+            raise RealtimeError(
+                f"No running robot is called {name!r} ({error.strerror}). Running: {running}."
+            ) from error
+        fcntl.flock(descriptor, fcntl.LOCK_SH)
+        try:
+            memory = _map(path)
+            valid = memory[0:8] == _MAGIC
+        except (OSError, ValueError):  # gone in the meantime, or empty
+            valid = False
+        if not valid:
+            os.close(descriptor)
+            raise RealtimeError(f"{path} is not a block of this version of bhd_lerobot.")
+        return cls._opened(name, descriptor, memory)
+
+    @classmethod
+    def _opened(cls, name: str, descriptor: int, memory: mmap.mmap) -> Self:
+        length = int.from_bytes(memory[8:16], "little")
+        described = json.loads(memory[16 : 16 + length])
+        start = -(-(16 + length) // _HEADER) * _HEADER
+        block = cls(name, descriptor, memory, {k: (start + o, s) for k, (o, s) in described["sections"].items()})
+        block.about = described["about"]
+        return block
+
+    @staticmethod
+    def _make_file(path: Path) -> int:
+        while True:
+            try:
+                descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            except FileExistsError:
+                raise RealtimeError(f"A robot called {path.name.removeprefix(PREFIX)!r} is running already.") from None
+            except OSError as error:
+                raise RealtimeError(f"Shared memory cannot be made in {FOLDER}: {error.strerror}.") from error
+            fcntl.flock(descriptor, fcntl.LOCK_SH)
+            # A sweep between the two calls took it for rubbish.
+            if path.exists() and os.stat(path).st_ino == os.fstat(descriptor).st_ino:
+                return descriptor
+            os.close(descriptor)
+
+    def section(self, name: str) -> memoryview:
+        """Return a section's memory; it is valid until `close`."""
+        start, size = self._sections[name]
+        view = memoryview(self._memory)[start : start + size]
+        self._views.append(view)
+        return view
+
+    def close(self) -> None:
+        """Leave the block; the last process that does so removes it. May be called twice."""
+        if self._descriptor < 0:
+            return
+        os.close(self._descriptor)
+        self._descriptor = -1
+        # Arrays over the memory may still be around; it is unmapped with the last of them.
+        for view in self._views:
+            with contextlib.suppress(BufferError):
+                view.release()
+        with contextlib.suppress(BufferError):
+            self._memory.close()
+        sweep()
+
+
+def _map(path: Path) -> mmap.mmap:
+    # By a descriptor of its own: the mapping keeps a copy of it, and would keep the lock of the other.
+    descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    try:
+        return mmap.mmap(descriptor, os.fstat(descriptor).st_size)
+    finally:
+        os.close(descriptor)
+
+
+def names() -> list[str]:
+    """Return the names of the blocks that a process holds."""
+    return sorted(path.name.removeprefix(PREFIX) for path, free in _blocks() if not free)
+
+
+def sweep() -> list[str]:
+    """Remove the blocks that no process holds any more; return their names."""
+    return sorted(path.name.removeprefix(PREFIX) for path, free in _blocks(remove=True) if free)
+
+
+def _blocks(*, remove: bool = False) -> Iterator[tuple[Path, bool]]:
+    """Yield each block's file and whether nobody holds it."""
+    for path in sorted(FOLDER.glob(f"{PREFIX}*")) if FOLDER.is_dir() else []:
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError:
+            continue  # gone in the meantime, or another user's
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if remove:
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(path)
+            yield path, True
+        except BlockingIOError:
+            yield path, False
+        finally:
+            os.close(descriptor)
