@@ -5,6 +5,7 @@ from typing import Any
 
 from lerobot.robots.config import RobotConfig
 
+from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.config_brain import BrainConfig
 from bhd_lerobot.runs.registry import SIMULATED_ROBOTS, brains_for, robot_of_brain, robot_of_task
@@ -50,6 +51,7 @@ class RecordConfig:
         dataset: what is recorded and where.
         brain: what drives the robot.
         task: what it is to achieve, and where.
+        timing: how unpunctual frames may be, and what becomes of an episode with too many of them.
         seed: every episode's seed follows from this and its number.
         split: `train` or `held_out`: which of two sets of seeds, disjoint by construction.
         n_envs: simulations that run side by side; changes the speed and nothing else.
@@ -63,6 +65,7 @@ class RecordConfig:
     dataset: DatasetConfig
     brain: BrainConfig
     task: TaskConfig
+    timing: TimingTolerance = field(default_factory=TimingTolerance)
     seed: int = 0
     split: str = "train"
     n_envs: int = 1

@@ -298,7 +298,7 @@ class EpisodeLoop:
             initial_state=initial,
             columns=columns,
             outcome=outcome,
-            timing=timing.summary(),
+            timing=timing.summary(age=columns[keys.AGE], late=columns[keys.LATE]),
             writer=sink,
             commands=self._commands[sim] if self._gives_goals else None,
             results=self._ends[sim],
