@@ -215,6 +215,9 @@ class Cerebellum:
             hit = (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT)
         else:
             hit = self.mode == Mode.TRACKING
+        if not np.count_nonzero(hit):
+            return
+        self.fifo.drop(np.flatnonzero(hit))  # what still waits would start motion again
         self._watchdog[hit] |= cause
         self._set_mode(hit, mode)
 
