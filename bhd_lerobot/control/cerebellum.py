@@ -101,7 +101,7 @@ class Cerebellum:
         self._deadline: int | None = None  # when the first command of a moving robot becomes too old [ns]
         self._stopping = False
         self._popped, self._popped_mask = np.zeros((n, width)), np.zeros(n, np.bool_)
-        self._estop_latched = np.zeros(n, np.bool_)
+        self.estop_latched = np.zeros(n, np.bool_)
         self._by_goal = np.zeros(n, np.bool_)  # moves because of a goal, not because of setpoints
         self._watchdog = np.zeros(n, np.int8)
 
@@ -134,7 +134,7 @@ class Cerebellum:
             hit = (self.estop_word != 0) & (self.mode != Mode.ESTOP)
             if hit.any():
                 self._set_mode(hit, Mode.ESTOP)
-                self._estop_latched |= hit
+                self.estop_latched |= hit
         if self._flat_reading.dot(self._zeros) != 0.0 or np.count_nonzero(self.reading.fault):
             self._handle_fault()
         if self._deadline is not None and now_ns > self._deadline:
@@ -303,7 +303,7 @@ class Cerebellum:
         if request == Request.RESET:
             # A word that was set after another latch has not been seen yet: the next tick will.
             self.estop_word[allowed & (self.mode == Mode.ESTOP)] = 0
-            self._estop_latched &= ~allowed
+            self.estop_latched &= ~allowed
             self._configure(allowed & ~self._configured)
         self._set_mode(allowed, result)
         if request == Request.DEACTIVATE:
@@ -322,7 +322,7 @@ class Cerebellum:
         self._sent_due[ids] = np.iinfo(np.int64).min
         self._last_due[ids] = 0
         self._deactivating[ids] = False
-        self._estop_latched[ids] = False
+        self.estop_latched[ids] = False
         self._by_goal[ids] = False
         self.refusals[:, ids] = 0
         self._watchdog[ids] = 0
@@ -354,7 +354,7 @@ class Cerebellum:
             measured=self.controller.measured(self.reading),
             mode=self.mode.copy(),
             is_moving=np.asarray((np.abs(velocity) > MOVING).any(axis=1)),
-            emergency_stop=self._estop_latched.copy(),
+            emergency_stop=self.estop_latched.copy(),
         )
 
     @staticmethod

@@ -104,7 +104,7 @@ class Simulation(ABC):
         n = self.n
         self.running = np.ones(n, np.bool_)
         self._active: NDArray[np.intp] | None = None
-        self._tick = 0
+        self.tick = 0
         self._start_tick = np.zeros(n, np.int64)
         self._rngs = [np.random.default_rng(0) for _ in range(n)]
         self._reading = PlantReading(n, self.cerebellum.controller.joints)
@@ -133,16 +133,22 @@ class Simulation(ABC):
         return
 
     @abstractmethod
-    def _sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
 
     @abstractmethod
     def truth(self) -> Any:
         """Return what the simulator knows that a task judges by; touches since the start of the last frame."""
 
+    @property
     @abstractmethod
+    def touches(self) -> tuple[NDArray[np.bool_], ...]:
+        """What was touched since the start of the last frame, by kind, live, each of shape (n,)."""
+
     def _clear_touches(self) -> None:
         """Forget the touches so far: a frame begins."""
+        for flags in self.touches:
+            flags[:] = False
 
     def _step(self) -> None:
         """Let one control tick of physics go by."""
@@ -177,7 +183,7 @@ class Simulation(ABC):
         for sim, seed in zip(ids, seeds, strict=True):
             self._rngs[sim] = np.random.default_rng(np.random.SeedSequence([SENSOR_STREAM, seed]))
         self.bridge.restart(ids)
-        self._start_tick[ids] = self._tick
+        self._start_tick[ids] = self.tick
         self.running[ids] = True
         self._active = None if self.running.all() else np.flatnonzero(self.running)
         self._started(ids, seeds)
@@ -191,8 +197,8 @@ class Simulation(ABC):
 
     def observe(self) -> Frame:
         """Return what the robots see now."""
-        state, oldest = self._sense()
-        now = (self._tick - self._start_tick) * NANOSECONDS // self.rates.control_hz
+        state, oldest = self.sense()
+        now = (self.tick - self._start_tick) * NANOSECONDS // self.rates.control_hz
         measured = (oldest - self._start_tick) * NANOSECONDS // self.rates.control_hz
         return Frame(state, now, now - measured)
 
@@ -331,9 +337,10 @@ class Simulation(ABC):
 
     # --- inside a tick -----------------------------------------------------------------------------------------------
 
-    def _advance(self) -> None:
+    def advance(self) -> None:
+        """Let one control tick of the plant go by, and of the sensors that have a rhythm of their own."""
         self._step()
-        self._tick += 1
+        self.tick += 1
         self._after_tick()
 
 

@@ -1,6 +1,7 @@
 """n simulated TurtleBot3s under one cerebellum."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,12 +10,14 @@ from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.control.base_controller import BaseController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.simulation import Simulation
 from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.world import World
 from bhd_lerobot.tasks.task import BaseTruth
+
+if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
+    from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 
 
 class TurtleBot3Simulation(Simulation):
@@ -29,7 +32,7 @@ class TurtleBot3Simulation(Simulation):
     action_names = ("x.vel", "theta.vel")
     film_speed = 4
 
-    def __init__(self, config: TurtleBot3Config, n: int = 1, threads: int | None = None) -> None:
+    def __init__(self, config: "TurtleBot3Config", n: int = 1, threads: int | None = None) -> None:
         self.config, self.n = config, n
         self.rates = config.rates
         body = self.body = config.body()
@@ -37,7 +40,7 @@ class TurtleBot3Simulation(Simulation):
         self.plant = SimulatedPlant(self.world)
         self._controller = BaseController(body, n, config.control_hz)
         self.cerebellum = Cerebellum(body, self.plant, config.control_hz, controller=self._controller)
-        self.bridge = LockstepBridge(self.cerebellum, self.rates, self._advance)
+        self.bridge = LockstepBridge(self.cerebellum, self.rates, self.advance)
         if body.lidar is None:
             raise AssertionError("The Burger has a lidar.")
         self.lidar = Lidar(self.world, body.lidar, config.beams)
@@ -83,7 +86,7 @@ class TurtleBot3Simulation(Simulation):
         self._scans[ids] = 0
         self._scan(ids)
 
-    def _sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         self.plant.read(self._reading)
         drive = self._controller.drive
         parts = [drive.twist_from_wheels(self._reading.velocity), self.lidar.ranges]
@@ -93,8 +96,10 @@ class TurtleBot3Simulation(Simulation):
             parts.append(self._gyro)
         return np.concatenate(parts, axis=1), self._scanned_tick
 
-    def _clear_touches(self) -> None:
-        self._touched[:] = False
+    @property
+    def touches(self) -> tuple[NDArray[np.bool_], ...]:
+        """Touches of the scene, shape (n,)."""
+        return (self._touched,)
 
     def _step(self) -> None:
         for _ in range(self.rates.steps_per_tick):
@@ -103,20 +108,20 @@ class TurtleBot3Simulation(Simulation):
             np.logical_or(self._touched, self._touch, out=self._touched)
 
     def _after_tick(self) -> None:
-        if self._tick >= self._next_scan:
-            due = self.running & (self._tick - self._scanned_tick >= self._scan_ticks)
+        if self.tick >= self._next_scan:
+            due = self.running & (self.tick - self._scanned_tick >= self._scan_ticks)
             self._scan(np.flatnonzero(due))
 
     def _scan(self, ids: NDArray[np.intp]) -> None:
         if len(ids):
             self.lidar.scan(self._rngs, ids)
-            self._scanned_tick[ids] = self._tick
+            self._scanned_tick[ids] = self.tick
             self._scans[ids] += 1
         running = self._scanned_tick[self.running]
-        self._next_scan = (int(running.min()) if len(running) else self._tick) + self._scan_ticks
+        self._next_scan = (int(running.min()) if len(running) else self.tick) + self._scan_ticks
 
 
-def observation_names(config: TurtleBot3Config) -> tuple[str, ...]:
+def observation_names(config: "TurtleBot3Config") -> tuple[str, ...]:
     """Return the names of the observation's floats, in order."""
     names = ["x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(config.beams))]
     if config.odometry:

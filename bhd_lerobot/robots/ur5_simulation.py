@@ -1,6 +1,7 @@
 """n simulated UR5s under one cerebellum."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,6 @@ from bhd_lerobot.control.kinematics import ArmKinematics
 from bhd_lerobot.control.messages import Reason
 from bhd_lerobot.control.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.latency import LatePlant
 from bhd_lerobot.robots.simulation import Simulation
 from bhd_lerobot.robots.tool_space import TOOL_NAMES, pose_matrices
@@ -25,6 +25,9 @@ from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
 from bhd_lerobot.tasks.task import ArmTruth
 from bhd_lerobot.tasks.variation import MAX_LATENCY_S
+
+if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
+    from bhd_lerobot.robots.config_ur5 import UR5Config
 
 JOINT_ACTIONS = (*(f"{joint}.pos" for joint in JOINTS), "gripper.pos")
 OBSERVED = (*JOINT_ACTIONS, *(f"{joint}.vel" for joint in JOINTS), "gripper.vel")
@@ -50,7 +53,7 @@ class UR5Simulation(Simulation):
     action_names = JOINT_ACTIONS
     observation_names = OBSERVED
 
-    def __init__(self, config: UR5Config, n: int = 1, threads: int | None = None) -> None:
+    def __init__(self, config: "UR5Config", n: int = 1, threads: int | None = None) -> None:
         self.config, self.n = config, n
         self.rates = config.rates
         body = self.body = config.body()
@@ -62,7 +65,7 @@ class UR5Simulation(Simulation):
             body, n, config.control_hz, self.rates.ticks_per_frame
         )
         self.cerebellum = Cerebellum(body, self.plant, config.control_hz, controller=self.controller)
-        self.bridge = LockstepBridge(self.cerebellum, self.rates, self._advance)
+        self.bridge = LockstepBridge(self.cerebellum, self.rates, self.advance)
         self.kinematics = ArmKinematics(body.chain, body.limits)
         if config.action_space == "tool":
             self.action_names = TOOL_NAMES
@@ -82,7 +85,7 @@ class UR5Simulation(Simulation):
         self.table.place(scenes, ids)
         self._noise[ids] = [scene.variation.sensor_noise for scene in scenes]
         self.plant.set_latency(ids, [round(late * self.rates.control_hz) for late in latency])
-        for flags in (self._arm_on_table, self._arm_on_object, self._self_contact):
+        for flags in self.touches:
             flags[ids] = False
 
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -103,18 +106,19 @@ class UR5Simulation(Simulation):
             fingers_on_object=np.array(self.table.finger_on_object),
         )
 
-    def _sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         self.plant.read(self._reading)
         position, velocity = self._reading.position.copy(), self._reading.velocity.copy()
         for sim in np.flatnonzero((self._noise > 0) & self.running):
             noise = self._rngs[sim].normal(0.0, self._noise[sim], (2, len(JOINTS)))
             position[sim, : len(JOINTS)] += noise[0]
             velocity[sim, : len(JOINTS)] += noise[1] * _SPEED_NOISE
-        return np.concatenate([position, velocity], axis=1), np.full(self.n, self._tick)
+        return np.concatenate([position, velocity], axis=1), np.full(self.n, self.tick)
 
-    def _clear_touches(self) -> None:
-        for flags in (self._arm_on_table, self._arm_on_object, self._self_contact):
-            flags[:] = False
+    @property
+    def touches(self) -> tuple[NDArray[np.bool_], ...]:
+        """Touches of the table, of objects with a link of the arm, and of the arm with itself, each of shape (n,)."""
+        return self._arm_on_table, self._arm_on_object, self._self_contact
 
     def _after_tick(self) -> None:
         # Contacts of an arm last longer than a physics step: once a tick is often enough.

@@ -1,0 +1,145 @@
+"""What the real-time process publishes at every tick."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.cerebellum import MOVING, Cerebellum
+from bhd_lerobot.control.fifo import StateRing
+from bhd_lerobot.control.grid import Slot, TickGrid
+from bhd_lerobot.control.messages import Limit, Reason, Watchdog
+from bhd_lerobot.robots.simulation import Simulation
+
+LIMITS, WATCHDOGS = tuple(limit for limit in Limit if limit), tuple(watchdog for watchdog in Watchdog if watchdog)
+
+
+def state_dtype(simulation: Simulation) -> np.dtype:
+    """Return the dtype of the published states of one robot.
+
+    Beside the fields of `CerebellumState`:
+
+    - ``tick``: number on the grid of its stretch; ``stretch``: number of the stretch.
+    - ``due_ns``, ``start_ns``: when the tick was due and when it started, monotonic; ``ended_ns``: when the tick before
+      it ended.
+    - ``executed``, ``skipped``, ``overruns``: ticks so far in the stretch.
+    - ``requested``, ``setpoints``: the setpoint taken last, and how many were taken; ``command_age_ns``: its age if it
+      is followed; ``waiting``: entries in the queue.
+    - ``limits``, ``watchdogs``, ``refusals``, ``touches``: how often each was raised so far, of `LIMITS`, `WATCHDOGS`,
+      `Reason`, and of what the simulation tells about touches. Limits are counted once a frame.
+    - ``observation``: the observation's floats; ``sensed_ns``: when they were read, monotonic; ``oldest_ns``: how much
+      older the oldest reading in them was.
+    - ``physics``: the simulator's generalised positions and velocities.
+    """
+    cerebellum = simulation.cerebellum
+    odometry = cerebellum.controller.odometry().shape[1]
+    own = Cerebellum.state_dtype(1, cerebellum.controller.joints, cerebellum.width, odometry)
+    physics = simulation.world.qpos.shape[1] + simulation.world.qvel.shape[1]
+    counts = [(name, np.int64) for name in ("tick", "stretch", "due_ns", "start_ns", "ended_ns")]
+    counts += [(name, np.int64) for name in ("executed", "skipped", "overruns", "sensed_ns", "oldest_ns")]
+    counts += [(name, np.int64) for name in ("setpoints", "command_age_ns", "waiting")]
+    return np.dtype(
+        [
+            *counts,
+            *((name, own[name].base, own[name].shape) for name in own.names or () if name != "stamp_ns"),
+            ("requested", np.float64, (1, cerebellum.width)),
+            ("limits", np.int64, (len(LIMITS),)),
+            ("watchdogs", np.int64, (len(WATCHDOGS),)),
+            ("refusals", np.int64, (len(Reason),)),
+            ("touches", np.int64, (len(simulation.touches),)),
+            ("observation", np.float64, (1, len(simulation.observation_names))),
+            ("physics", np.float64, (1, physics)),
+        ]
+    )
+
+
+class StatePublisher:
+    """Publishes the states of one robot, into a ring.
+
+    Args:
+        simulation: the robot.
+        ring: where they go, of dtype `state_dtype(simulation)`.
+        clock: monotonic time [ns].
+    """
+
+    def __init__(self, simulation: Simulation, ring: StateRing, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._clock = clock
+        self._simulation, self._cerebellum, self._ring = simulation, simulation.cerebellum, ring
+        self._record = np.zeros(1, state_dtype(simulation))
+        self._field = {name: self._record[name] for name in self._record.dtype.names or ()}
+        self._touches = np.zeros(len(simulation.touches), np.int64)
+        self._limits, self._watchdogs = np.zeros(len(LIMITS), np.int64), np.zeros(len(WATCHDOGS), np.int64)
+        self._nq = simulation.world.qpos.shape[1]
+        self._frame = simulation.rates.ticks_per_frame
+        self._next_frame = 0
+        self.stretch = 0
+
+    def restart(self, stretch: int) -> None:
+        """Begin a new stretch."""
+        self.stretch = stretch
+        self._next_frame = 0
+        self._limits[:] = self._watchdogs[:] = self._touches[:] = 0
+
+    def publish(self, slot: Slot, start_ns: int, ended_ns: int, grid: TickGrid) -> None:
+        """Publish what is so at the end of a tick.
+
+        Args:
+            slot: the tick.
+            start_ns: when it started [ns].
+            ended_ns: when its predecessor ended [ns].
+            grid: what the loop has done so far.
+        """
+        simulation, cerebellum, field = self._simulation, self._cerebellum, self._field
+        self._count(slot)
+        controller, reading = cerebellum.controller, cerebellum.reading
+        field["tick"][0], field["stretch"][0] = slot.index, self.stretch
+        field["due_ns"][0], field["start_ns"][0], field["ended_ns"][0] = slot.due_ns, start_ns, ended_ns
+        field["executed"][0], field["skipped"][0] = grid.executed, grid.skipped
+        field["overruns"][0], field["setpoints"][0] = grid.overruns, cerebellum.setpoints_taken
+        field["waiting"][0] = len(cerebellum.fifo)
+        field["command_age_ns"][:] = cerebellum.command_age_ns(slot.due_ns - grid.start_ns)
+        field["joint_positions"][0], field["joint_velocities"][0] = reading.position, reading.velocity
+        field["joint_efforts"][0] = controller.efforts(reading)
+        field["command"][0], field["measured"][0] = cerebellum.command, controller.measured(reading)
+        field["odometry"][0] = controller.odometry()
+        field["mode"][0], field["requested"][0] = cerebellum.mode, cerebellum.requested
+        field["is_moving"][0] = np.abs(reading.velocity).max() > MOVING
+        field["emergency_stop"][0] = cerebellum.estop_latched
+        field["refusals"][0] = cerebellum.refusals[:, 0]
+        field["observation"][0], oldest = simulation.sense()
+        field["sensed_ns"][0] = self._clock()
+        field["oldest_ns"][:] = (simulation.tick - oldest) * grid.period_ns
+        physics = field["physics"][0]
+        physics[:, : self._nq], physics[:, self._nq :] = simulation.world.qpos, simulation.world.qvel
+        self._ring.publish(self._record[0])
+
+    def _count(self, slot: Slot) -> None:
+        """Count what was raised since the last tick, and the limits at the first tick of every frame."""
+        field = self._field
+        flags = [flag[0] for flag in self._simulation.touches]
+        if any(flags):
+            self._touches += flags
+            field["touches"][0] = self._touches
+            for flag in self._simulation.touches:
+                flag[0] = False
+        if slot.index < self._next_frame:
+            return
+        self._next_frame = (slot.index // self._frame + 1) * self._frame
+        limits, watchdog = self._cerebellum.take_flags()
+        raised = int(limits[0])
+        if raised:
+            self._limits += [bool(raised & limit) for limit in LIMITS]
+            field["limits"][0] = self._limits
+        raised = int(watchdog[0])
+        if raised:
+            self._watchdogs += [bool(raised & one) for one in WATCHDOGS]
+            field["watchdogs"][0] = self._watchdogs
+
+
+def raised(before: Any, after: Any) -> tuple[int, int]:
+    """Return the `Limit` and `Watchdog` flags that were raised between two published states."""
+    limits = sum(int(limit) for limit, more in zip(LIMITS, after["limits"] > before["limits"], strict=True) if more)
+    seen: NDArray[np.bool_] = after["watchdogs"] > before["watchdogs"]
+    return limits, sum(int(one) for one, more in zip(WATCHDOGS, seen, strict=True) if more)
