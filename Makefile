@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format bench lock clean venv
+.PHONY: help demo test lint format bench bench-realtime lock clean venv
 
 PYTHON_IN_VENV := .venv/bin/python
 # Two test processes by default; `make test WORKERS=0` runs everything in one, for a debugger.
@@ -9,7 +9,7 @@ BENCH ?=
 LOCK_ARGS ?=
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-15s %s\n", $$1, $$2}' Makefile
 
 demo: venv ## record, replay and summarise a small dataset
 	$(PYTHON_IN_VENV) -m bhd_lerobot.runs.demo
@@ -28,6 +28,9 @@ format: venv ## repair what ruff can repair
 
 bench: venv ## run the benchmarks; BENCH='name' picks some
 	$(PYTHON_IN_VENV) -m benchmarks.run $(BENCH)
+
+bench-realtime: venv ## measure how punctual the control loop is; BENCH='--quick' for a short run
+	$(PYTHON_IN_VENV) -m benchmarks.realtime $(BENCH)
 
 lock: ## rewrite constraints.txt; LOCK_ARGS=--upgrade takes the newest versions
 	uv=$$(scripts/bootstrap.sh --print-uv) && printf 'hatchling\neditables\n' | "$$uv" pip compile --quiet \

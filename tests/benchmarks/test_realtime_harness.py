@@ -1,0 +1,242 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.realtime import __main__ as program
+from benchmarks.realtime.cases import Case, CaseError
+from benchmarks.realtime.harness import Run, measure, remarks, turns
+from benchmarks.realtime.load import Load, LoadError, cpu_load
+from benchmarks.realtime.machine import CpuTimes
+from benchmarks.realtime.statistics import Samples
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def samples(wake_us: float, notes: tuple[str, ...] = ()) -> Samples:
+    wake = np.full(100, wake_us * 1000, np.int64)
+    return Samples(wake, wake // 2, 1_000_000, 0, 99_000_000, notes)
+
+
+class Stage:
+    """Fake cases and a fake load that write down what happened in which order."""
+
+    def __init__(self) -> None:
+        self.events: list[str] = []
+        self.loaded = False
+
+    def case(self, name: str, wake_us: float = 20.0, fails_at: int | None = None) -> Case:
+        runs = 0
+
+        def run(seconds: float) -> Samples:
+            nonlocal runs
+            self.events.append(f"{name}{'*' if self.loaded else ''}")
+            runs += 1
+            if runs == fails_at:
+                raise CaseError("it broke")
+            return samples(wake_us)
+
+        return Case(name, name.upper(), run)
+
+    @contextmanager
+    def load(self, seconds: float) -> Iterator[Load]:
+        load = Load(2)
+        self.loaded = True
+        try:
+            yield load
+            load.share = 0.9
+        finally:
+            self.loaded = False
+
+
+def test_every_case_has_its_blocks_and_goes_first_as_often_as_last() -> None:
+    order = list(turns(("a", "b", "c"), ("idle", "load"), 4))
+    assert [(number, condition) for number, condition, _ in order] == [
+        (k, c) for k in range(4) for c in ("idle", "load")
+    ]
+    assert [names for _, condition, names in order if condition == "idle"] == [("a", "b", "c"), ("c", "b", "a")] * 2
+
+
+def test_cases_take_turns_and_the_load_runs_only_in_its_own() -> None:
+    stage = Stage()
+    cases = [stage.case("a"), stage.case("b")]
+    run = measure(cases, ("idle", "load"), 2, 1.0, progress=lambda _: None, load=stage.load)
+    assert stage.events == ["a", "b", "a*", "b*", "b", "a", "b*", "a*"]
+    assert [(b.case, b.condition, b.round) for b in run.blocks if b.case == "a"] == [
+        ("a", "idle", 0),
+        ("a", "load", 0),
+        ("a", "idle", 1),
+        ("a", "load", 1),
+    ]
+    assert run.load_shares == [0.9, 0.9]
+    assert run.missing == {}
+
+
+def test_a_case_that_fails_is_left_out_loudly_and_the_others_go_on() -> None:
+    stage = Stage()
+    said: list[str] = []
+    cases = [stage.case("a", fails_at=2), stage.case("b")]
+    run = measure(cases, ("idle",), 3, 1.0, progress=said.append, load=stage.load)
+    assert stage.events == ["a", "b", "b", "a", "b"]
+    assert run.missing == {"a": "it broke"}
+    assert any(text.startswith("LEFT OUT") and "it broke" in text for text in said)
+    assert any("A was NOT MEASURED: it broke" in line for line in remarks(run, {"a": "A", "b": "B"}))
+
+
+def test_remarks_tell_what_was_refused_once_and_a_load_that_was_none() -> None:
+    stage = Stage()
+    refused = Case("a", "A", lambda _: samples(20.0, ("SCHED_FIFO: Operation not permitted",)))
+    run = measure([refused], ("idle",), 3, 1.0, progress=lambda _: None, load=stage.load)
+    assert [line for line in remarks(run, {"a": "A"}) if "SCHED_FIFO" in line] == [
+        "A: the system refused SCHED_FIFO: Operation not permitted."
+    ]
+    assert any("LESS THAN HALF" in line for line in remarks(Run(load_shares=[0.9, 0.3]), {}))
+    assert not any("LESS THAN HALF" in line for line in remarks(Run(load_shares=[0.9, 0.8]), {}))
+
+
+def test_the_whole_program_on_fake_loops(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stage = Stage()
+
+    def unavailable(folder: Path) -> Case:
+        raise CaseError("cyclictest is not installed")
+
+    wake = {"twin": 20.0, "python": 26.0, "thread": 5000.0}
+    makers = {name: lambda _, name=name: stage.case(name, wake[name]) for name in wake}
+    monkeypatch.setattr(program, "MAKERS", makers | {"cyclictest": unavailable})
+    monkeypatch.setattr(program, "how_busy", lambda: "Nothing else ran.")
+    monkeypatch.setattr(program, "measure", lambda *args, progress: measure(*args, progress=progress, load=stage.load))
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    out = tmp_path / "result.json"
+    status = program.main(["--quick", "--json", str(out)])
+    shown = capsys.readouterr()
+    result = json.loads(out.read_text())
+    verdicts = {(c["name"].split(": ")[1].split(" ÷")[0], c["condition"]): c["verdict"] for c in result["checks"]}
+    assert status == 1
+    assert verdicts["wake-up p99", "idle"] == "met"
+    assert "MISSED" in shown.out
+    assert "not to be quoted" in shown.out
+    assert "cyclictest was NOT MEASURED: cyclictest is not installed." in shown.out
+    assert "LEFT OUT: cyclictest" in shown.err
+    assert result["quotable"] is False
+    assert len(result["blocks"]) == 2 * 2 * 3
+    missed = [c["name"] for c in result["checks"] if c["verdict"] == "MISSED"]
+    assert len(missed) == 2
+    assert all("p50" in name for name in missed)  # 26 / 20
+    reasons = {c["reason"] for c in result["checks"] if c["verdict"] == "not measured"}
+    assert reasons == {"cyclictest is not installed"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--only", "twin", "pyton"], "Unknown case 'pyton'. Did you mean 'python'?"),
+        (["--blocks", "0"], "--blocks is 0"),
+        (["--seconds", "0.01"], "--seconds is 0.01"),
+        (["--conditions", "busy"], "invalid choice: 'busy'"),
+    ],
+)
+def test_a_wrong_option_ends_in_a_message(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        program.parse_arguments(arguments)
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_only_a_full_run_is_quotable() -> None:
+    assert program.quotable(program.parse_arguments([]))
+    assert program.quotable(program.parse_arguments(["--blocks", "8", "--seconds", "20"]))
+    assert not program.quotable(program.parse_arguments(["--quick"]))
+    assert not program.quotable(program.parse_arguments(["--blocks", "5"]))
+    quick = program.parse_arguments(["--quick", "--seconds", "3"])
+    assert (quick.blocks, quick.seconds) == (program.QUICK["blocks"], 3)
+
+
+def test_shares_of_the_processors() -> None:
+    before = CpuTimes.parse("cpu  100 10 40 800 50 0 0 0 7 7\ncpu0 1 1 1 1 1 1 1 1 1 1\n")
+    after = CpuTimes.parse("cpu  140 10 50 830 60 0 0 10 9 9\ncpu0 1 1 1 1 1 1 1 1 1 1\n")
+    assert before.total == 1000
+    assert after.shares_since(before) == pytest.approx((0.5, 0.1))
+    assert after.shares_since(after) == (0.0, 0.0)
+
+
+def alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def children_of(pid: int) -> list[int]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if int(fields[1]) == pid:
+            found.append(int(path.parent.name))
+    return found
+
+
+def test_the_load_ends_with_its_block_also_when_that_fails() -> None:
+    before = set(children_of(os.getpid()))
+    started: set[int] = set()
+
+    def fail_under_load() -> None:
+        with cpu_load(30.0) as load:
+            started.update(set(children_of(os.getpid())) - before)
+            assert len(started) == load.cores
+            raise RuntimeError("a block failed")
+
+    with pytest.raises(RuntimeError, match="a block failed"):
+        fail_under_load()
+    assert started
+    assert not any(alive(pid) for pid in started)
+
+
+def test_a_load_that_ends_early_is_an_error() -> None:
+    before = set(children_of(os.getpid()))
+
+    def lose_one() -> None:
+        with cpu_load(30.0):
+            one = sorted(set(children_of(os.getpid())) - before)[-1:]
+            os.kill(one[0], signal.SIGKILL)
+            wait_until_gone(one)
+
+    with pytest.raises(LoadError, match="ended before its time"):
+        lose_one()
+    assert set(children_of(os.getpid())) == before
+
+
+def test_the_load_ends_when_its_parent_is_killed() -> None:
+    text = (
+        "import time\nfrom benchmarks.realtime.load import cpu_load\n"
+        "with cpu_load(60.0):\n    print('up', flush=True)\n    time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", text], cwd=ROOT, stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == b"up\n"
+        children = children_of(parent.pid)
+        assert children
+        parent.kill()
+    wait_until_gone(children)
+
+
+def wait_until_gone(pids: list[int]) -> None:
+    until = time.monotonic() + 30  # generous: only a failure takes that long
+    while any(alive(pid) for pid in pids):
+        assert time.monotonic() < until, f"{pids} live on"
+        time.sleep(0.01)
