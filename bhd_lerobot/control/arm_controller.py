@@ -8,6 +8,7 @@ from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, 
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.goals import GoalManager
 from bhd_lerobot.control.messages import Limit, Mode
+from bhd_lerobot.control.planning import Planning
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.control.setpoints import SetpointFilter
 
@@ -29,13 +30,14 @@ class ArmController(Controller):
         n: number of arms.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame, over which a setpoint is approached.
+        planning: who plans goals; they are planned in the tick that they start in if None.
     """
 
-    def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int) -> None:
+    def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int, planning: Planning | None = None) -> None:
         limits = arm.limits
         self.arm = arm
         self.width = self.joints = width = len(limits.names)
-        self.goals = GoalManager(arm, n, control_hz)
+        self.goals = GoalManager(arm, n, control_hz, planning=planning)
         self.setpoints = SetpointFilter(limits, n, control_hz, frame_ticks)
         self.command = np.tile(np.asarray(arm.home), (n, 1))
         self.velocity: NDArray[np.float64] = np.zeros((n, width))

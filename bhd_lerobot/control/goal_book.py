@@ -14,6 +14,9 @@ REASONS = {
 }
 """What happened to an arm that takes no goals."""
 
+NO_FAILURE = (ResultCode.SUCCEEDED, ResultCode.CANCELLED, ResultCode.PREEMPTED, ResultCode.REPLACED_BY_SETPOINT)
+"""How a goal may end without anything being wrong."""
+
 
 class GoalBook:
     """Sees to it that every goal of one episode ends in exactly one result.

@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
-from bhd_lerobot.control.goal_book import REASONS, GoalBook
+from bhd_lerobot.control.goal_book import NO_FAILURE, REASONS, GoalBook
 from bhd_lerobot.control.kinematics import ArmKinematics
 from bhd_lerobot.control.planner import GoalPlanner, Plan
+from bhd_lerobot.control.planning import InlinePlanning, Planning, PlanOrders
 from bhd_lerobot.control.player import TrajectoryPlayer
 from bhd_lerobot.control.supervision import Supervisor
 from bhd_lerobot.control.trajectory import PlanFailure, State, to_target
@@ -44,10 +45,18 @@ class GoalManager:
         control_hz: ticks a second [Hz].
         kinematics: the arm's; made from its chain if None.
         queue: how many goals may wait.
+        planning: who plans; planned in the tick that a goal starts in if None.
     """
 
     def __init__(
-        self, arm: Arm, n: int, control_hz: int, kinematics: ArmKinematics | None = None, queue: int = 8
+        self,
+        arm: Arm,
+        n: int,
+        control_hz: int,
+        kinematics: ArmKinematics | None = None,
+        queue: int = 8,
+        *,
+        planning: Planning | None = None,
     ) -> None:
         self.planner = GoalPlanner(arm, control_hz, kinematics)
         self.phase: NDArray[np.int8] = np.full(n, GoalPhase.IDLE, np.int8)
@@ -55,6 +64,7 @@ class GoalManager:
         self.following: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self._hz, self._dof = control_hz, len(arm.chain.joints)
         self._player = TrajectoryPlayer(n, self._dof + 1)
+        self._orders = PlanOrders(n, InlinePlanning(self.planner) if planning is None else planning, control_hz)
         self._supervisor = Supervisor(arm, n, control_hz)
         self._capacity = queue
         self._books = [GoalBook(queue) for _ in range(n)]
@@ -70,7 +80,7 @@ class GoalManager:
     # --- what a brain asks for ---------------------------------------------------------------------------------------
 
     def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
-        """Take a goal; it starts in one of the next ticks.
+        """Take a goal; it starts as soon as it is planned.
 
         A refusal is also among the results, except for a goal that has the name of one that is followed or waits: that
         one still gets its own. A name counts as used even if its goal was refused.
@@ -196,6 +206,7 @@ class GoalManager:
         """
         if self._idle:
             return
+        self._orders.tick += 1
         reference = (position, velocity, acceleration)
         if len(self._judged):
             measured = (measured_position, measured_velocity)
@@ -211,8 +222,8 @@ class GoalManager:
                 self._changed(sim)
         if self._waiting:
             for sim in sorted(self._waiting):
-                self._serve(sim, reference)
-                self._changed(sim)
+                if self._serve(sim, reference):
+                    self._changed(sim)
         self._player.tick(position, velocity, acceleration)
 
     def convert(self, sim: int, command: BrainCommand, reference: Reference) -> Plan | PlanFailure:
@@ -222,35 +233,58 @@ class GoalManager:
 
     # --- the state machine -------------------------------------------------------------------------------------------
 
-    def _serve(self, sim: int, reference: Reference) -> None:
-        """Start the next goal of an arm, or the brake of one that was cancelled, as soon as it may."""
+    def _serve(self, sim: int, reference: Reference) -> bool:
+        """Start the next goal of an arm, or the brake of one that was cancelled, as soon as it may.
+
+        Returns:
+            Whether anything was started or ended.
+        """
         book, motion = self._books[sim], self._motion[sim]
         if motion == _Motion.HARD_BRAKE:
-            return
+            return False
         if book.followed is not None:
             self._brake(sim, reference, _Motion.BRAKE)
             if self._motion[sim] == _Motion.NONE:
                 self._end(sim, ResultCode.CANCELLED, "It was cancelled; the arm was at rest.")
-        elif book.waiting and (motion != _Motion.BRAKE or book.waiting[0].preempt):
-            self._start(sim, book.follow(), reference)
+        elif book.waiting and (motion != _Motion.BRAKE or book.waiting[0].preempt or self._orders.wanted(sim)):
+            return self._prepare(sim, book, reference)
         elif motion == _Motion.GOAL:
             # The goal that took the last one's place was cancelled before it began.
             self._brake(sim, reference, _Motion.BRAKE)
+        return True
 
-    def _start(self, sim: int, command: BrainCommand, reference: Reference) -> None:
+    def _prepare(self, sim: int, book: GoalBook, reference: Reference) -> bool:
+        """Have the next goal planned, and start it; return whether it was started or has failed."""
         self.phase[sim] = GoalPhase.CONVERTING
-        plan = self.convert(sim, command, reference)
+        now = State(*(array[sim] for array in reference))
+        if self._orders.deferred and self._motion[sim] == _Motion.NONE and now.moving:
+            # It has followed setpoints. Where it is going to be is known only if it is told.
+            self._brake(sim, reference, _Motion.BRAKE)
+            self._changed(sim)
+
+        def ahead(ticks: int) -> State:
+            return (self._player.ahead(sim, ticks) if ticks else None) or State.of(*(array[sim] for array in reference))
+
+        command = book.waiting[0]
+        plan = self._orders.ask(sim, command, now, ahead, self._opening[sim])
+        if plan is None:
+            return False
+        book.follow()
         if isinstance(plan, PlanFailure):
             self._end(sim, plan.code, plan.message)
             if self._motion[sim] < _Motion.BRAKE:
                 self._brake(sim, reference, _Motion.BRAKE)
-            return
+            return True
         self._planned[sim] = plan.trajectory.ticks
         self._opening[sim] = float(plan.target[self._dof])
-        self._player.start(sim, plan.trajectory)
+        if plan.rows is None:
+            self._player.start(sim, plan.trajectory)
+        else:
+            self._player.borrow(plan.rows)
         self._supervisor.begin(sim, command, plan.target)
         self._motion[sim] = _Motion.GOAL
         self.phase[sim] = GoalPhase.EXECUTING
+        return True
 
     def _brake(self, sim: int, reference: Reference, motion: _Motion) -> None:
         """Brake an arm; one that is at rest stays there."""
@@ -268,17 +302,19 @@ class GoalManager:
     def _end(self, sim: int, code: ResultCode, message: str) -> None:
         """End the goal that is followed."""
         if self._books[sim].end(code, message):
-            self.phase[sim] = GoalPhase.IDLE if code in _NO_FAILURE else GoalPhase.ERROR
+            self.phase[sim] = GoalPhase.IDLE if code in NO_FAILURE else GoalPhase.ERROR
 
     def _end_all(self, sim: int, code: ResultCode, message: str) -> None:
         """End the goal that is followed and those that wait."""
         if self._books[sim].end_all(code, message):
-            self.phase[sim] = GoalPhase.IDLE if code in _NO_FAILURE else GoalPhase.ERROR
+            self.phase[sim] = GoalPhase.IDLE if code in NO_FAILURE else GoalPhase.ERROR
 
     def _changed(self, sim: int) -> None:
         """Bring up to date what follows from the state of an arm."""
         book, motion = self._books[sim], self._motion[sim]
         followed, cancelled = book.followed is not None, book.cancelled
+        if self._orders.wanted(sim) is not (book.waiting[0] if book.waiting else None):
+            self._orders.drop(sim)
         on_the_way = motion == _Motion.GOAL
         self._is_judged[sim] = followed and on_the_way and not cancelled
         self.following[sim] = motion != _Motion.NONE
@@ -290,11 +326,3 @@ class GoalManager:
         self._judged = np.flatnonzero(self._is_judged)
         self._braking = np.flatnonzero(self._motion >= _Motion.BRAKE)
         self._idle = not self.busy.any()
-
-
-_NO_FAILURE = (
-    ResultCode.SUCCEEDED,
-    ResultCode.CANCELLED,
-    ResultCode.PREEMPTED,
-    ResultCode.REPLACED_BY_SETPOINT,
-)

@@ -34,10 +34,13 @@ class Plan:
     Attributes:
         trajectory: of all command dimensions, the gripper's last.
         target: where it ends [rad], and the opening that the gripper is commanded to [m], shape (dof + 1,).
+        rows: the trajectory's position, velocity and acceleration at each tick in one block, shape (T, 3, dof + 1), if
+            it lies in memory that may be played from without copying it; None if it does not.
     """
 
     trajectory: Trajectory
     target: Array
+    rows: Array | None = None
 
 
 class GoalPlanner:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.trajectory import Trajectory
+from bhd_lerobot.control.trajectory import State, Trajectory
 
 
 class TrajectoryPlayer:
@@ -21,7 +21,8 @@ class TrajectoryPlayer:
 
     def __init__(self, n: int, dof: int) -> None:
         self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
-        self._rows = np.zeros((4096, 3, dof))
+        self._rows: NDArray[np.float64] = np.zeros((4096, 3, dof))
+        self._source = self._rows  # what the only trajectory is played from: the block, or somebody else's rows
         self._used = 0
         # The row that is next is the number of ticks so far and this.
         self._offset, self._end = np.zeros(n, np.intp), np.zeros(n, np.intp)
@@ -39,7 +40,25 @@ class TrajectoryPlayer:
         rows = self._rows[begin:end]
         rows[:, 0], rows[:, 1], rows[:, 2] = trajectory.position, trajectory.velocity, trajectory.acceleration
         self._offset[sim], self._end[sim], self._used = begin - self._ticks, end, end
+        self._source = self._rows
         self.active[sim] = True
+        self._changed()
+
+    def borrow(self, rows: NDArray[np.float64]) -> None:
+        """Play somebody else's rows from the next tick on, without copying them; for one simulation.
+
+        Args:
+            rows: position, velocity and acceleration at each tick, shape (T, 3, dof). They must stay as they are until
+                something else is played.
+
+        Raises:
+            ValueError: there are several simulations, whose rows lie in one block.
+        """
+        if len(self.active) != 1:
+            raise ValueError(f"Rows of {len(self.active)} simulations lie in one block; only a single one may borrow.")
+        self._offset[0], self._end[0] = -self._ticks, len(rows)
+        self._source = rows
+        self.active[0] = True
         self._changed()
 
     def stop(self, sim: int) -> None:
@@ -51,6 +70,14 @@ class TrajectoryPlayer:
         """Return how many ticks are left."""
         return int(self._end[sim] - self._offset[sim]) - self._ticks if self.active[sim] else 0
 
+    def ahead(self, sim: int, ticks: int) -> State | None:
+        """Return the state after so many more ticks, at least one, or at the end; None if nothing is played."""
+        if not self.active[sim]:
+            return None
+        rows = self._source if len(self.active) == 1 else self._rows
+        last = min(int(self._offset[sim]) + self._ticks + ticks, int(self._end[sim])) - 1
+        return State.of(*rows[last])
+
     def tick(
         self, position: NDArray[np.float64], velocity: NDArray[np.float64], acceleration: NDArray[np.float64]
     ) -> None:
@@ -59,7 +86,7 @@ class TrajectoryPlayer:
             return
         if self._only is not None:
             sim, offset = self._only
-            position[sim], velocity[sim], acceleration[sim] = self._rows[offset + self._ticks]
+            position[sim], velocity[sim], acceleration[sim] = self._source[offset + self._ticks]
         else:
             ids = self._ids
             rows = self._rows[self._offset[ids] + self._ticks]
