@@ -32,7 +32,7 @@ GRANT_BANDWIDTH = (
 )
 GRANT_LATENCY_FILE = (
     'a udev rule: `KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"`; in a container, start it with '
-    "`--device=/dev/cpu_dma_latency`; or set the processor's governor to `performance`"
+    "`--device=/dev/cpu_dma_latency`; or `cpupower idle-set -D 10`"
 )
 
 
