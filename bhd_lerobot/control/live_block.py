@@ -139,6 +139,10 @@ class LiveBlock:
         """Return the memory of a further section."""
         return self._block.section(name)
 
+    def has(self, name: str) -> bool:
+        """Return whether there is a section of this name."""
+        return self._block.has(name)
+
     @property
     def estop_word(self) -> NDArray[np.int64]:
         """The word of the emergency stop, shape (1,): any process may set it."""

@@ -1,6 +1,6 @@
 """Configuration of the simulated TurtleBot3 Burger."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from lerobot.robots.config import RobotConfig
 
@@ -8,9 +8,8 @@ from bhd_lerobot.bodies.arenas import ARENAS
 from bhd_lerobot.bodies.body import MobileBase, Rates
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.robots.config_realtime import CLOCKS, RealtimeConfig
 from bhd_lerobot.sim.lidar import check_beams
-
-CLOCKS = ("lockstep",)
 
 
 @RobotConfig.register_subclass("turtlebot3")
@@ -20,7 +19,10 @@ class TurtleBot3Config(RobotConfig):
 
     Attributes:
         fps: actions a second [Hz]; one `send_action` advances simulated time by 1 / fps. Record at the same rate.
-        clock: ``"lockstep"``: simulated time, advanced by `send_action`, as fast as the machine can.
+        clock: ``"lockstep"``: simulated time, advanced by `send_action`, as fast as the machine can; ``"realtime"``:
+            the wall clock, in processes of its own.
+        require_realtime: with ``clock = "realtime"``, refuse to start if the system does not grant SCHED_FIFO.
+        realtime: how it runs on the wall clock.
         control_hz: cerebellum ticks a second [Hz], a multiple of fps.
         physics_hz: physics steps a second [Hz], a multiple of control_hz.
         arena: where the robot is when it is used by itself: ``"turtlebot3_world"``, ``"random"`` or ``"empty"``. In a
@@ -38,6 +40,8 @@ class TurtleBot3Config(RobotConfig):
 
     fps: int = 10
     clock: str = "lockstep"
+    require_realtime: bool = False
+    realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
     control_hz: int = 200
     physics_hz: int = 200
     arena: str = "turtlebot3_world"

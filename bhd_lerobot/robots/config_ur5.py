@@ -1,14 +1,14 @@
 """Configuration of the simulated UR5."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.bodies.body import Arm, Rates
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.robots.config_realtime import CLOCKS, RealtimeConfig
 
-CLOCKS = ("lockstep",)
 CONTROLS = ("servo", "impedance")
 ACTION_SPACES = ("joint", "tool")
 SCENES = ("empty", "reach", "pick")
@@ -21,7 +21,10 @@ class UR5Config(RobotConfig):
 
     Attributes:
         fps: actions a second [Hz]; one `send_action` advances simulated time by 1 / fps. Record at the same rate.
-        clock: ``"lockstep"``: simulated time, advanced by `send_action`, as fast as the machine can.
+        clock: ``"lockstep"``: simulated time, advanced by `send_action`, as fast as the machine can; ``"realtime"``:
+            the wall clock, in processes of its own.
+        require_realtime: with ``clock = "realtime"``, refuse to start if the system does not grant SCHED_FIFO.
+        realtime: how it runs on the wall clock.
         control_hz: cerebellum ticks a second [Hz], a multiple of fps.
         physics_hz: physics steps a second [Hz], a multiple of control_hz.
         control: ``"servo"``: position servos, stiff and precise, with goals; ``"impedance"``: joint torques that make
@@ -38,6 +41,8 @@ class UR5Config(RobotConfig):
 
     fps: int = 25
     clock: str = "lockstep"
+    require_realtime: bool = False
+    realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
     control_hz: int = 500
     physics_hz: int = 500
     control: str = "servo"

@@ -19,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.bodies.body import Body, Rates
+from bhd_lerobot.bodies.body import Arm, Body, Rates
 from bhd_lerobot.control.grid import Slot, TickGrid
 from bhd_lerobot.control.live_block import LiveBlock, Phase, Word
-from bhd_lerobot.control.live_sections import cerebellum_side
+from bhd_lerobot.control.live_sections import cerebellum_side, plan_link
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
+from bhd_lerobot.control.planning import Planning
 from bhd_lerobot.control.privileges import Privileges, RealtimeSettings
 from bhd_lerobot.control.realtime import LoopLimits, RealtimeLoop
 from bhd_lerobot.control.timing import TimingStatistics
@@ -58,12 +59,17 @@ class LiveSpec:
     privileges: RealtimeSettings
     limits: LoopLimits
 
-    def make_simulation(self) -> Simulation:
-        """Return a simulation of one robot."""
+    def make_simulation(self, planning: Planning | None = None) -> Simulation:
+        """Return a simulation of one robot.
+
+        Args:
+            planning: who plans its goals, for an arm that takes goals.
+        """
         module, _, name = self.simulation.partition(":")
         body = self.body
         config = SimpleNamespace(**self.values, rates=self.rates, body=lambda: body)
-        made: Simulation = getattr(importlib.import_module(module), name)(config, 1, 1)
+        kind = getattr(importlib.import_module(module), name)
+        made: Simulation = kind(config, 1, 1) if planning is None else kind(config, 1, 1, planning)
         return made
 
 
@@ -79,7 +85,9 @@ class LiveProcess:
         self._connection = connection
         self._block = LiveBlock.attach(spec.block)
         self._words = self._block.words
-        self._simulation = simulation = spec.make_simulation()
+        dof = len(spec.body.chain.joints) if isinstance(spec.body, Arm) else 0
+        planning = plan_link(self._block, dof, spec.rates.control_hz)
+        self._simulation = simulation = spec.make_simulation(planning)
         cerebellum = simulation.cerebellum
         cerebellum.fifo, cerebellum.estop_word = self._block.fifo, self._block.estop_word
         self._serve_bridge = cerebellum_side(self._block, cerebellum)

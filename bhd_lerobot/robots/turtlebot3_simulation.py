@@ -87,6 +87,7 @@ class TurtleBot3Simulation(Simulation):
         self._scan(ids)
 
     def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
         self.plant.read(self._reading)
         drive = self._controller.drive
         parts = [drive.twist_from_wheels(self._reading.velocity), self.lidar.ranges]

@@ -15,6 +15,7 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.impedance import ImpedanceController
 from bhd_lerobot.control.kinematics import ArmKinematics
 from bhd_lerobot.control.messages import Reason
+from bhd_lerobot.control.planning import Planning
 from bhd_lerobot.control.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.latency import LatePlant
@@ -48,22 +49,26 @@ class UR5Simulation(Simulation):
         config: the robot.
         n: how many.
         threads: threads that step the physics; all processors if None.
+        planning: who plans goals; they are planned in the tick that they start in if None.
     """
 
     action_names = JOINT_ACTIONS
     observation_names = OBSERVED
 
-    def __init__(self, config: "UR5Config", n: int = 1, threads: int | None = None) -> None:
+    def __init__(
+        self, config: "UR5Config", n: int = 1, threads: int | None = None, planning: Planning | None = None
+    ) -> None:
         self.config, self.n = config, n
         self.rates = config.rates
         body = self.body = config.body()
         self.world = World(body, n, physics_hz=config.physics_hz, threads=threads)
         self.table = Tabletop(self.world)
         self.plant = LatePlant(SimulatedPlant(self.world), body, round(MAX_LATENCY_S * config.control_hz))
-        kind = ImpedanceController if config.control == "impedance" else ArmController
-        self.controller: ArmController | ImpedanceController = kind(
-            body, n, config.control_hz, self.rates.ticks_per_frame
-        )
+        self.controller: ArmController | ImpedanceController
+        if config.control == "impedance":
+            self.controller = ImpedanceController(body, n, config.control_hz, self.rates.ticks_per_frame)
+        else:
+            self.controller = ArmController(body, n, config.control_hz, self.rates.ticks_per_frame, planning)
         self.cerebellum = Cerebellum(body, self.plant, config.control_hz, controller=self.controller)
         self.bridge = LockstepBridge(self.cerebellum, self.rates, self.advance)
         self.kinematics = ArmKinematics(body.chain, body.limits)
@@ -107,6 +112,7 @@ class UR5Simulation(Simulation):
         )
 
     def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
         self.plant.read(self._reading)
         position, velocity = self._reading.position.copy(), self._reading.velocity.copy()
         for sim in np.flatnonzero((self._noise > 0) & self.running):
