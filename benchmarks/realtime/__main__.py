@@ -84,7 +84,8 @@ def report(run: Run, checks: Sequence[Check], options: argparse.Namespace, notes
     out.print(measured_table(run.blocks, TITLES))
     out.print(verdict_table(checks))
     for note in [*notes, *remarks(run, TITLES)]:
-        out.print(note, markup=False, highlight=False)
+        loud = note.endswith("!")
+        out.print(note, markup=False, highlight=False, style="bold red" if loud else None)
     if not quotable(options):
         wanted = f"{FULL['blocks']} blocks of {FULL['seconds']:g} s"
         out.print(f"A SHORT RUN: these numbers are not to be quoted; that takes {wanted}.", style="bold yellow")
@@ -108,7 +109,7 @@ def how_busy() -> str:
     time.sleep(1.0)
     busy, stolen = CpuTimes.now().shares_since(before)
     text = f"Before the run other programs used {busy:.0%} of the processors, and the host took {stolen:.1%}."
-    return text + (" THE MACHINE IS NOT IDLE: these numbers are disturbed." if busy + stolen > DISTURBED else "")
+    return text + (" THE MACHINE IS NOT IDLE, its numbers are disturbed!" if busy + stolen > DISTURBED else "")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -104,7 +104,9 @@ def _block(case: Case, seconds: float, condition: str, number: int, run: Run) ->
 
 def remarks(run: Run, titles: Mapping[str, str]) -> list[str]:
     """Return what a reader must know beside the tables: what the system refused, and how heavy the load was."""
-    lines = [f"{titles.get(name, name)} was NOT MEASURED: {reason}." for name, reason in run.missing.items()]
+    lines = [
+        f"{titles.get(name, name)} was NOT MEASURED: {reason.rstrip('.')}!" for name, reason in run.missing.items()
+    ]
     refused: dict[tuple[str, str], None] = {}
     for block in run.blocks:
         refused.update({(block.case, note): None for note in block.notes})
@@ -113,7 +115,7 @@ def remarks(run: Run, titles: Mapping[str, str]) -> list[str]:
         low = min(run.load_shares)
         lines.append(f"The load got {low:.0%} of the processor time or more, beside the loops.")
         if low < 0.5:
-            lines.append("That is LESS THAN HALF: something else ran on this machine, or the load is not one.")
+            lines.append("That is LESS THAN HALF: something else ran on this machine, or the load is not one!")
     return lines
 
 

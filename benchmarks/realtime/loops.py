@@ -40,7 +40,7 @@ def run_grid(
         sleep: waits for some seconds.
 
     Returns:
-        Ticks executed and points of the grid skipped.
+        Ticks executed and points of the grid skipped, with those that passed during the last tick.
     """
     points = len(records)
     executed = 0
@@ -58,7 +58,7 @@ def run_grid(
         record[0], record[1], record[2] = due, woke, ended
         executed += 1
         point = max(point + 1, (ended - start) // period_ns + 1)
-    return executed, points - executed
+    return executed, point - executed
 
 
 def request_real_time(priority: int) -> tuple[str, list[str]]:

@@ -21,7 +21,7 @@ class Samples:
         duration_ns: how long each tick took [ns], shape (ticks,), or (0,) of a loop that does nothing in a tick.
         period_ns: the grid's period [ns].
         skipped: points of the grid that the loop reports as skipped.
-        elapsed_ns: from the start of the first tick to the start of the last [ns]; None where it is not known.
+        elapsed_ns: from when the first tick was due to the end of the last [ns]; None where it is not known.
         notes: what the system refused to the loop.
     """
 
@@ -39,10 +39,14 @@ class Samples:
 
     @property
     def count_error(self) -> float | None:
-        """Executed + skipped − rate × elapsed time, in ticks: 0 of a loop that keeps its rate and counts right."""
+        """Executed + skipped − rate × elapsed time, in ticks.
+
+        From 0 to 1 of a loop that keeps its rate and counts right, however late a tick is: the first point of the grid
+        is at time 0, and what passes during the last tick is skipped.
+        """
         if self.elapsed_ns is None:
             return None
-        return self.ticks + self.skipped - 1 - self.elapsed_ns / self.period_ns
+        return self.ticks + self.skipped - self.elapsed_ns / self.period_ns
 
     @classmethod
     def from_records(
@@ -57,7 +61,7 @@ class Samples:
             notes: what the system refused to the loop.
         """
         due, woke, ended = records.T
-        elapsed = int(woke[-1] - woke[0]) if len(woke) else None
+        elapsed = int(ended[-1] - due[0]) if len(due) else None
         return cls(woke - due, ended - woke, period_ns, skipped, elapsed, notes)
 
 

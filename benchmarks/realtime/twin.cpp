@@ -35,12 +35,13 @@ static std::int64_t now_ns() {
   return std::chrono::duration_cast<nanoseconds>(Clock::now().time_since_epoch()).count();
 }
 
-// Runs the grid; returns how many points of it were skipped.
+// Runs the grid; returns how many points of it were skipped, with those that passed during the last tick.
 static std::int64_t run(const mjModel* model, mjData* data, std::int64_t period, std::int64_t points,
                         std::vector<Record>* records) {
   std::int64_t executed = 0;
   const std::int64_t start = now_ns() + period;
-  for (std::int64_t point = 0; point < points; ++executed) {
+  std::int64_t point = 0;
+  for (; point < points; ++executed) {
     const std::int64_t due = start + point * period;
     std::this_thread::sleep_until(Clock::time_point(nanoseconds(due)));
     const std::int64_t woke = now_ns();
@@ -49,7 +50,7 @@ static std::int64_t run(const mjModel* model, mjData* data, std::int64_t period,
     if (records != nullptr) records->push_back({due, woke, ended});
     point = std::max(point + 1, (ended - start) / period + 1);
   }
-  return points - executed;
+  return point - executed;
 }
 
 int main(int argc, char** argv) {

@@ -125,7 +125,7 @@ def test_the_whole_program_on_fake_loops(
     assert verdicts["wake-up p99", "idle"] == "met"
     assert "MISSED" in shown.out
     assert "not to be quoted" in shown.out
-    assert "cyclictest was NOT MEASURED: cyclictest is not installed." in shown.out
+    assert "cyclictest was NOT MEASURED: cyclictest is not installed!" in shown.out
     assert "LEFT OUT: cyclictest" in shown.err
     assert result["quotable"] is False
     assert len(result["blocks"]) == 2 * 2 * 3
