@@ -6,6 +6,7 @@ import os
 import signal
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -41,8 +42,11 @@ def run_child(function: Callable[..., Any], *arguments: Any, timeout_s: float = 
         timeout_s: after this time the process is killed [s].
     """
     context = multiprocessing.get_context("spawn")
-    with tempfile.TemporaryDirectory(prefix="bhd-doctor-") as folder:
-        log = Path(folder) / "output.txt"
+    with ExitStack() as stack:
+        try:
+            log = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bhd-doctor-"))) / "output.txt"
+        except OSError:  # a full disk is for another check to report
+            log = Path(os.devnull)
         ours, theirs = context.Pipe(duplex=False)
         process = context.Process(target=_serve, args=(theirs, log, function, arguments), daemon=True)
         process.start()
@@ -90,7 +94,8 @@ def _last_line(log: Path) -> str:
 
 def _end(status: int | None) -> str:
     if status is not None and status < 0:
-        return f"ended by {signal.Signals(-status).name}"
+        names = {one.value: one.name for one in signal.Signals}
+        return f"ended by {names.get(-status, f'signal {-status}')}"
     return f"ended with status {status}"
 
 

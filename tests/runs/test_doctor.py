@@ -4,6 +4,7 @@ import importlib
 import json
 import os
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from importlib import metadata
@@ -113,6 +114,11 @@ def test_the_last_words_of_a_process_are_kept(trials: Any) -> None:
     outcome = run_child(trials.noisy_and_dead)
     assert (outcome.kind, outcome.error) == ("crash", "ended by SIGKILL")
     assert outcome.output.startswith("and complains: ")
+
+
+def test_without_a_temporary_folder_only_the_last_words_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", "/no/such/folder")
+    assert run_child(divmod, 7, 2) == Outcome("value", value=(3, 1))
 
 
 def test_measuring_for_real_imports_nothing_heavy(trials: Any) -> None:
