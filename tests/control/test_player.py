@@ -1,0 +1,102 @@
+"""What a trajectory is going to be, and rows that are played where they lie. How it plays: see test_trajectory."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.control.player import TrajectoryPlayer
+from bhd_lerobot.control.trajectory import State, Trajectory
+
+
+def rows_of(ticks: int, seed: int = 0, dof: int = 2) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(ticks, 3, dof))
+
+
+def trajectory(rows: np.ndarray) -> Trajectory:
+    return Trajectory(rows[:, 0], rows[:, 1], rows[:, 2])
+
+
+def play(player: TrajectoryPlayer, n: int = 1) -> np.ndarray:
+    reference = np.full((3, n, 2), np.nan)
+    player.tick(*reference)
+    return reference
+
+
+def equal(state: State | None, row: np.ndarray) -> bool:
+    return state is not None and np.array_equal((state.position, state.velocity, state.acceleration), row)
+
+
+@given(st.integers(1, 20), st.integers(0, 19), st.integers(1, 30), st.booleans())
+def test_what_lies_ahead_is_what_is_played_then_or_the_end(ticks: int, played: int, ahead: int, borrowed: bool) -> None:
+    player, rows = TrajectoryPlayer(1, 2), rows_of(ticks)
+    player.start(0, trajectory(rows_of(5, 1)))
+    play(player)
+    if borrowed:
+        player.borrow(rows)
+    else:
+        player.start(0, trajectory(rows))
+    for _ in range(played):
+        play(player)
+    if played >= ticks:
+        assert player.ahead(0, ahead) is None
+        assert not player.active[0]
+        return
+    state = player.ahead(0, ahead)
+    assert equal(state, rows[min(played + ahead, ticks) - 1])
+    last = play(player)
+    for _ in range(min(ahead, ticks - played) - 1):
+        last = play(player)
+    assert equal(state, last[:, 0])
+
+
+def test_what_lies_ahead_of_one_of_many() -> None:
+    player, blocks = TrajectoryPlayer(3, 2), [rows_of(ticks, ticks) for ticks in (5, 9)]
+    player.start(0, trajectory(blocks[0]))
+    player.start(2, trajectory(blocks[1]))
+    play(player, 3)
+    assert equal(player.ahead(0, 2), blocks[0][2])
+    assert equal(player.ahead(2, 2), blocks[1][2])
+    assert equal(player.ahead(0, 99), blocks[0][-1])
+    assert player.ahead(1, 1) is None
+
+
+def test_a_look_ahead_is_a_copy() -> None:
+    player, rows = TrajectoryPlayer(1, 2), rows_of(4)
+    player.borrow(rows)
+    state = player.ahead(0, 2)
+    assert state is not None
+    state.position[:] = 9.0
+    assert (rows != 9.0).all()
+
+
+def test_borrowed_rows_are_played_where_they_lie() -> None:
+    player, rows = TrajectoryPlayer(1, 2), rows_of(6)
+    player.borrow(rows)
+    assert player.remaining(0) == 6
+    assert np.array_equal(play(player)[:, 0], rows[0])
+    rows[1] = 7.0  # whoever lends them must not; that it shows proves that nothing was copied
+    assert (play(player) == 7.0).all()
+    player.stop(0)
+    assert np.isnan(play(player)).all()
+    assert player.remaining(0) == 0
+
+
+@given(st.lists(st.tuples(st.integers(1, 6000), st.booleans(), st.integers(0, 8)), max_size=6))
+def test_borrowed_rows_and_its_own_take_turns(pieces: list[tuple[int, bool, int]]) -> None:
+    player = TrajectoryPlayer(1, 2)
+    for number, (ticks, borrowed, played) in enumerate(pieces):
+        rows = rows_of(ticks, number)
+        if borrowed:
+            player.borrow(rows)
+        else:
+            player.start(0, trajectory(rows))
+        for tick in range(played):
+            reference = play(player)
+            assert np.array_equal(reference[:, 0], rows[tick]) if tick < ticks else np.isnan(reference).all()
+        assert player.remaining(0) == max(0, ticks - played)
+
+
+def test_one_of_many_may_not_borrow() -> None:
+    with pytest.raises(ValueError, match="3 simulations"):
+        TrajectoryPlayer(3, 2).borrow(rows_of(2))
