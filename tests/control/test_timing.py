@@ -1,9 +1,14 @@
+import json
+from dataclasses import asdict
+from multiprocessing.shared_memory import SharedMemory
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.timing import TimingStatistics
+from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
+from bhd_lerobot.errors import ConfigError
 
 PERIOD = 5_000_000
 BIN = 10 ** (1 / 20)  # 20 bins a decade
@@ -63,3 +68,167 @@ def test_a_few_late_ticks_show_in_the_tail_only() -> None:
 def test_lateness_beyond_the_last_bin_is_reported() -> None:
     summary = collect(np.array([60_000_000_000])).summary()
     assert summary.lateness_p50 == 60.0
+
+
+# --- skipped ticks, the grid -----------------------------------------------------------------------------------------
+
+TICKS = st.lists(st.tuples(st.integers(0, PERIOD - 1), st.integers(0, 20_000_000), st.integers(0, 4)), max_size=40)
+
+
+def on_grid(ticks: list[tuple[int, int, int]], first: int = 10**15, drift: float = 0.0) -> TimingStatistics:
+    """Return the statistics of a loop that keeps to its grid, or is slower by a share: lateness, duration, skipped."""
+    statistics = TimingStatistics(PERIOD)
+    due = first
+    for late, long, skipped in ticks:
+        due += round((1 + skipped) * PERIOD * (1 + drift))
+        statistics.add(due, due + late, due + late + long, skipped)
+    return statistics
+
+
+@given(TICKS)
+def test_a_loop_on_its_grid_has_an_error_below_a_tick(ticks: list[tuple[int, int, int]]) -> None:
+    summary = on_grid(ticks).summary()
+    assert summary.ticks == len(ticks)
+    assert summary.skipped == sum(skipped for *_, skipped in ticks)
+    assert abs(summary.rate_error) < 1
+
+
+def test_a_loop_that_drifts_has_an_error_that_grows() -> None:
+    errors = [on_grid([(0, 100, 0)] * ticks, drift=0.01).summary().rate_error for ticks in (101, 1001)]
+    assert errors == pytest.approx([-1, -10], rel=1e-6)
+
+
+def test_ticks_that_are_neither_run_nor_counted_show_in_the_rate_error() -> None:
+    statistics = TimingStatistics(PERIOD)
+    for k in (0, 1, 2, 7, 8):
+        statistics.add(k * PERIOD, k * PERIOD, k * PERIOD + 10)
+    assert statistics.summary().rate_error == -4
+
+
+def test_no_ticks_give_zeros() -> None:
+    summary = TimingStatistics(PERIOD).summary()
+    counted = {name: value for name, value in asdict(summary).items() if name not in ("period", "clock", "tolerated")}
+    assert set(counted.values()) == {0}
+    assert (summary.period, summary.clock, summary.tolerated) == (PERIOD / 1e9, "lockstep", {})
+
+
+@given(st.lists(st.integers(1, 10**11), min_size=1, max_size=60))
+def test_quantiles_of_durations_are_at_most_one_bin_too_high_and_never_too_low(durations: list[int]) -> None:
+    summary = collect(np.zeros(len(durations)), np.array(durations)).summary()
+    for share, measured in ((0.50, summary.duration_p50), (0.99, summary.duration_p99)):
+        exact = np.quantile(durations, share, method="inverted_cdf") / 1e9
+        assert exact <= measured * (1 + 1e-12)
+        if exact <= 10:
+            assert measured <= max(exact * BIN * 1.001, 1e-6)
+    assert summary.duration_p99 <= summary.duration_max == max(durations) / 1e9
+
+
+# --- together and apart ----------------------------------------------------------------------------------------------
+
+
+@given(TICKS, TICKS)
+def test_merging_is_counting_both(first: list[tuple[int, int, int]], second: list[tuple[int, int, int]]) -> None:
+    a, b = on_grid(first), on_grid(second, first=3 * 10**15)
+    merged, swapped = a.copy(), b.copy()
+    merged.merge(b)
+    swapped.merge(a)
+    assert merged.summary() == swapped.summary()
+    for total, *parts in zip(merged.histograms[1:], a.histograms[1:], b.histograms[1:], strict=True):
+        assert np.array_equal(total, parts[0] + parts[1])
+    for name in ("ticks", "skipped", "overruns"):
+        assert getattr(merged.summary(), name) == getattr(a.summary(), name) + getattr(b.summary(), name)
+    for name in ("lateness_max", "duration_max"):
+        assert getattr(merged.summary(), name) == max(getattr(a.summary(), name), getattr(b.summary(), name))
+    # The time between the two is no part of either: two loops on their grid are on it together.
+    assert merged.summary().rate_error == pytest.approx(a.summary().rate_error + b.summary().rate_error, abs=1e-6)
+
+
+def test_loops_of_different_periods_are_not_merged() -> None:
+    with pytest.raises(ConfigError, match="different periods"):
+        TimingStatistics(PERIOD).merge(TimingStatistics(2 * PERIOD))
+
+
+@given(TICKS, TICKS)
+def test_what_came_since_is_what_was_added(first: list[tuple[int, int, int]], then: list[tuple[int, int, int]]) -> None:
+    statistics = on_grid(first)
+    before = statistics.copy()
+    later = on_grid(then, first=10**15 + PERIOD * 10**6)
+    for late, long, skipped in then:
+        statistics.add(2 * 10**15, 2 * 10**15 + late, 2 * 10**15 + late + long, skipped)
+    since, wanted = statistics.since(before).summary(), later.summary()
+    assert (since.ticks, since.skipped, since.overruns) == (wanted.ticks, wanted.skipped, wanted.overruns)
+    for name in ("lateness", "duration"):
+        exact, found = getattr(wanted, f"{name}_max"), getattr(since, f"{name}_max")
+        assert exact <= found * (1 + 1e-12)
+        assert found <= max(exact * BIN * 1.001, 1e-6)
+    assert before.summary() == on_grid(first).summary()
+
+
+# --- shared memory ---------------------------------------------------------------------------------------------------
+
+
+def test_a_reader_sees_what_is_counted_and_changes_nothing() -> None:
+    memory = SharedMemory(create=True, size=TimingStatistics.nbytes + 100)
+    try:
+        writer = TimingStatistics(PERIOD, memory.buf)
+        writer.add(0, 7_000, 90_000, 2)
+        content = bytes(memory.buf)
+        reader = TimingStatistics.view(memory.buf)
+        assert reader.period_ns == PERIOD
+        assert reader.summary() == writer.summary()
+        assert bytes(memory.buf) == content
+        kept = reader.copy()
+        writer.add(PERIOD, PERIOD, PERIOD + 5)
+        assert (reader.ticks, kept.ticks) == (2, 1)
+        writer.reset()
+        assert reader.summary() == TimingStatistics(PERIOD).summary()
+        writer.release()
+        reader.release()
+    finally:
+        memory.close()  # raises if somebody still holds the buffer
+        memory.unlink()
+
+
+def test_a_used_buffer_is_cleared_for_a_new_loop() -> None:
+    buffer = bytearray(b"\xff" * (TimingStatistics.nbytes + 8))
+    assert TimingStatistics(PERIOD, buffer).summary() == TimingStatistics(PERIOD).summary()
+    assert buffer[-8:] == b"\xff" * 8  # what lies behind is not ours
+
+
+def test_memory_without_statistics_is_refused() -> None:
+    with pytest.raises(ConfigError, match="holds no timing statistics"):
+        TimingStatistics.view(bytearray(TimingStatistics.nbytes))
+    for make in (TimingStatistics.view, lambda buffer: TimingStatistics(PERIOD, buffer)):
+        with pytest.raises(ConfigError, match=f"{TimingStatistics.nbytes - 1} bytes"):
+            make(bytearray(TimingStatistics.nbytes - 1))
+    with pytest.raises(ConfigError, match="period_ns is 0"):
+        TimingStatistics(0)
+
+
+# --- summaries -------------------------------------------------------------------------------------------------------
+
+
+def test_a_summary_survives_json() -> None:
+    statistics = on_grid([(10_000, 300_000, 0), (4_000_000, 6_000_000, 3)])
+    summary = statistics.summary(
+        clock="realtime",
+        age=[0.01, 0.03],
+        inference_time=np.array([0.2, 0.1], np.float32),
+        late=[False, True],
+        drops=4,
+        tolerated={"lateness": 0.0025},
+    )
+    assert TimingSummary.from_fields(json.loads(json.dumps(asdict(summary)))) == summary
+    assert (summary.frames, summary.late_frames, summary.drops, summary.age_max) == (2, 1, 4, 0.03)
+    assert summary.inference_p50 == pytest.approx(0.1)
+    assert summary.inference_max == summary.inference_p99 == pytest.approx(0.2)
+
+
+def test_a_summary_of_before_and_one_of_later_can_be_read() -> None:
+    old = {"ticks": 200, "overruns": 0, "lateness_p50": 0.0, "lateness_p99": 0.0, "lateness_max": 0.0}
+    old["duration_max"] = 0.0
+    summary = TimingSummary.from_fields(old)
+    assert (summary.ticks, summary.skipped, summary.late_frames, summary.clock) == (200, 0, 0, "lockstep")
+    assert TimingSummary.from_fields({**old, "from_the_future": [1]}) == summary
+    with pytest.raises(TypeError, match="ticks"):
+        TimingSummary.from_fields({"overruns": 0})
