@@ -19,6 +19,7 @@ from bhd_lerobot.control.messages import (
     SendResult,
     Setpoint,
     Watchdog,
+    mode_reason,
 )
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError
@@ -420,10 +421,7 @@ class Cerebellum:
         np.copyto(self.requested, self.command, where=mask[:, None])
 
 
-_MODE_REASON = np.full(len(Mode), Reason.NOT_ACTIVE, np.int8)
-_MODE_REASON[[Mode.HOLD, Mode.TRACKING, Mode.STOPPING]] = Reason.ACCEPTED
-_MODE_REASON[Mode.ESTOP] = Reason.ESTOP
-_MODE_REASON[Mode.FAULT] = Reason.FAULT
+_MODE_REASON = np.array([mode_reason(mode) for mode in Mode], np.int8)
 _GOAL_REFUSAL = {
     int(Reason.NOT_ACTIVE): ResultCode.NOT_ACTIVE,
     int(Reason.ESTOP): ResultCode.ESTOP,

@@ -75,6 +75,13 @@ _EXPLANATIONS = {
 }
 
 
+def mode_reason(mode: Mode) -> Reason:
+    """Return why a robot in this mode takes no commands, or `ACCEPTED` if it does."""
+    if mode in (Mode.HOLD, Mode.TRACKING, Mode.STOPPING):
+        return Reason.ACCEPTED
+    return {Mode.ESTOP: Reason.ESTOP, Mode.FAULT: Reason.FAULT}.get(mode, Reason.NOT_ACTIVE)
+
+
 class Limit(IntFlag):
     """What the safety filter changed about a command during a frame."""
 

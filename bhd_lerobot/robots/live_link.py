@@ -82,7 +82,7 @@ class LiveLink:
         self._threads: list[threading.Thread] = []
         self.block = layout.create(name, about)
         self.log = FrameLog(dtype, frames, self.block.section("frames"))
-        self.bridge_side = BrainSide(self.block, mirror.cerebellum, self._wait_a_little)
+        self.bridge_side = BrainSide(self.block, mirror.cerebellum, self.wait)
         try:
             self._start(mirror, config, realtime)
         except BaseException:
@@ -200,7 +200,12 @@ class LiveLink:
         while not self._stop.wait(_LIFE_S):
             self.block.show_life(Word.BRAIN_ALIVE)
 
-    def _wait_a_little(self) -> None:
+    def wait(self) -> None:
+        """Wait for about a tick.
+
+        Raises:
+            RealtimeError: a process has ended.
+        """
         self.check()
         time.sleep(0.0005)
 
@@ -209,7 +214,7 @@ class LiveLink:
         while not condition():
             if time.monotonic() > end:
                 raise RealtimeError(f"{message} within {seconds:g} s.")
-            self._wait_a_little()
+            self.wait()
 
     def _ask(self, kind: str, *arguments: Any) -> None:
         if self._connection is None:

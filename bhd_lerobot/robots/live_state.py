@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.cerebellum import MOVING, Cerebellum
 from bhd_lerobot.control.fifo import StateRing
+from bhd_lerobot.control.goal_codec import FEEDBACK_DTYPE, encode_feedback
 from bhd_lerobot.control.grid import Slot, TickGrid
 from bhd_lerobot.control.messages import Limit, Reason, Watchdog
 from bhd_lerobot.robots.simulation import Simulation
@@ -29,6 +30,7 @@ def state_dtype(simulation: Simulation) -> np.dtype:
       is followed; ``waiting``: entries in the queue.
     - ``limits``, ``watchdogs``, ``refusals``, ``touches``: how often each was raised so far, of `LIMITS`, `WATCHDOGS`,
       `Reason`, and of what the simulation tells about touches. Limits are counted once a frame.
+    - ``feedback``: how far the goal is that is followed, once a frame.
     - ``observation``: the observation's floats; ``sensed_ns``: when they were read, monotonic; ``oldest_ns``: how much
       older the oldest reading in them was.
     - ``physics``: the simulator's generalised positions and velocities.
@@ -51,6 +53,7 @@ def state_dtype(simulation: Simulation) -> np.dtype:
             ("touches", np.int64, (len(simulation.touches),)),
             ("observation", np.float64, (1, len(simulation.observation_names))),
             ("physics", np.float64, (1, physics)),
+            ("feedback", FEEDBACK_DTYPE),
         ]
     )
 
@@ -69,6 +72,7 @@ class StatePublisher:
         self._simulation, self._cerebellum, self._ring = simulation, simulation.cerebellum, ring
         self._record = np.zeros(1, state_dtype(simulation))
         self._field = {name: self._record[name] for name in self._record.dtype.names or ()}
+        self._feedback = self._record[0]["feedback"]
         self._touches = np.zeros(len(simulation.touches), np.int64)
         self._limits, self._watchdogs = np.zeros(len(LIMITS), np.int64), np.zeros(len(WATCHDOGS), np.int64)
         self._nq = simulation.world.qpos.shape[1]
@@ -127,6 +131,7 @@ class StatePublisher:
         if slot.index < self._next_frame:
             return
         self._next_frame = (slot.index // self._frame + 1) * self._frame
+        encode_feedback(self._cerebellum.controller.feedback(0), self._feedback)
         limits, watchdog = self._cerebellum.take_flags()
         raised = int(limits[0])
         if raised:

@@ -51,6 +51,8 @@ class FrameReport:
         mode: `Mode` at the end of the frame, shape (n,).
         results: how goals ended, or were refused, during the frame, by simulation.
         refusals: in words why setpoints were refused, by simulation, where a `Reason` does not say it all.
+        live: the `LiveFrame` of a robot on the wall clock.
+        missed: the frames before this one that went by on the wall clock while the brain was thinking.
     """
 
     applied: NDArray[np.float64]
@@ -61,6 +63,8 @@ class FrameReport:
     mode: NDArray[np.int8]
     results: Mapping[int, Sequence[CommandResult]] = field(default_factory=dict)
     refusals: Mapping[int, str] = field(default_factory=dict)
+    live: Any = None
+    missed: list["FrameReport"] = field(default_factory=list)
 
 
 class Simulation(ABC):
@@ -137,8 +141,12 @@ class Simulation(ABC):
         """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
 
     @abstractmethod
-    def truth(self) -> Any:
-        """Return what the simulator knows that a task judges by; touches since the start of the last frame."""
+    def truth(self, report: FrameReport | None = None) -> Any:
+        """Return what the simulator knows that a task judges by; touches since the start of the last frame.
+
+        Args:
+            report: the frame at the end of which it is true; only on the wall clock it need not be the last.
+        """
 
     @property
     @abstractmethod
@@ -162,7 +170,7 @@ class Simulation(ABC):
         """Return commands of the cerebellum, shape (n, width), in the space of the actions, shape (n, actions)."""
         return command.copy()
 
-    def _setpoints(
+    def to_setpoints(
         self, action: NDArray[np.float64], mask: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
         """Turn actions into setpoints of the cerebellum, shape (n, width), and say which cannot be, and why."""
@@ -210,7 +218,7 @@ class Simulation(ABC):
             mask: the robots that it is for, shape (n,); all that run if None.
         """
         mask = self.running if mask is None else mask & self.running
-        setpoints, refused = self._setpoints(action, mask)
+        setpoints, refused = self.to_setpoints(action, mask)
         if refused:
             mask = mask.copy()
             mask[list(refused)] = False

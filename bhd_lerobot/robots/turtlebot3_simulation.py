@@ -10,7 +10,7 @@ from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.control.base_controller import BaseController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.robots.simulation import FrameReport, Simulation
 from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.world import World
@@ -56,7 +56,7 @@ class TurtleBot3Simulation(Simulation):
         self._scans = np.zeros(n, np.int64)  # scans taken in the episode
         self._next_scan = 0
 
-    def truth(self) -> BaseTruth:
+    def truth(self, report: FrameReport | None = None) -> BaseTruth:
         """Return where the bases are, and whether they touched the scene since the start of the last frame."""
         return BaseTruth(self.world.base_pose, self._touched.copy())
 

@@ -19,7 +19,7 @@ from bhd_lerobot.control.planning import Planning
 from bhd_lerobot.control.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.latency import LatePlant
-from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.robots.simulation import FrameReport, Simulation
 from bhd_lerobot.robots.tool_space import TOOL_NAMES, pose_matrices
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
@@ -98,7 +98,7 @@ class UR5Simulation(Simulation):
         joints, _ = self.world.joint_slice(JOINTS)
         return pose_vectors(self.kinematics.tool(states[:, joints]))
 
-    def truth(self) -> ArmTruth:
+    def truth(self, report: FrameReport | None = None) -> ArmTruth:
         """Return where tool and objects are, and what the arms touched since the start of the last frame."""
         self.plant.read(self._reading)
         return ArmTruth(
@@ -144,7 +144,7 @@ class UR5Simulation(Simulation):
         tool = pose_vectors(self.kinematics.tool(command[:, :-1]))
         return np.concatenate([tool, command[:, -1:]], axis=1)
 
-    def _setpoints(
+    def to_setpoints(
         self, action: NDArray[np.float64], mask: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
         if self.config.action_space == "joint":
