@@ -78,7 +78,9 @@ def test_the_state_and_the_opening_arrive(opening: float | None) -> None:
     link.request(0, ramp(3, 0.5), STATE, opening, 0)
     server.serve_once()
     plan = answer(link)
-    assert plan.trajectory.velocity.tolist() == [(STATE.velocity + 0.5 * k).tolist() for k in (1, 2, 3)]
+    for name in ("position", "velocity", "acceleration"):
+        expected = getattr(STATE, name) + 0.5 * np.arange(1, 4)[:, None]
+        assert np.array_equal(getattr(plan.trajectory, name), expected)
     assert plan.target.tolist() == [-1.0 if opening is None else opening] * 7
 
 

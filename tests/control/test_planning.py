@@ -365,6 +365,10 @@ def test_a_goal_that_comes_while_setpoints_are_followed_begins_with_a_brake(late
     rows = rows[-1:]
     rows[0][2] = np.where(rows[0][2] * rows[0][1] > 0, 0.0, rows[0][2])  # what follows a setpoint may be dropped
     assert controller.submit(0, BrainCommand("b", joint_target=NEAR, preempt=preempt)) is None
+    tick(LEAD + 1)
+    assert controller.velocity.any()
+    if latency == 1:
+        assert controller.goals.phase[0] == GoalPhase.EXECUTING  # it does not wait for the end of the brake
     for _ in range(3000):
         tick(1)
         if not controller.busy.any():

@@ -180,6 +180,8 @@ def test_a_restart_forgets_results_and_names() -> None:
     for name in "abcd":  # more than there is room for
         pair.client.submit(goal(name, 99.0))
     pair.client.submit(goal("live", 2.0))
+    for number in range(6):
+        pair.cerebellum.submit(0, goal(str(number), 99.0))
     pair.tick(50)
     pair.client.restart()
     assert pair.results() == []
