@@ -4,6 +4,7 @@ Cerebellum, physics and recorder run in processes of their own. Here is a mirror
 put into published states, to tell what is true and to render images.
 """
 
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.control.live_block import Word
 from bhd_lerobot.control.live_bridge import LiveBridge
 from bhd_lerobot.control.messages import NANOSECONDS, SendResult
-from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
+from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.robots.live_link import LiveLink
 from bhd_lerobot.robots.live_state import raised
@@ -78,11 +79,13 @@ class LiveSimulation(Simulation):
         self.mirror, self.config, self.n, self.rates, self.body = mirror, mirror.config, 1, mirror.rates, mirror.body
         self.world, self.cerebellum, self.camera_names = mirror.world, mirror.cerebellum, mirror.camera_names
         self.action_names, self.observation_names = mirror.action_names, mirror.observation_names
-        self.view, self.film_speed = mirror.view, 1
+        self.view, self.film_speed = mirror.view, mirror.film_speed
+        self.is_live, self.sensor_period_s = True, mirror.sensor_period_s
         self._begin()
         self.link = LiveLink(mirror, mirror.config, name)
         self.live_bridge = LiveBridge(self.link.block, self.rates, self.link.bridge_side.client, self.link.wait)
         self.bridge = self.live_bridge  # type: ignore[assignment]
+        self.grants = self.link.grants
         self._frame_ns = NANOSECONDS // self.rates.fps
         self._reader: RingReader | None = None
         self._boundary: Any = None  # the newest boundary of a frame that was taken
@@ -120,7 +123,7 @@ class LiveSimulation(Simulation):
         """Return what is true at the end of a frame; at the start of the present one if None."""
         if report is not None and report.live is not None:
             self._show(report.live.end, report.live.touches)
-        elif self._boundary is not None:
+        elif self._shown is None and self._boundary is not None:
             self._show(self._boundary["state"])
         return self.mirror.truth()
 
@@ -172,6 +175,7 @@ class LiveSimulation(Simulation):
 
     def observe(self) -> Frame:
         """Return the observation that the present frame began with; its age is what it is now."""
+        self._show(self._boundary["state"])
         return self._frame_of(self._boundary["state"])
 
     def latest(self) -> Frame:
@@ -289,14 +293,9 @@ class LiveSimulation(Simulation):
             else:
                 link.wait()
 
-    def timing(self, frames: int) -> TimingSummary:
-        """Return how punctual the episode's ticks were.
-
-        Args:
-            frames: frames that were recorded.
-        """
-        summary = TimingStatistics.view(self.link.block.section("statistics")).summary()
-        return summary
+    def statistics(self) -> TimingStatistics:
+        """Return how punctual the ticks of the present episode are; live."""
+        return TimingStatistics.view(self.link.block.section("statistics"))
 
     @property
     def modes(self) -> NDArray[np.int8]:
@@ -311,3 +310,13 @@ class LiveSimulation(Simulation):
         super().close()
         self.mirror.close()
         self.link.close()
+
+
+def make_live(mirror: Simulation, name: str | None) -> LiveSimulation:
+    """Return a robot on the wall clock.
+
+    Args:
+        mirror: a simulation of one robot.
+        name: the robot's id; its type and this process's number if None.
+    """
+    return LiveSimulation(mirror, name or f"{mirror.config.type}-{os.getpid()}")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import CommandResult
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
+from bhd_lerobot.robots.live_simulation import LiveSimulation, make_live
 from bhd_lerobot.robots.simulation import Simulation
 
 # Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator; one that
@@ -28,11 +29,14 @@ def connected_robots() -> list["SimulatedRobot"]:
 
 
 class SimulatedRobot(Robot):
-    """A simulated robot on a lockstep clock: `send_action` applies an action and advances time by one frame.
+    """A simulated robot.
 
-    Two things differ from a robot on a table. Time stands still between two calls of `send_action`, so that a slow
-    brain is not a late one. And `send_action` returns at the end of the frame, with what the cerebellum commanded by
-    then.
+    On the lockstep clock `send_action` applies an action and advances time by one frame. Two things differ from a robot
+    on a table. Time stands still between two calls of `send_action`, so that a slow brain is not a late one. And
+    `send_action` returns at the end of the frame, with what the cerebellum commanded by then.
+
+    With ``clock = "realtime"`` the robot runs on the wall clock, in processes of its own: `send_action` returns at
+    once, and a robot that hears nothing for too long decelerates and holds.
     """
 
     config: Any
@@ -102,14 +106,16 @@ class SimulatedRobot(Robot):
         if self.is_connected:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
         self._simulation = self.make_simulation()
-        self.restart()
-        if self.camera_shapes:
-            try:
-                for name in self.camera_shapes:
-                    self._simulation.render(0, name)
-            except BaseException:
-                self._simulation = None
-                raise
+        try:
+            if self.config.clock == "realtime":
+                self._simulation = make_live(self._simulation, self.id)
+            self.restart()
+            for name in self.camera_shapes:
+                self._simulation.render(0, name)
+        except BaseException:
+            self._simulation.close()
+            self._simulation = None
+            raise
         _connected.add(self)
 
     def restart(self) -> None:
@@ -149,9 +155,8 @@ class SimulatedRobot(Robot):
             DeviceNotConnectedError: the robot is not connected.
         """
         simulation = self.simulation
-        observation: dict[str, Any] = dict(
-            zip(self.observation_names, simulation.observe().state[0].tolist(), strict=True)
-        )
+        frame = simulation.latest() if isinstance(simulation, LiveSimulation) else simulation.observe()
+        observation: dict[str, Any] = dict(zip(self.observation_names, frame.state[0].tolist(), strict=True))
         for name in self.camera_shapes:
             observation[name] = simulation.render(0, name)
         self._last_observation = {
@@ -188,6 +193,8 @@ class SimulatedRobot(Robot):
         """
         simulation = self.simulation
         values = self.action_array(action)
+        if isinstance(simulation, LiveSimulation):
+            return self._send_live(simulation, values)
         report = simulation.act(values)
         self._results += report.results.get(0, ())
         reason = Reason(int(report.sent.reasons[0]))
@@ -196,6 +203,18 @@ class SimulatedRobot(Robot):
             why = report.refusals.get(0, reason.explanation)
             raise CommandRefusedError(f"The {self.name} refused the action: {why} (mode {mode}).")
         return dict(zip(self.action_names, report.applied[0].tolist(), strict=True))
+
+    def _send_live(self, simulation: LiveSimulation, values: NDArray[np.float64]) -> dict[str, float]:
+        """Send an action and return at once, with what is commanded now."""
+        sent, refusals = simulation.send(values, np.ones(1, np.bool_))
+        reason = Reason(int(sent.reasons[0]))
+        if reason != Reason.ACCEPTED:
+            mode = Mode(int(simulation.modes[0])).name
+            raise CommandRefusedError(
+                f"The {self.name} refused the action: {refusals.get(0, reason.explanation)} (mode {mode})."
+            )
+        applied = simulation.to_action(simulation.live_bridge.latest["command"])
+        return dict(zip(self.action_names, applied[0].tolist(), strict=True))
 
     def action_array(self, action: Mapping[str, Any]) -> NDArray[np.float64]:
         """Return an action as an array of shape (1, actions), checked.
@@ -273,5 +292,5 @@ class SimulatedRobot(Robot):
 
     def _request(self, reason: int) -> None:
         if reason != Reason.ACCEPTED:
-            mode = Mode(int(self.simulation.cerebellum.mode[0])).name
+            mode = Mode(int(self.simulation.modes[0])).name
             raise CommandRefusedError(f"{Reason(int(reason)).explanation} (mode {mode})")

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
 from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.sim.render_thread import Deliver, RenderThread
 from bhd_lerobot.sim.world import Snapshot, World
@@ -88,6 +89,9 @@ class Simulation(ABC):
         view: the camera that looks at the robot from outside, for films.
         film_speed: how much faster than the robot was a film of it is shown.
         running: which robots are in an episode, shape (n,).
+        is_live: whether it runs on the wall clock, in processes of its own.
+        sensor_period_s: time between two readings of the slowest sensor [s]; 0 if all are read at every tick.
+        grants: what the real-time process was granted and refused, as plain values; None on the lockstep clock.
     """
 
     config: Any
@@ -102,6 +106,9 @@ class Simulation(ABC):
     camera_names: tuple[str, ...]
     view = "overview"
     film_speed = 1
+    is_live = False
+    sensor_period_s = 0.0
+    grants: list[dict[str, Any]] | None = None
 
     def _begin(self) -> None:
         """Set up what all kinds of robots have in common; the subclass has made the attributes above."""
@@ -313,6 +320,15 @@ class Simulation(ABC):
             self._camera.close()
             self._camera = None
 
+    def statistics(self) -> TimingStatistics:
+        """Return how punctual the ticks of the present episode are: on time, by construction, on the lockstep clock."""
+        return self.bridge.timing
+
+    @property
+    def modes(self) -> NDArray[np.int8]:
+        """The present `Mode` of each robot, shape (n,)."""
+        return self.cerebellum.mode
+
     @property
     def physics_state(self) -> NDArray[np.float64]:
         """Generalised positions and velocities, shape (n, nq + nv), a copy."""
@@ -354,5 +370,12 @@ class Simulation(ABC):
 
 def describe(config: Any) -> dict[str, Any]:
     """Return everything about a robot that shapes its data, as plain values."""
-    left_out = ("id", "calibration_dir", "seed", "arena", "scene")
-    return {"type": config.type, **{key: value for key, value in vars(config).items() if key not in left_out}}
+    left_out = ["id", "calibration_dir", "seed", "arena", "scene", "realtime"]
+    if config.clock == "lockstep":
+        left_out.append("require_realtime")  # it has no effect
+    values = {key: value for key, value in vars(config).items() if key not in left_out}
+    return {
+        "type": config.type,
+        **values,
+        **({"realtime": asdict(config.realtime)} if config.clock == "realtime" else {}),
+    }

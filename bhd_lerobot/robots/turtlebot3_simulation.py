@@ -51,6 +51,7 @@ class TurtleBot3Simulation(Simulation):
         self._gyro = self.world.sensor("imu_gyro")
         self._touched = np.zeros(n, np.bool_)
         self.scan_rate_hz = body.lidar.rate_hz
+        self.sensor_period_s = 1 / body.lidar.rate_hz
         self._scan_ticks = config.control_hz // body.lidar.rate_hz
         self._scanned_tick = np.zeros(n, np.int64)
         self._scans = np.zeros(n, np.int64)  # scans taken in the episode

@@ -1,6 +1,7 @@
 """The only observe-think-act-record loop: n episodes side by side, each as if it were alone."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent import futures
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
+from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.policies.brain import Brain, Goals, Observation
 from bhd_lerobot.robots.simulation import FrameReport, Simulation
@@ -50,6 +52,7 @@ class Episode:
         commands: the goals that the brain gave, each with the frame in which it gave it; None if it gave setpoints.
         results: how goals ended, each with the frame in which it did.
         plan: the brain's plan, as plain values, if it has one.
+        realtime: what the real-time process was granted and refused; None on the lockstep clock.
     """
 
     spec: EpisodeSpec
@@ -63,6 +66,7 @@ class Episode:
     commands: list[tuple[int, BrainCommand]] | None = None
     results: list[tuple[int, CommandResult]] = field(default_factory=list)
     plan: dict[str, Any] = field(default_factory=dict)
+    realtime: list[dict[str, Any]] | None = None
 
     @property
     def frames(self) -> int:
@@ -80,6 +84,7 @@ class EpisodeLoop:
         simulation: the robots.
         task: what is to be achieved.
         brain: what drives them.
+        tolerance: how unpunctual a frame may be on the wall clock; the defaults if None.
     """
 
     def __init__(
@@ -87,8 +92,11 @@ class EpisodeLoop:
         simulation: Simulation,
         task: Task,
         brain: Brain,
+        tolerance: TimingTolerance | None = None,
     ) -> None:
         self.simulation, self.task, self.brain = simulation, task, brain
+        self.tolerance = tolerance or TimingTolerance()
+        self._last_frame = -1  # number of the last frame on the wall clock
         self._open_images: Callable[[], Any] | None = None
         self._frames = max(1, round(task.duration_s * simulation.rates.fps))
         self._columns: dict[str, NDArray] = {}
@@ -105,7 +113,7 @@ class EpisodeLoop:
         specs: Sequence[EpisodeSpec],
         stop: Callable[[], bool] = lambda: False,
         open_images: Callable[[], Any] | None = None,
-    ) -> Iterator[Episode]:
+    ) -> Generator[Episode]:
         """Run episodes and yield them in their order, each as soon as it and all before it are done.
 
         Args:
@@ -191,7 +199,10 @@ class EpisodeLoop:
             self._results,
             simulation.running,
         )
+        started = time.perf_counter()
         decision = brain.act(seen)
+        # On the lockstep clock time stands still while the brain thinks.
+        thought = np.full(simulation.n, time.perf_counter() - started if simulation.is_live else 0.0)
         physics = simulation.physics_state
         if isinstance(decision, Goals):
             report = simulation.pursue(decision.commands)
@@ -200,29 +211,71 @@ class EpisodeLoop:
             action = np.asarray(decision).astype(np.float32)
             report = simulation.act(action.astype(np.float64))
         self._log(decision, report)
-        running = np.flatnonzero(simulation.running)
-        self._truth = simulation.truth()
-        reward, event = task.judge(self._truth, simulation.running)
         if brain.has_plan:
             values[keys.SUBTASK] = np.array(brain.subtasks(), object)
         values |= {
             keys.OBSERVATION_STATE: state,
             keys.ACTION: action,
-            keys.APPLIED_ACTION: report.applied,
             keys.TIME: frame.time_ns / NANOSECONDS,
             keys.AGE: frame.age_ns / NANOSECONDS,
+            keys.INFERENCE_TIME: thought,
+            keys.PHYSICS_STATE: physics,
+        }
+        finished: list[tuple[int, Event]] = []
+        for one in (*report.missed, report):
+            if one.live is not None:
+                values |= self._live_values(one, is_first=one is (report.missed or [report])[0])
+            finished = self._end_frame(one, values)
+            if finished:
+                break  # what a robot did after its episode's end is not part of it
+        return finished
+
+    def _end_frame(self, report: FrameReport, values: dict[str, NDArray]) -> list[tuple[int, Event]]:
+        """Judge and store a frame; return the episodes that ended with it."""
+        simulation = self.simulation
+        running = np.flatnonzero(simulation.running)
+        self._truth = simulation.truth(report)
+        reward, event = self.task.judge(self._truth, simulation.running)
+        values |= {
+            keys.APPLIED_ACTION: report.applied,
             keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,
             keys.LIMITS: report.limits,
             keys.WATCHDOG: report.watchdog,
             keys.MODE: report.mode,
             keys.REWARD: reward,
             keys.EVENT: event,
-            keys.PHYSICS_STATE: physics,
         }
         self._store(running, values)
         self._length[running] += 1
         self.frames += len(running)
         return [(int(sim), Event(int(event[sim]))) for sim in running if event[sim] != Event.NOTHING]
+
+    def _live_values(self, report: FrameReport, *, is_first: bool) -> dict[str, NDArray]:
+        """Return what was measured of a frame on the wall clock.
+
+        The first is the one that the brain saw the beginning of; later ones went by while it was still thinking.
+        """
+        live = report.live
+        self._last_frame = live.number
+        values: dict[str, NDArray] = {
+            keys.ACTION: live.requested.astype(np.float32),
+            keys.LATENESS: np.array([live.lateness_ns / NANOSECONDS]),
+            keys.OVERRUNS: np.array([live.overruns]),
+            keys.SKIPPED: np.array([live.skipped]),
+        }
+        if is_first:
+            return values
+        values |= {
+            keys.OBSERVATION_STATE: live.seen.state.astype(np.float32),
+            keys.TIME: live.seen.time_ns / NANOSECONDS,
+            keys.AGE: live.seen.age_ns / NANOSECONDS,
+            keys.PHYSICS_STATE: live.physics,
+        }
+        if self.task.environment_names:
+            values[keys.ENVIRONMENT_STATE] = self.task.environment_state(self._truth).astype(np.float32)
+        for sim in np.flatnonzero(self.simulation.running).tolist():
+            self._order_images(sim)  # the simulation shows the end of the frame before, which is this one's beginning
+        return values
 
     def _log(self, decision: Any, report: FrameReport) -> None:
         """Remember goals and how they ended, for the episode's metadata and for the brain."""
@@ -241,22 +294,28 @@ class EpisodeLoop:
         """
         simulation = self.simulation
         images: dict[str, NDArray[np.uint8]] = {}
-        for camera in simulation.camera_names:
-            key = f"{keys.OBSERVATION_IMAGES}.{camera}"
-            for sim in np.flatnonzero(simulation.running).tolist():
-                sink = self._sinks[sim]
-                deliver = None if sink is None else partial(sink.add_image, key)
-                self._pending[sim].append(simulation.render_later(sim, camera, deliver))
-            if self.brain.uses_images:
-                height, width = simulation.config.camera_height, simulation.config.camera_width
-                images[camera] = np.zeros((simulation.n, height, width, 3), np.uint8)
-                for sim in np.flatnonzero(simulation.running):
-                    images[camera][sim] = self._pending[sim][-1].result()
+        cameras = simulation.camera_names
+        running = np.flatnonzero(simulation.running).tolist() if cameras else []
+        for sim in running:
+            self._order_images(sim)
+        if self.brain.uses_images:
+            height, width = simulation.config.camera_height, simulation.config.camera_width
+            images = {camera: np.zeros((simulation.n, height, width, 3), np.uint8) for camera in cameras}
+            for sim in running:
+                for camera, image in zip(cameras, self._pending[sim][-len(cameras) :], strict=True):
+                    images[camera][sim] = image.result()
         # What went wrong in the making of an image ends the run now, not at the end of the episode.
         for waiting in self._pending:
             while waiting and waiting[0].done():
                 waiting.pop(0).result()
         return images
+
+    def _order_images(self, sim: int) -> None:
+        """Order the images of what one simulation shows now."""
+        sink = self._sinks[sim]
+        for camera in self.simulation.camera_names:
+            deliver = None if sink is None else partial(sink.add_image, f"{keys.OBSERVATION_IMAGES}.{camera}")
+            self._pending[sim].append(self.simulation.render_later(sim, camera, deliver))
 
     def _wait_for_images(self, sim: int) -> None:
         while self._pending[sim]:
@@ -273,6 +332,27 @@ class EpisodeLoop:
         for key, value in values.items():
             self._columns[key][running, rows] = value[running]
 
+    def _timing(self, sim: int, columns: dict[str, NDArray]) -> TimingSummary:
+        """Return how punctual an episode was, and add the columns that follow from that."""
+        simulation, length = self.simulation, len(columns[keys.ACTION])
+        rates = simulation.rates
+        if not simulation.is_live:
+            columns |= {key: np.zeros(length, keys.SCALARS[key][0]) for key in keys.PUNCTUALITY}
+            timing = TimingStatistics(NANOSECONDS // rates.control_hz)
+            timing.add_punctual(length * rates.ticks_per_frame)
+            return timing.summary(age=columns[keys.AGE], late=columns[keys.LATE])
+        simulation.stop(np.array([sim]))
+        measured = FrameTiming(*(columns[key] for key in (keys.TIME, keys.AGE, keys.LATENESS, keys.SKIPPED)))
+        columns[keys.LATE] = late_frames(measured, self.tolerance, rates, simulation.sensor_period_s)
+        return simulation.statistics().summary(
+            clock="realtime",
+            age=columns[keys.AGE],
+            inference_time=columns[keys.INFERENCE_TIME],
+            late=columns[keys.LATE],
+            drops=self._last_frame + 1 - length,
+            tolerated=self.tolerance.limits(rates, simulation.sensor_period_s),
+        )
+
     def _finish(self, sim: int, event: Event) -> Episode:
         spec, scene, initial = self._specs[sim], self._scenes[sim], self._initial[sim]
         if spec is None or initial is None:
@@ -285,11 +365,7 @@ class EpisodeLoop:
         last = np.arange(length) == length - 1
         columns[keys.DONE] = last
         columns[keys.SUCCESS] = last & outcome.success
-        # A simulated clock is never late.
-        columns |= {key: np.zeros(length, keys.SCALARS[key][0]) for key in keys.PUNCTUALITY}
-        rates = self.simulation.rates
-        timing = TimingStatistics(NANOSECONDS // rates.control_hz)
-        timing.add_punctual(length * rates.ticks_per_frame)
+        timing = self._timing(sim, columns)
         sink, self._sinks[sim] = self._sinks[sim], None
         return Episode(
             spec=spec,
@@ -298,9 +374,10 @@ class EpisodeLoop:
             initial_state=initial,
             columns=columns,
             outcome=outcome,
-            timing=timing.summary(age=columns[keys.AGE], late=columns[keys.LATE]),
+            timing=timing,
             writer=sink,
             commands=self._commands[sim] if self._gives_goals else None,
             results=self._ends[sim],
             plan=plan,
+            realtime=self.simulation.grants,
         )

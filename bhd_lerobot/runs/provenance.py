@@ -44,6 +44,7 @@ def episode_metadata(episode: Episode, *, split: str, task: dict[str, Any], brai
         "initial_state": episode.initial_state.tolist(),
         "timing": _json(asdict(episode.timing)),
         "versions": _json(versions()),
+        **({} if episode.realtime is None else {"realtime": _json(episode.realtime)}),
         **_goals(episode),
     }
 

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -17,10 +17,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from bhd_lerobot.control.tolerance import verdict
 from bhd_lerobot.data.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
+from bhd_lerobot.errors import BhdError, ConfigError, RealtimeError, RenderingError
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.robots.simulation import Simulation, describe
 from bhd_lerobot.runs.config_record import RecordConfig
@@ -30,9 +31,11 @@ from bhd_lerobot.runs.language_rows import language_column
 from bhd_lerobot.runs.plots import Trajectory, draw_trajectories
 from bhd_lerobot.runs.preview import Preview
 from bhd_lerobot.runs.provenance import episode_metadata
-from bhd_lerobot.runs.registry import make_brain, make_simulation, make_task
+from bhd_lerobot.runs.registry import make_brain, make_robot, make_simulation, make_task
 from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
 from bhd_lerobot.tasks.task import Task, episode_seed
+
+_ATTEMPTS = 3  # that an episode gets to be punctual
 
 
 @dataclass
@@ -86,12 +89,15 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     """
     console = console or Console(stderr=True)
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
-    simulation = make_simulation(config.robot, min(config.n_envs, config.dataset.num_episodes), config.threads)
-    task = make_task(config.task, simulation.n, config.dataset.fps)
-    brain = make_brain(config.brain)
-    loop = EpisodeLoop(simulation, task, brain)  # a brain that does not fit the robot fails here, likewise
+    n = 1 if config.robot.clock == "realtime" else min(config.n_envs, config.dataset.num_episodes)
+    simulation = make_robot(config.robot, n, config.threads)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
     with closing(simulation), stop_on_signals() as stop:
+        task = make_task(config.task, simulation.n, config.dataset.fps)
+        brain = make_brain(config.brain)
+        # A brain that does not fit the robot fails here, before a dataset exists.
+        loop = EpisodeLoop(simulation, task, brain, config.timing)
+        _tell_refusals(simulation, console)
         preview = _make_preview(config, simulation, console)
         if simulation.camera_names:
             simulation.start_rendering()  # a machine without OpenGL fails here, before a dataset exists
@@ -129,7 +135,7 @@ def _run(
     with _progress(console) as progress:
         bar = progress.add_task("recording", total=len(specs), success="", speed="")
         started = time.perf_counter()
-        for episode in loop.run(specs, lambda: bool(result.stopped_by), recorder.begin_episode):
+        for episode in _episodes(loop, specs, result, recorder, console):
             metadata = episode_metadata(episode, split=config.split, task=task.parameters(), brain=brain.parameters())
             if config.dataset.language and brain.has_plan:
                 said = language_column(episode.plan, episode.columns[SUBTASK], config.dataset.fps)
@@ -149,6 +155,50 @@ def _run(
     recorder.finalize()
     result.wall_s = time.perf_counter() - started if result.recorded else 0.0
     return trajectories, first
+
+
+def _episodes(
+    loop: EpisodeLoop, specs: list[EpisodeSpec], result: RecordResult, recorder: DatasetRecorder, console: Console
+) -> Iterator[Episode]:
+    """Run episodes; those that were too unpunctual are run again, if that was asked for.
+
+    Raises:
+        RealtimeError: an episode was too unpunctual every time.
+    """
+
+    def stop() -> bool:
+        return bool(result.stopped_by)
+
+    if not (loop.simulation.is_live and loop.tolerance.reject):
+        yield from loop.run(specs, stop, recorder.begin_episode)
+        return
+    for spec in specs:
+        for attempt in range(1, _ATTEMPTS + 1):
+            with closing(loop.run([spec], stop, recorder.begin_episode)) as run_once:
+                episode = next(run_once, None)
+            if episode is None:
+                return
+            why = verdict(episode.timing, loop.tolerance)
+            if why is None:
+                yield episode
+                break
+            if episode.writer is not None:
+                episode.writer.discard()
+            console.print(f"Episode {spec.index}, attempt {attempt} of {_ATTEMPTS}, was not saved: {escape(why)}")
+        else:
+            raise RealtimeError(
+                f"Episode {spec.index} was too unpunctual {_ATTEMPTS} times. Those before it are saved. Mend the cause "
+                "and go on with --resume=true, or save such episodes too, flagged, with --timing.reject=false."
+            )
+
+
+def _tell_refusals(simulation: Simulation, console: Console) -> None:
+    """Say loudly what the system refused the real-time process, and the remedy."""
+    refused = [grant for grant in simulation.grants or () if not grant["granted"]]
+    for grant in refused:
+        console.print(
+            f"[bold]Real time: {grant['name']} was refused.[/bold] {escape(grant['detail'])} {escape(grant['remedy'])}"
+        )
 
 
 def _open_recorder(
@@ -268,7 +318,10 @@ def _summary(console: Console, config: RecordConfig, result: RecordResult, film:
         for problem, count in result.problems.most_common(3):
             table.add_row("gave up" if count == 1 else f"gave up {count} times", escape(problem))
         table.add_row("mean score", f"{np.mean(result.scores):.3f}")
-        table.add_row("speed", f"{result.real_time_factor:.0f} x real time, n_envs = {config.n_envs}")
+        table.add_row(
+            "speed",
+            f"{result.real_time_factor:.{0 if result.real_time_factor > 9 else 2}f} x real time, {_clock(config)}",
+        )
     files = [
         "config.yaml",
         *(["trajectories.png"] if result.recorded else []),
@@ -281,6 +334,10 @@ def _summary(console: Console, config: RecordConfig, result: RecordResult, film:
             f"Stopped by {result.stopped_by.name}. Episodes that were running were dropped, all others are saved. "
             "Go on with --resume=true: the dropped ones are run again, the same."
         )
+
+
+def _clock(config: RecordConfig) -> str:
+    return "on the wall clock" if config.robot.clock == "realtime" else f"n_envs = {config.n_envs}"
 
 
 def _push(config: RecordConfig, root: Path) -> None:

@@ -14,6 +14,7 @@ from bhd_lerobot.policies.pick import PickBrain, PickBrainConfig
 from bhd_lerobot.policies.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.live_simulation import make_live
 from bhd_lerobot.robots.simulation import Simulation
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
@@ -46,8 +47,19 @@ SIMULATED_ROBOTS = tuple(_SIMULATIONS)
 
 
 def make_simulation(config: Any, n: int = 1, threads: int | None = None) -> Simulation:
-    """Return n simulations of the robot that a configuration describes."""
+    """Return n simulations of the robot that a configuration describes, on the lockstep clock whatever it says."""
     return _SIMULATIONS[type(config)](config, n, threads)
+
+
+def make_robot(config: Any, n: int = 1, threads: int | None = None) -> Simulation:
+    """Return n robots on the clock that the configuration asks for.
+
+    Raises:
+        ConfigError: more than one on the wall clock.
+        RealtimeError: the processes of a robot on the wall clock could not be started.
+    """
+    simulation = make_simulation(config, n, threads)
+    return make_live(simulation, config.id) if config.clock == "realtime" else simulation
 
 
 def make_brain(config: BrainConfig) -> Brain:
