@@ -8,12 +8,16 @@ from dataclasses import dataclass, field
 
 from benchmarks.realtime.cases import Case, CaseError
 from benchmarks.realtime.load import Load, cpu_load
-from benchmarks.realtime.statistics import Block, Samples, summarise
+from benchmarks.realtime.machine import CpuTimes
+from benchmarks.realtime.statistics import Block, summarise
 
 CONDITIONS = ("idle", "load")
 
 # What a case needs beside its seconds: start, imports, warm-up. Only for the estimate and the load's upper limit.
 OVERHEAD_S = 1.5
+
+# What a loop at 1 kHz may use of two processors, start of its process included; what is beyond it is somebody else's.
+_IDLE_BUSY = 0.15
 
 
 @dataclass
@@ -92,12 +96,13 @@ def measure(
 
 
 def _block(case: Case, seconds: float, condition: str, number: int, run: Run) -> Block | None:
+    before = CpuTimes.now()
     try:
-        samples: Samples = case.run(seconds)
+        samples = case.run(seconds)
     except CaseError as error:
         run.missing[case.name] = str(error)
         return None
-    block = summarise(samples, case.name, condition, number)
+    block = summarise(samples, case.name, condition, number, CpuTimes.now().shares_since(before)[0])
     run.blocks.append(block)
     return block
 
@@ -111,6 +116,16 @@ def remarks(run: Run, titles: Mapping[str, str]) -> list[str]:
     for block in run.blocks:
         refused.update({(block.case, note): None for note in block.notes})
     lines += [f"{titles[case]}: the system refused {note}." for case, note in refused]
+    # The smallest of a round: the negative control keeps a processor busy, and starting a process costs some, too.
+    idle: dict[int, float] = {}
+    for block in run.blocks:
+        if block.condition == "idle" and block.busy is not None:
+            idle[block.round] = min(block.busy, idle.get(block.round, 1.0))
+    if idle:
+        busiest = max(idle.values())
+        lines.append(f"Idle, the processors were up to {busiest:.0%} busy with everything, the loops included.")
+        if busiest > _IDLE_BUSY:
+            lines.append("That is NOT IDLE: something else ran on this machine, and these numbers are disturbed!")
     if run.load_shares:
         low = min(run.load_shares)
         lines.append(f"The load got {low:.0%} of the processor time or more, beside the loops.")

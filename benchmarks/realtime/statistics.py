@@ -86,6 +86,7 @@ class Block:
         period: the grid's period.
         count_error: executed + skipped − rate × elapsed, in ticks; None where it is not known.
         notes: what the system refused to the loop.
+        busy: share of the machine's processor time that was used meanwhile, by everybody; None where it is not known.
     """
 
     case: str
@@ -104,13 +105,14 @@ class Block:
     period: float
     count_error: float | None
     notes: tuple[str, ...] = ()
+    busy: float | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Return the block as a mapping that JSON can hold."""
         return asdict(self)
 
 
-def summarise(samples: Samples, case: str, condition: str, round_: int) -> Block:
+def summarise(samples: Samples, case: str, condition: str, round_: int, busy: float | None = None) -> Block:
     """Return the numbers of a block.
 
     Raises:
@@ -139,6 +141,7 @@ def summarise(samples: Samples, case: str, condition: str, round_: int) -> Block
         period=samples.period_ns / 1e3,
         count_error=samples.count_error,
         notes=samples.notes,
+        busy=busy,
     )
 
 

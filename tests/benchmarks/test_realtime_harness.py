@@ -16,7 +16,7 @@ from benchmarks.realtime.cases import Case, CaseError
 from benchmarks.realtime.harness import Run, measure, remarks, turns
 from benchmarks.realtime.load import Load, LoadError, cpu_load
 from benchmarks.realtime.machine import CpuTimes
-from benchmarks.realtime.statistics import Samples
+from benchmarks.realtime.statistics import Samples, summarise
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -100,6 +100,21 @@ def test_remarks_tell_what_was_refused_once_and_a_load_that_was_none() -> None:
     ]
     assert any("LESS THAN HALF" in line for line in remarks(Run(load_shares=[0.9, 0.3]), {}))
     assert not any("LESS THAN HALF" in line for line in remarks(Run(load_shares=[0.9, 0.8]), {}))
+
+
+@pytest.mark.parametrize(
+    ("busy", "disturbed"),
+    [
+        ([0.03, 0.55, 0.04, 0.56], False),  # two rounds, in each of them a case that keeps a processor busy
+        ([0.03, 0.55, 0.40, 0.95], True),
+    ],
+)
+def test_idle_blocks_that_were_not_idle_are_remarked(busy: list[float], disturbed: bool) -> None:
+    blocks = [summarise(samples(20.0), f"case {k % 2}", "idle", k // 2, share) for k, share in enumerate(busy)]
+    blocks.append(summarise(samples(20.0), "case 0", "load", 0, 1.0))
+    lines = remarks(Run(blocks), {})
+    assert any("NOT IDLE" in line for line in lines) == disturbed
+    assert any(f"up to {0.4 if disturbed else 0.04:.0%} busy" in line for line in lines)
 
 
 def test_the_whole_program_on_fake_loops(
