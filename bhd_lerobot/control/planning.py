@@ -203,8 +203,9 @@ class PlanOrders:
 
 
 def _same(one: State, other: State) -> bool:
-    return (
-        np.array_equal(one.position, other.position)
-        and np.array_equal(one.velocity, other.velocity)
-        and np.array_equal(one.acceleration, other.acceleration)
+    # Counting is several times cheaper than `np.array_equal`.
+    return not (
+        np.count_nonzero(one.position != other.position)
+        or np.count_nonzero(one.velocity != other.velocity)
+        or np.count_nonzero(one.acceleration != other.acceleration)
     )
