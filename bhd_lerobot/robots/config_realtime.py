@@ -1,6 +1,6 @@
 """Options of a robot on the wall clock."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from bhd_lerobot.control.privileges import RealtimeSettings
 from bhd_lerobot.control.realtime import LoopLimits
@@ -31,7 +31,7 @@ class RealtimeConfig:
     lock_memory: bool = True
     hold_cpu_latency: bool = True
     freeze_collector: bool = True
-    affinity: tuple[int, ...] = ()
+    affinity: list[int] = field(default_factory=list)
     brain_timeout_s: float = 0.5
     recorder_timeout_s: float = 1.0
     most_misses: int = 10

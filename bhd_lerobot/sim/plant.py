@@ -17,6 +17,11 @@ class JointReading(Protocol):
     velocity: NDArray[np.float64]
 
 
+_MOST_VIEWS = 8  # readings that are remembered
+_Array = NDArray[np.float64]
+_Views = tuple[_Array, _Array, list[tuple[_Array, _Array, _Array]]]
+
+
 class SimulatedPlant:
     """Reads the joints of all simulations and writes their servos' commands.
 
@@ -46,26 +51,29 @@ class SimulatedPlant:
         if actuators != list(range(actuators[0], actuators[0] + len(actuators))):
             raise SimulationError(f"Actuators {list(names)} are not neighbours in the model.")
         self._ctrl = world.ctrl[:, actuators[0] : actuators[-1] + 1]
-        self._out: JointReading | None = None  # where the last reading went
+        # The views into the readings that are used, with the readings, which must live as long as their numbers count.
+        self._views: dict[int, tuple[JointReading, _Views]] = {}
 
     def read(self, out: JointReading) -> None:
         """Write the joints' positions and velocities, each of shape (n, joints), into `out`."""
-        if out is not self._out:
-            self._bind(out)
-        self._to_position[:] = self._position
-        self._to_velocity[:] = self._velocity
-        for one, other, to in self._sums:
+        entry = self._views.get(id(out))
+        if entry is None:
+            if len(self._views) >= _MOST_VIEWS:
+                self._views.clear()
+            entry = self._views[id(out)] = out, self._bind(out)
+        position, velocity, sums = entry[1]
+        position[:] = self._position
+        velocity[:] = self._velocity
+        for one, other, to in sums:
             np.add(one, other, out=to)
 
-    def _bind(self, out: JointReading) -> None:
+    def _bind(self, out: JointReading) -> "_Views":
         """Make the views into a reading once, not at every tick."""
-        self._out = out
-        self._to_position, self._to_velocity = out.position, out.velocity
-        self._sums: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = []
-        if self._fingers is not None:
-            self._to_position, self._to_velocity = out.position[:, :-1], out.velocity[:, :-1]
-            both = zip(self._fingers, (out.position, out.velocity), strict=True)
-            self._sums = [(fingers[:, 0], fingers[:, 1], to[:, -1]) for fingers, to in both]
+        if self._fingers is None:
+            return out.position, out.velocity, []
+        both = zip(self._fingers, (out.position, out.velocity), strict=True)
+        sums = [(fingers[:, 0], fingers[:, 1], to[:, -1]) for fingers, to in both]
+        return out.position[:, :-1], out.velocity[:, :-1], sums
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the servos' commands, shape (n, joints)."""

@@ -25,7 +25,9 @@ def test_numbers_that_are_recorded_stay_what_they_are() -> None:
     assert {flag.name: int(flag) for flag in Limit} == {
         "NON_FINITE": 1, "VELOCITY": 2, "ACCELERATION": 4, "EFFORT": 8, "POSITION": 16,
     }  # fmt: skip
-    assert {flag.name: int(flag) for flag in Watchdog} == {"COMMAND_AGE": 1, "BLOCKED": 2}
+    assert {flag.name: int(flag) for flag in Watchdog} == {
+        "COMMAND_AGE": 1, "BLOCKED": 2, "BRAIN": 4, "RECORDER": 8, "PLANT": 16, "MISSES": 32,
+    }  # fmt: skip
 
 
 def test_a_result_tells_who_took_the_command() -> None:
