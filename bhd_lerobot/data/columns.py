@@ -41,12 +41,10 @@ def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = No
             table = pq.read_table(path, columns=["episode_index", *present], page_checksum_verification=True)
         except (OSError, pa.ArrowException) as error:
             raise corrupt(path, error) from error
-        indices = np.asarray(table["episode_index"])
-        order = np.argsort(indices, kind="stable")
-        sorted_indices = indices[order]
-        arrays = {key: np.asarray(table[key])[order] for key in present}
+        indices = np.asarray(table["episode_index"])  # in ascending order, as LeRobot's format wants it
+        arrays = {key: np.asarray(table[key]) for key in present}
         for row in inside:
             index = row["episode_index"]
-            first, last = np.searchsorted(sorted_indices, [index, index + 1])
+            first, last = np.searchsorted(indices, [index, index + 1])
             result[index] = {key: array[first:last] for key, array in arrays.items()}
     return [result[row["episode_index"]] for row in rows]

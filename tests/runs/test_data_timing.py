@@ -8,18 +8,15 @@ import pytest
 from PIL import Image
 
 from bhd_lerobot.bodies.body import Rates
-from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.timing import TimingStatistics
-from bhd_lerobot.control.tolerance import TimingTolerance
+from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.runs import data, timing_report
-from bhd_lerobot.runs.episode_timing import close_timing, sensor_period
 from bhd_lerobot.runs.timing_plots import draw_timing
 from bhd_lerobot.runs.timing_tables import fitting, ms, ticks
-from tests.runs.support import run_record
+from tests.runs.support import data_columns, run_record
 
 RATES = Rates(500, 500, 25)
 FRAMES, LATE = 60, (17, 42)
@@ -44,7 +41,16 @@ def make_episode(seed):
     columns[keys.AGE] = rng.uniform(0.001, 0.002, FRAMES).astype(np.float32)
     columns[keys.LATENESS] = (lateness.reshape(FRAMES, -1).max(axis=1) / 1e9).astype(np.float32)
     columns[keys.INFERENCE_TIME] = rng.uniform(0.005, 0.01, FRAMES).astype(np.float32)
-    return columns, close_timing(columns, statistics, TimingTolerance(), RATES, clock="realtime", drops=3)
+    measured = FrameTiming(columns[keys.TIME], columns[keys.AGE], columns[keys.LATENESS], columns[keys.SKIPPED])
+    columns[keys.LATE] = late_frames(measured, TimingTolerance(), RATES)
+    return columns, statistics.summary(
+        clock="realtime",
+        age=columns[keys.AGE],
+        inference_time=columns[keys.INFERENCE_TIME],
+        late=columns[keys.LATE],
+        drops=3,
+        tolerated=TimingTolerance().limits(RATES),
+    )
 
 
 def save(root, episodes, features=FEATURES):
@@ -74,41 +80,24 @@ def simulated(tmp_path_factory):
     return root
 
 
-# --- an episode's timing ---------------------------------------------------------------------------------------------
+# --- in lockstep -----------------------------------------------------------------------------------------------------
 
 
-def test_late_frames_are_flagged_and_counted():
-    columns, summary = make_episode(0)
-    assert np.flatnonzero(columns[keys.LATE]).tolist() == list(LATE)
-    assert (summary.frames, summary.late_frames, summary.drops, summary.clock) == (FRAMES, 2, 3, "realtime")
-    assert summary.age_max == columns[keys.AGE].max()
-    assert summary.inference_max == columns[keys.INFERENCE_TIME].max()
-    assert summary.tolerated["lateness"] == 0.001
-
-
-def test_in_lockstep_the_tolerance_has_no_effect():
-    """Whatever the columns of a simulated clock say, an age of one scan period above all, no frame is late."""
-    columns = {keys.TIME: np.arange(9.0), keys.AGE: np.full(9, 5, np.float32)}
-    statistics = TimingStatistics(10**9 // RATES.control_hz)
-    statistics.add_punctual(9 * RATES.ticks_per_frame)
-    strict = TimingTolerance(max_age_s=1e-9, max_late_frames=0.0, reject=True)
-    summary = close_timing(columns, statistics, strict, RATES, clock="lockstep")
+def test_in_lockstep_the_tolerance_has_no_effect(simulated, tmp_path):
+    """A scan is up to 0.2 s old here, and still no frame is late, no episode is bad and no byte is another one."""
+    strict = {"timing__max_age_s": 1e-6, "timing__max_late_frames": 0.0, "timing__reject": "true"}
+    result, _ = run_record(tmp_path / "strict", seed=4, **strict)
+    assert result.recorded == 3
+    columns = data_columns(tmp_path / "strict")
+    assert max(columns[keys.AGE]) > 0.01
     for key in keys.PUNCTUALITY:
-        assert columns[key].dtype == keys.SCALARS[key][0]
-        assert not columns[key].any()
-    assert (summary.late_frames, summary.rate_error, summary.lateness_max, summary.duration_max) == (0, 0, 0, 0)
-    assert (summary.age_max, summary.frames, summary.tolerated) == (5, 9, {})
+        assert not any(columns[key])
+    assert columns == data_columns(simulated)
 
 
-def test_the_slowest_sensor_of_a_body():
-    assert sensor_period(turtlebot3_burger()) == 1 / 5
-    assert sensor_period(ur5()) == 0
-
-
-def test_a_recording_in_lockstep_has_the_columns_and_they_are_zero(simulated):
-    for columns in timing_report.read_columns(simulated, keys.PUNCTUALITY):
-        assert set(columns) == set(keys.PUNCTUALITY)
-        assert not any(column.any() for column in columns.values())
+def test_a_tolerance_in_the_configuration_is_checked(tmp_path):
+    with pytest.raises(ConfigError, match=r"timing\.max_late_frames is 2"):
+        run_record(tmp_path / "d", timing__max_late_frames=2)
 
 
 # --- the report ------------------------------------------------------------------------------------------------------
@@ -122,8 +111,15 @@ def test_all_episodes_together_are_sums_maxima_and_bounds(measured):
     for name in ("lateness_p99", "lateness_max", "duration_p50", "age_max", "inference_max"):
         assert getattr(total, name) == max(getattr(one, name) for one in parts)
     assert len(report.total.intervals) == 3 * (FRAMES - 1)  # from one episode to the next there is none
-    assert abs(total.rate_error) == max(abs(one.rate_error) for one in parts)
     assert total.tolerated == parts[0].tolerated
+
+
+def test_of_rate_errors_the_largest_is_shown_with_its_sign(measured):
+    report = timing_report.load_timing(measured)
+    errors = (0.5, -2.0, 1.0)
+    pairs = zip(report.episodes, errors, strict=True)
+    episodes = tuple(replace(one, summary=replace(one.summary, rate_error=error)) for one, error in pairs)
+    assert replace(report, episodes=episodes).total.summary.rate_error == -2.0
 
 
 def test_limits_that_differ_are_not_shown_as_one(measured):
