@@ -102,7 +102,8 @@ class LiveLayout:
             "ring_capacity": self.ring_capacity,
             "state": npy.dtype_to_descr(self.state),
         }
-        return LiveBlock(SharedBlock.create(name, sections, {**about, "layout": described}))
+        about = {**about, "made_ns": time.monotonic_ns(), "layout": described}
+        return LiveBlock(SharedBlock.create(name, sections, about))
 
 
 class LiveBlock:
@@ -134,6 +135,24 @@ class LiveBlock:
             RealtimeError: there is none.
         """
         return cls(SharedBlock.attach(name))
+
+    @classmethod
+    def watch(cls, name: str) -> Self:
+        """Open the block of a running robot to look at it; nothing in it can be written but by `set_estop`.
+
+        Raises:
+            RealtimeError: there is none.
+        """
+        return cls(SharedBlock.watch(name))
+
+    @property
+    def is_held(self) -> bool:
+        """Whether a process of the robot still holds the block that this one watches; for the result of `watch`."""
+        return self._block.is_held
+
+    def set_estop(self) -> None:
+        """Set the word of the emergency stop of a robot that is watched."""
+        self._block.write("words", 8 * Word.ESTOP, np.int64(1).tobytes())
 
     def section(self, name: str) -> memoryview:
         """Return the memory of a further section."""

@@ -110,10 +110,7 @@ class SharedBlock:
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except OSError as error:
-            running = ", ".join(names()) or "none"
-            raise RealtimeError(
-                f"No running robot is called {name!r} ({error.strerror}). Running: {running}."
-            ) from error
+            raise _nobody(name, error.strerror) from error
         fcntl.flock(descriptor, fcntl.LOCK_SH)
         try:
             memory = _map(path)
@@ -124,6 +121,48 @@ class SharedBlock:
             os.close(descriptor)
             raise RealtimeError(f"{path} is not a block of this version of bhd_lerobot.")
         return cls._opened(name, descriptor, memory)
+
+    @classmethod
+    def watch(cls, name: str) -> Self:
+        """Open a block of another process to look at it: its memory cannot be written, and it does not count as held.
+
+        So nobody who watches keeps a name taken, and the block's end does not wait for him.
+
+        Raises:
+            RealtimeError: there is none; the message lists those that there are.
+        """
+        path = FOLDER / f"{PREFIX}{name}"
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError as error:
+            raise _nobody(name, error.strerror) from error
+        try:
+            memory = mmap.mmap(descriptor, os.fstat(descriptor).st_size, access=mmap.ACCESS_READ)
+            valid = memory[0:8] == _MAGIC
+        except (OSError, ValueError):
+            valid = False
+        if not valid or _is_free(descriptor):
+            os.close(descriptor)
+            raise _nobody(name, "it is no block of this version" if not valid else "nobody holds it any more")
+        return cls._opened(name, descriptor, memory)
+
+    @property
+    def is_held(self) -> bool:
+        """Whether a process holds the block that this one watches; for the result of `watch` only."""
+        return self._descriptor >= 0 and not _is_free(self._descriptor)
+
+    def write(self, section: str, offset: int, data: bytes) -> None:
+        """Write into a block that is watched. Past its memory, which cannot be written: so only on purpose.
+
+        Args:
+            section: where.
+            offset: from the section's beginning [bytes].
+            data: what.
+        """
+        start, size = self._sections[section]
+        if not 0 <= offset <= size - len(data):
+            raise ConfigError(f"Bytes {offset} to {offset + len(data)} are not in section {section!r} of {size} bytes.")
+        os.pwrite(self._descriptor, data, start + offset)
 
     @classmethod
     def _opened(cls, name: str, descriptor: int, memory: mmap.mmap) -> Self:
@@ -173,6 +212,20 @@ class SharedBlock:
         with contextlib.suppress(BufferError):
             self._memory.close()
         sweep()
+
+
+def _nobody(name: str, why: str | None) -> RealtimeError:
+    return RealtimeError(f"No running robot is called {name!r} ({why}). Running: {', '.join(names()) or 'none'}.")
+
+
+def _is_free(descriptor: int) -> bool:
+    """Return whether nobody holds a block; the descriptor itself must not."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    fcntl.flock(descriptor, fcntl.LOCK_UN)
+    return True
 
 
 def _map(path: Path) -> mmap.mmap:
