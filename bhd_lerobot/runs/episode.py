@@ -19,6 +19,10 @@ from bhd_lerobot.policies.brain import Brain, Goals, Observation
 from bhd_lerobot.robots.simulation import FrameReport, Simulation
 from bhd_lerobot.tasks.task import Event, Outcome, Task
 
+Observer = Callable[[int, Mapping[str, Any]], None]
+"""Is shown a frame: the simulation, and its columns so far by key; or an image, under its camera's key. Must not wait,
+and copy what it keeps; images come on another thread."""
+
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.
 _BRAIN_STREAM = 2
 
@@ -80,12 +84,17 @@ class EpisodeLoop:
     What the brain sees and what it asks for are rounded to single precision first, because that is what is recorded: a
     recorded action, applied again, is exactly the action that was applied.
 
+    Attributes:
+        observer: is shown every frame of every simulation, and every image; None if nobody looks.
+
     Args:
         simulation: the robots.
         task: what is to be achieved.
         brain: what drives them.
         tolerance: how unpunctual a frame may be on the wall clock; the defaults if None.
     """
+
+    observer: Observer | None = None
 
     def __init__(
         self,
@@ -246,6 +255,9 @@ class EpisodeLoop:
             keys.EVENT: event,
         }
         self._store(running, values)
+        if self.observer is not None:
+            for sim in running.tolist():
+                self.observer(sim, {key: value[sim] for key, value in values.items()})
         self._length[running] += 1
         self.frames += len(running)
         return [(int(sim), Event(int(event[sim]))) for sim in running if event[sim] != Event.NOTHING]
@@ -315,7 +327,14 @@ class EpisodeLoop:
         sink = self._sinks[sim]
         for camera in self.simulation.camera_names:
             deliver = None if sink is None else partial(sink.add_image, f"{keys.OBSERVATION_IMAGES}.{camera}")
-            self._pending[sim].append(self.simulation.render_later(sim, camera, deliver))
+            image = self.simulation.render_later(sim, camera, deliver)
+            self._pending[sim].append(image)
+            if self.observer is not None:
+                image.add_done_callback(partial(self._show_image, sim, camera))
+
+    def _show_image(self, sim: int, camera: str, image: futures.Future[NDArray[np.uint8]]) -> None:
+        if self.observer is not None and not image.cancelled() and image.exception() is None:
+            self.observer(sim, {f"{keys.OBSERVATION_IMAGES}.{camera}": image.result()})
 
     def _wait_for_images(self, sim: int) -> None:
         while self._pending[sim]:
