@@ -35,6 +35,11 @@ class SetpointFilter:
         # [rad/s, m/s] by which a speed changes while a brake's acceleration rises to its limit
         self._ramp = self._acceleration**2 / (2 * np.asarray(limits.jerk))
         self._hz, self._frame_ticks = control_hz, frame_ticks
+        self._slowest = -self._speed
+        self._hardest = -self._acceleration
+        # Farther from an end of the range than this, any speed can be stopped in time.
+        room = self._room_for(self._speed)
+        self._near_upper, self._near_lower = self._upper - room, self._lower + room
         self._target, self._step = np.zeros((n, width)), np.zeros((n, width))
         self._goal, self._left = np.zeros((n, width)), np.zeros(n, np.int64)
         self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
@@ -87,15 +92,19 @@ class SetpointFilter:
         closing = np.minimum(_GAIN * size, np.sqrt(2 * _APPROACH * self._acceleration * size))
         wanted = feed + np.copysign(closing, error)
         # Near an end of a range, no faster than what can still be stopped before it.
-        wanted = np.minimum(wanted, self._stoppable(np.maximum(self._upper - position, 0.0)))
-        wanted = np.maximum(wanted, -self._stoppable(np.maximum(position - self._lower, 0.0)))
-        speed = np.minimum(np.maximum(wanted, -self._speed), self._speed)
+        if np.count_nonzero(position > self._near_upper):
+            wanted = np.minimum(wanted, self._stoppable(np.maximum(self._upper - position, 0.0)))
+        if np.count_nonzero(position < self._near_lower):
+            wanted = np.maximum(wanted, -self._stoppable(np.maximum(position - self._lower, 0.0)))
+        speed = np.minimum(np.maximum(wanted, self._slowest), self._speed)
         change = (speed - velocity) * self._hz
-        allowed = np.minimum(np.maximum(change, -self._acceleration), self._acceleration)
+        allowed = np.minimum(np.maximum(change, self._hardest), self._acceleration)
         active = self.active[:, None]
-        self.limited = True
-        self.limited_velocity |= self.active & (speed != wanted).any(axis=1)
-        self.limited_acceleration |= self.active & (allowed != change).any(axis=1)
+        faster, harder = speed != wanted, allowed != change
+        if np.count_nonzero(faster) or np.count_nonzero(harder):
+            self.limited = True
+            self.limited_velocity |= self.active & faster.any(axis=1)
+            self.limited_acceleration |= self.active & harder.any(axis=1)
         np.copyto(acceleration, allowed, where=active)
         np.copyto(velocity, velocity + allowed / self._hz, where=active)
         np.copyto(position, position + velocity / self._hz, where=active)
@@ -111,6 +120,15 @@ class SetpointFilter:
         tick_by_tick = np.minimum(np.sqrt(half * half + 2 * slowing * room) - half, room * self._hz)
         gradually = np.sqrt(self._ramp * self._ramp + 2 * self._acceleration * room) - self._ramp
         return np.asarray(np.minimum(tick_by_tick, gradually))
+
+    def _room_for(self, speed: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how much room is enough to stop from a speed, within a rounding."""
+        low, high = np.zeros_like(speed), self._upper - self._lower + speed * speed / self._acceleration + 1.0
+        for _ in range(60):
+            middle = (low + high) / 2
+            enough = self._stoppable(middle) >= speed
+            low, high = np.where(enough, low, middle), np.where(enough, middle, high)
+        return np.asarray(high)
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget robots that were put somewhere else."""
