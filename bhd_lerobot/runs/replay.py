@@ -138,6 +138,7 @@ class Replay:
             for frame, fields_ in json.loads(metadata["goals"]):
                 self.goals.setdefault(frame, []).append(command_from_json(fields_))
         self._initial = np.asarray(metadata["initial_state"], np.float64)
+        self.is_live = summary.recording["robot"].get("clock") == "realtime"
 
     def changed_versions(self) -> dict[str, tuple[str, str]]:
         """Return what has another version than at the recording: name to recorded and present version."""
@@ -229,6 +230,11 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
         raise ConfigError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
     for name, (then, now) in episode.changed_versions().items():
         console.print(f"Recorded with {name} {then}, replayed with {now}: differences may come from that.")
+    if episode.is_live:
+        console.print(
+            "Recorded on the wall clock: commands took effect when they came, not at the start of a frame. open_loop "
+            "gives them at the start and so differs; state shows whether the record is true to itself."
+        )
     results = []
     table = Table(title=f"Replay of episode {config.dataset.episode} of {root}", title_justify="left")
     for heading in ("largest difference", "frames", "position", "angle", "state", "observed", ""):
@@ -284,8 +290,9 @@ def _robot_config(recorded: dict[str, Any]) -> Any:
     except KeyError:
         raise DatasetError(f"The dataset was recorded by an unknown robot, {recorded.get('type')!r}.") from None
     known = {one.name for one in fields(kind)}
-    parameters = {key: value for key, value in recorded.items() if key in known}
-    return kind(**{**parameters, "camera": False})
+    # Replayed in simulated time, whatever clock it was recorded on.
+    parameters = {key: value for key, value in recorded.items() if key in known and key != "realtime"}
+    return kind(**{**parameters, "camera": False, "clock": "lockstep"})
 
 
 def _main(config: ReplayConfig) -> int:
