@@ -1,0 +1,287 @@
+"""Emergency stops from outside of the program: a signal, a key of the terminal, a physical button."""
+
+import contextlib
+import math
+import os
+import select
+import signal
+import threading
+from collections.abc import Callable
+from functools import partial
+from types import FrameType, TracebackType
+from typing import Any, Protocol, Self
+
+from bhd_lerobot.control.estop_terminal import KeyTerminal, standard_input
+from bhd_lerobot.errors import ConfigError
+
+SIGNALS = ("SIGUSR1", "SIGUSR2", "SIGQUIT")
+"""Signals that may stand for an emergency stop: those that mean nothing else to a run."""
+KEYS = b" e"
+"""Keys of the terminal that press: space and e."""
+POLL_S = 0.01  # [s] between two questions to a callable, unless another time is asked for
+_ROUND_S = 0.05  # [s] between two rounds of the thread: how often what stays pressed is pressed again
+_SILENCE_S = 1.0  # [s] a callable that has not answered for so long hangs
+
+
+class HasDescriptor(Protocol):
+    """A file, a socket, a serial port."""
+
+    def fileno(self) -> int:
+        """Return its file descriptor."""
+
+
+Source = int | HasDescriptor | Callable[[], Any]
+"""A physical button: a file descriptor, what has one, or a callable."""
+
+
+def estop_signal(name: str) -> signal.Signals:
+    """Return the signal of a name, ``SIGUSR1`` or ``usr1``.
+
+    Raises:
+        ConfigError: it does not exist, or means something else; the message lists the valid ones.
+    """
+    wanted = name.upper()
+    wanted = wanted if wanted.startswith("SIG") else f"SIG{wanted}"
+    if wanted not in SIGNALS:
+        raise ConfigError(f"The signal for an emergency stop is {name!r}. Valid: {', '.join(SIGNALS)}.")
+    return signal.Signals[wanted]
+
+
+class EstopInputs:
+    """Inputs in the brain's process that press the emergency stop.
+
+    A thread waits for all descriptors at once and each callable has a thread of its own, so that none holds up another.
+    Each presses again for as long as it stays pressed: a reset does not help while a wire is cut.
+
+    From the press to the call of `press`: a descriptor, a key or a signal takes one wake-up of a thread, a callable at
+    most its period in addition. All of them need Python's interpreter lock: a brain that keeps it keeps them waiting,
+    until the watchdog on the brain's process stops the robot. This is no certified safety function.
+
+    Args:
+        press: what presses: sets the word of the emergency stop. Called from any thread and from a signal handler, as
+            often as it likes; must neither block nor raise.
+
+    Attributes:
+        causes: what has pressed so far, in words, each once, in the order of the first time.
+    """
+
+    def __init__(self, press: Callable[[], None]) -> None:
+        self.causes: list[str] = []
+        self._press_word = press
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self._hear: dict[int, Callable[[bytes], None]] = {}  # what is to be done with the bytes of each descriptor
+        self._broken: list[str] = []  # inputs that can press no more, and therefore stay pressed
+        self._silence: dict[str, int] = {}  # rounds of the thread that a callable may still be silent for
+        self._signals: dict[signal.Signals, Any] = {}
+        self._pipe: tuple[int, int] | None = None  # signals arrive here even if the main thread is busy
+        self._terminal: KeyTerminal | None = None
+        self._poll = select.poll()
+        self._waker, self._wake = os.pipe()
+        self._poll.register(self._waker, select.POLLIN)
+
+    # --- inputs ------------------------------------------------------------------------------------------------------
+
+    def add(self, source: Source, name: str = "", period_s: float = POLL_S) -> None:
+        """Add a physical button.
+
+        Args:
+            source: a file descriptor or an object with one: any byte presses, and so does its end or an error, a wire
+                that is cut. Or a callable, asked again and again: it presses when it returns something true, raises, or
+                does not return for a second. Neither is closed here.
+            name: what it is called in `causes`.
+            period_s: time between two questions to a callable [s].
+
+        Raises:
+            ConfigError: it is neither, the descriptor is not open, or the period is not positive.
+        """
+        name = name or f"input {len(self._hear) + len(self._silence)}"
+        fileno = getattr(source, "fileno", None)
+        descriptor = source if isinstance(source, int) else fileno() if fileno else None
+        if descriptor is not None:
+            try:
+                os.fstat(descriptor)
+            except OSError as error:
+                raise ConfigError(f"The emergency stop's input {source!r} cannot be used: {error.strerror}.") from None
+            self._watch(descriptor, partial(self._hear_button, descriptor, name))
+        elif not callable(source):
+            raise ConfigError(
+                f"An input of the emergency stop is {source!r}; give a file descriptor, an object with fileno(), "
+                "or a callable that returns whether it is pressed."
+            )
+        elif not 0 < period_s < math.inf:
+            raise ConfigError(f"period_s is {period_s}; it must be positive and finite.")
+        else:
+            name = name if name not in self._silence else f"{name} ({len(self._silence)})"
+            rounds = math.ceil((_SILENCE_S + period_s) / _ROUND_S)
+            self._silence[name] = rounds
+            self._run_thread(f"bhd-estop {name}", self._ask, source, name, period_s, rounds)
+            self._start()
+
+    def add_key(self, descriptor: int | None = None) -> bool:
+        """Let space and ``e`` in the terminal press; return whether there is a terminal to do so.
+
+        A process that runs in the background leaves the terminal alone.
+
+        Args:
+            descriptor: of the terminal; standard input if None.
+        """
+        descriptor = standard_input() if descriptor is None else descriptor
+        if descriptor is None or self._terminal is not None or not KeyTerminal.usable(descriptor):
+            return False
+        self._terminal = KeyTerminal(descriptor)
+        self._watch(descriptor, self._hear_keys)
+        return True
+
+    def add_signal(self, number: signal.Signals = signal.SIGUSR1) -> None:
+        """Let a signal press. The former handler comes back with `close`.
+
+        Raises:
+            ConfigError: this is not the main thread, the only one in which Python installs handlers.
+        """
+        thread = threading.current_thread()
+        if thread is not threading.main_thread():
+            raise ConfigError(
+                f"{number.name} can be made an emergency stop in the main thread only; this is {thread.name!r}. "
+                "Do it there, or call robot.estop() here."
+            )
+        if number in self._signals:
+            return
+        # A handler runs when the main thread comes back to Python; the pipe tells the thread at once.
+        if self._pipe is None:
+            self._open_pipe()
+        self._signals[number] = signal.signal(number, self._handle)
+
+    def _open_pipe(self) -> None:
+        reader, writer = os.pipe()
+        os.set_blocking(reader, False)
+        os.set_blocking(writer, False)
+        former = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        if former != -1:  # somebody else's, an event loop's for example: the handler alone has to do
+            signal.set_wakeup_fd(former, warn_on_full_buffer=False)
+            os.close(reader)
+            os.close(writer)
+            return
+        self._pipe = reader, writer
+        self._watch(reader, self._hear_signals)
+
+    # --- pressing ----------------------------------------------------------------------------------------------------
+
+    def _press(self, cause: str) -> None:
+        if self._stop.is_set():
+            return
+        self._press_word()
+        if cause not in self.causes:
+            self.causes.append(cause)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self._press(f"signal {signal.Signals(number).name}")
+
+    def _hear_signals(self, said: bytes) -> None:
+        for number in said:
+            if number in self._signals:
+                self._press(f"signal {signal.Signals(number).name}")
+
+    def _hear_keys(self, said: bytes) -> None:
+        if any(key in said for key in KEYS):
+            self._press("key")
+        if not said and self._terminal is not None:  # it is gone; that is a SIGHUP, which ends a run
+            self._poll.unregister(self._terminal.descriptor)
+
+    def _hear_button(self, descriptor: int, name: str, said: bytes) -> None:
+        if said:
+            self._press(name)
+        else:
+            self._poll.unregister(descriptor)
+            self._broken.append(f"{name} is closed or broken")
+
+    def _ask(self, source: Callable[[], Any], name: str, period_s: float, rounds: int) -> None:
+        """Ask a callable; the work of its thread."""
+        while not self._stop.wait(period_s):
+            try:
+                if source():
+                    self._press(name)
+            except Exception as error:  # whatever it is: an input that fails cannot be relied on
+                self._press(f"{name} failed: {type(error).__name__}: {error}")
+            self._silence[name] = rounds
+
+    def _watch(self, descriptor: int, hear: Callable[[bytes], None]) -> None:
+        self._hear[descriptor] = hear
+        self._poll.register(descriptor, select.POLLIN)
+        self._start()
+
+    def _start(self) -> None:
+        """Start the thread, or tell it that there is more to wait for."""
+        if "bhd-estop" not in [thread.name for thread in self._threads]:
+            self._run_thread("bhd-estop", self._work)
+        os.write(self._wake, b"\0")
+
+    def _run_thread(self, name: str, target: Callable[..., None], *arguments: Any) -> None:
+        thread = threading.Thread(target=target, args=arguments, name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _work(self) -> None:
+        while not self._stop.is_set():
+            events = self._poll.poll(1000 * _ROUND_S if self._broken or self._silence else None)
+            for descriptor, _ in events:
+                if descriptor == self._waker:
+                    os.read(self._waker, 64)
+                else:
+                    self._listen(descriptor)
+            for cause in self._broken:
+                self._press(cause)
+            if not events:  # rounds are counted, not time: if this thread gets no processor, neither do the others
+                self._count_silence()
+
+    def _listen(self, descriptor: int) -> None:
+        terminal = self._terminal
+        is_key = terminal is not None and terminal.descriptor == descriptor
+        if is_key and os.isatty(descriptor) and not KeyTerminal.usable(descriptor):
+            self._stop.wait(_ROUND_S)  # to read now would stop the whole process: the keys are another's
+            return
+        try:
+            said = os.read(descriptor, 4096)
+        except BlockingIOError:
+            return
+        except OSError:
+            said = b""
+        self._hear[descriptor](said)
+
+    def _count_silence(self) -> None:
+        for name in list(self._silence):
+            self._silence[name] -= 1
+            if self._silence[name] <= 0:
+                self._press(f"{name} does not answer")
+
+    # --- the end -----------------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Take no more presses; give terminal and signals back. May be called twice; in the main thread."""
+        if self._stop.is_set():
+            return
+        self._stop.set()
+        os.write(self._wake, b"\0")
+        if self._terminal is not None:
+            self._terminal.restore()
+        # Outside of the main thread handler and pipe stay, and do nothing any more.
+        with contextlib.suppress(ValueError):
+            for number, handler in self._signals.items():
+                signal.signal(number, signal.SIG_DFL if handler is None else handler)
+            if self._pipe is not None:
+                signal.set_wakeup_fd(-1)
+        for thread in self._threads:
+            thread.join(0.2)  # a callable that hangs keeps its own thread, and nothing else
+        if threading.current_thread() is threading.main_thread():
+            for descriptor in (self._waker, self._wake, *(self._pipe or ())):
+                os.close(descriptor)
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()

@@ -1,0 +1,346 @@
+"""Every input presses, stays pressed where it must, and leaves terminal and signals as they were."""
+
+import ctypes
+import os
+import pty
+import signal
+import socket
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+
+import pytest
+
+from bhd_lerobot.control.estop import SIGNALS, EstopInputs, estop_signal
+from bhd_lerobot.errors import ConfigError
+
+
+class Button:
+    """The word that inputs press, and a test clears."""
+
+    def __init__(self) -> None:
+        self.word = threading.Event()
+
+    def press(self) -> None:
+        self.word.set()
+
+    def is_pressed(self) -> bool:
+        return self.word.wait(20)
+
+
+@pytest.fixture
+def button() -> Button:
+    return Button()
+
+
+@pytest.fixture
+def inputs(button: Button) -> Iterator[EstopInputs]:
+    with EstopInputs(button.press) as inputs:
+        yield inputs
+
+
+@pytest.fixture
+def wire() -> Iterator[tuple[int, int]]:
+    reader, writer = os.pipe()
+    yield reader, writer
+    for end in (reader, writer):
+        with suppress(OSError):
+            os.close(end)
+
+
+def hear(inputs: EstopInputs, cause: str) -> None:
+    """Wait until a cause is among those that pressed."""
+    deadline = time.monotonic() + 20
+    while cause not in inputs.causes:
+        assert time.monotonic() < deadline, inputs.causes
+        time.sleep(0.001)
+
+
+def test_a_byte_presses_and_after_a_reset_the_next_one_does(button, inputs, wire):
+    inputs.add(wire[0], "button")
+    for _ in range(3):
+        button.word.clear()
+        os.write(wire[1], b"x")
+        assert button.is_pressed()
+    assert inputs.causes == ["button"]
+
+
+def test_a_cut_wire_stays_pressed(button, inputs, wire):
+    inputs.add(wire[0], "button")
+    assert not button.word.is_set()
+    os.close(wire[1])
+    for _ in range(3):
+        assert button.is_pressed()
+        button.word.clear()  # a reset does not help
+    assert inputs.causes == ["button is closed or broken"]
+
+
+def test_an_error_on_a_descriptor_presses(button, inputs):
+    ours, theirs = socket.socketpair()
+    inputs.add(ours, "relay")
+    ours.close()  # behind our back: the descriptor is not valid any more
+    theirs.close()
+    inputs.add(lambda: False)  # anything that wakes the thread
+    assert button.is_pressed()
+    assert inputs.causes == ["relay is closed or broken"]
+
+
+def test_a_callable_presses_for_as_long_as_it_says_so(button, inputs):
+    state = {"pressed": False}
+    inputs.add(lambda: state["pressed"], "relay", period_s=0.001)
+    asked = threading.Event()
+    inputs.add(asked.set, "witness", period_s=0.001)
+    assert asked.wait(20)
+    assert not button.word.is_set()
+    state["pressed"] = True
+    for _ in range(3):
+        assert button.is_pressed()
+        button.word.clear()
+    assert inputs.causes == ["relay"]
+
+
+def test_a_callable_that_raises_presses(button, inputs):
+    def broken() -> bool:
+        raise OSError("the bus is gone")
+
+    inputs.add(broken, "relay", period_s=0.001)
+    hear(inputs, "relay failed: OSError: the bus is gone")
+    assert button.is_pressed()
+
+
+def test_a_callable_that_hangs_presses_and_holds_up_no_other_input(button, wire):
+    let_go = threading.Event()
+    with EstopInputs(button.press) as inputs:
+        inputs.add(lambda: let_go.wait(30), "relay", period_s=0.001)
+        inputs.add(wire[0], "button")
+        os.write(wire[1], b"x")
+        hear(inputs, "button")
+        hear(inputs, "relay does not answer")
+        assert inputs.causes == ["button", "relay does not answer"]
+        let_go.set()
+
+
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGUSR2])
+def test_a_signal_presses_and_the_former_handler_comes_back(button, number):
+    def handler(*_: object) -> None:
+        raise AssertionError("the former handler must not run")
+
+    former = signal.signal(number, handler)
+    try:
+        with EstopInputs(button.press) as inputs:
+            inputs.add_signal(number)
+            os.kill(os.getpid(), number)
+            assert button.is_pressed()
+            assert inputs.causes == [f"signal {number.name}"]
+        assert signal.getsignal(number) is handler
+        assert signal.set_wakeup_fd(-1) == -1
+    finally:
+        signal.signal(number, former)
+
+
+def test_a_signal_presses_though_the_main_thread_does_not_come_back_to_python(button, inputs):
+    inputs.add_signal(signal.SIGUSR1)
+    library, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)
+    pressed: list[bool] = []
+
+    def other() -> None:
+        os.kill(os.getpid(), signal.SIGUSR1)
+        pressed.append(button.is_pressed())
+        library.pthread_mutex_unlock(mutex)
+
+    library.pthread_mutex_lock(mutex)
+    thread = threading.Thread(target=other)
+    thread.start()
+    library.pthread_mutex_lock(mutex)  # no signal ends this call, and no handler of Python runs before it ends
+    thread.join(20)
+    assert pressed == [True]
+
+
+def test_somebody_elses_wake_up_descriptor_is_left_alone(button):
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer)
+    try:
+        with EstopInputs(button.press) as inputs:
+            inputs.add_signal(signal.SIGUSR1)
+            os.kill(os.getpid(), signal.SIGUSR1)
+            assert button.is_pressed()
+    finally:
+        assert signal.set_wakeup_fd(-1) == writer
+        os.close(reader)
+        os.close(writer)
+
+
+def test_a_signal_outside_of_the_main_thread_is_refused(inputs):
+    errors: list[str] = []
+
+    def work() -> None:
+        try:
+            inputs.add_signal()
+        except ConfigError as error:
+            errors.append(str(error))
+
+    thread = threading.Thread(target=work, name="worker")
+    thread.start()
+    thread.join(20)
+    assert len(errors) == 1
+    assert "main thread only" in errors[0]
+    assert "'worker'" in errors[0]
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL", "SIGTERM", "", "9", "SIGFOO"])
+def test_a_signal_that_means_something_else_is_refused(name):
+    with pytest.raises(ConfigError, match="Valid: SIGUSR1"):
+        estop_signal(name)
+
+
+def test_signals_by_name():
+    assert [estop_signal(name).name for name in SIGNALS] == list(SIGNALS)
+    assert estop_signal("usr2") == signal.SIGUSR2
+
+
+@pytest.mark.parametrize(
+    ("source", "period", "message"),
+    [
+        ("button", 0.01, "give a file descriptor"),
+        (None, 0.01, "None"),
+        (1 << 20, 0.01, "Bad file descriptor"),
+        (bool, 0.0, "period_s is 0"),
+        (bool, float("nan"), "period_s is nan"),
+    ],
+)
+def test_what_is_no_input_is_refused(inputs, source, period, message):
+    with pytest.raises(ConfigError, match=message):
+        inputs.add(source, period_s=period)
+
+
+def test_after_close_nothing_presses_and_no_thread_is_left(button, wire):
+    before = threading.active_count()
+    inputs = EstopInputs(button.press)
+    inputs.add(wire[0])
+    inputs.add(lambda: False, period_s=0.001)
+    inputs.close()
+    inputs.close()
+    assert threading.active_count() == before
+    os.write(wire[1], b"x")
+    assert not button.word.is_set()
+    assert os.read(wire[0], 1) == b"x"  # it was left for whoever reads it next
+
+
+def test_without_a_terminal_there_is_no_key(inputs, wire):
+    assert not inputs.add_key(wire[0])
+
+
+_CHILD = """
+import fcntl, os, signal, sys, termios, time
+from bhd_lerobot.control.estop import EstopInputs
+
+def press():
+    print("pressed", flush=True)
+
+fcntl.ioctl(0, termios.TIOCSCTTY)
+inputs = EstopInputs(press)
+print("key", inputs.add_key(), inputs.add_key(), flush=True)
+{}
+"""
+
+
+class Terminal:
+    """A terminal with a program in its foreground, and a person in front of it."""
+
+    def __init__(self, program: str) -> None:
+        self.person, device = pty.openpty()
+        self.before = termios.tcgetattr(device)
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _CHILD.format(program)],
+            stdin=device,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self.device = device
+
+    def expect(self, line: str) -> None:
+        assert self.process.stdout.readline().strip() == line
+
+    def type(self, keys: bytes) -> None:
+        os.write(self.person, keys)
+
+    def end(self) -> tuple[int, str]:
+        """Wait for the program's end; return its status and what it complained about."""
+        _, error = self.process.communicate(timeout=20)
+        return self.process.returncode, error
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self.person)
+        os.close(self.device)
+
+
+@pytest.fixture
+def terminal() -> Iterator[Callable[[str], Terminal]]:
+    made: list[Terminal] = []
+
+    def make(program: str) -> Terminal:
+        made.append(Terminal(program))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def test_space_and_e_press_at_once_and_other_keys_do_not(terminal):
+    one = terminal("while True: time.sleep(1)")
+    one.expect("key True False")  # a second time there is nothing to be done
+    mode = termios.tcgetattr(one.device)
+    assert not mode[3] & (termios.ICANON | termios.ECHO)
+    assert mode[3] & termios.ISIG
+    for keys in (b" ", b"e", b"xyz e\n"):  # no Enter is needed
+        one.type(b"qx\n")
+        one.type(keys)
+        one.expect("pressed")
+    assert one.process.poll() is None
+
+
+def test_ctrl_c_still_interrupts_and_the_terminal_is_as_it_was(terminal):
+    one = terminal("while True: time.sleep(1)")
+    one.expect("key True False")
+    one.type(b"\x03")
+    status, error = one.end()
+    assert status == -signal.SIGINT
+    assert "KeyboardInterrupt" in error
+    assert termios.tcgetattr(one.device) == one.before
+
+
+@pytest.mark.parametrize(
+    ("program", "status"), [("inputs.close()", 0), ("raise RuntimeError('a bug')", 1), ("sys.exit(3)", 3)]
+)
+def test_however_the_program_ends_the_terminal_is_as_it_was(terminal, program, status):
+    one = terminal(program)
+    one.expect("key True False")
+    assert one.end()[0] == status
+    assert termios.tcgetattr(one.device) == one.before
+
+
+def test_in_the_background_the_terminal_is_left_alone(terminal):
+    one = terminal(
+        "inputs.close()\n"
+        "pid = os.fork()\n"
+        "if pid == 0:\n"
+        "    os.setpgid(0, 0)\n"
+        "    again = EstopInputs(press)\n"
+        "    print('background', again.add_key(), flush=True)\n"
+        "    os._exit(0)\n"
+        "sys.exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))"
+    )
+    one.expect("key True False")
+    one.expect("background False")
+    assert one.end()[0] == 0
+    assert termios.tcgetattr(one.device) == one.before
