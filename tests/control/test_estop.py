@@ -29,7 +29,7 @@ class Button:
         self.word.set()
 
     def is_pressed(self) -> bool:
-        return self.word.wait(20)
+        return self.word.wait(10)
 
 
 @pytest.fixture
@@ -146,8 +146,10 @@ def test_a_signal_presses_though_the_main_thread_does_not_come_back_to_python(bu
     inputs.add_signal(signal.SIGUSR1)
     library, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)
     pressed: list[bool] = []
+    go = threading.Event()
 
     def other() -> None:
+        go.wait(20)
         os.kill(os.getpid(), signal.SIGUSR1)
         pressed.append(button.is_pressed())
         library.pthread_mutex_unlock(mutex)
@@ -155,7 +157,11 @@ def test_a_signal_presses_though_the_main_thread_does_not_come_back_to_python(bu
     library.pthread_mutex_lock(mutex)
     thread = threading.Thread(target=other)
     thread.start()
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(60)  # the other thread goes on when this one is in the call, and not before
+    go.set()
     library.pthread_mutex_lock(mutex)  # no signal ends this call, and no handler of Python runs before it ends
+    sys.setswitchinterval(interval)
     thread.join(20)
     assert pressed == [True]
 
