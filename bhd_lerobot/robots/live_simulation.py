@@ -176,17 +176,17 @@ class LiveSimulation(Simulation):
     def observe(self) -> Frame:
         """Return the observation that the present frame began with; its age is what it is now."""
         self._show(self._boundary["state"])
-        return self._frame_of(self._boundary["state"])
+        return self._frame_of(self._boundary["state"], time.monotonic_ns())
 
     def latest(self) -> Frame:
         """Return the newest observation, whatever frame it is in."""
         state = self.live_bridge.latest
         self._show(state)
-        return self._frame_of(state)
+        return self._frame_of(state, time.monotonic_ns())
 
-    def _frame_of(self, state: Any) -> Frame:
+    def _frame_of(self, state: Any, seen_ns: int) -> Frame:
         sensed = int(state["sensed_ns"])
-        age = max(0, time.monotonic_ns() - sensed) + int(state["oldest_ns"])
+        age = max(0, seen_ns - sensed) + int(state["oldest_ns"])
         return Frame(state["observation"].copy(), np.array([sensed - self._origin]), np.array([age]))
 
     # --- frames ------------------------------------------------------------------------------------------------------
@@ -258,7 +258,7 @@ class LiveSimulation(Simulation):
         begun, end = before["state"], after["state"]
         return LiveFrame(
             number=int(before["frame"]),
-            seen=self._frame_of(begun),
+            seen=self._frame_of(begun, int(begun["sensed_ns"])),  # if the brain did not look at it, nobody waited
             physics=begun["physics"].copy(),
             requested=self.mirror.to_action(end["requested"]),
             end=end,

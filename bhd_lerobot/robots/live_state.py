@@ -113,7 +113,8 @@ class StatePublisher:
         field["emergency_stop"][0] = cerebellum.estop_latched
         field["refusals"][0] = cerebellum.refusals[:, 0]
         field["observation"][0], oldest = simulation.sense()
-        field["sensed_ns"][0] = self._clock()
+        # Before the first tick everything stands still: what is read then is so until that tick.
+        field["sensed_ns"][0] = self._clock() if slot.index >= 0 else slot.due_ns
         field["oldest_ns"][:] = (simulation.tick - oldest) * grid.period_ns
         physics = field["physics"][0]
         physics[:, : self._nq], physics[:, self._nq :] = simulation.world.qpos, simulation.world.qvel
