@@ -4,6 +4,7 @@ Cerebellum, physics and recorder run in processes of their own. Here is a mirror
 put into published states, to tell what is true and to render images.
 """
 
+import itertools
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -319,4 +320,8 @@ def make_live(mirror: Simulation, name: str | None) -> LiveSimulation:
         mirror: a simulation of one robot.
         name: the robot's id; its type and this process's number if None.
     """
-    return LiveSimulation(mirror, name or f"{mirror.config.type}-{os.getpid()}")
+    number = next(_nameless) if name is None else 0
+    return LiveSimulation(mirror, name or f"{mirror.config.type}-{os.getpid()}{f'-{number}' if number else ''}")
+
+
+_nameless = itertools.count()  # several robots of one process that have no id

@@ -121,7 +121,7 @@ class StatePublisher:
         self._ring.publish(self._record[0])
 
     def _count(self, slot: Slot) -> None:
-        """Count what was raised since the last tick, and the limits at the first tick of every frame."""
+        """Count what was raised since the last tick; limits and watchdogs at the last tick of every frame."""
         field = self._field
         flags = [flag[0] for flag in self._simulation.touches]
         if any(flags):
@@ -129,9 +129,11 @@ class StatePublisher:
             field["touches"][0] = self._touches
             for flag in self._simulation.touches:
                 flag[0] = False
-        if slot.index < self._next_frame:
+        # The state that a frame ends with holds all that was raised in it, also if its last tick was skipped.
+        frame = (slot.index + 1) // self._frame
+        if frame < self._next_frame:
             return
-        self._next_frame = (slot.index // self._frame + 1) * self._frame
+        self._next_frame = frame + 1
         encode_feedback(self._cerebellum.controller.feedback(0), self._feedback)
         limits, watchdog = self._cerebellum.take_flags()
         raised = int(limits[0])
