@@ -8,6 +8,7 @@ from lerobot.robots.config import RobotConfig
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.runs.live_view import check_options
 from bhd_lerobot.runs.registry import SIMULATED_ROBOTS, brains_for, robot_of_brain, robot_of_task
 from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import SPLITS
@@ -59,6 +60,14 @@ class RecordConfig:
         resume: continue the dataset at `dataset.root`, or start it if there is none.
         output_dir: run folder, for the resolved configuration and pictures; a new one in `outputs/record` if nothing.
         preview_video: make an MP4 of the first episode; if nothing, where images can be rendered.
+        display_data: show what happens live in Rerun or Foxglove; of robots side by side the first. The names of these
+            options are those of `lerobot-record`.
+        display_mode: where: `rerun` or `foxglove`.
+        display_ip: for `rerun`, where a viewer runs, if not here; for `foxglove`, the interface that it can connect to,
+            127.0.0.1 if nothing.
+        display_port: for `rerun`, the viewer's port, if it does not run here; for `foxglove`, the port that it can
+            connect to, 8765 if nothing.
+        display_compressed_images: send images as JPEG; always so to a viewer that does not run here.
     """
 
     robot: RobotConfig
@@ -73,6 +82,11 @@ class RecordConfig:
     resume: bool = False
     output_dir: str | None = None
     preview_video: bool | None = None
+    display_data: bool = False
+    display_mode: str = "rerun"
+    display_ip: str | None = None
+    display_port: int | None = None
+    display_compressed_images: bool = False
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be honoured.
@@ -108,6 +122,7 @@ class RecordConfig:
                 raise ConfigError(f"{name} is {value}; it must be at least 1.")
         if self.seed < 0:
             raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
+        check_options(self)
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
         robot: Any = self.robot

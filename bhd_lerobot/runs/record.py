@@ -28,6 +28,7 @@ from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import encode, run
 from bhd_lerobot.runs.episode import Episode, EpisodeLoop, EpisodeSpec
 from bhd_lerobot.runs.language_rows import language_column
+from bhd_lerobot.runs.live_view import live_view
 from bhd_lerobot.runs.plots import Trajectory, draw_trajectories
 from bhd_lerobot.runs.preview import Preview
 from bhd_lerobot.runs.provenance import episode_metadata
@@ -103,7 +104,8 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
             simulation.start_rendering()  # a machine without OpenGL fails here, before a dataset exists
         output_dir = _make_output_dir(config)
         result = RecordResult(root, output_dir, stopped_by=stop)
-        with _open_recorder(config, root, simulation, task, brain) as recorder:
+        show = live_view(config, simulation, console)  # a view that cannot be started fails before a dataset exists
+        with show as loop.observer, _open_recorder(config, root, simulation, task, brain) as recorder:
             if recorder.repair_report:
                 console.print(f"Mended before resuming: {recorder.repair_report}")
             trajectories, first = _run(config, recorder, loop, result, console)
