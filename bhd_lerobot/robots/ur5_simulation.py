@@ -147,6 +147,7 @@ class UR5Simulation(Simulation):
     def to_setpoints(
         self, action: NDArray[np.float64], mask: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
+        """Turn actions into setpoints, shape (n, width), and say which cannot be, and why."""
         if self.config.action_space == "joint":
             return action, {}
         command = self.cerebellum.command
