@@ -129,6 +129,11 @@ class LockstepBridge:
         """Set the emergency-stop word; the next tick latches it."""
         self.cerebellum.estop_word[slice(None) if ids is None else ids] = 1
 
+    @property
+    def estop_pressed(self) -> bool:
+        """Whether the emergency-stop word of any simulation is set, be it latched already or not."""
+        return bool(np.any(self.cerebellum.estop_word))
+
     def configure(self, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Leave UNCONFIGURED: odometry starts here."""
         return self.cerebellum.request(Request.CONFIGURE, ids)

@@ -313,10 +313,13 @@ class Cerebellum:
         return SendResult(reasons)
 
     def restart(self, ids: NDArray[np.intp]) -> None:
-        """Forget everything about simulations that were put somewhere else: they are unconfigured again."""
+        """Forget everything about simulations that were put somewhere else: they are unconfigured again.
+
+        All but an emergency stop that no tick has seen yet: the next one will.
+        """
         self.fifo.drop(ids)
+        self.estop_word[ids[self.mode[ids] == Mode.ESTOP]] = 0
         self.mode[ids] = Mode.UNCONFIGURED
-        self.estop_word[ids] = 0
         self.controller.restart(ids)
         self._configured[ids] = False
         self._sent_sequence[ids] = -1

@@ -157,6 +157,11 @@ class LiveBridge:
         """Set the emergency-stop word; the next tick latches it."""
         self._block.words[Word.ESTOP] = 1
 
+    @property
+    def estop_pressed(self) -> bool:
+        """Whether the emergency-stop word is set, be it latched already or not."""
+        return bool(self._block.words[Word.ESTOP])
+
     def configure(self, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Leave UNCONFIGURED: odometry starts here."""
         return self._ask(Request.CONFIGURE)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
-from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.data import features as keys
@@ -92,6 +92,9 @@ class EpisodeLoop:
         task: what is to be achieved.
         brain: what drives them.
         tolerance: how unpunctual a frame may be on the wall clock; the defaults if None.
+
+    Attributes:
+        emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
     """
 
     observer: Observer | None = None
@@ -105,6 +108,7 @@ class EpisodeLoop:
     ) -> None:
         self.simulation, self.task, self.brain = simulation, task, brain
         self.tolerance = tolerance or TimingTolerance()
+        self.emergency_stop = False
         self._last_frame = -1  # number of the last frame on the wall clock
         self._open_images: Callable[[], Any] | None = None
         self._frames = max(1, round(task.duration_s * simulation.rates.fps))
@@ -152,12 +156,13 @@ class EpisodeLoop:
                 for sim, event in finished:
                     episode = self._finish(sim, event)
                     done[episode.spec.index] = episode
-                if finished:
-                    ids = np.array([sim for sim, _ in finished])
-                    self.simulation.stop(ids)
-                    self._start(ids, waiting)
+                    self.emergency_stop |= event == Event.ESTOP
+                ids = np.array([sim for sim, _ in finished], np.intp)
+                self.simulation.stop(ids)
+                # Before others start: on the wall clock they would begin while these are still being saved.
                 while order and order[0] in done:
                     yield done.pop(order.pop(0))
+                self._start(ids, waiting)
         finally:
             for pending in self._pending:
                 futures.wait(pending)
@@ -170,6 +175,11 @@ class EpisodeLoop:
         """Start the next episodes in idle simulations."""
         ids = ids[: len(waiting)]
         if not len(ids):
+            return
+        # A person decides when the robot moves again; the stop may also have come between two episodes.
+        self.emergency_stop |= self.simulation.bridge.estop_pressed
+        if self.emergency_stop:
+            waiting.clear()
             return
         specs = [waiting.pop() for _ in ids]
         scenes = [self.task.sample(spec.seed) for spec in specs]
@@ -245,6 +255,7 @@ class EpisodeLoop:
         running = np.flatnonzero(simulation.running)
         self._truth = simulation.truth(report)
         reward, event = self.task.judge(self._truth, simulation.running)
+        event = np.where(report.mode == Mode.ESTOP, Event.ESTOP, event)  # whatever else happened
         values |= {
             keys.APPLIED_ACTION: report.applied,
             keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,
