@@ -24,6 +24,10 @@ class RealtimeConfig:
         recorder_timeout_s: the same for the recorder's process [s].
         most_misses: after so many ticks in a row that came a period or more too late the robot stops, with FAULT.
         most_catch_up: so many missed ticks at the most are caught up at once by the simulation.
+        plant_process: run the simulated world in a process of its own, which stops the robot by itself when it hears
+            nothing from the cerebellum, as a motor controller would.
+        plant_timeout_s: it does that after so long without a command, and the cerebellum goes to FAULT after so long
+            without a sign of life of it [s]; at least two control ticks.
         buffer_s: so long may the recorder fall behind before a state is lost, and counted [s].
     """
 
@@ -36,6 +40,8 @@ class RealtimeConfig:
     recorder_timeout_s: float = 1.0
     most_misses: int = 10
     most_catch_up: int = 10
+    plant_process: bool = False
+    plant_timeout_s: float = 0.02
     buffer_s: float = 8.0
 
     def __post_init__(self) -> None:
@@ -44,7 +50,7 @@ class RealtimeConfig:
         Raises:
             ConfigError: names the value and the valid ones.
         """
-        for name in ("brain_timeout_s", "recorder_timeout_s", "buffer_s"):
+        for name in ("brain_timeout_s", "recorder_timeout_s", "plant_timeout_s", "buffer_s"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ConfigError(
                     f"robot.realtime.{name} is {getattr(self, name)}; it must be positive and finite. "
@@ -71,6 +77,7 @@ class RealtimeConfig:
         return LoopLimits(
             brain_timeout_s=self.brain_timeout_s,
             recorder_timeout_s=self.recorder_timeout_s,
+            plant_timeout_s=self.plant_timeout_s,
             most_misses=self.most_misses,
             most_catch_up=self.most_catch_up,
         )

@@ -9,8 +9,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -19,16 +20,18 @@ from bhd_lerobot.control.live_block import LiveLayout, Word
 from bhd_lerobot.control.live_sections import BrainSide, section_sizes
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics
-from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.robots.config_realtime import RealtimeConfig
 from bhd_lerobot.robots.live_process import LiveSpec
 from bhd_lerobot.robots.live_state import state_dtype
+from bhd_lerobot.robots.remote_plant import plant_shape
 from bhd_lerobot.robots.simulation import Simulation
 
 _LIFE_S = 0.02  # between two signs of life of this process
 _START_S = 120.0  # that a process may take to import, build its model and warm up
 _ANSWER_S = 30.0  # that it may take to place a scene
 _HEAD_START_S = 0.02  # from the order to run to the first tick
+_SILENCE_S = 2.0  # so long without a sign of life a plant is stopped, or gets no processor time
 _FIFO = 256
 
 
@@ -46,6 +49,7 @@ class LiveLink:
         name: name of the running robot, for `bhd-monitor`.
 
     Raises:
+        ConfigError: the plant's time-out is shorter than two control ticks.
         RealtimeError: a process could not be started, or real time is required and was refused.
     """
 
@@ -54,6 +58,12 @@ class LiveLink:
         rates = mirror.rates
         dtype = state_dtype(mirror)
         frames = max(64, round(realtime.buffer_s * rates.fps * 4))
+        shape = plant_shape(mirror) if realtime.plant_process else None
+        if shape is not None and realtime.plant_timeout_s * rates.control_hz < 2:
+            raise ConfigError(
+                f"robot.realtime.plant_timeout_s is {realtime.plant_timeout_s:g}; at control_hz = {rates.control_hz} "
+                f"it must be at least {2 / rates.control_hz:g} s, two ticks."
+            )
         layout = LiveLayout(
             mirror.cerebellum.width,
             dtype,
@@ -63,6 +73,7 @@ class LiveLink:
                 **section_sizes(mirror.cerebellum),
                 "statistics": TimingStatistics.nbytes,
                 "frames": FrameLog.nbytes(dtype, frames),
+                **({} if shape is None else shape.sections()),
             },
         )
         about = {
@@ -74,10 +85,11 @@ class LiveLink:
             "commands": list(mirror.body.limits.names),
             "observations": list(mirror.observation_names),
             "brain_pid": os.getpid(),
+            **({} if shape is None else {"plant": shape.as_dict()}),
         }
         self.grants: list[dict[str, Any]] = []
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._connection: Connection | None = None
+        self._pipes: dict[str, Connection] = {}
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self.block = layout.create(name, about)
@@ -100,13 +112,15 @@ class LiveLink:
             limits=realtime.limits(),
         )
         pickle.dumps(spec)  # what cannot be sent is found out before a process waits for it
-        ours, theirs = socket.socketpair()
-        with theirs:
-            arguments = ["-m", "bhd_lerobot.robots.live_process", str(theirs.fileno())]
-            self._spawn("cerebellum", arguments, (theirs.fileno(),))
-        self._connection = Connection(ours.detach())
+        self._spawn_piped("cerebellum", "bhd_lerobot.robots.live_process")
+        if realtime.plant_process:
+            self._spawn_piped("plant", "bhd_lerobot.robots.plant_process")
         self._spawn("recorder", ["-m", "bhd_lerobot.control.recorder_process", self.block.name])
-        self._connection.send(spec)
+        self._pipes["cerebellum"].send(spec)
+        if realtime.plant_process:
+            # One above the cerebellum: no command that fails to come, for whatever reason, keeps it from noticing.
+            privileges = replace(spec.privileges, priority=min(spec.privileges.priority + 1, 99))
+            self._pipes["plant"].send(replace(spec, privileges=privileges))
         self.block.show_life(Word.BRAIN_ALIVE)
         self._threads.append(threading.Thread(target=self._live, name="bhd-brain-life", daemon=True))
         serve = self.bridge_side.serve
@@ -116,6 +130,9 @@ class LiveLink:
             thread.start()
         self.about = self._answer("ready", _START_S)
         self.grants = self.about["grants"]
+        if realtime.plant_process:
+            grants = self._answer("ready", _START_S, "plant")["grants"]
+            self.grants = self.grants + [{**grant, "name": f"plant: {grant['name']}"} for grant in grants]
         self._until(lambda: self.block.words[Word.RECORDER_ALIVE] != 0, _START_S, "The recorder did not start")
 
     def _spawn(self, name: str, arguments: list[str], descriptors: tuple[int, ...] = ()) -> None:
@@ -123,6 +140,12 @@ class LiveLink:
         self._processes[name] = subprocess.Popen(
             [sys.executable, *arguments], pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True
         )
+
+    def _spawn_piped(self, name: str, module: str) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._spawn(name, ["-m", module, str(theirs.fileno())], (theirs.fileno(),))
+        self._pipes[name] = Connection(ours.detach())
 
     @property
     def pids(self) -> dict[str, int]:
@@ -132,6 +155,9 @@ class LiveLink:
     def place(self, scene: Any, seed: int) -> None:
         """Put the robot into a scene, at rest; its loop stands."""
         self.pause()
+        if "plant" in self._pipes:  # first: the cerebellum starts from where the robot is
+            self._ask("place", scene, seed, to="plant")
+            self._answer("place", _ANSWER_S, "plant")
         self._ask("place", scene, seed)
         self._answer("place", _ANSWER_S)
 
@@ -140,7 +166,14 @@ class LiveLink:
         words = self.block.words
         words[Word.PAUSE] = 0
         stretch = int(words[Word.STRETCH])
-        start = time.monotonic_ns() + round(_HEAD_START_S * NANOSECONDS)
+        has_plant = "plant" in self._pipes
+        start = time.monotonic_ns() + round(_HEAD_START_S * (1 + has_plant) * NANOSECONDS)
+        if has_plant:
+            self._ask("run", start, to="plant")
+            self._answer("run", _ANSWER_S, "plant")
+            answered = time.monotonic_ns()
+            # The first frame's observation is to be of now.
+            self._until(lambda: words[Word.PLANT_ALIVE] > answered, _ANSWER_S, "The plant did not start")
         self._ask("run", start)
         self._running = True
         self._until(lambda: words[Word.STRETCH] > stretch, _ANSWER_S, "The loop did not start")
@@ -153,10 +186,12 @@ class LiveLink:
         if self._running:
             self.block.words[Word.PAUSE] = 1
             self._answer("run", _ANSWER_S)
+            if "plant" in self._pipes:
+                self._answer("stood", _ANSWER_S, "plant")
             self._running = False
 
     def check(self) -> None:
-        """Raise if a process has ended.
+        """Raise if a process has ended, or the plant's is stopped.
 
         Raises:
             RealtimeError: names it, and what became of the robot.
@@ -165,11 +200,22 @@ class LiveLink:
             status = process.poll()
             if status is not None:
                 how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
-                what = {
-                    "cerebellum": "The simulated robot ended with it.",
-                    "recorder": "The robot decelerates and holds.",
-                }[name]
-                raise RealtimeError(f"The {name}'s process {how}. {what} Episodes that were saved are intact.")
+                self._complain(name, how)
+        if self._running and "plant" in self._pipes:
+            silence = time.monotonic_ns() - int(self.block.words[Word.PLANT_ALIVE])
+            if silence > _SILENCE_S * NANOSECONDS:
+                self._complain(
+                    "plant", f"({self.pids['plant']}) has shown no sign of life for {silence / NANOSECONDS:.1f} s"
+                )
+
+    def _complain(self, name: str, how: str) -> NoReturn:
+        alone = "plant" not in self._pipes
+        what = {
+            "cerebellum": "The simulated robot ended with it." if alone else "The plant stops the robot by itself.",
+            "recorder": "The robot decelerates and holds.",
+            "plant": "The cerebellum is in FAULT; the simulated robot stands still.",
+        }[name]
+        raise RealtimeError(f"The {name}'s process {how}. {what} Episodes that were saved are intact.")
 
     def close(self) -> None:
         """End all processes. May be called twice."""
@@ -177,9 +223,9 @@ class LiveLink:
             return
         words = self.block.words
         words[Word.PAUSE] = words[Word.END] = 1
-        if self._connection is not None:
+        for pipe in self._pipes.values():
             with contextlib.suppress(OSError):
-                self._connection.send(("end",))
+                pipe.send(("end",))
         for process in self._processes.values():
             try:
                 process.wait(5.0)
@@ -190,8 +236,8 @@ class LiveLink:
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join(5.0)
-        if self._connection is not None:
-            self._connection.close()
+        for pipe in self._pipes.values():
+            pipe.close()
         self.block.close()
 
     # --- waiting -----------------------------------------------------------------------------------------------------
@@ -216,34 +262,35 @@ class LiveLink:
                 raise RealtimeError(f"{message} within {seconds:g} s.")
             self.wait()
 
-    def _ask(self, kind: str, *arguments: Any) -> None:
-        if self._connection is None:
-            raise RealtimeError("The robot's processes have ended.")
+    def _ask(self, kind: str, *arguments: Any, to: str = "cerebellum") -> None:
         try:
-            self._connection.send((kind, *arguments))
+            self._pipe(to).send((kind, *arguments))
         except OSError:
             self.check()
             raise
 
-    def _answer(self, wanted: str, seconds: float) -> Any:
-        connection = self._connection
-        if connection is None:
+    def _pipe(self, name: str) -> Connection:
+        if self._stop.is_set():
             raise RealtimeError("The robot's processes have ended.")
+        return self._pipes[name]
+
+    def _answer(self, wanted: str, seconds: float, name: str = "cerebellum") -> Any:
+        connection = self._pipe(name)
         end = time.monotonic() + seconds
         while not connection.poll(0.01):
             self.check()
             if time.monotonic() > end:
-                raise RealtimeError(f"The real-time process did not answer ({wanted}) within {seconds:g} s.")
+                raise RealtimeError(f"The {name}'s process did not answer ({wanted}) within {seconds:g} s.")
         try:
             kind, value = connection.recv()
         except (EOFError, OSError):
-            self._processes["cerebellum"].wait(5.0)
+            self._processes[name].wait(5.0)
             self.check()
-            raise RealtimeError("The real-time process closed its pipe.") from None
+            raise RealtimeError(f"The {name}'s process closed its pipe.") from None
         if kind in ("failed", "refused"):
-            raise RealtimeError(f"The real-time process could not do what was asked: {value}")
+            raise RealtimeError(f"The {name}'s process could not do what was asked: {value}")
         if kind != wanted:
-            raise RealtimeError(f"The real-time process answered {kind!r} where {wanted!r} was expected.")
+            raise RealtimeError(f"The {name}'s process answered {kind!r} where {wanted!r} was expected.")
         return value
 
 

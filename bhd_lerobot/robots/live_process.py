@@ -1,5 +1,7 @@
 """The real-time process: cerebellum and simulated plant of one robot, ticking on the wall clock.
 
+With a plant in a process of its own (`plant_process`) the cerebellum runs here alone, against what that one publishes.
+
 Started by `LiveLink` as a program of its own, ``python -m bhd_lerobot.robots.live_process``, never forked and not by
 `multiprocessing`, whose children import the main module of their parent: it imports neither torch nor LeRobot. While
 its loop stands it takes messages from a pipe; while the loop runs it reads shared memory only.
@@ -15,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -25,15 +27,18 @@ from bhd_lerobot.control.live_block import LiveBlock, Phase, Word
 from bhd_lerobot.control.live_sections import cerebellum_side, plan_link
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.control.planning import Planning
+from bhd_lerobot.control.plant_link import PlantLink
 from bhd_lerobot.control.privileges import Privileges, RealtimeSettings
 from bhd_lerobot.control.realtime import LoopLimits, RealtimeLoop
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.robots.live_state import StatePublisher
+from bhd_lerobot.robots.remote_plant import RemoteSimulation
 from bhd_lerobot.robots.simulation import Simulation
 
 _WARM_UP_S = 0.2  # ticks before the first real one: caches, pages and branches are as they will be
 _POLL_S = 0.02
+_LATCHED = (Mode.ESTOP, Mode.FAULT)
 _ORPHAN_S = 5.0  # so long at the most a robot whose brain is gone may take to come to rest before the process ends
 
 
@@ -87,11 +92,16 @@ class LiveProcess:
         self._words = self._block.words
         dof = len(spec.body.chain.joints) if isinstance(spec.body, Arm) else 0
         planning = plan_link(self._block, dof, spec.rates.control_hz)
-        self._simulation = simulation = spec.make_simulation(planning)
+        simulation = spec.make_simulation(planning)
+        link = PlantLink.of(self._block)
+        self._remote = None if link is None else RemoteSimulation(simulation, link)
+        self._simulation = simulation = simulation if self._remote is None else self._remote
         cerebellum = simulation.cerebellum
         cerebellum.fifo, cerebellum.estop_word = self._block.fifo, self._block.estop_word
         self._serve_bridge = cerebellum_side(self._block, cerebellum)
         self._publisher = StatePublisher(simulation, self._block.ring)
+        if self._remote is not None:
+            self._publisher = StatePublisher(simulation, self._block.ring, self._remote.sensed_ns)
         period = NANOSECONDS // spec.rates.control_hz
         self._statistics = TimingStatistics(period, self._block.section("statistics"))
         self._warm_up_ticks = round(_WARM_UP_S * spec.rates.control_hz)
@@ -163,7 +173,11 @@ class LiveProcess:
         return grid.executed, grid.skipped
 
     def _serve(self, now_ns: int) -> None:
+        mode = self._simulation.cerebellum.mode
+        was_latched = mode[0] in _LATCHED
         self._serve_bridge(now_ns)
+        if was_latched and self._remote is not None and mode[0] not in _LATCHED:
+            self._remote.resume()
         if os.getppid() == self._parent:
             return
         # Nobody is left to work for: come to rest (the watchdog on the brain sees to that), then end.
@@ -183,15 +197,32 @@ class LiveProcess:
         self._block.close()
 
 
-def main() -> int:
-    """Run the process; its one argument is the descriptor of the pipe."""
+class Worker(Protocol):
+    """What one of the robot's real-time processes does."""
+
+    def work(self) -> None:
+        """Take messages until the brain's process says end, or is gone."""
+
+    def close(self) -> None:
+        """Free everything."""
+
+
+def run_worker(make: Callable[[LiveSpec, Connection], Worker]) -> int:
+    """Run a real-time process; the program's one argument is the descriptor of its pipe.
+
+    Args:
+        make: makes what it runs, from what the brain's process sends and the pipe.
+
+    Returns:
+        The process's exit status.
+    """
     connection = Connection(int(sys.argv[1]))
     # Keys of the terminal are for the brain's process, which decides what becomes of the robot.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     spec: LiveSpec = connection.recv()
     try:
         with Privileges() as privileges:
-            process = LiveProcess(spec, connection)
+            process = make(spec, connection)
             try:
                 grants = [grant.as_dict() for grant in privileges.acquire(spec.privileges)]
                 heavy = sorted({"torch", "lerobot"} & set(sys.modules))
@@ -209,4 +240,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_worker(LiveProcess))
