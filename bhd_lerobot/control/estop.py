@@ -47,6 +47,30 @@ def estop_signal(name: str) -> signal.Signals:
     return signal.Signals[wanted]
 
 
+def check_source(source: Source, period_s: float = POLL_S) -> int | None:
+    """Return the file descriptor of a button, or None for a callable.
+
+    Raises:
+        ConfigError: it is neither, the descriptor is not open, or the period is not positive.
+    """
+    fileno = getattr(source, "fileno", None)
+    if isinstance(source, int) or fileno is not None:
+        try:
+            descriptor = source if isinstance(source, int) else int(fileno())
+            os.fstat(descriptor)
+        except (OSError, ValueError, OverflowError) as error:
+            raise ConfigError(f"The emergency stop's input {source!r} cannot be used: {error}.") from None
+        return descriptor
+    if not callable(source):
+        raise ConfigError(
+            f"An input of the emergency stop is {source!r}; give a file descriptor, an object with fileno(), "
+            "or a callable that returns whether it is pressed."
+        )
+    if not 0 < period_s < math.inf:
+        raise ConfigError(f"period_s is {period_s}; it must be positive and finite.")
+    return None
+
+
 class EstopInputs:
     """Inputs in the brain's process that press the emergency stop.
 
@@ -95,28 +119,16 @@ class EstopInputs:
         Raises:
             ConfigError: it is neither, the descriptor is not open, or the period is not positive.
         """
+        descriptor = check_source(source, period_s)
         name = name or f"input {len(self._hear) + len(self._silence)}"
-        fileno = getattr(source, "fileno", None)
-        descriptor = source if isinstance(source, int) else fileno() if fileno else None
         if descriptor is not None:
-            try:
-                os.fstat(descriptor)
-            except OSError as error:
-                raise ConfigError(f"The emergency stop's input {source!r} cannot be used: {error.strerror}.") from None
             self._watch(descriptor, partial(self._hear_button, descriptor, name))
-        elif not callable(source):
-            raise ConfigError(
-                f"An input of the emergency stop is {source!r}; give a file descriptor, an object with fileno(), "
-                "or a callable that returns whether it is pressed."
-            )
-        elif not 0 < period_s < math.inf:
-            raise ConfigError(f"period_s is {period_s}; it must be positive and finite.")
-        else:
-            name = name if name not in self._silence else f"{name} ({len(self._silence)})"
-            rounds = math.ceil((_SILENCE_S + period_s) / _ROUND_S)
-            self._silence[name] = rounds
-            self._run_thread(f"bhd-estop {name}", self._ask, source, name, period_s, rounds)
-            self._start()
+            return
+        name = name if name not in self._silence else f"{name} ({len(self._silence)})"
+        rounds = math.ceil((_SILENCE_S + period_s) / _ROUND_S)
+        self._silence[name] = rounds
+        self._run_thread(f"bhd-estop {name}", self._ask, source, name, period_s, rounds)
+        self._start()
 
     def add_key(self, descriptor: int | None = None) -> bool:
         """Let space and ``e`` in the terminal press; return whether there is a terminal to do so.

@@ -13,6 +13,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import CommandResult
+from bhd_lerobot.control.estop import POLL_S, EstopInputs, Source, check_source
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
 from bhd_lerobot.robots.live_simulation import LiveSimulation, make_live
@@ -47,6 +48,8 @@ class SimulatedRobot(Robot):
         self._simulation: Simulation | None = None
         self._last_observation: dict[str, Any] | None = None
         self._results: list[CommandResult] = []
+        self._estop_sources: list[tuple[Source, str, float]] = []
+        self._estop_inputs: EstopInputs | None = None
         # lerobot-record asks for its length, with or without cameras.
         self.cameras: dict[str, Any] = dict.fromkeys(self.camera_shapes)
 
@@ -112,9 +115,10 @@ class SimulatedRobot(Robot):
             self.restart()
             for name in self.camera_shapes:
                 self._simulation.render(0, name)
+            for source in self._estop_sources:
+                self._listen(*source)
         except BaseException:
-            self._simulation.close()
-            self._simulation = None
+            self.disconnect()
             raise
         _connected.add(self)
 
@@ -124,6 +128,9 @@ class SimulatedRobot(Robot):
 
     def disconnect(self) -> None:
         """Stop the simulation. May be called at any time, also twice."""
+        if self._estop_inputs is not None:
+            self._estop_inputs.close()
+            self._estop_inputs = None
         if self._simulation is not None:
             self._simulation.close()
             self._simulation = None
@@ -273,6 +280,29 @@ class SimulatedRobot(Robot):
         This is a software stop, not a certified safety function.
         """
         self.simulation.bridge.estop()
+
+    def add_estop_input(self, source: Source, name: str = "", period_s: float = POLL_S) -> None:
+        """Let a physical button press the emergency stop while the robot is connected, now and at later times.
+
+        Args:
+            source: a file descriptor or an object with one: any byte presses, and so does its end or an error, a wire
+                that is cut. Or a callable, asked again and again: it presses when it returns something true, raises, or
+                does not return for a second.
+            name: what it is called.
+            period_s: time between two questions to a callable [s].
+
+        Raises:
+            ConfigError: it is neither, the descriptor is not open, or the period is not positive.
+        """
+        check_source(source, period_s)
+        if self.is_connected:
+            self._listen(source, name, period_s)
+        self._estop_sources.append((source, name, period_s))
+
+    def _listen(self, source: Source, name: str, period_s: float) -> None:
+        if self._estop_inputs is None:
+            self._estop_inputs = EstopInputs(self.simulation.bridge.estop)
+        self._estop_inputs.add(source, name, period_s)
 
     def reset(self) -> None:
         """Clear an emergency stop, a fault or a deactivation. The robot moves again only after `activate`.

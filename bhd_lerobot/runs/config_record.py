@@ -5,6 +5,7 @@ from typing import Any
 
 from lerobot.robots.config import RobotConfig
 
+from bhd_lerobot.control.estop import estop_signal
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.config_brain import BrainConfig
@@ -60,6 +61,9 @@ class RecordConfig:
         resume: continue the dataset at `dataset.root`, or start it if there is none.
         output_dir: run folder, for the resolved configuration and pictures; a new one in `outputs/record` if nothing.
         preview_video: make an MP4 of the first episode; if nothing, where images can be rendered.
+        estop_key: space or `e` in the terminal is an emergency stop; if nothing, where there is a terminal and the
+            robot runs on the wall clock.
+        estop_signal: this signal is an emergency stop, too: `SIGUSR1`, `SIGUSR2` or `SIGQUIT`.
         display_data: show what happens live in Rerun or Foxglove; of robots side by side the first. The names of these
             options are those of `lerobot-record`.
         display_mode: where: `rerun` or `foxglove`.
@@ -82,6 +86,8 @@ class RecordConfig:
     resume: bool = False
     output_dir: str | None = None
     preview_video: bool | None = None
+    estop_key: bool | None = None
+    estop_signal: str = "SIGUSR1"
     display_data: bool = False
     display_mode: str = "rerun"
     display_ip: str | None = None
@@ -123,6 +129,7 @@ class RecordConfig:
         if self.seed < 0:
             raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
         check_options(self)
+        estop_signal(self.estop_signal)
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
         robot: Any = self.robot

@@ -1,5 +1,6 @@
 """`bhd-record`: episodes of a simulated robot, driven by a brain, into a LeRobotDataset."""
 
+import os
 import sys
 import time
 from collections import Counter
@@ -17,6 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
 from bhd_lerobot.data.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
 from bhd_lerobot.data.identity import default_root
@@ -36,6 +38,7 @@ from bhd_lerobot.runs.registry import make_brain, make_robot, make_simulation, m
 from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
 from bhd_lerobot.tasks.task import Task, episode_seed
 
+ESTOP_STATUS = 3  # exit status of a run that an emergency stop ended
 _ATTEMPTS = 3  # that an episode gets to be punctual
 
 
@@ -56,6 +59,7 @@ class RecordResult:
         simulated_s: simulated time of the episodes that this run added [s].
         wall_s: time that this took [s], from the first observation to the last save.
         stopped_by: the signal that ended the run early, or None.
+        estop: what pressed the emergency stop that ended the run, in words; None if there was none.
     """
 
     root: Path
@@ -70,6 +74,14 @@ class RecordResult:
     simulated_s: float = 0.0
     wall_s: float = 0.0
     stopped_by: StopRequest | None = None
+    estop: str | None = None
+
+    @property
+    def exit_status(self) -> int:
+        """The program's exit status: 0 if the dataset is complete."""
+        if self.estop is not None:
+            return ESTOP_STATUS
+        return self.stopped_by.exit_status if self.stopped_by else 0
 
     @property
     def real_time_factor(self) -> float:
@@ -93,7 +105,9 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     n = 1 if config.robot.clock == "realtime" else min(config.n_envs, config.dataset.num_episodes)
     simulation = make_robot(config.robot, n, config.threads)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
-    with closing(simulation), stop_on_signals() as stop:
+    pressed = EstopInputs(simulation.bridge.estop)
+    with closing(simulation), stop_on_signals() as stop, pressed:
+        _add_estop_inputs(config, pressed, console)
         task = make_task(config.task, simulation.n, config.dataset.fps)
         brain = make_brain(config.brain)
         # A brain that does not fit the robot fails here, before a dataset exists.
@@ -109,6 +123,8 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
             if recorder.repair_report:
                 console.print(f"Mended before resuming: {recorder.repair_report}")
             trajectories, first = _run(config, recorder, loop, result, console)
+        if loop.emergency_stop:
+            result.estop = ", ".join(pressed.causes) or "from another process"
     if trajectories:
         heading = f"{task.name}, {brain.name}: {result.successes} of {result.recorded} episodes succeeded"
         draw_trajectories(trajectories, output_dir / "trajectories.png", heading)
@@ -118,7 +134,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         preview.write_strip(first.scene, states, output_dir / "episode.png")
         preview.close()
     _summary(console, config, result, preview is not None and first is not None)
-    if config.dataset.push_to_hub and not stop:
+    if config.dataset.push_to_hub and result.exit_status == 0:
         _push(config, root)
     return result
 
@@ -180,6 +196,9 @@ def _episodes(
                 episode = next(run_once, None)
             if episode is None:
                 return
+            if loop.emergency_stop:  # it is not run again, however punctual it was
+                yield episode
+                return
             why = verdict(episode.timing, loop.tolerance)
             if why is None:
                 yield episode
@@ -192,6 +211,23 @@ def _episodes(
                 f"Episode {spec.index} was too unpunctual {_ATTEMPTS} times. Those before it are saved. Mend the cause "
                 "and go on with --resume=true, or save such episodes too, flagged, with --timing.reject=false."
             )
+
+
+def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Console) -> None:
+    """Let a signal and, in a terminal, a key press the emergency stop.
+
+    Raises:
+        ConfigError: a key was asked for where there is no terminal.
+    """
+    is_live = config.robot.clock == "realtime"
+    number = estop_signal(config.estop_signal)
+    pressed.add_signal(number)
+    has_key = (is_live if config.estop_key is None else config.estop_key) and pressed.add_key()
+    if config.estop_key and not has_key:
+        raise ConfigError("estop_key is true, but standard input is no terminal that this program has to itself.")
+    if is_live:
+        key = "space or e, or " if has_key else ""
+        console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} {os.getpid()}")
 
 
 def _tell_refusals(simulation: Simulation, console: Console) -> None:
@@ -331,6 +367,11 @@ def _summary(console: Console, config: RecordConfig, result: RecordResult, film:
     ]
     table.add_row("run folder", f"{result.output_dir}: {', '.join(files)}")
     console.print(table)
+    if result.estop is not None:
+        console.print(
+            f"[bold]Emergency stop ({escape(result.estop)}).[/bold] The episode that was running is saved with the "
+            "outcome 'estop', and no other was begun. Clear the cause and go on with --resume=true."
+        )
     if result.stopped_by:
         console.print(
             f"Stopped by {result.stopped_by.name}. Episodes that were running were dropped, all others are saved. "
@@ -354,7 +395,7 @@ def _push(config: RecordConfig, root: Path) -> None:
 
 def _main(config: RecordConfig) -> int:
     result = record(config)
-    return result.stopped_by.exit_status if result.stopped_by else 0
+    return result.exit_status
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -13,10 +13,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
+import numpy as np
 import pytest
 
 from bhd_lerobot.control.estop import SIGNALS, EstopInputs, estop_signal
+from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.errors import ConfigError
+from tests.control.support import Rig
 
 
 class Button:
@@ -222,6 +225,27 @@ def test_signals_by_name():
 def test_what_is_no_input_is_refused(inputs, source, period, message):
     with pytest.raises(ConfigError, match=message):
         inputs.add(source, period_s=period)
+
+
+def test_a_closed_file_is_no_input(inputs):
+    with open(os.devnull) as file:
+        pass
+    with pytest.raises(ConfigError, match="closed file"):
+        inputs.add(file)
+
+
+def test_an_emergency_stop_that_no_tick_has_seen_survives_a_restart():
+    """Pressed between two episodes: the next one begins stopped."""
+    rig = Rig()
+    rig.cerebellum.estop_word[0] = 1
+    rig.cerebellum.restart(np.arange(1))
+    rig.request(Request.CONFIGURE)
+    rig.request(Request.ACTIVATE)
+    rig.tick()
+    assert rig.mode == Mode.ESTOP
+    rig.cerebellum.restart(np.arange(1))  # this one was seen: a new episode is a new beginning
+    rig.tick()
+    assert rig.mode == Mode.UNCONFIGURED
 
 
 def test_after_close_nothing_presses_and_no_thread_is_left(button, wire):
