@@ -52,7 +52,12 @@ class LockstepBridge:
         return self._tick * NANOSECONDS // self.rates.control_hz
 
     def send(
-        self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, due_ns: int | None = None
+        self,
+        values: NDArray[np.float64],
+        mask: NDArray[np.bool_] | None = None,
+        due_ns: int | None = None,
+        *,
+        replaces: bool = False,
     ) -> SendResult:
         """Send one setpoint.
 
@@ -60,19 +65,22 @@ class LockstepBridge:
             values: the commands, shape (n, width).
             mask: the simulations it is for, shape (n,); all if None.
             due_ns: when it takes effect [ns]; now if None.
+            replaces: whether it takes the place of what was sent before and is not due yet.
         """
         self._sequence += 1
-        return self.cerebellum.offer(Setpoint(self._sequence, self.now_ns if due_ns is None else due_ns, values), mask)
+        due = self.now_ns if due_ns is None else due_ns
+        return self.cerebellum.offer(Setpoint(self._sequence, due, values, replaces), mask)
 
-    def send_chunk(self, values: NDArray[np.float64]) -> list[SendResult]:
-        """Send several setpoints, one for each coming frame.
+    def send_chunk(self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> list[SendResult]:
+        """Send an action chunk: several setpoints, one for each coming frame, in place of what is left of the last.
 
         Args:
             values: the commands, shape (frames, n, width).
+            mask: the simulations it is for, shape (n,); all if None.
         """
         frame = self.rates.ticks_per_frame
         return [
-            self.send(row, due_ns=(self._tick + k * frame) * NANOSECONDS // self.rates.control_hz)
+            self.send(row, mask, (self._tick + k * frame) * NANOSECONDS // self.rates.control_hz, replaces=k == 0)
             for k, row in enumerate(values)
         ]
 

@@ -164,7 +164,10 @@ class Cerebellum:
         """Take what is due from the queue, in order; the newest that is due wins."""
         due = self.fifo.next_due()
         while due is not None and due <= now_ns:
-            self.fifo.pop(self._popped, self._popped_mask)
+            popped = self.fifo.pop(self._popped, self._popped_mask)
+            if popped is not None:
+                # What was sent before and is due later belongs to an action chunk that a newer one took the place of.
+                self.fifo.drop_older(popped[0], self._popped_mask)
             # Modes may have changed since the command was sent.
             reasons = self._mode_reasons()
             reasons[(reasons == Reason.ACCEPTED) & (now_ns - due > self._timeout_ns)] = Reason.STALE
@@ -258,7 +261,9 @@ class Cerebellum:
             self._count_refusals(reasons)
             return SendResult(reasons)
         reasons = self._mode_reasons()
-        late = (setpoint.sequence <= self._sent_sequence) | (setpoint.due_ns < self._sent_due)
+        late = setpoint.sequence <= self._sent_sequence
+        if not setpoint.replaces:
+            late |= setpoint.due_ns < self._sent_due
         reasons[(reasons == Reason.ACCEPTED) & late] = Reason.OUT_OF_ORDER
         if not np.isfinite(values).all():
             reasons[~np.isfinite(values).all(axis=1)] = Reason.NON_FINITE

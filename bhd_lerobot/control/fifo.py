@@ -27,7 +27,7 @@ class CommandFifo:
         buffer: memory of at least `nbytes(n, width, capacity)` bytes, zeroed before its first use; new memory if None.
     """
 
-    def __init__(self, n: int, width: int, capacity: int = 64, buffer: Any = None) -> None:
+    def __init__(self, n: int, width: int, capacity: int = 256, buffer: Any = None) -> None:
         if capacity < 1:
             raise ConfigError(f"The command queue's capacity is {capacity}; it must be at least 1.")
         self.n, self.width, self.capacity = n, width, capacity
@@ -58,7 +58,7 @@ class CommandFifo:
         )
 
     @classmethod
-    def nbytes(cls, n: int, width: int, capacity: int = 64) -> int:
+    def nbytes(cls, n: int, width: int, capacity: int = 256) -> int:
         """Return the size of the memory block [bytes]."""
         return 16 + capacity * cls._dtype(n, width).itemsize
 
@@ -122,20 +122,38 @@ class CommandFifo:
         self._look()
         return dropped
 
+    def drop_older(self, sequence: int, mask: NDArray[np.bool_]) -> None:
+        """Drop what was sent to some simulations before a sequence number and still waits. For the reader.
+
+        Args:
+            sequence: the sequence number.
+            mask: the simulations, shape (n,).
+        """
+        if int(self._tail[0]) == int(self._head[0]):
+            return
+        slots = np.arange(int(self._tail[0]), int(self._head[0])) % self.capacity
+        older = slots[self._sequence[slots] < sequence]
+        if len(older):
+            self._mask[np.ix_(older, np.flatnonzero(mask))] = False
+            self._look()
+
     def _look(self) -> None:
         """Find the next entry, and give up the oldest entries that nobody waits for any more."""
         tail, head = int(self._tail[0]), int(self._head[0])
         self._seen_head = head
         self._next, self._next_due = None, None
-        for entry in range(tail, head):
-            slot = entry % self.capacity
-            if self._mask[slot].any():
-                due = int(self._due[slot])
-                if self._next_due is None or due < self._next_due:
-                    self._next, self._next_due = entry, due
-            elif self._next is None:
-                tail = entry + 1
-        self._tail[0] = tail
+        if tail == head:
+            return
+        # All at once: a chunk of actions is a hundred entries, and this is asked within a tick.
+        slots = np.arange(tail, head) % self.capacity
+        waiting = np.flatnonzero(self._mask[slots].any(axis=1))
+        if not len(waiting):
+            self._tail[0] = head
+            return
+        first = int(self._due[slots[waiting]].argmin())  # of equal ones the first
+        self._next = tail + int(waiting[first])
+        self._next_due = int(self._due[slots[waiting[first]]])
+        self._tail[0] = tail + int(waiting[0])
 
 
 class StateRing:

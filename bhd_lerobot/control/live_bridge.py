@@ -68,7 +68,12 @@ class LiveBridge:
     # --- setpoints ---------------------------------------------------------------------------------------------------
 
     def send(
-        self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, due_ns: int | None = None
+        self,
+        values: NDArray[np.float64],
+        mask: NDArray[np.bool_] | None = None,
+        due_ns: int | None = None,
+        *,
+        replaces: bool = False,
     ) -> SendResult:
         """Send one setpoint.
 
@@ -76,10 +81,13 @@ class LiveBridge:
             values: the command, shape (1, width).
             mask: whether it is sent at all, shape (1,); it is if None.
             due_ns: when it takes effect [ns]; at the next tick if None.
+            replaces: whether it takes the place of what was sent before and is not due yet.
         """
         if mask is not None and not mask[0]:
             return SendResult(np.zeros(1, np.int8))
         due = self.now_ns if due_ns is None else due_ns
+        if replaces:
+            self._last_due = due
         reason = self._refusal(values, due)
         if reason == Reason.ACCEPTED:
             self._sequence += 1
@@ -102,14 +110,21 @@ class LiveBridge:
         return Reason.ACCEPTED if np.isfinite(values).all() else Reason.NON_FINITE
 
     def send_chunk(self, values: NDArray[np.float64], start_ns: int | None = None) -> list[SendResult]:
-        """Send several setpoints, one for each coming frame.
+        """Send an action chunk: several setpoints, one for each coming frame, in place of what is left of the last.
 
         Args:
             values: the commands, shape (frames, 1, width).
-            start_ns: when the first takes effect [ns]; at the next tick if None.
+            start_ns: when the first takes effect [ns]; at the next tick if None. Those whose frame has gone by already
+                are left out: a brain that took its time does not make the robot hurry.
         """
-        start = self.now_ns if start_ns is None else start_ns
-        return [self.send(row, due_ns=start + k * NANOSECONDS // self.rates.fps) for k, row in enumerate(values)]
+        now = self.now_ns
+        start = now if start_ns is None else start_ns
+        frame = NANOSECONDS // self.rates.fps
+        results: list[SendResult] = []
+        for k, row in enumerate(values):
+            if start + (k + 1) * frame > now:
+                results.append(self.send(row, due_ns=max(now, start + k * frame), replaces=not results))
+        return results
 
     # --- goals -------------------------------------------------------------------------------------------------------
 

@@ -133,11 +133,14 @@ class Setpoint:
         sequence: counts up with every setpoint of one sender.
         due_ns: when it is to take effect, on the cerebellum's clock [ns].
         values: the command, shape (n, width), in the units of the action features.
+        replaces: whether it takes the place of what was sent before and is not due yet: the first of a new action
+            chunk. Otherwise it must not be due before what was sent before.
     """
 
     sequence: int
     due_ns: int
     values: NDArray[np.float64]
+    replaces: bool = False
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,9 @@ class EpisodeLoop:
                     episode = self._finish(sim, event)
                     done[episode.spec.index] = episode
                     self.emergency_stop |= event == Event.ESTOP
-                ids = np.array([sim for sim, _ in finished], np.intp)
+                if not finished:
+                    continue
+                ids = np.array([sim for sim, _ in finished])
                 self.simulation.stop(ids)
                 # Before others start: on the wall clock they would begin while these are still being saved.
                 while order and order[0] in done:
