@@ -43,6 +43,20 @@ class Goals:
     commands: Mapping[int, Sequence[BrainCommand]]
 
 
+@dataclass(frozen=True)
+class Chunk:
+    """What a brain wants that plans several frames ahead.
+
+    Each action takes effect when its frame begins, whatever the brain is doing then. A new chunk takes the place of
+    what is left of the last; when one is used up, the robot holds.
+
+    Attributes:
+        actions: for this frame and those after it, shape (frames, n, actions), in the order of the action features.
+    """
+
+    actions: NDArray[np.float64]
+
+
 class Brain(Protocol):
     """A rule or a network that drives n robots.
 
@@ -87,8 +101,12 @@ class Brain(Protocol):
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the plan of one simulation, as plain values; of a brain that `has_plan`."""
 
-    def act(self, observation: Observation) -> NDArray[np.float64] | Goals:
-        """Return setpoints, shape (n, actions), in the order of the action features, or goals; always the same kind."""
+    def act(self, observation: Observation) -> "NDArray[np.float64] | Goals | Chunk | None":
+        """Return what the robots are to do.
+
+        Setpoints for this frame, shape (n, actions), in the order of the action features; or a chunk of them, or None
+        to go on with the last chunk; or goals. A brain gives goals always or never.
+        """
 
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the brain, as plain values."""

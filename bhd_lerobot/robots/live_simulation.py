@@ -18,7 +18,7 @@ from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.control.live_block import Word
 from bhd_lerobot.control.live_bridge import LiveBridge
-from bhd_lerobot.control.messages import NANOSECONDS, SendResult
+from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.robots.live_link import LiveLink
@@ -205,6 +205,25 @@ class LiveSimulation(Simulation):
         """Send a setpoint, and wait for the end of the present frame."""
         sent, refusals = self.send(action, self.running if mask is None else mask & self.running)
         return self.wait(sent, refusals=refusals)
+
+    def follow(self, actions: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> FrameReport:
+        """Send an action chunk that begins with the present frame, and wait for the end of the frame that it is now."""
+        mask = self.running if mask is None else mask & self.running
+        self._show(self.live_bridge.latest)
+        rows: list[NDArray[np.float64]] = []
+        refusals: dict[int, str] = {}
+        reason = int(Reason.ACCEPTED)
+        for action in actions:
+            setpoints, refused = self.mirror.to_setpoints(action, mask)
+            if refused:
+                reason, refusals[0] = int(refused[0][0]), refused[0][1]
+                break
+            rows.append(setpoints)
+        if rows and mask[0]:
+            start = int(self._boundary["frame"]) * self._frame_ns
+            results = self.live_bridge.send_chunk(np.array(rows), start)
+            reason = next((int(one.reasons[0]) for one in results if one.reasons[0]), reason)
+        return self.wait(SendResult(np.array([reason], np.int8)), refusals=refusals)
 
     def pursue(self, commands: Mapping[int, Sequence[BrainCommand]]) -> FrameReport:
         """Send goals, and wait for the end of the present frame."""

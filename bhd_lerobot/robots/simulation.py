@@ -234,6 +234,31 @@ class Simulation(ABC):
             sent.reasons[sim] = reason
         return self.wait(sent, refusals={sim: message for sim, (_, message) in refused.items()})
 
+    def follow(self, actions: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> FrameReport:
+        """Send an action chunk to running robots and let one frame go by; `wait` goes on with it.
+
+        Args:
+            actions: for this frame and those after it, shape (frames, n, actions).
+            mask: the robots that it is for, shape (n,); all that run if None.
+        """
+        mask = self.running if mask is None else mask & self.running
+        rows: list[NDArray[np.float64]] = []
+        refused: dict[int, tuple[Reason, str]] = {}
+        for action in actions:
+            setpoints, refused = self.to_setpoints(action, mask)
+            if refused:
+                break  # what comes before it is sent
+            rows.append(setpoints)
+        sent = SendResult(np.zeros(self.n, np.int8))
+        if rows:
+            results = self.bridge.send_chunk(np.array(rows), mask)
+            # What was refused first, of each robot.
+            reasons = np.array([result.reasons for result in results])
+            sent = SendResult(reasons[(reasons != 0).argmax(axis=0), np.arange(self.n)])
+        for sim, (reason, _) in refused.items():
+            sent.reasons[sim] = reason
+        return self.wait(sent, refusals={sim: message for sim, (_, message) in refused.items()})
+
     def pursue(self, commands: Mapping[int, Sequence[BrainCommand]]) -> FrameReport:
         """Send goals to running robots and let one frame go by.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import CommandResult
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.policies.brain import Brain, Goals, Observation
+from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Observation
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
 from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
 from bhd_lerobot.runs.goal_streamer import GoalStreamer
@@ -37,6 +37,7 @@ class BhdBrain(Teleoperator):
         self._brain: Brain | None = None
         self._robot: SimulatedRobot | None = None
         self._streamer: GoalStreamer | None = None
+        self._chunk: list[NDArray[np.float64]] = []
         self._results: list[CommandResult] = []
 
     @property
@@ -99,7 +100,7 @@ class BhdBrain(Teleoperator):
             names, _ = robot.environment
             self._brain.bind(robot.observation_names, robot.action_names, self.config.fps or robot.config.fps, names)
             self._brain.reset(np.zeros(1, np.intp), [self.config.seed], 1, [robot.instruction])
-            self._robot, self._streamer, self._results = robot, None, []
+            self._robot, self._streamer, self._results, self._chunk = robot, None, [], []
         seen = robot.last_observation
         state = np.array([[seen[name] for name in robot.observation_names]])
         images = {name: seen[name][None] for name in robot.camera_shapes}
@@ -111,8 +112,20 @@ class BhdBrain(Teleoperator):
         if isinstance(wanted, Goals):
             action, self._results = self._stream(robot, wanted)
         else:
-            action = wanted[0]
+            action = self._next_of_chunk(wanted) if wanted is None or isinstance(wanted, Chunk) else wanted[0]
         return dict(zip(robot.action_names, action.tolist(), strict=True))
+
+    def _next_of_chunk(self, wanted: Chunk | None) -> NDArray[np.float64]:
+        """Return what a chunk asks for over the coming frame; when it is used up, its last.
+
+        Raises:
+            ConfigError: the brain goes on with a chunk that it never gave.
+        """
+        if wanted is not None:
+            self._chunk = list(wanted.actions[:, 0])
+        if not self._chunk:
+            raise ConfigError(f"The brain {self._brain_name!r} gave neither an action nor a chunk of them.")
+        return self._chunk.pop(0) if len(self._chunk) > 1 else self._chunk[0]
 
     def _stream(self, robot: SimulatedRobot, goals: Goals) -> tuple[NDArray[np.float64], list[CommandResult]]:
         """Return the setpoint that goals mean for the coming frame, and the goals that ended."""

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
-from bhd_lerobot.control.messages import NANOSECONDS, Mode
+from bhd_lerobot.control.messages import NANOSECONDS, Mode, SendResult
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.data import features as keys
-from bhd_lerobot.policies.brain import Brain, Goals, Observation
+from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Observation
 from bhd_lerobot.robots.simulation import FrameReport, Simulation
 from bhd_lerobot.tasks.task import Event, Outcome, Task
 
@@ -228,6 +228,13 @@ class EpisodeLoop:
         if isinstance(decision, Goals):
             report = simulation.pursue(decision.commands)
             action = report.applied.astype(np.float32)
+        elif decision is None or isinstance(decision, Chunk):
+            if decision is None:
+                report = simulation.wait(SendResult(np.zeros(simulation.n, np.int8)))
+            else:
+                report = simulation.follow(np.asarray(decision.actions).astype(np.float32).astype(np.float64))
+            # What the chunk asks for over this frame; when it is used up, its last.
+            action = simulation.to_action(simulation.cerebellum.requested).astype(np.float32)
         else:
             action = np.asarray(decision).astype(np.float32)
             report = simulation.act(action.astype(np.float64))
