@@ -35,10 +35,18 @@ class LiveBridge:
         rates: the rates.
         client: asks for modes and goals.
         wait: waits for about a tick, and raises if there is nothing to wait for any more.
+        clock: monotonic time [ns].
     """
 
-    def __init__(self, block: LiveBlock, rates: Rates, client: RequestClient, wait: Callable[[], None]) -> None:
-        self.rates, self._wait = rates, wait
+    def __init__(
+        self,
+        block: LiveBlock,
+        rates: Rates,
+        client: RequestClient,
+        wait: Callable[[], None],
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.rates, self._wait, self._clock = rates, wait, clock
         self._block, self._client = block, client
         self._sequence, self._last_due = 0, -(1 << 62)
         self._all = np.ones(1, np.bool_)
@@ -46,7 +54,7 @@ class LiveBridge:
     @property
     def now_ns(self) -> int:
         """Time of the cerebellum: since its tick 0 was due [ns]."""
-        return time.monotonic_ns() - int(self._block.words[Word.START])
+        return self._clock() - int(self._block.words[Word.START])
 
     @property
     def latest(self) -> Any:
