@@ -12,7 +12,7 @@ from bhd_lerobot.control.frame_log import FrameCollector, FrameLog
 from bhd_lerobot.control.live_block import LiveBlock, Phase, Word
 from bhd_lerobot.errors import BhdError
 
-_PAUSE_S = 0.005  # the ring holds seconds: how soon a state is taken does not matter
+_PAUSE_S = 0.002  # the ring holds seconds, but the brain waits for the frames
 
 
 def main() -> int:

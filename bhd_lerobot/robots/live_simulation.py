@@ -136,7 +136,7 @@ class LiveSimulation(Simulation):
     @property
     def physics_state(self) -> NDArray[np.float64]:
         """Generalised positions and velocities at the start of the present frame, shape (1, nq + nv)."""
-        if self._boundary is None:
+        if self._boundary is None:  # the episode's time has not begun
             return self.mirror.physics_state
         physics: NDArray[np.float64] = self._boundary["state"]["physics"].copy()
         return physics
@@ -152,7 +152,7 @@ class LiveSimulation(Simulation):
     # --- episodes ----------------------------------------------------------------------------------------------------
 
     def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
-        """Start an episode: put the robot into its scene and let the loop run.
+        """Start an episode: put the robot into its scene. Its time begins with the first observation, or with `begin`.
 
         Raises:
             RealtimeError: a process has ended or does not answer.
@@ -161,12 +161,20 @@ class LiveSimulation(Simulation):
         link.place(scenes[0], int(seeds[0]))
         self.mirror.reset(ids, scenes, seeds)
         self.live_bridge.begin()
-        self._reader = link.log.reader()
+        self._reader = None
         self._boundary, self._shown = None, None
-        start = link.run()
-        self._origin = start - NANOSECONDS // self.rates.control_hz
         self.running[:] = True
-        self._take(0)
+
+    def begin(self) -> None:
+        """Let the loop run, if it does not yet.
+
+        Raises:
+            RealtimeError: a process has ended or does not answer.
+        """
+        if self._reader is None:
+            self._reader = self.link.log.reader()
+            self._origin = self.link.run() - NANOSECONDS // self.rates.control_hz
+            self._take(0)
 
     def stop(self, ids: NDArray[np.intp]) -> None:
         """End the episode: the loop stands."""
@@ -176,6 +184,7 @@ class LiveSimulation(Simulation):
 
     def observe(self) -> Frame:
         """Return the observation that the present frame began with; its age is what it is now."""
+        self.begin()
         self._show(self._boundary["state"])
         return self._frame_of(self._boundary["state"], time.monotonic_ns())
 

@@ -124,7 +124,10 @@ class SimulatedRobot(Robot):
 
     def restart(self) -> None:
         """Put the robot back to the start of its scene, at rest."""
-        self.simulation.reset(np.zeros(1, np.intp), [self.make_scene()], [self.config.seed])
+        simulation = self.simulation
+        simulation.reset(np.zeros(1, np.intp), [self.make_scene()], [self.config.seed])
+        if isinstance(simulation, LiveSimulation):
+            simulation.begin()
 
     def disconnect(self) -> None:
         """Stop the simulation. May be called at any time, also twice."""
