@@ -38,7 +38,6 @@ from bhd_lerobot.robots.simulation import Simulation
 
 _WARM_UP_S = 0.2  # ticks before the first real one: caches, pages and branches are as they will be
 _POLL_S = 0.02
-_LATCHED = (Mode.ESTOP, Mode.FAULT)
 _ORPHAN_S = 5.0  # so long at the most a robot whose brain is gone may take to come to rest before the process ends
 
 
@@ -94,14 +93,15 @@ class LiveProcess:
         planning = plan_link(self._block, dof, spec.rates.control_hz)
         simulation = spec.make_simulation(planning)
         link = PlantLink.of(self._block)
-        self._remote = None if link is None else RemoteSimulation(simulation, link)
-        self._simulation = simulation = simulation if self._remote is None else self._remote
+        remote = None if link is None else RemoteSimulation(simulation, link)
+        self._simulation = simulation = simulation if remote is None else remote
         cerebellum = simulation.cerebellum
         cerebellum.fifo, cerebellum.estop_word = self._block.fifo, self._block.estop_word
         self._serve_bridge = cerebellum_side(self._block, cerebellum)
         self._publisher = StatePublisher(simulation, self._block.ring)
-        if self._remote is not None:
-            self._publisher = StatePublisher(simulation, self._block.ring, self._remote.sensed_ns)
+        if remote is not None:
+            self._publisher = StatePublisher(simulation, self._block.ring, remote.sensed_ns)
+            self._serve_bridge = remote.resuming(self._serve_bridge)
         period = NANOSECONDS // spec.rates.control_hz
         self._statistics = TimingStatistics(period, self._block.section("statistics"))
         self._warm_up_ticks = round(_WARM_UP_S * spec.rates.control_hz)
@@ -173,11 +173,7 @@ class LiveProcess:
         return grid.executed, grid.skipped
 
     def _serve(self, now_ns: int) -> None:
-        mode = self._simulation.cerebellum.mode
-        was_latched = mode[0] in _LATCHED
         self._serve_bridge(now_ns)
-        if was_latched and self._remote is not None and mode[0] not in _LATCHED:
-            self._remote.resume()
         if os.getppid() == self._parent:
             return
         # Nobody is left to work for: come to rest (the watchdog on the brain sees to that), then end.

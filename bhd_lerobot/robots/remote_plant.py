@@ -8,9 +8,12 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.arm_controller import ArmController
 from bhd_lerobot.control.base_controller import BaseController
+from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.plant_link import PlantLink, PlantShape, RemotePlant
+from bhd_lerobot.control.realtime import Serve
 from bhd_lerobot.robots.simulation import FrameReport, Simulation
 
+_LATCHED = (Mode.ESTOP, Mode.FAULT)
 _ODOMETRY = ("x.pos", "y.pos", "theta.pos")
 
 
@@ -47,6 +50,7 @@ class RemoteSimulation(Simulation):
         self.camera_names, self.sensor_period_s = own.camera_names, own.sensor_period_s
         self._begin()
         self.remote = self.cerebellum.plant = RemotePlant(link)
+        self._taken: Any = None
         self._touches: NDArray[np.int64] = np.zeros(len(own.touches), np.int64)  # that it told of
         has_odometry = set(_ODOMETRY) <= set(own.observation_names)
         first = own.observation_names.index(_ODOMETRY[0]) if has_odometry else 0
@@ -82,8 +86,9 @@ class RemoteSimulation(Simulation):
     def advance(self) -> None:
         """Take the newest state of the plant, which goes on by itself."""
         state = self.remote.refresh()
-        if state is None:
+        if state is None or state is self._taken:
             return
+        self._taken = state
         self.tick = int(state["tick"])
         self.world.qpos[:], self.world.qvel[:] = state["qpos"], state["qvel"]
         touched = state["touches"] > self._touches
@@ -107,10 +112,24 @@ class RemoteSimulation(Simulation):
         """Return when the plant read what `sense` returned last, monotonic [ns]."""
         return int(self.remote.state["stamp_ns"])
 
-    def resume(self) -> None:
-        """Let a plant that stopped by itself be driven again, from where it is; to be called when a latch was reset."""
-        if not self.remote.has_stopped:
-            return
+    def resuming(self, serve: Serve) -> Serve:
+        """Return what answers requests, and lets a plant that stopped by itself be driven again after a reset.
+
+        Args:
+            serve: answers requests.
+        """
+        mode = self.cerebellum.mode
+
+        def serve_and_resume(now_ns: int) -> None:
+            was_latched = mode[0] in _LATCHED
+            serve(now_ns)
+            if was_latched and mode[0] not in _LATCHED and self.remote.has_stopped:
+                self._resume()
+
+        return serve_and_resume
+
+    def _resume(self) -> None:
+        """Let the plant be driven again, from where the robot is."""
         self.remote.acknowledge()
         controller = self.cerebellum.controller
         if isinstance(controller, ArmController):
