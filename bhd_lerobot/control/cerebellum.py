@@ -217,11 +217,14 @@ class Cerebellum:
         """
         if mode == Mode.FAULT:
             hit = (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT)
+            held = hit
         else:
             hit = self.mode == Mode.TRACKING
+            held = hit | (self.mode == Mode.STOPPING) | (self.mode == Mode.HOLD)
+        if len(self.fifo) and np.count_nonzero(held):
+            self.fifo.drop(np.flatnonzero(held))  # what still waits would start motion again
         if not np.count_nonzero(hit):
             return
-        self.fifo.drop(np.flatnonzero(hit))  # what still waits would start motion again
         self._watchdog[hit] |= cause
         self._set_mode(hit, mode)
 
