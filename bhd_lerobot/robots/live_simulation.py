@@ -189,10 +189,26 @@ class LiveSimulation(Simulation):
         return self._frame_of(self._boundary["state"], time.monotonic_ns())
 
     def latest(self) -> Frame:
-        """Return the newest observation, whatever frame it is in."""
-        state = self.live_bridge.latest
+        """Return the newest observation, whatever frame it is in.
+
+        Raises:
+            RealtimeError: a process has ended, or is stopped.
+        """
+        state = self._newest()
         self._show(state)
         return self._frame_of(state, time.monotonic_ns())
+
+    def _newest(self) -> Any:
+        """Return the newest state; what a process said that has ended, or is stopped, is none."""
+        self.link.check()
+        state = self.live_bridge.latest
+        silence = (time.monotonic_ns() - int(state["sensed_ns"])) / NANOSECONDS
+        if self._reader is not None and self.running[0] and silence > _SILENCE_S:
+            raise RealtimeError(
+                f"The cerebellum's process ({self.link.pids['cerebellum']}) has published nothing for {silence:.1f} s: "
+                "it is stopped, or gets no processor time. Disconnect and connect again."
+            )
+        return state
 
     def _frame_of(self, state: Any, seen_ns: int) -> Frame:
         sensed = int(state["sensed_ns"])
@@ -202,8 +218,12 @@ class LiveSimulation(Simulation):
     # --- frames ------------------------------------------------------------------------------------------------------
 
     def send(self, action: NDArray[np.float64], mask: NDArray[np.bool_]) -> tuple[SendResult, dict[int, str]]:
-        """Send a setpoint and return at once: what became of it, and in words why it was refused."""
-        self._show(self.live_bridge.latest)  # what a tool pose is solved from is where the arm is commanded to be
+        """Send a setpoint and return at once: what became of it, and in words why it was refused.
+
+        Raises:
+            RealtimeError: a process has ended, or is stopped.
+        """
+        self._show(self._newest())  # what a tool pose is solved from is where the arm is commanded to be
         setpoints, refused = self.mirror.to_setpoints(action, mask)
         if refused:
             reason, message = refused[0]
