@@ -1,0 +1,253 @@
+"""A cerebellum and a plant in two processes: the plant judges commands by their age, and stops are latched."""
+
+import mmap
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.plant_link import CommandGuard, PlantLink, PlantPhase, PlantShape, RemotePlant
+
+SHAPE = PlantShape(joints=2, positions=9, velocities=8, features=300, touches=1, kept=4)
+MS = 1_000_000
+TIMEOUT = 20 * MS
+
+
+class Rig:
+    """Both ends of a link in one process, on a virtual clock."""
+
+    def __init__(self, timeout_ns: int = TIMEOUT) -> None:
+        self.now = 1000 * MS
+        self.link = PlantLink(SHAPE)
+        self.remote = RemotePlant(self.link, lambda: self.now)
+        self.guard = CommandGuard(self.link, timeout_ns)
+        self.guard.begin()
+
+    def send(self, value: float = 1.0) -> None:
+        self.remote.write(np.full((1, 2), value))
+
+    def check(self, after_ms: float = 0.0) -> PlantPhase:
+        self.now += round(after_ms * MS)
+        return self.guard.check(self.now)
+
+    def tell(self) -> PlantReading:
+        """Publish what the guard knows, and return the cerebellum's reading of it."""
+        state = np.zeros((), SHAPE.state_dtype)
+        state["stops"], state["position"], state["velocity"] = self.guard.stops, (1.0, 2.0), (3.0, 4.0)
+        self.link.states.publish(state)
+        reading = PlantReading(1, 2)
+        self.remote.read(reading)
+        return reading
+
+    def stop(self) -> None:
+        self.send()
+        self.check()
+        assert self.check(21) == PlantPhase.STOPPED
+
+
+def test_a_plant_waits_until_it_is_commanded() -> None:
+    rig = Rig()
+    assert [rig.check(5) for _ in range(10)] == [PlantPhase.WAITING] * 10
+    rig.send(3.0)
+    assert rig.check(1) == PlantPhase.DRIVEN
+    assert rig.guard.actuators.tolist() == [[3.0, 3.0]]
+    assert rig.guard.stops == 0
+
+
+@given(
+    period=st.integers(1, 9),
+    phase=st.floats(0.0, 1.0, exclude_max=True),
+    ticks=st.integers(1, 50),
+)
+def test_silence_stops_the_plant_within_its_time_out_and_a_tick(period: int, phase: float, ticks: int) -> None:
+    rig = Rig()
+    for _ in range(ticks):
+        rig.send()
+        assert rig.check(phase * period) == PlantPhase.DRIVEN
+        rig.now += round((1 - phase) * period * MS)
+    last = rig.guard.stamp_ns
+    rig.now -= round((1 - phase) * period * MS)
+    while rig.check(period) == PlantPhase.DRIVEN:
+        assert rig.now - last <= TIMEOUT
+    assert rig.guard.stopped_ns == rig.now
+    assert TIMEOUT < rig.now - last <= TIMEOUT + period * MS
+    assert rig.guard.stops == 1
+
+
+def test_a_stop_is_latched_until_a_fresh_command_acknowledges_it() -> None:
+    rig = Rig()
+    rig.stop()
+    for _ in range(5):
+        rig.send()
+        assert rig.check(1) == PlantPhase.STOPPED
+    assert rig.tell().fault.tolist() == [True]
+    rig.remote.acknowledge()
+    assert rig.tell().fault.tolist() == [False]
+    assert rig.check(1) == PlantPhase.STOPPED  # the commands so far acknowledge nothing
+    rig.send()
+    assert rig.check(1) == PlantPhase.DRIVEN
+    assert rig.guard.stops == 1
+
+
+def test_an_old_command_acknowledges_nothing() -> None:
+    rig = Rig()
+    rig.stop()
+    rig.tell()
+    rig.remote.acknowledge()
+    rig.send()
+    assert rig.check(21) == PlantPhase.STOPPED
+
+
+def test_an_acknowledgement_is_for_the_stops_that_were_seen() -> None:
+    rig = Rig()
+    rig.tell()
+    rig.remote.acknowledge()  # of none
+    rig.stop()
+    rig.send()
+    assert rig.check(1) == PlantPhase.STOPPED
+
+
+def test_commands_of_an_earlier_stretch_do_not_drive() -> None:
+    rig = Rig()
+    rig.send()
+    rig.guard.begin()
+    assert rig.check(1) == PlantPhase.WAITING
+    rig.send()
+    assert rig.check(1) == PlantPhase.DRIVEN
+    rig.guard.begin()
+    assert rig.check(1) == PlantPhase.WAITING
+
+
+def test_a_stop_outlasts_a_pause_and_ends_with_a_new_scene() -> None:
+    rig = Rig()
+    rig.stop()
+    rig.guard.begin()
+    rig.send()
+    assert rig.check(1) == PlantPhase.STOPPED
+    rig.guard.place()
+    assert rig.check(1) == PlantPhase.WAITING
+    rig.send()
+    assert rig.check(1) == PlantPhase.DRIVEN
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_command_that_is_no_number_stops_the_plant(bad: float) -> None:
+    rig = Rig()
+    rig.send(2.0)
+    rig.check()
+    rig.send(bad)
+    assert rig.check(1) == PlantPhase.STOPPED
+    assert rig.guard.actuators.tolist() == [[2.0, 2.0]]
+
+
+def test_a_plant_that_was_away_itself_stops_although_commands_are_fresh() -> None:
+    rig = Rig()
+    rig.send()
+    rig.check()
+    rig.now += 21 * MS
+    rig.send()
+    assert rig.check() == PlantPhase.STOPPED
+
+
+def test_a_pause_is_no_absence() -> None:
+    rig = Rig()
+    rig.send()
+    rig.check()
+    rig.now += 5000 * MS
+    rig.guard.begin()
+    rig.send()
+    assert rig.check() == PlantPhase.DRIVEN
+
+
+def test_the_cerebellum_reads_the_newest_state_and_a_plant_that_tells_nothing_is_a_fault() -> None:
+    rig = Rig()
+    reading = PlantReading(1, 2)
+    rig.remote.read(reading)
+    assert reading.fault.tolist() == [True]
+    rig.remote.acknowledge()  # of nothing: refused without an error
+    reading = rig.tell()
+    assert (reading.position.tolist(), reading.velocity.tolist()) == ([[1.0, 2.0]], [[3.0, 4.0]])
+    assert reading.fault.tolist() == [False]
+
+
+def test_reading_and_writing_never_wait_for_the_other_side() -> None:
+    """Ten times as many entries as there are slots, without a reader; then the newest is there."""
+    rig = Rig()
+    for number in range(80):
+        rig.send(float(number))
+        rig.tell()
+    assert rig.check() == PlantPhase.DRIVEN
+    assert rig.guard.actuators.tolist() == [[79.0, 79.0]]
+    assert rig.guard.number == 80
+
+
+def test_sections_are_as_large_as_the_rings_need() -> None:
+    sizes = SHAPE.sections()
+    memory = {name: bytearray(size) for name, size in sizes.items()}
+    link = PlantLink(SHAPE, memory["plant_commands"], memory["plant_states"])
+    RemotePlant(link).write(np.ones((1, 2)))
+    again = PlantLink(PlantShape(**SHAPE.as_dict()), memory["plant_commands"], memory["plant_states"])
+    assert again.commands.latest()["actuators"].tolist() == [[1.0, 1.0]]  # type: ignore[index]
+    assert set(sizes) == {"plant_commands", "plant_states"}
+
+
+# --- two processes ---------------------------------------------------------------------------------------------------
+
+COUNT = 20_000
+
+
+def memory_of(path: Path) -> tuple[memoryview, memoryview]:
+    with path.open("r+b") as file:
+        whole = memoryview(mmap.mmap(file.fileno(), 0))
+    size = SHAPE.sections()["plant_commands"] // 64 * 64 + 64
+    return whole[:size], whole[size:]
+
+
+def write_commands(path: Path) -> None:
+    """Write commands that are full of their number, and states of which the same is true."""
+    link = PlantLink(SHAPE, *memory_of(path))
+    plant = RemotePlant(link)
+    state = np.zeros((), SHAPE.state_dtype)
+    for number in range(1, COUNT + 1):
+        plant.write(np.full((1, 2), float(number)))
+        state["command"] = number
+        state["observation"] = number
+        link.states.publish(state)
+
+
+def test_another_process_never_shows_half_of_a_command_or_of_a_state(tmp_path: Path) -> None:
+    path = tmp_path / "block"
+    path.write_bytes(bytes(sum(SHAPE.sections().values()) + 128))
+    link = PlantLink(SHAPE, *memory_of(path))
+    guard = CommandGuard(link, 10**12)
+    remote = RemotePlant(link)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    process = subprocess.Popen([sys.executable, __file__, str(path)], env=environment)
+    try:
+        seen, newest = 0, 0
+        while guard.number < COUNT or len(link.states) < COUNT:
+            assert process.poll() in (None, 0)
+            guard.check(0)
+            assert guard.number >= newest
+            newest = guard.number
+            assert guard.actuators.tolist() == [[float(newest)] * 2]
+            state = remote.refresh()
+            if state is not None:
+                assert (state["observation"] == state["command"]).all()
+                seen += 1
+        assert process.wait(30) == 0
+    finally:
+        process.kill()
+        process.wait()
+    assert seen > 0
+    assert remote.refresh()["command"] == COUNT
+
+
+if __name__ == "__main__":
+    write_commands(Path(sys.argv[1]))
