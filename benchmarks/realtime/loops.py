@@ -95,10 +95,9 @@ def main() -> int:
     parser.add_argument("--beside-busy-thread", action="store_true")
     options = parser.parse_args()
 
-    from bhd_lerobot.bodies.ur5 import ur5
-    from bhd_lerobot.sim.world import World
+    from benchmarks.realtime.stage import settled_robot
 
-    world = World(ur5(), physics_hz=round(1e9 / options.period_ns))
+    world = settled_robot(round(1e9 / options.period_ns)).world
     records = np.zeros((options.ticks, 3), np.int64)
     warm_up = np.zeros((options.warm_up_ticks, 3), np.int64)
     if options.beside_busy_thread:

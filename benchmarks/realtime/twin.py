@@ -11,9 +11,8 @@ import mujoco
 import numpy as np
 
 from benchmarks.realtime.cases import PERIOD_NS, PRIORITY, WARM_UP_TICKS, Case, CaseError, run_recorder, ticks_in
+from benchmarks.realtime.stage import settled_robot
 from benchmarks.realtime.statistics import Samples
-from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.sim.world import World
 
 _SOURCE = Path(__file__).with_name("twin.cpp")
 
@@ -61,8 +60,8 @@ def build(folder: Path) -> Path:
 
 
 def save_model(path: Path) -> None:
-    """Save the model that a UR5 world steps at the benchmark's rate, with that world's state as its first keyframe."""
-    world = World(ur5(), physics_hz=round(1e9 / PERIOD_NS))
+    """Save the model that the benchmark's robots step, in the same scene, with its state as the first keyframe."""
+    world = settled_robot(round(1e9 / PERIOD_NS)).world
     model = world.copy_model(0)
     model.key_qpos[0], model.key_qvel[0], model.key_ctrl[0] = world.qpos[0], world.qvel[0], world.ctrl[0]
     mujoco.mj_saveModel(model, str(path), None)

@@ -1,0 +1,344 @@
+"""Robots that are measured: each is owned by a process of its own, and watched from here through its shared memory."""
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.realtime.cases import ROOT, WARM_UP_TICKS, Case, CaseError
+from benchmarks.realtime.owner import OwnerSpec, as_argument
+from benchmarks.realtime.stamps import Array, StampError, block_samples, records_of
+from benchmarks.realtime.statistics import Samples
+from bhd_lerobot.control.fifo import RingReader
+from bhd_lerobot.control.live_block import LiveBlock, Word
+from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.shared_block import FOLDER, PREFIX
+from bhd_lerobot.errors import BhdError
+
+_START_S = 180.0
+_END_S = 20.0
+_DRAIN_S = 0.1  # between two looks into the ring, which holds seconds
+
+
+class Watcher:
+    """Reads every published state of a robot, from another process.
+
+    Args:
+        name: the robot's name.
+
+    Raises:
+        CaseError: there is no such robot.
+    """
+
+    def __init__(self, name: str) -> None:
+        try:
+            self.block = LiveBlock.attach(name)
+        except BhdError as error:
+            raise CaseError(str(error)) from error
+        self.words = self.block.words
+        self.period_ns = NANOSECONDS // int(self.block.about["control_hz"])
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what was read; what is published from now on is kept."""
+        self._reader = RingReader(self.block.ring)
+        self._batches: list[Array] = []
+
+    @property
+    def drops(self) -> int:
+        """States that were overwritten before they could be read."""
+        return self._reader.drops
+
+    def drain(self) -> Array:
+        """Read what was published since the last call, and return it."""
+        states = []
+        while (state := self._reader.read()) is not None:
+            states.append(state)
+        batch = records_of(np.array(states, self.block.state_dtype))
+        if len(batch):
+            self._batches.append(batch)
+        return batch
+
+    def records(self) -> Array:
+        """Return all that was read since `begin`, in order."""
+        return np.concatenate(self._batches) if self._batches else records_of(np.zeros(0, self.block.state_dtype))
+
+    def close(self) -> None:
+        """Leave the robot's memory."""
+        self.block.close()
+
+
+class OwnedRobot:
+    """A robot, the process that owns it, and a `Watcher`.
+
+    Attributes:
+        spec: what the owner runs.
+        watcher: reads its states.
+        pids: numbers of the robot's processes, by name.
+        about: what the owner said about it.
+
+    Use `owned_robot`, which ends it whatever happens.
+    """
+
+    def __init__(self, spec: OwnerSpec) -> None:
+        self.spec = spec
+        self.pids: dict[str, int] = {}
+        self.about: dict[str, Any] = {}
+        self._watcher: Watcher | None = None
+        self._rest = b""
+        # Unbuffered: `select` must see all that was not read yet.
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.realtime.owner", as_argument(spec), str(os.getpid())],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+        )
+
+    def prepare(self) -> None:
+        """Wait until the robot is ready.
+
+        Raises:
+            CaseError: it cannot be started.
+        """
+        if self._watcher is not None:
+            return
+        self.about = self.expect("ready", _START_S)
+        self.pids = dict(self.about["pids"])
+        if self.about["heavy"]:
+            raise CaseError(f"the loop's process has imported {', '.join(self.about['heavy'])}")
+        self._watcher = Watcher(self.spec.name)
+
+    @property
+    def watcher(self) -> Watcher:
+        """What reads the robot's states."""
+        if self._watcher is None:
+            raise CaseError(f"{self.spec.name} is not ready")
+        return self._watcher
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the system refused to the loop."""
+        return tuple(self.about["refused"])
+
+    def tell(self, line: str) -> None:
+        """Write a line to the owner.
+
+        Raises:
+            CaseError: it has ended.
+        """
+        assert self.process.stdin is not None
+        try:
+            self.process.stdin.write(line.encode() + b"\n")
+        except OSError:
+            raise CaseError(f"the process that owns {self.spec.name} has ended") from None
+
+    def hear(self, seconds: float) -> dict[str, Any] | None:
+        """Return what the owner says next, or None if it says nothing in time.
+
+        Raises:
+            CaseError: it failed, or has ended.
+        """
+        assert self.process.stdout is not None
+        until = time.monotonic() + seconds
+        while b"\n" not in self._rest:
+            left = until - time.monotonic()
+            if not select.select([self.process.stdout], [], [], max(0.0, left))[0]:
+                return None
+            got = self.process.stdout.read(4096)
+            if not got:
+                raise CaseError(f"the process that owns {self.spec.name} has ended ({self.process.wait(_END_S)})")
+            self._rest += got
+        line, _, self._rest = self._rest.partition(b"\n")
+        try:
+            said: dict[str, Any] = json.loads(line)
+        except ValueError:
+            raise CaseError(f"the process that owns {self.spec.name} said {line[:200]!r}") from None
+        if said["event"] == "failed":
+            raise CaseError(f"{self.spec.name}: {said['message']}")
+        return said
+
+    def expect(self, event: str, seconds: float, meanwhile: Callable[[], object] = lambda: None) -> dict[str, Any]:
+        """Wait for an event; read the ring while waiting.
+
+        Raises:
+            CaseError: it does not come in time, or another one comes.
+        """
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            said = self.hear(_DRAIN_S)
+            meanwhile()
+            if said is not None:
+                if said["event"] != event:
+                    raise CaseError(f"the owner of {self.spec.name} said {said['event']}, not {event}")
+                return said
+        raise CaseError(f"the owner of {self.spec.name} did not say {event!r} within {seconds:g} s")
+
+    def run(self, seconds: float) -> None:
+        """Begin a stretch of some seconds; returns when it has begun."""
+        watcher = self.watcher
+        watcher.begin()
+        self.tell(f"run {seconds}")
+        self.expect("started", 60.0, watcher.drain)
+
+    def finish(self, seconds: float) -> dict[str, Any]:
+        """Wait for the end of a stretch, reading its states; return what the owner says about it."""
+        said = self.expect("done", 60.0 + 3 * seconds, self.watcher.drain)
+        self.watcher.drain()
+        return said
+
+    def pause(self) -> None:
+        """End a stretch of setpoints before its time."""
+        self.tell("pause")
+        self.finish(1.0)
+
+    def samples(self, warm_up: int = WARM_UP_TICKS) -> Samples:
+        """Return the ticks of the stretch that has ended.
+
+        Raises:
+            CaseError: a state was lost: what was measured is not what happened.
+        """
+        watcher = self.watcher
+        try:
+            records = watcher.records()
+            # What the loop's warm-up published, before its first stretch, is not of this one.
+            records = records[records["stretch"] == watcher.words[Word.STRETCH]]
+            return block_samples(records, watcher.period_ns, watcher.drops, warm_up, self.notes)
+        except StampError as error:
+            raise CaseError(str(error)) from error
+
+    @contextmanager
+    def signalled(self, pid: int) -> Iterator[None]:
+        """Let a process stand still for as long as the block takes."""
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
+
+    def sleep(self) -> None:
+        """Let the owner stand still while others are measured: its threads would disturb them."""
+        if self.process.poll() is None:
+            os.kill(self.process.pid, signal.SIGSTOP)
+
+    def wake(self) -> None:
+        """Undo `sleep`."""
+        if self.process.poll() is None:
+            os.kill(self.process.pid, signal.SIGCONT)
+
+    def leftovers(self, seconds: float) -> list[str]:
+        """Return what is left of a robot whose owner has ended: its processes, its memory; waits for them to go."""
+        if self._watcher is not None:
+            self._watcher.close()
+            self._watcher = None
+        until = time.monotonic() + seconds
+        while True:
+            left = [f"{name} ({pid})" for name, pid in self.pids.items() if is_running(pid)]
+            # What its last user left behind is removed by whoever comes next; what somebody holds is not.
+            memory = FOLDER / f"{PREFIX}{self.spec.name}"
+            if memory.exists():
+                left.append(str(memory))
+            if not left or time.monotonic() > until:
+                return left
+            time.sleep(0.05)
+
+    def close(self) -> list[str]:
+        """End the robot and all of its processes; return what is left of it, which should be nothing."""
+        process = self.process
+        self.wake()
+        for stream in (process.stdin, process.stdout):
+            if stream is not None:
+                with suppress(OSError):
+                    stream.close()
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        left = self.leftovers(10.0)
+        for pid in self.pids.values():
+            if is_running(pid):
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        return left
+
+
+def is_running(pid: int) -> bool:
+    """Return whether a process exists that has not ended; one that only waits to be asked for its status has."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in "ZX"
+
+
+@contextmanager
+def owned_robot(spec: OwnerSpec) -> Iterator[OwnedRobot]:
+    """Yield a robot, which may not be ready yet, and end it.
+
+    Raises:
+        CaseError: something was left behind that should not be.
+    """
+    robot = OwnedRobot(spec)
+    try:
+        yield robot
+    except BaseException:
+        robot.close()
+        raise
+    left = robot.close()
+    if left:
+        raise CaseError(f"{spec.name} left behind: {', '.join(left)}")
+
+
+def robot_case(
+    name: str,
+    title: str,
+    robot: OwnedRobot,
+    *,
+    reports: list[dict[str, Any]],
+    stop: str = "",
+) -> Case:
+    """Return the loop of a robot as a case.
+
+    Args:
+        name: of the case.
+        title: of the case.
+        robot: the robot; it sleeps between its turns.
+        reports: gets what the owner says of each stretch, with ``count_error`` of the loop.
+        stop: name of the process that stands still meanwhile; none if empty.
+    """
+
+    def run(seconds: float) -> Samples:
+        robot.wake()
+        try:
+            warm_up_s = WARM_UP_TICKS * robot.watcher.period_ns / NANOSECONDS
+            seconds += warm_up_s
+            robot.run(seconds)
+            if stop:
+                time.sleep(warm_up_s / 2)
+                with robot.signalled(robot.pids[stop]):
+                    said = robot.finish(seconds)
+            else:
+                said = robot.finish(seconds)
+            samples = robot.samples()
+        finally:
+            robot.sleep()
+        reports.append({**said, "case": name, "count_error": samples.count_error})
+        return samples
+
+    return Case(name, title, run)
+
+
+def drops_word(robot: OwnedRobot) -> int:
+    """Return how many states the recorder says that it lost."""
+    return int(robot.watcher.words[Word.RECORDER_DROPS])
