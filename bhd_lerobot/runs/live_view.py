@@ -5,6 +5,7 @@ what it has no time for: the run never waits for the view.
 """
 
 import importlib.util
+import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -118,13 +119,16 @@ class LiveView:
         self._changed, self._ended = threading.Condition(), False
         self._log: Callable[..., None]
         self._shutdown: Callable[[str], None]
-        self._extras: Callable[[dict[str, Any], dict[str, Any]], None] | None = None
+        self._extras: RerunExtras | None = None
         self._start(options)
         self._thread = threading.Thread(target=self._work, name="bhd-live-view", daemon=True)
         self._thread.start()
 
     def _start(self, options: DisplayOptions) -> None:
         try:
+            if options.display_mode == "rerun" and options.display_ip is not None:
+                # Rerun would go on looking for its viewer in silence.
+                socket.create_connection((options.display_ip, options.display_port or 0), _END_S).close()
             from lerobot.utils import visualization_utils as helpers
 
             helpers.init_visualization(
@@ -201,9 +205,11 @@ class LiveView:
         self._thread.join(_END_S)
         if self._thread.is_alive():
             self.problem = f"it did not take the last frames within {_END_S:g} s"
-            return
         try:
-            self._shutdown(self._mode)
+            if self._extras is not None:
+                self._extras.flush()
+            if not self._thread.is_alive():
+                self._shutdown(self._mode)
         except Exception as error:
             self.problem = self.problem or f"{type(error).__name__}: {error}"
 
@@ -243,6 +249,21 @@ class RerunExtras:
 
         log_rerun_data.blueprint = self._layout(observation, action)
         rerun.send_blueprint(log_rerun_data.blueprint)
+
+    def flush(self) -> None:
+        """Send what waits to be sent.
+
+        Raises:
+            Exception: the viewer does not take it. Nothing more is sent then, not even at the end of the program, which
+                would wait for the viewer for ever.
+        """
+        recording = self._rerun.get_global_data_recording()
+        try:
+            if recording is not None:
+                recording.flush(timeout_sec=_END_S)
+        except Exception:
+            self._rerun.unregister_shutdown()
+            raise
 
     def _layout(self, observation: dict[str, Any], action: dict[str, Any]) -> Any:
         import rerun.blueprint as layout
