@@ -36,7 +36,7 @@ def render(state: MonitorState, *, height: int | None = None, message: str = "",
         state: what is shown.
         height: lines that there are; sections are set apart if there is room. All that is needed if None.
         message: something that is said instead of the keys.
-        keys: what the last line says.
+        keys: what the last line says; there is none if empty.
     """
     sections = [
         ("", [_title(state), _mode(state)]),
@@ -53,13 +53,14 @@ def render(state: MonitorState, *, height: int | None = None, message: str = "",
             lines += [Text(), Text(f"── {name} " + "─" * (WIDTH - 4 - len(name)), "dim")] if name else []
             lines += section
         lines.append(Text())
-    last = Text(message or keys, "bold yellow" if message else "dim")
+    last = [Text(f" {message or keys}", "bold yellow" if message else "dim")] if message or keys else []
     if height is not None:
-        lines = lines[: max(0, height - 1)]
-    for line in (*lines, last):
+        lines = lines[: max(0, height - len(last))]
+    lines += last
+    for line in lines:
         line.no_wrap, line.overflow = True, "ellipsis"
         line.truncate(WIDTH, overflow="ellipsis")
-    return Group(*lines, last)
+    return Group(*lines)
 
 
 def _title(state: MonitorState) -> Text:
@@ -76,12 +77,12 @@ def _mode(state: MonitorState) -> Text:
     mode = state.mode or "UNKNOWN"
     line = Text.assemble(" ", (f" {mode:<12} ", _MODES.get(mode, "black on white")), f"  loop {state.phase.lower():<9}")
     time = _NOTHING if state.episode_time is None else f"{state.episode_time:.1f} s"
-    line.append(f"episode {state.episode:<4d} {time:>9}   ")
+    line.append(f"episode {state.episode:<4d} {time:>9}  ")
     silent = state.alive.get("cerebellum")
     if state.phase == "RUNNING" and silent is not None and silent > _SILENT_S:
-        line.append(f"cerebellum silent {silent:6.1f} s", "bold white on red")
+        line.append(f"cerebellum silent {min(silent, 999):3.0f} s", "bold white on red")
     elif state.estop and not state.estop_latched:
-        line.append("e-stop set, not latched yet", "bold white on red")
+        line.append("e-stop not latched yet", "bold white on red")
     elif state.estop_latched:
         line.append("emergency stop latched", "bold red")
     return line
@@ -94,14 +95,14 @@ def _rates(state: MonitorState) -> list[Text]:
         text.append(f"{_NOTHING if measured is None else f'{measured:.1f}':>7}", style)
         return text.append(f" of {wanted:>4.0f} Hz" if wanted else " Hz        ")
 
-    def count(label: str, number: int) -> tuple[str, str]:
-        return f"   {label:<12}{number:>9}", "yellow" if number else ""
+    def count(label: str, number: int, width: int = 12) -> tuple[str, str]:
+        return f"   {label:<{width}}{number:>{21 - width}}", "yellow" if number else ""
 
     control = rate("control", state.control_rate, state.control_hz, 0.01)
-    control.append(f"   {'executed':<12}{state.executed:>9}").append(*count("overruns", state.overruns))
+    control.append(f"   {'executed':<12}{state.executed:>9}").append(*count("overruns", state.overruns, 14))
     frames = rate("frames", state.frame_rate, state.fps, 0.15)
-    frames.append(*count("skipped", state.skipped)).append(*count("rec. drops", state.recorder_drops))
-    commands = rate("commands", state.command_rate, None, 0.0).append(*count("sim. behind", state.catch_up_lost))
+    frames.append(*count("skipped", state.skipped)).append(*count("recorder drops", state.recorder_drops, 14))
+    commands = rate("commands", state.command_rate, None, 0.0).append(*count("world behind", state.catch_up_lost))
     return [control, frames, commands]
 
 

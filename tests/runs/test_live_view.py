@@ -1,6 +1,7 @@
 """`--display_data=true`: what the viewers are sent, that nobody waits for them, and what happens without them."""
 
 import io
+import socket
 import subprocess
 import sys
 import threading
@@ -172,6 +173,34 @@ def test_a_view_that_fails_is_told_at_the_end_and_ends_nothing_else(sent: Helper
     assert sent.ended == ["foxglove"]
 
 
+def test_a_viewer_that_is_not_there_is_found_out_before_the_run(robot: Simulation) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(ConfigError, match=r"rerun could not be started: .*refused"):
+        LiveView(display(display_mode="rerun", display_ip="127.0.0.1", display_port=port), robot)
+
+
+def test_a_viewer_that_goes_away_keeps_nobody_from_ending(tmp_path: Path) -> None:
+    program = (
+        "import socket\n"
+        "from bhd_lerobot.runs import live_view\n"
+        "from bhd_lerobot.runs.record import main\n"
+        "live_view._END_S = 0.5\n"
+        "server = socket.create_server(('127.0.0.1', 0))\n"
+        "start = live_view.RerunExtras.__init__\n"
+        "def start_and_go(*arguments):\n"
+        "    start(*arguments)\n"
+        "    server.close()\n"
+        "live_view.RerunExtras.__init__ = start_and_go\n"
+        "where = ['--display_data=true', '--display_ip=127.0.0.1', f'--display_port={server.getsockname()[1]}']\n"
+        f"assert main({options(tmp_path / 'd', dataset__num_episodes=1, dataset__episode_time_s=1)!r} + where) == 0\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=90)
+    assert done.returncode == 0, done.stderr
+    assert "Live view: ended after" in done.stderr
+    assert len(data_columns(tmp_path / "d")["index"]) == 10
+
+
 @pytest.mark.parametrize(("ip", "port", "compress"), [(None, None, False), ("10.0.0.1", 9876, True)])
 def test_images_over_a_network_are_compressed(
     sent: Helpers, robot: Simulation, ip: str | None, port: int | None, compress: bool
@@ -286,5 +315,5 @@ def test_rerun_itself_takes_it(robot: Simulation, monkeypatch: pytest.MonkeyPatc
 
 
 def entity_paths(rerun: Any, path: Path) -> set[str]:
-    schema = rerun.recording.load_recording(path).schema()
+    schema = rerun.experimental.RrdReader(path).store().schema()
     return {column.entity_path.replace("\\", "") for column in schema.component_columns()}
