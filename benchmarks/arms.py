@@ -18,7 +18,8 @@ from bhd_lerobot.policies.pick import PickBrain
 from bhd_lerobot.policies.reach import ReachBrain
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.runs.episode import Episode, EpisodeLoop, EpisodeSpec
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Task, episode_seed

@@ -18,7 +18,8 @@ from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.policies.gap_follower import GapFollowerBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
-from bhd_lerobot.runs.episode import EpisodeLoop, EpisodeSpec
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import Event, Outcome, episode_seed
 

@@ -2,9 +2,6 @@
 
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent import futures
-from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,65 +14,12 @@ from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_fra
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Observation
 from bhd_lerobot.robots.simulation import FrameReport, Simulation
-from bhd_lerobot.tasks.task import Event, Outcome, Task
-
-Observer = Callable[[int, Mapping[str, Any]], None]
-"""Is shown a frame: the simulation, and its columns so far by key; or an image, under its camera's key. Must not wait,
-and copy what it keeps; images come on another thread."""
+from bhd_lerobot.runs.episode_images import EpisodeImages, Observer
+from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
+from bhd_lerobot.tasks.task import Event, Task
 
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.
 _BRAIN_STREAM = 2
-
-
-@dataclass(frozen=True)
-class EpisodeSpec:
-    """An episode to be run.
-
-    Attributes:
-        index: its number in the run; results come back in this order.
-        seed: decides everything that is random in it.
-    """
-
-    index: int
-    seed: int
-
-
-@dataclass(frozen=True)
-class Episode:
-    """An episode that was run.
-
-    Attributes:
-        spec: what was asked for.
-        scene: where it was: an `Arena` or a `TableScene`.
-        instruction: what was asked for: what the brain was told to do, or what the task asks for.
-        initial_state: the simulator's complete state at its start, shape (nstate,).
-        columns: the dataset's columns by key, each of shape (frames, ...), images left out.
-        outcome: how it ended.
-        timing: how punctual its control ticks were.
-        writer: what was given for the episode's images at its start, or None.
-        commands: the goals that the brain gave, each with the frame in which it gave it; None if it gave setpoints.
-        results: how goals ended, each with the frame in which it did.
-        plan: the brain's plan, as plain values, if it has one.
-        realtime: what the real-time process was granted and refused; None on the lockstep clock.
-    """
-
-    spec: EpisodeSpec
-    scene: Any
-    instruction: str
-    initial_state: NDArray[np.float64]
-    columns: dict[str, NDArray]
-    outcome: Outcome
-    timing: TimingSummary
-    writer: Any
-    commands: list[tuple[int, BrainCommand]] | None = None
-    results: list[tuple[int, CommandResult]] = field(default_factory=list)
-    plan: dict[str, Any] = field(default_factory=dict)
-    realtime: list[dict[str, Any]] | None = None
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return len(self.columns[keys.ACTION])
 
 
 class EpisodeLoop:
@@ -144,8 +88,7 @@ class EpisodeLoop:
         self._commands: list[list[tuple[int, BrainCommand]]] = [[] for _ in range(n)]
         self._ends: list[list[tuple[int, CommandResult]]] = [[] for _ in range(n)]
         self._initial: list[NDArray[np.float64] | None] = [None] * n
-        self._sinks: list[Any] = [None] * n
-        self._pending: list[list[futures.Future[NDArray[np.uint8]]]] = [[] for _ in range(n)]
+        self._images = EpisodeImages(self.simulation)
         self.simulation.stop(np.arange(n))
         self._start(np.arange(n), waiting)
         try:
@@ -166,12 +109,10 @@ class EpisodeLoop:
                     yield done.pop(order.pop(0))
                 self._start(ids, waiting)
         finally:
-            for pending in self._pending:
-                futures.wait(pending)
-                pending.clear()
-            for sink in [*self._sinks, *(episode.writer for episode in done.values())]:
-                if sink is not None:
-                    sink.discard()
+            self._images.discard()
+            for episode in done.values():
+                if episode.writer is not None:
+                    episode.writer.discard()
 
     def _start(self, ids: NDArray[np.intp], waiting: list[EpisodeSpec]) -> None:
         """Start the next episodes in idle simulations."""
@@ -195,7 +136,9 @@ class EpisodeLoop:
         for sim, spec, scene, state in zip(ids, specs, scenes, states, strict=True):
             self._specs[sim], self._scenes[sim], self._initial[sim] = spec, scene, state
             self._commands[sim], self._ends[sim] = [], []
-            self._sinks[sim] = self._open_images() if self._open_images and self.simulation.camera_names else None
+            self._images.sinks[sim] = (
+                self._open_images() if self._open_images and self.simulation.camera_names else None
+            )
         self._length[ids] = 0
         self._truth = None
 
@@ -204,7 +147,7 @@ class EpisodeLoop:
         simulation, task, brain = self.simulation, self.task, self.brain
         frame = simulation.observe()
         state = frame.state.astype(np.float32)
-        images = self._images()
+        images = self._images.order_all(self.observer, wanted=brain.uses_images)
         values: dict[str, NDArray] = {}
         environment = None
         if task.environment_names:
@@ -306,7 +249,7 @@ class EpisodeLoop:
         if self.task.environment_names:
             values[keys.ENVIRONMENT_STATE] = self.task.environment_state(self._truth).astype(np.float32)
         for sim in np.flatnonzero(self.simulation.running).tolist():
-            self._order_images(sim)  # the simulation shows the end of the frame before, which is this one's beginning
+            self._images.order(sim, self.observer)  # what is shown is the end of the frame before: its beginning
         return values
 
     def _log(self, decision: Any, report: FrameReport) -> None:
@@ -318,47 +261,6 @@ class EpisodeLoop:
         for sim, results in report.results.items():
             self._ends[sim] += [(int(self._length[sim]), result) for result in results]
         self._results = report.results
-
-    def _images(self) -> dict[str, NDArray[np.uint8]]:
-        """Order the images of the running simulations; return them if the brain looks at them.
-
-        A brain that does not look at images does not wait for them: they are made while the frame goes on.
-        """
-        simulation = self.simulation
-        images: dict[str, NDArray[np.uint8]] = {}
-        cameras = simulation.camera_names
-        running = np.flatnonzero(simulation.running).tolist() if cameras else []
-        for sim in running:
-            self._order_images(sim)
-        if self.brain.uses_images:
-            height, width = simulation.config.camera_height, simulation.config.camera_width
-            images = {camera: np.zeros((simulation.n, height, width, 3), np.uint8) for camera in cameras}
-            for sim in running:
-                for camera, image in zip(cameras, self._pending[sim][-len(cameras) :], strict=True):
-                    images[camera][sim] = image.result()
-        # What went wrong in the making of an image ends the run now, not at the end of the episode.
-        for waiting in self._pending:
-            while waiting and waiting[0].done():
-                waiting.pop(0).result()
-        return images
-
-    def _order_images(self, sim: int) -> None:
-        """Order the images of what one simulation shows now."""
-        sink = self._sinks[sim]
-        for camera in self.simulation.camera_names:
-            deliver = None if sink is None else partial(sink.add_image, f"{keys.OBSERVATION_IMAGES}.{camera}")
-            image = self.simulation.render_later(sim, camera, deliver)
-            self._pending[sim].append(image)
-            if self.observer is not None:
-                image.add_done_callback(partial(self._show_image, sim, camera))
-
-    def _show_image(self, sim: int, camera: str, image: futures.Future[NDArray[np.uint8]]) -> None:
-        if self.observer is not None and not image.cancelled() and image.exception() is None:
-            self.observer(sim, {f"{keys.OBSERVATION_IMAGES}.{camera}": image.result()})
-
-    def _wait_for_images(self, sim: int) -> None:
-        while self._pending[sim]:
-            self._pending[sim].pop(0).result()
 
     def _store(self, running: NDArray[np.intp], values: Mapping[str, NDArray]) -> None:
         """Write one frame of the running simulations into their columns."""
@@ -396,7 +298,7 @@ class EpisodeLoop:
         spec, scene, initial = self._specs[sim], self._scenes[sim], self._initial[sim]
         if spec is None or initial is None:
             raise AssertionError(f"Simulation {sim} ended an episode that it never started.")
-        self._wait_for_images(sim)
+        writer = self._images.finish(sim)
         length = int(self._length[sim])
         columns = {key: column[sim, :length].copy() for key, column in self._columns.items()}
         outcome = self.task.outcome(sim, event)
@@ -405,7 +307,6 @@ class EpisodeLoop:
         columns[keys.DONE] = last
         columns[keys.SUCCESS] = last & outcome.success
         timing = self._timing(sim, columns)
-        sink, self._sinks[sim] = self._sinks[sim], None
         return Episode(
             spec=spec,
             scene=scene,
@@ -414,7 +315,7 @@ class EpisodeLoop:
             columns=columns,
             outcome=outcome,
             timing=timing,
-            writer=sink,
+            writer=writer,
             commands=self._commands[sim] if self._gives_goals else None,
             results=self._ends[sim],
             plan=plan,

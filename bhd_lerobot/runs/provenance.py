@@ -12,7 +12,7 @@ from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableObject, TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand, Pose
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.runs.episode import Episode
+from bhd_lerobot.runs.episode_types import Episode
 
 
 def versions() -> dict[str, str]:

@@ -28,7 +28,8 @@ from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.robots.simulation import Simulation, describe
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import encode, run
-from bhd_lerobot.runs.episode import Episode, EpisodeLoop, EpisodeSpec
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.runs.language_rows import language_column
 from bhd_lerobot.runs.live_view import live_view
 from bhd_lerobot.runs.plots import Trajectory, draw_trajectories

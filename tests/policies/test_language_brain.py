@@ -13,7 +13,8 @@ from bhd_lerobot.policies.language_brain import LanguageBrain, LanguageBrainConf
 from bhd_lerobot.policies.planner import Plan, SceneObject, Skill, TextPlanner, make_plan
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.runs.episode import Episode, EpisodeLoop, EpisodeSpec
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig

@@ -14,7 +14,8 @@ from bhd_lerobot.policies.brain import Goals, Observation
 from bhd_lerobot.policies.pick import PickBrain, PickBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.runs.episode import Episode, EpisodeLoop, EpisodeSpec
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from tests.policies.arm_desk import BOX, CUP, OBSERVED, Desk, scene

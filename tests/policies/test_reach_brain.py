@@ -10,7 +10,8 @@ from bhd_lerobot.policies.brain import Goals, Observation
 from bhd_lerobot.policies.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.runs.episode import EpisodeLoop, EpisodeSpec
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import EpisodeSpec
 from bhd_lerobot.tasks.reach import ENVIRONMENT, ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
