@@ -87,7 +87,7 @@ def loop_checks(
     """
 
     def why(*cases: str) -> str:
-        return "; ".join(missing[case] for case in cases if case in missing)
+        return "; ".join(dict.fromkeys(missing[case] for case in cases if case in missing))
 
     def each(row: Callable[[str], Check]) -> list[Check]:
         return [row(condition) for condition in conditions]

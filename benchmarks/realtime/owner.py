@@ -201,7 +201,8 @@ class Episodes:
     def run(self, seconds: float) -> dict[str, Any]:
         """Record one episode; return what is to be said of it."""
         from bhd_lerobot.data import features as keys
-        from bhd_lerobot.runs.episode import EpisodeLoop, EpisodeSpec
+        from bhd_lerobot.runs.episode import EpisodeLoop
+        from bhd_lerobot.runs.episode_types import EpisodeSpec
         from bhd_lerobot.runs.provenance import episode_metadata
 
         task, recorder = self._task(seconds), self._recorder

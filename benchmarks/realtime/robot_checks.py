@@ -41,7 +41,7 @@ def ratio_checks(
         conditions: the conditions of the run.
         missing: why a case has no blocks.
     """
-    reason = "; ".join(missing[case] for case in (pair.case, pair.other) if case in missing)
+    reason = "; ".join(dict.fromkeys(missing[case] for case in (pair.case, pair.other) if case in missing))
 
     def ratio(condition: str, value: str) -> Spread | None:
         return paired_ratio(blocks, pair.case, pair.other, condition, value)
@@ -133,7 +133,7 @@ def loss_checks(losses: Losses | None, reason: str) -> list[Check]:
             0.0,
             measured=float(len(losses.left)) if losses.ended_s else None,
             detail=", ".join(losses.left) or f"{len(losses.ended_s)} times; all had ended {took:.1f} s after HOLD",
-            reason="no brain was killed",
+            reason="" if losses.ended_s else "no brain was killed",
         )
     )
     return checks

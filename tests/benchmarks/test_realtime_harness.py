@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ import pytest
 from benchmarks.realtime import __main__ as program
 from benchmarks.realtime.cases import Case, CaseError
 from benchmarks.realtime.harness import Run, measure, remarks, turns
+from benchmarks.realtime.injections import Drops
 from benchmarks.realtime.load import Load, LoadError, cpu_load
 from benchmarks.realtime.machine import CpuTimes
+from benchmarks.realtime.parts import NAMES, QUICK_SIZES, Experiments, Sizes
 from benchmarks.realtime.statistics import Samples, summarise
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -122,12 +125,30 @@ def test_the_whole_program_on_fake_loops(
 ) -> None:
     stage = Stage()
 
-    def unavailable(folder: Path) -> Case:
-        raise CaseError("cyclictest is not installed")
+    wake = {
+        "twin": 20.0,
+        "bhd": 26.0,
+        "python": 22.0,
+        "thread": 5000.0,
+        "torch": 30.0,
+        "running": 26.0,
+        "stopped": 26.0,
+    }
 
-    wake = {"twin": 20.0, "python": 26.0, "thread": 5000.0}
-    makers = {name: lambda _, name=name: stage.case(name, wake[name]) for name in wake}
-    monkeypatch.setattr(program, "MAKERS", makers | {"cyclictest": unavailable})
+    class FakeBench:
+        def __init__(self, *_: Any) -> None:
+            self.reports: list[dict[str, Any]] = []
+
+        def cases(self, names: list[str], absent: dict[str, str]) -> list[Case]:
+            absent["cyclictest"] = "cyclictest is not installed"
+            return [stage.case(name, wake[name]) for name in names if name in wake]
+
+        def experiments(self, names: list[str], conditions: list[str], sizes: Sizes) -> Experiments:
+            assert sizes == QUICK_SIZES
+            assert names == ["estop", "brain", "drops", "plant"]
+            return Experiments(drops=Drops(100, 90, 10), missing={"plant": "it does not start"})
+
+    monkeypatch.setattr(program, "Bench", FakeBench)
     monkeypatch.setattr(program, "how_busy", lambda: "Nothing else ran.")
     monkeypatch.setattr(program, "measure", lambda *args, progress: measure(*args, progress=progress, load=stage.load))
     monkeypatch.setattr(signal, "signal", lambda *_: None)
@@ -135,26 +156,28 @@ def test_the_whole_program_on_fake_loops(
     status = program.main(["--quick", "--json", str(out)])
     shown = capsys.readouterr()
     result = json.loads(out.read_text())
-    verdicts = {(c["name"].split(": ")[1].split(" ÷")[0], c["condition"]): c["verdict"] for c in result["checks"]}
+    verdicts = {(c["name"], c["condition"]): c["verdict"] for c in result["checks"]}
     assert status == 1
-    assert verdicts["wake-up p99", "idle"] == "met"
+    assert verdicts["bhd-lerobot, UR5: wake-up p99 ÷ C++ twin's", "idle"] == "met"
     assert "MISSED" in shown.out
     assert "not to be quoted" in shown.out
     assert "cyclictest was NOT MEASURED: cyclictest is not installed!" in shown.out
-    assert "LEFT OUT: cyclictest" in shown.err
     assert result["quotable"] is False
-    assert len(result["blocks"]) == 2 * 2 * 3
+    assert len(result["blocks"]) == 2 * 2 * len(wake)
+    assert result["experiments"]["drops"] == {"published": 100, "taken": 90, "counted": 10}
     missed = [c["name"] for c in result["checks"] if c["verdict"] == "MISSED"]
     assert len(missed) == 2
     assert all("p50" in name for name in missed)  # 26 / 20
     reasons = {c["reason"] for c in result["checks"] if c["verdict"] == "not measured"}
-    assert reasons == {"cyclictest is not installed"}
+    assert {"cyclictest is not installed", "it does not start", "no block was measured"} <= reasons
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--only", "twin", "pyton"], "Unknown case 'pyton'. Did you mean 'python'?"),
+        (["--only", "twin", "pyton"], "Unknown part 'pyton'. Did you mean 'python'?"),
+        (["--skip", "estopp"], "Unknown part 'estopp'. Did you mean 'estop'?"),
+        (["--only", "plant", "--skip", "plant"], "--skip leaves nothing"),
         (["--blocks", "0"], "--blocks is 0"),
         (["--seconds", "0.01"], "--seconds is 0.01"),
         (["--conditions", "busy"], "invalid choice: 'busy'"),
@@ -167,6 +190,15 @@ def test_a_wrong_option_ends_in_a_message(
         program.parse_arguments(arguments)
     assert end.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_parts_stand_for_what_they_are_made_of() -> None:
+    options = program.parse_arguments(["--only", "recording", "loop", "estop", "--skip", "thread", "torch"])
+    assert options.only == ["twin", "bhd", "python", "cyclictest", "estop"]
+    assert program.parse_arguments([]).only == list(NAMES)
+    assert program.parse_arguments(["--skip", "recorder"]).only == [
+        name for name in NAMES if name not in ("running", "stopped", "drops")
+    ]
 
 
 def test_only_a_full_run_is_quotable() -> None:
