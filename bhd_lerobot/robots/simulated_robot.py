@@ -131,9 +131,7 @@ class SimulatedRobot(Robot):
 
     def disconnect(self) -> None:
         """Stop the simulation. May be called at any time, also twice."""
-        if self._estop_inputs is not None:
-            self._estop_inputs.close()
-            self._estop_inputs = None
+        self._stop_listening()
         if self._simulation is not None:
             self._simulation.close()
             self._simulation = None
@@ -301,6 +299,16 @@ class SimulatedRobot(Robot):
         if self.is_connected:
             self._listen(source, name, period_s)
         self._estop_sources.append((source, name, period_s))
+
+    def remove_estop_inputs(self) -> None:
+        """Forget all buttons. What they have pressed stays pressed until `reset`."""
+        self._stop_listening()
+        self._estop_sources.clear()
+
+    def _stop_listening(self) -> None:
+        if self._estop_inputs is not None:
+            self._estop_inputs.close()
+            self._estop_inputs = None
 
     def _listen(self, source: Source, name: str, period_s: float) -> None:
         if self._estop_inputs is None:
