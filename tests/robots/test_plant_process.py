@@ -516,13 +516,16 @@ def test_a_cerebellum_that_was_stopped_finds_a_fault_and_goes_on_after_a_reset()
         assert link.states.latest()["stops"] == 1  # type: ignore[index]
 
 
-def test_killing_the_plant_is_a_fault_and_an_error_that_says_so() -> None:
+def test_a_plant_that_is_stopped_or_killed_is_a_fault_and_an_error_that_says_so() -> None:
     with moving("turtlebot3") as (robot, _):
         live_link = robot.simulation.link
-        os.kill(live_link.pids["plant"], signal.SIGKILL)
+        os.kill(live_link.pids["plant"], signal.SIGSTOP)
         wait_for(lambda: robot.simulation.modes[0] == Mode.FAULT)
         seen = WATCHDOGS.index(Watchdog.PLANT)
         wait_for(lambda: robot.simulation.live_bridge.latest["watchdogs"][seen] > 0)
+        with pytest.raises(RealtimeError, match=r"plant's process \(\d+\) has shown no sign of life for 2\.\d s"):
+            wait_for(live_link.check)  # it says nothing until then
+        os.kill(live_link.pids["plant"], signal.SIGKILL)
         wait_for(lambda: live_link._processes["plant"].poll() is not None)
         with pytest.raises(RealtimeError, match=r"plant's process was killed by signal 9. The cerebellum is in FAULT"):
             live_link.check()
