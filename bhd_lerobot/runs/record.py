@@ -3,20 +3,16 @@
 import os
 import sys
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
@@ -35,59 +31,12 @@ from bhd_lerobot.runs.live_view import live_view
 from bhd_lerobot.runs.plots import Trajectory, draw_trajectories
 from bhd_lerobot.runs.preview import Preview
 from bhd_lerobot.runs.provenance import episode_metadata
+from bhd_lerobot.runs.record_report import RecordResult, tell_refusals, tell_summary
 from bhd_lerobot.runs.registry import make_brain, make_robot, make_simulation, make_task
-from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
+from bhd_lerobot.runs.signals import stop_on_signals
 from bhd_lerobot.tasks.task import Task, episode_seed
 
-ESTOP_STATUS = 3  # exit status of a run that an emergency stop ended
 _ATTEMPTS = 3  # that an episode gets to be punctual
-
-
-@dataclass
-class RecordResult:
-    """What a run recorded.
-
-    Attributes:
-        root: the dataset.
-        output_dir: the run folder.
-        episodes: episodes that the dataset holds.
-        recorded: episodes that this run added.
-        successes: how many of them were a success.
-        outcomes: how many ended how.
-        scores: their scores.
-        problems: why brains gave up, in words, of the episodes that were no success.
-        frames: frames that this run added.
-        simulated_s: simulated time of the episodes that this run added [s].
-        wall_s: time that this took [s], from the first observation to the last save.
-        stopped_by: the signal that ended the run early, or None.
-        estop: what pressed the emergency stop that ended the run, in words; None if there was none.
-    """
-
-    root: Path
-    output_dir: Path
-    episodes: int = 0
-    recorded: int = 0
-    successes: int = 0
-    outcomes: Counter[str] = field(default_factory=Counter)
-    scores: list[float] = field(default_factory=list)
-    problems: Counter[str] = field(default_factory=Counter)
-    frames: int = 0
-    simulated_s: float = 0.0
-    wall_s: float = 0.0
-    stopped_by: StopRequest | None = None
-    estop: str | None = None
-
-    @property
-    def exit_status(self) -> int:
-        """The program's exit status: 0 if the dataset is complete."""
-        if self.estop is not None:
-            return ESTOP_STATUS
-        return self.stopped_by.exit_status if self.stopped_by else 0
-
-    @property
-    def real_time_factor(self) -> float:
-        """Simulated seconds in a second."""
-        return self.simulated_s / self.wall_s if self.wall_s > 0 else 0.0
 
 
 def record(config: RecordConfig, console: Console | None = None) -> RecordResult:
@@ -113,7 +62,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         brain = make_brain(config.brain)
         # A brain that does not fit the robot fails here, before a dataset exists.
         loop = EpisodeLoop(simulation, task, brain, config.timing)
-        _tell_refusals(simulation, console)
+        tell_refusals(simulation, console)
         preview = _make_preview(config, simulation, console)
         if simulation.camera_names:
             simulation.start_rendering()  # a machine without OpenGL fails here, before a dataset exists
@@ -134,7 +83,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         preview.write(first.scene, states, config.dataset.fps, output_dir / "episode.mp4")
         preview.write_strip(first.scene, states, output_dir / "episode.png")
         preview.close()
-    _summary(console, config, result, preview is not None and first is not None)
+    tell_summary(console, config, result, preview is not None and first is not None)
     if config.dataset.push_to_hub and result.exit_status == 0:
         _push(config, root)
     return result
@@ -160,7 +109,7 @@ def _run(
                 said = language_column(episode.plan, episode.columns[SUBTASK], config.dataset.fps)
                 episode.columns[LANGUAGE] = said
             _save(recorder, episode, metadata)
-            _count(result, episode, config.dataset.fps)
+            result.count(episode, config.dataset.fps)
             result.wall_s = time.perf_counter() - started
             trajectories.append(_trajectory(episode, loop.simulation))
             first = first or episode
@@ -231,15 +180,6 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
         console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} {os.getpid()}")
 
 
-def _tell_refusals(simulation: Simulation, console: Console) -> None:
-    """Say loudly what the system refused the real-time process, and the remedy."""
-    refused = [grant for grant in simulation.grants or () if not grant["granted"]]
-    for grant in refused:
-        console.print(
-            f"[bold]Real time: {grant['name']} was refused.[/bold] {escape(grant['detail'])} {escape(grant['remedy'])}"
-        )
-
-
 def _open_recorder(
     config: RecordConfig, root: Path, simulation: Simulation, task: Task, brain: Brain
 ) -> DatasetRecorder:
@@ -288,17 +228,6 @@ def _save(recorder: DatasetRecorder, episode: Episode, metadata: dict[str, Any])
         raise
 
 
-def _count(result: RecordResult, episode: Episode, fps: int) -> None:
-    result.recorded += 1
-    result.successes += episode.outcome.success
-    result.outcomes[episode.outcome.event.cause] += 1
-    result.scores.append(episode.outcome.score)
-    if episode.plan.get("problem") and not episode.outcome.success:
-        result.problems[episode.plan["problem"]] += 1
-    result.frames += episode.frames
-    result.simulated_s += episode.frames / fps
-
-
 def _trajectory(episode: Episode, simulation: Simulation) -> Trajectory:
     outcome = episode.outcome
     title = f"{episode.spec.index}: {outcome.event.cause}, score {outcome.score:.2f}"
@@ -343,45 +272,6 @@ def _progress(console: Console) -> Progress:
         TimeRemainingColumn(),
         console=console,
     )
-
-
-def _summary(console: Console, config: RecordConfig, result: RecordResult, film: bool) -> None:
-    table = Table(title="Recorded", show_header=False, title_justify="left")
-    table.add_row("dataset", f"{result.root} ({result.episodes} episodes)")
-    table.add_row(
-        "this run", f"{result.recorded} episodes, {result.frames} frames, {result.simulated_s:.0f} s simulated"
-    )
-    if result.recorded:
-        table.add_row("success", f"{result.successes} of {result.recorded}")
-        table.add_row("outcomes", ", ".join(f"{name} {count}" for name, count in result.outcomes.most_common()))
-        for problem, count in result.problems.most_common(3):
-            table.add_row("gave up" if count == 1 else f"gave up {count} times", escape(problem))
-        table.add_row("mean score", f"{np.mean(result.scores):.3f}")
-        table.add_row(
-            "speed",
-            f"{result.real_time_factor:.{0 if result.real_time_factor > 9 else 2}f} x real time, {_clock(config)}",
-        )
-    files = [
-        "config.yaml",
-        *(["trajectories.png"] if result.recorded else []),
-        *(["episode.mp4", "episode.png"] if film else []),
-    ]
-    table.add_row("run folder", f"{result.output_dir}: {', '.join(files)}")
-    console.print(table)
-    if result.estop is not None:
-        console.print(
-            f"[bold]Emergency stop ({escape(result.estop)}).[/bold] The episode that was running is saved with the "
-            "outcome 'estop', and no other was begun. Clear the cause and go on with --resume=true."
-        )
-    if result.stopped_by:
-        console.print(
-            f"Stopped by {result.stopped_by.name}. Episodes that were running were dropped, all others are saved. "
-            "Go on with --resume=true: the dropped ones are run again, the same."
-        )
-
-
-def _clock(config: RecordConfig) -> str:
-    return "on the wall clock" if config.robot.clock == "realtime" else f"n_envs = {config.n_envs}"
 
 
 def _push(config: RecordConfig, root: Path) -> None:

@@ -8,7 +8,8 @@ from rich.console import Console
 
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.record import RecordResult, record
+from bhd_lerobot.runs.record import record
+from bhd_lerobot.runs.record_report import RecordResult
 
 
 def options(root: Path, **overrides: object) -> list[str]:
