@@ -7,6 +7,7 @@ Started by `LiveLink` as a program of its own, ``python -m bhd_lerobot.robots.li
 its loop stands it takes messages from a pipe; while the loop runs it reads shared memory only.
 """
 
+import contextlib
 import gc
 import importlib
 import os
@@ -227,12 +228,17 @@ def run_worker(make: Callable[[LiveSpec, Connection], Worker]) -> int:
             finally:
                 process.close()
     except BhdError as error:
-        connection.send(("failed", f"{type(error).__name__}: {error}"))
+        _say(connection, f"{type(error).__name__}: {error}")
         return 2
     except Exception:
-        connection.send(("failed", traceback.format_exc()))
+        _say(connection, traceback.format_exc())
         return 1
     return 0
+
+
+def _say(connection: Connection, what: str) -> None:
+    with contextlib.suppress(OSError):  # the brain's process is gone: nobody wants to know
+        connection.send(("failed", what))
 
 
 if __name__ == "__main__":
