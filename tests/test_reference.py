@@ -12,7 +12,7 @@ from types import ModuleType
 import pytest
 
 from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.runs import data
+from bhd_lerobot.runs import data, monitor
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import parse
 from bhd_lerobot.runs.record import record
@@ -132,6 +132,8 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
         parse(ReplayConfig, arguments)
     elif program == "bhd-data":
         data._parser().parse_args(arguments)
+    elif program == "bhd-monitor":
+        monitor._parser().parse_args(arguments)
     else:
         raise AssertionError(f"Unknown program {program}.")
 
@@ -140,7 +142,7 @@ COMMANDS = [(path, line) for path in [*DOCUMENTS, *CONFIGURATIONS] for line in q
 
 
 def test_the_documents_quote_commands() -> None:
-    assert {line.split()[0] for _, line in COMMANDS} == {"bhd-record", "bhd-replay", "bhd-data"}
+    assert {line.split()[0] for _, line in COMMANDS} == {"bhd-record", "bhd-replay", "bhd-data", "bhd-monitor"}
 
 
 @pytest.mark.parametrize(("path", "line"), COMMANDS, ids=[f"{by_name(path)}: {line}" for path, line in COMMANDS])
