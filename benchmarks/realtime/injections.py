@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.realtime.cases import CaseError
 from benchmarks.realtime.owner import OwnerSpec
-from benchmarks.realtime.robots import OwnedRobot, drops_word
+from benchmarks.realtime.robots import OwnedRobot, drops_word, standing_still
 from benchmarks.realtime.stamps import Loss, Stop, judge_loss, judge_stop, reference_speed
 from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.control.frame_log import FrameLog
@@ -205,7 +205,7 @@ def count_drops(robot: OwnedRobot, stopped_s: list[float]) -> Drops:
     robot.run(600.0)
     taken += read(0.3)
     for seconds in stopped_s:
-        with robot.signalled(robot.pids["recorder"]):
+        with standing_still(robot.pids["recorder"]):
             taken += read(seconds)
         taken += read(0.3)
     robot.pause()

@@ -282,9 +282,8 @@ def main(specification: str, parent: int) -> int:
         return 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the benchmark decides when it is over
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    spec = OwnerSpec(**json.loads(specification))
     try:
-        work(spec, Lines(0))
+        work(OwnerSpec(**json.loads(specification)), Lines(0))
     except Exception as error:
         say("failed", message=f"{type(error).__name__}: {error}")
         return 1

@@ -139,7 +139,7 @@ class OwnedRobot:
         assert self.process.stdin is not None
         try:
             self.process.stdin.write(line.encode() + b"\n")
-        except OSError:
+        except (OSError, ValueError):  # the pipe is broken, or closed
             raise CaseError(f"the process that owns {self.spec.name} has ended") from None
 
     def hear(self, seconds: float) -> dict[str, Any] | None:
@@ -216,16 +216,6 @@ class OwnedRobot:
         except StampError as error:
             raise CaseError(str(error)) from error
 
-    @contextmanager
-    def signalled(self, pid: int) -> Iterator[None]:
-        """Let a process stand still for as long as the block takes."""
-        os.kill(pid, signal.SIGSTOP)
-        try:
-            yield
-        finally:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGCONT)
-
     def sleep(self) -> None:
         """Let the owner stand still while others are measured: its threads would disturb them."""
         if self.process.poll() is None:
@@ -252,10 +242,16 @@ class OwnedRobot:
                 return left
             time.sleep(0.05)
 
-    def close(self) -> list[str]:
-        """End the robot and all of its processes; return what is left of it, which should be nothing."""
+    def close(self, *, at_once: bool = False) -> list[str]:
+        """End the robot and all of its processes; return what is left of it, which should be nothing.
+
+        Args:
+            at_once: not at the end of what its owner does now, its start for example.
+        """
         process = self.process
         self.wake()
+        if at_once:
+            process.terminate()
         for stream in (process.stdin, process.stdout):
             if stream is not None:
                 with suppress(OSError):
@@ -271,6 +267,22 @@ class OwnedRobot:
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
         return left
+
+
+@contextmanager
+def standing_still(pid: int) -> Iterator[None]:
+    """Let a process stand still.
+
+    A child does it that lets the process go on as soon as its standard input ends, which it does with this process
+    however that dies: no process of a robot stands still for ever.
+    """
+    script = 'kill -STOP "$0" && echo stopped && read -r _; kill -CONT "$0"'
+    with subprocess.Popen(["/bin/sh", "-c", script, str(pid)], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        if child.stdout.readline() != b"stopped\n":
+            raise CaseError(f"process {pid} could not be stopped")
+        yield
+        # The end of the block closes its input.
 
 
 def is_running(pid: int) -> bool:
@@ -293,7 +305,7 @@ def owned_robot(spec: OwnerSpec) -> Iterator[OwnedRobot]:
     try:
         yield robot
     except BaseException:
-        robot.close()
+        robot.close(at_once=True)
         raise
     left = robot.close()
     if left:
@@ -326,7 +338,7 @@ def robot_case(
             robot.run(seconds)
             if stop:
                 time.sleep(warm_up_s / 2)
-                with robot.signalled(robot.pids[stop]):
+                with standing_still(robot.pids[stop]):
                     said = robot.finish(seconds)
             else:
                 said = robot.finish(seconds)
