@@ -20,14 +20,16 @@ from rich.console import Console
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.shared_block import names, sweep
 from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.record import ESTOP_STATUS, RecordResult, record
+from bhd_lerobot.runs.record import record
+from bhd_lerobot.runs.record_report import ESTOP_STATUS, RecordResult
 from bhd_lerobot.tasks.avoid import AvoidTask
 from bhd_lerobot.tasks.task import Event
 from tests.robots.live_support import is_alive, is_gone, unique, until
-from tests.runs.support import data_columns, options
+from tests.runs.support import data_columns, options, run_record
 
 LIVE = {
     "robot__clock": "realtime",
@@ -71,10 +73,10 @@ def test_a_recording_is_complete_and_no_frame_is_lost_uncounted(tmp_path, robot)
         rows = columns["episode_index"] == index
         timing = json.loads(row["bhd/timing"])
         assert timing["clock"] == "realtime"
-        # Every frame that was due is there, or counted as lost.
-        due = round(2 * dataset.fps)
-        assert rows.sum() + timing["drops"] >= due or columns["next.done"][rows][-1]
+        if columns["event"][rows][-1] == Event.TIMEOUT:
+            assert rows.sum() == 2 * dataset.fps
         assert timing["frames"] == rows.sum()
+        # Every frame that was due by the end is there, or counted as lost.
         times = columns["control.time"][rows].ravel()
         numbers = np.rint(times * dataset.fps).astype(int)
         assert np.all(np.diff(times) > 0)
@@ -212,7 +214,7 @@ def test_in_lockstep_a_signal_stops_all_episodes_that_run(tmp_path):
     """As on the wall clock: what was running is saved with its outcome, nothing else is begun."""
     root = tmp_path / "d"
     console = Console(file=io.StringIO(), width=160)
-    config = parse(RecordConfig, options(root, dataset__num_episodes=10**6, n_envs=3, dataset__episode_time_s=60))
+    config = parse(RecordConfig, options(root, dataset__num_episodes=20, n_envs=3, dataset__episode_time_s=60))
     begun: list[int] = []
 
     judge = AvoidTask.judge
@@ -233,3 +235,36 @@ def test_in_lockstep_a_signal_stops_all_episodes_that_run(tmp_path):
     columns = data_columns(root)
     assert columns["event"].count(int(Event.ESTOP)) == 3
     assert len(set(columns["episode_index"])) == result.recorded
+
+
+def test_a_press_between_two_episodes_begins_no_other(tmp_path, monkeypatch):
+    save = DatasetRecorder.save
+
+    def pressing(self: Any, *arguments: Any, **options: Any) -> Any:
+        saved = save(self, *arguments, **options)
+        if self.num_episodes == 2:
+            os.kill(os.getpid(), signal.SIGUSR2)
+        return saved
+
+    monkeypatch.setattr(DatasetRecorder, "save", pressing)
+    root = tmp_path / "d"
+    result, text = run_record(root, dataset__num_episodes=5, dataset__episode_time_s=1, estop_signal="usr2")
+    assert (result.recorded, result.exit_status) == (2, ESTOP_STATUS)
+    assert result.estop == "signal SIGUSR2"
+    assert "--resume=true" in text
+    assert int(Event.ESTOP) not in data_columns(root)["event"]  # both had ended before
+    result, _ = run_record(root, dataset__num_episodes=5, dataset__episode_time_s=1, resume="true")
+    assert (result.recorded, result.exit_status) == (3, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"estop_signal": "SIGINT"}, "'SIGINT'. Valid: SIGUSR1"),
+        ({"estop_key": "true"}, "standard input is no terminal"),
+    ],
+)
+def test_an_input_that_cannot_be_is_refused_before_anything_is_written(tmp_path, change, message):
+    with pytest.raises(ConfigError, match=message):
+        run_record(tmp_path / "d", **change)
+    assert list(tmp_path.iterdir()) == []
