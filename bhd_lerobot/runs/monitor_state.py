@@ -33,7 +33,6 @@ DECADES, CELLS = 6, 5
 """A histogram has so many decades from 1 us on, and so many cells in each."""
 _FINE = 20 // CELLS  # bins of `TimingStatistics` in a cell
 _WINDOW_NS = 2 * NANOSECONDS  # over which rates are measured
-_SILENT_S = 1.0  # a brain that was silent for so long when its robot ended had not ended it
 
 
 @dataclass(frozen=True)
@@ -189,10 +188,10 @@ class Sampler:
         """Return in words how the robot ended, ``"ended"`` if that was in order, or None if it still runs."""
         words = self._block.words
         if words[Word.PHASE] == Phase.ENDED:
-            silent = (self._clock() - int(words[Word.BRAIN_ALIVE])) / NANOSECONDS
-            if words[Word.BRAIN_ALIVE] and silent > _SILENT_S:
-                return f"stopped and ended by itself: its brain's process was silent for {silent:.1f} s, or was killed"
-            return "ended"
+            # The brain's process asks for both; a loop that finds itself alone has at most one of them.
+            if words[Word.END] and words[Word.PAUSE]:
+                return "ended"
+            return "came to rest and ended by itself: its brain's process is gone"
         return None if self._block.is_held else "is gone without having ended: its processes were killed"
 
     def sample(self) -> MonitorState:

@@ -310,10 +310,13 @@ def test_before_anything_is_published_there_is_something_to_show() -> None:
 def test_how_a_robot_ended_is_told(robot: Robot) -> None:
     sampler, block = robot.sampler()
     assert sampler.end() is None
-    robot.block.words[Word.PHASE] = Phase.ENDED
+    words = robot.block.words
+    words[Word.PHASE] = Phase.ENDED
+    for pause, end in ((0, 0), (1, 0), (0, 1)):
+        words[Word.PAUSE], words[Word.END] = pause, end
+        assert "its brain's process is gone" in str(sampler.end())
+    words[Word.PAUSE] = words[Word.END] = 1
     assert sampler.end() == "ended"
-    robot.now += 3 * S
-    assert "brain's process was silent for 3.0 s" in str(sampler.end())
     robot.block.words[Word.PHASE] = Phase.RUNNING
     assert sampler.end() is None
     robot.block.close()
@@ -323,8 +326,9 @@ def test_how_a_robot_ended_is_told(robot: Robot) -> None:
 
 @pytest.mark.usefixtures("only")
 def test_a_robot_that_ends_while_it_is_watched(robot: Robot, capsys: pytest.CaptureFixture[str]) -> None:
+    words = robot.block.words
     for phase, status, message in ((Phase.ENDED, 0, "has ended."), (Phase.RUNNING, 1, "killed")):
-        robot.block.words[Word.PHASE], robot.block.words[Word.BRAIN_ALIVE] = phase, 0
+        words[Word.PHASE], words[Word.PAUSE], words[Word.END] = phase, 1, 1
         ender = threading.Timer(0.2, robot.block.close)
         if phase == Phase.RUNNING:
             ender.start()
