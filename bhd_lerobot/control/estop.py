@@ -53,10 +53,9 @@ def check_source(source: Source, period_s: float = POLL_S) -> int | None:
     Raises:
         ConfigError: it is neither, the descriptor is not open, or the period is not positive.
     """
-    fileno = getattr(source, "fileno", None)
-    if isinstance(source, int) or fileno is not None:
+    if isinstance(source, int) or hasattr(source, "fileno"):
         try:
-            descriptor = source if isinstance(source, int) else int(fileno())
+            descriptor = source if isinstance(source, int) else int(source.fileno())
             os.fstat(descriptor)
         except (OSError, ValueError, OverflowError) as error:
             raise ConfigError(f"The emergency stop's input {source!r} cannot be used: {error}.") from None
