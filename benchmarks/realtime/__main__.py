@@ -81,7 +81,7 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
 
 def quotable(options: argparse.Namespace) -> bool:
     """Tell whether a run is long enough for its numbers to be quoted."""
-    return options.blocks >= FULL["blocks"] and options.seconds >= FULL["seconds"]
+    return bool(options.blocks >= FULL["blocks"] and options.seconds >= FULL["seconds"])
 
 
 def report(

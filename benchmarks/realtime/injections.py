@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.realtime.cases import CaseError
 from benchmarks.realtime.owner import OwnerSpec
-from benchmarks.realtime.robots import OwnedRobot, drops_word, standing_still
+from benchmarks.realtime.robots import OwnedRobot, standing_still
 from benchmarks.realtime.stamps import Loss, Stop, judge_loss, judge_stop, reference_speed
 from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.control.frame_log import FrameLog
@@ -212,7 +212,7 @@ def count_drops(robot: OwnedRobot, stopped_s: list[float]) -> Drops:
     taken += read(0.5)  # the recorder goes on until it has seen everything
     if reader.drops:
         raise CaseError(f"{reader.drops} entries of the recorder's log were overwritten before they were counted")
-    return Drops(len(block.ring) - before, taken, drops_word(robot))
+    return Drops(len(block.ring) - before, taken, int(robot.watcher.words[Word.RECORDER_DROPS]))
 
 
 @dataclass(frozen=True)

@@ -114,18 +114,18 @@ class Sway:
         if self._base:
             if now_s - self._since > _BASE_TURN_S:
                 self._sign, self._since = -self._sign, now_s
-            return (self._sign * _BASE_SPEED)[None]
+            return np.asarray((self._sign * _BASE_SPEED)[None])
         if self._centre is None:
             self._centre = command.copy()
         way = (command - self._centre)[0] @ np.sign(_ARM_SPEED) / np.count_nonzero(_ARM_SPEED)
         if abs(way) > _ARM_RANGE:
             self._sign = -np.sign(way)
-        return command + self._sign * _ARM_SPEED / self._fps
+        return np.asarray(command + self._sign * _ARM_SPEED / self._fps)
 
     def planned(self, start: NDArray[np.float64], at_s: float) -> NDArray[np.float64]:
         """Return the setpoint for a time, for a brain that sends them ahead; it moves all the time."""
         if self._base:
-            return (np.cos(at_s) * _BASE_SPEED)[None]
+            return np.asarray((np.cos(at_s) * _BASE_SPEED)[None])
         return np.asarray(start + np.sin(at_s) * _ARM_SPEED)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from benchmarks.realtime.cases import Case, CaseError, cyclictest_case, python_case
 from benchmarks.realtime.injections import (
+    WATCHDOGS,
     Drops,
     Losses,
     PlantStop,
@@ -193,7 +194,7 @@ class Bench:
     def _lose_brains(self, found: Experiments, sizes: "Sizes", rng: random.Random) -> None:
         losses = Losses()
         for number in range(sizes.kills):
-            specs = [lose_spec(self.name(f"{drive}-{number}"), drive, str(self.folder)) for drive in DRIVES]
+            specs = [lose_spec(self.name(f"{drive}-{number}"), drive, str(self.folder)) for drive in WATCHDOGS]
             with ExitStack() as stack:
                 robots = [stack.enter_context(owned_robot(spec)) for spec in specs]
                 for robot in robots:
@@ -216,9 +217,6 @@ class Bench:
                 robot.prepare()
                 stops.append(kill_cerebellum(robot, rng))
         found.plant = stops
-
-
-DRIVES = ("setpoints", "chunks")
 
 
 @dataclass(frozen=True)

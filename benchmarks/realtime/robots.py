@@ -12,69 +12,18 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks.realtime.cases import ROOT, WARM_UP_TICKS, Case, CaseError
 from benchmarks.realtime.owner import OwnerSpec, as_argument
-from benchmarks.realtime.stamps import Array, StampError, block_samples, records_of
+from benchmarks.realtime.stamps import StampError, block_samples
 from benchmarks.realtime.statistics import Samples
-from bhd_lerobot.control.fifo import RingReader
-from bhd_lerobot.control.live_block import LiveBlock, Word
+from benchmarks.realtime.watcher import Watcher
+from bhd_lerobot.control.live_block import Word
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.shared_block import FOLDER, PREFIX
-from bhd_lerobot.errors import BhdError
 
 _START_S = 180.0
 _END_S = 20.0
 _DRAIN_S = 0.1  # between two looks into the ring, which holds seconds
-
-
-class Watcher:
-    """Reads every published state of a robot, from another process.
-
-    Args:
-        name: the robot's name.
-
-    Raises:
-        CaseError: there is no such robot.
-    """
-
-    def __init__(self, name: str) -> None:
-        try:
-            self.block = LiveBlock.attach(name)
-        except BhdError as error:
-            raise CaseError(str(error)) from error
-        self.words = self.block.words
-        self.period_ns = NANOSECONDS // int(self.block.about["control_hz"])
-        self.begin()
-
-    def begin(self) -> None:
-        """Forget what was read; what is published from now on is kept."""
-        self._reader = RingReader(self.block.ring)
-        self._batches: list[Array] = []
-
-    @property
-    def drops(self) -> int:
-        """States that were overwritten before they could be read."""
-        return self._reader.drops
-
-    def drain(self) -> Array:
-        """Read what was published since the last call, and return it."""
-        states = []
-        while (state := self._reader.read()) is not None:
-            states.append(state)
-        batch = records_of(np.array(states, self.block.state_dtype))
-        if len(batch):
-            self._batches.append(batch)
-        return batch
-
-    def records(self) -> Array:
-        """Return all that was read since `begin`, in order."""
-        return np.concatenate(self._batches) if self._batches else records_of(np.zeros(0, self.block.state_dtype))
-
-    def close(self) -> None:
-        """Leave the robot's memory."""
-        self.block.close()
 
 
 class OwnedRobot:
@@ -349,8 +298,3 @@ def robot_case(
         return samples
 
     return Case(name, title, run)
-
-
-def drops_word(robot: OwnedRobot) -> int:
-    """Return how many states the recorder says that it lost."""
-    return int(robot.watcher.words[Word.RECORDER_DROPS])

@@ -10,7 +10,8 @@ import pytest
 from benchmarks.realtime import robots
 from benchmarks.realtime.cases import CaseError
 from benchmarks.realtime.owner import Lines, OwnerSpec, Sway, as_argument
-from benchmarks.realtime.robots import OwnedRobot, Watcher, is_running, standing_still
+from benchmarks.realtime.robots import OwnedRobot, is_running, standing_still
+from benchmarks.realtime.watcher import Watcher
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 30.0  # generous: only a failure takes that long
