@@ -12,7 +12,7 @@ from bhd_lerobot.control.plan_link import PlanLink, PlanServer
 from bhd_lerobot.control.requests import EVENT_DTYPE, RequestClient, RequestServer, request_dtype
 
 _REQUESTS, _EVENTS = 16, 64
-_REST_S = 0.001  # between two looks of the planner for a request
+_REST_S = 0.002  # between two looks of the planner for a request
 
 
 def _dof(cerebellum: Cerebellum) -> int:

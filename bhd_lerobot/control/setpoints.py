@@ -92,9 +92,9 @@ class SetpointFilter:
         closing = np.minimum(_GAIN * size, np.sqrt(2 * _APPROACH * self._acceleration * size))
         wanted = feed + np.copysign(closing, error)
         # Near an end of a range, no faster than what can still be stopped before it.
-        if np.count_nonzero(position > self._near_upper):
+        if np.count_nonzero((position > self._near_upper) & (wanted > 0)):
             wanted = np.minimum(wanted, self._stoppable(np.maximum(self._upper - position, 0.0)))
-        if np.count_nonzero(position < self._near_lower):
+        if np.count_nonzero((position < self._near_lower) & (wanted < 0)):
             wanted = np.maximum(wanted, -self._stoppable(np.maximum(position - self._lower, 0.0)))
         speed = np.minimum(np.maximum(wanted, self._slowest), self._speed)
         change = (speed - velocity) * self._hz

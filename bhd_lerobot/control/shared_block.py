@@ -12,6 +12,7 @@ import mmap
 import os
 import platform
 import re
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
@@ -22,6 +23,7 @@ FOLDER = Path("/dev/shm")
 PREFIX = "bhd-"
 _MAGIC = b"bhd-blk1"
 _ALIGNMENT = 64  # a cache line: no two sections share one
+_ASKING_S = 0.002  # it takes much less to find out whether somebody holds a block
 _HEADER = 4096  # bytes for the description; it grows in pages
 # Aligned 64-bit stores become visible to other processes in program order on x86 alone; on other processors the
 # counters that guard an entry could be seen before the entry.
@@ -212,6 +214,11 @@ class SharedBlock:
         with contextlib.suppress(BufferError):
             self._memory.close()
         sweep()
+        path = FOLDER / f"{PREFIX}{self.name}"
+        if path.exists():
+            # Either others hold it, or somebody was just asking whether anybody does.
+            time.sleep(_ASKING_S)
+            sweep()
 
 
 def _nobody(name: str, why: str | None) -> RealtimeError:

@@ -17,6 +17,13 @@ from bhd_lerobot.robots.simulation import Simulation
 LIMITS, WATCHDOGS = tuple(limit for limit in Limit if limit), tuple(watchdog for watchdog in Watchdog if watchdog)
 
 
+# The numbers that a state begins with, in the order in which they are written.
+_NUMBERS = (
+    *("tick", "stretch", "due_ns", "start_ns", "ended_ns", "executed", "skipped", "overruns"),
+    *("setpoints", "waiting", "command_age_ns", "sensed_ns", "oldest_ns"),
+)
+
+
 def state_dtype(simulation: Simulation) -> np.dtype:
     """Return the dtype of the published states of one robot.
 
@@ -39,12 +46,9 @@ def state_dtype(simulation: Simulation) -> np.dtype:
     odometry = cerebellum.controller.odometry().shape[1]
     own = Cerebellum.state_dtype(1, cerebellum.controller.joints, cerebellum.width, odometry)
     physics = simulation.world.qpos.shape[1] + simulation.world.qvel.shape[1]
-    counts = [(name, np.int64) for name in ("tick", "stretch", "due_ns", "start_ns", "ended_ns")]
-    counts += [(name, np.int64) for name in ("executed", "skipped", "overruns", "sensed_ns", "oldest_ns")]
-    counts += [(name, np.int64) for name in ("setpoints", "command_age_ns", "waiting")]
     return np.dtype(
         [
-            *counts,
+            *((name, np.int64) for name in _NUMBERS),
             *((name, own[name].base, own[name].shape) for name in own.names or () if name != "stamp_ns"),
             ("requested", np.float64, (1, cerebellum.width)),
             ("limits", np.int64, (len(LIMITS),)),
@@ -72,6 +76,7 @@ class StatePublisher:
         self._simulation, self._cerebellum, self._ring = simulation, simulation.cerebellum, ring
         self._record = np.zeros(1, state_dtype(simulation))
         self._field = {name: self._record[name] for name in self._record.dtype.names or ()}
+        self._numbers = np.frombuffer(self._record.data, np.int64, len(_NUMBERS))  # one write instead of thirteen
         self._feedback = self._record[0]["feedback"]
         self._touches = np.zeros(len(simulation.touches), np.int64)
         self._limits, self._watchdogs = np.zeros(len(LIMITS), np.int64), np.zeros(len(WATCHDOGS), np.int64)
@@ -98,12 +103,6 @@ class StatePublisher:
         simulation, cerebellum, field = self._simulation, self._cerebellum, self._field
         self._count(slot)
         controller, reading = cerebellum.controller, cerebellum.reading
-        field["tick"][0], field["stretch"][0] = slot.index, self.stretch
-        field["due_ns"][0], field["start_ns"][0], field["ended_ns"][0] = slot.due_ns, start_ns, ended_ns
-        field["executed"][0], field["skipped"][0] = grid.executed, grid.skipped
-        field["overruns"][0], field["setpoints"][0] = grid.overruns, cerebellum.setpoints_taken
-        field["waiting"][0] = len(cerebellum.fifo)
-        field["command_age_ns"][:] = cerebellum.command_age_ns(slot.due_ns - grid.start_ns)
         field["joint_positions"][0], field["joint_velocities"][0] = reading.position, reading.velocity
         field["joint_efforts"][0] = controller.efforts(reading)
         field["command"][0], field["measured"][0] = cerebellum.command, controller.measured(reading)
@@ -113,9 +112,22 @@ class StatePublisher:
         field["emergency_stop"][0] = cerebellum.estop_latched
         field["refusals"][0] = cerebellum.refusals[:, 0]
         field["observation"][0], oldest = simulation.sense()
-        # Before the first tick everything stands still: what is read then is so until that tick.
-        field["sensed_ns"][0] = self._clock() if slot.index >= 0 else slot.due_ns
-        field["oldest_ns"][:] = (simulation.tick - oldest) * grid.period_ns
+        self._numbers[:] = (
+            slot.index,
+            self.stretch,
+            slot.due_ns,
+            start_ns,
+            ended_ns,
+            grid.executed,
+            grid.skipped,
+            grid.overruns,
+            cerebellum.setpoints_taken,
+            len(cerebellum.fifo),
+            cerebellum.command_age_ns(slot.due_ns - grid.start_ns)[0],
+            # Before the first tick everything stands still: what is read then is so until that tick.
+            self._clock() if slot.index >= 0 else slot.due_ns,
+            (simulation.tick - int(oldest[0])) * grid.period_ns,
+        )
         physics = field["physics"][0]
         physics[:, : self._nq], physics[:, self._nq :] = simulation.world.qpos, simulation.world.qvel
         self._ring.publish(self._record[0])

@@ -207,7 +207,12 @@ class EpisodeLoop:
         running = np.flatnonzero(simulation.running)
         self._truth = simulation.truth(report)
         reward, event = self.task.judge(self._truth, simulation.running)
-        event = np.where(report.mode == Mode.ESTOP, Event.ESTOP, event)  # whatever else happened
+        stopped = report.mode >= Mode.ESTOP
+        if np.count_nonzero(stopped):
+            # A robot that has latched a fault takes no action any more. What the task says of the frame says more, but
+            # an emergency stop comes before all else.
+            event = np.where((report.mode == Mode.FAULT) & (event == Event.NOTHING), Event.FAULT, event)
+            event = np.where(report.mode == Mode.ESTOP, Event.ESTOP, event)
         values |= {
             keys.APPLIED_ACTION: report.applied,
             keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,

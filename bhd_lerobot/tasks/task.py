@@ -27,6 +27,7 @@ class Event(IntEnum):
     WRONG_OBJECT = 7
     DROPPED = 8
     UNREACHABLE = 9
+    FAULT = 10
 
     @property
     def cause(self) -> str:

@@ -15,6 +15,7 @@ from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.runs.registry import make_simulation, make_task
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.reach import ReachConfig
+from bhd_lerobot.tasks.task import Event
 
 FRAMES = 20
 
@@ -90,3 +91,41 @@ def test_a_chunk_that_is_used_up_means_hold(kind: str) -> None:
     assert (columns[keys.WATCHDOG] & Watchdog.COMMAND_AGE).any()
     steps = np.abs(np.diff(columns[keys.APPLIED_ACTION][-3:], axis=0))
     assert (steps < 1e-6).all()
+
+
+class Breaker(Script):
+    """Latches a fault in the first simulation, in its fifth frame."""
+
+    def __init__(self, rows: np.ndarray) -> None:
+        super().__init__(rows)
+        self.simulation: Any = None
+        self.is_broken = False
+
+    def act(self, observation: Any) -> Any:
+        if self.frame == 4 and not self.is_broken:
+            self.is_broken = True
+            self.simulation.cerebellum.reading.fault[0] = True
+        return super().act(observation)
+
+
+def test_a_latched_fault_ends_the_episode_and_the_next_one_moves_again() -> None:
+    simulation = make_simulation(TurtleBot3Config(beams=36), 2)
+    task = make_task(AvoidConfig(duration_s=FRAMES / 10), 2, 10)
+    brain = Breaker(script("turtlebot3"))
+    brain.simulation = simulation
+    plant_fault = simulation.cerebellum.reading.fault
+    episodes = []
+    for episode in EpisodeLoop(simulation, task, brain).run([EpisodeSpec(i, 2 * i) for i in range(3)]):
+        plant_fault[:] = False
+        episodes.append(episode)
+    first, second, third = episodes
+    assert first.outcome.event == Event.FAULT
+    assert not first.outcome.success
+    assert first.frames == 5
+    assert first.columns[keys.MODE][-1] == Mode.FAULT
+    assert first.columns[keys.EVENT].tolist() == [0, 0, 0, 0, Event.FAULT]
+    for other in (second, third):
+        assert other.outcome.event != Event.FAULT
+        assert other.frames == FRAMES
+        assert (other.columns[keys.MODE] != Mode.FAULT).all()
+    assert np.abs(third.columns[keys.APPLIED_ACTION]).max() > 0.05
