@@ -353,6 +353,12 @@ class Cerebellum:
         by_setpoint = (self.mode == _TRACKING) & ~self._by_goal
         return np.where(by_setpoint, now_ns - self._last_due, 0)
 
+    def command_age_of(self, sim: int, now_ns: int) -> int:
+        """Return `command_age_ns` of one simulation [ns]."""
+        if self.mode[sim] != _TRACKING or self._by_goal[sim]:
+            return 0
+        return now_ns - int(self._last_due[sim])
+
     def state(self, now_ns: int) -> CerebellumState:
         """Return a copy of the present state."""
         velocity = self.reading.velocity.copy()

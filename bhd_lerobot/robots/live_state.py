@@ -123,7 +123,7 @@ class StatePublisher:
             grid.overruns,
             cerebellum.setpoints_taken,
             len(cerebellum.fifo),
-            cerebellum.command_age_ns(slot.due_ns - grid.start_ns)[0],
+            cerebellum.command_age_of(0, slot.due_ns - grid.start_ns),
             # Before the first tick everything stands still: what is read then is so until that tick.
             self._clock() if slot.index >= 0 else slot.due_ns,
             (simulation.tick - int(oldest[0])) * grid.period_ns,

@@ -113,13 +113,16 @@ class UR5Simulation(Simulation):
 
     def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
-        self.plant.read(self._reading)
-        position, velocity = self._reading.position.copy(), self._reading.velocity.copy()
-        for sim in np.flatnonzero((self._noise > 0) & self.running):
-            noise = self._rngs[sim].normal(0.0, self._noise[sim], (2, len(JOINTS)))
-            position[sim, : len(JOINTS)] += noise[0]
-            velocity[sim, : len(JOINTS)] += noise[1] * _SPEED_NOISE
-        return np.concatenate([position, velocity], axis=1), np.full(self.n, self.tick)
+        reading = self._reading
+        self.plant.read(reading)
+        state = np.concatenate([reading.position, reading.velocity], axis=1)
+        if np.count_nonzero(self._noise):
+            joints = len(JOINTS)
+            for sim in np.flatnonzero((self._noise > 0) & self.running):
+                noise = self._rngs[sim].normal(0.0, self._noise[sim], (2, joints))
+                state[sim, :joints] += noise[0]
+                state[sim, joints + 1 : -1] += noise[1] * _SPEED_NOISE
+        return state, np.full(self.n, self.tick)
 
     @property
     def touches(self) -> tuple[NDArray[np.bool_], ...]:
