@@ -264,7 +264,8 @@ class EpisodeLoop:
             for sim, commands in decision.commands.items():
                 self._commands[sim] += [(int(self._length[sim]), command) for command in commands]
         for sim, results in report.results.items():
-            self._ends[sim] += [(int(self._length[sim]), result) for result in results]
+            last = int(self._length[sim]) + len(report.missed)
+            self._ends[sim] += [(last, result) for result in results]
         self._results = report.results
 
     def _store(self, running: NDArray[np.intp], values: Mapping[str, NDArray]) -> None:
