@@ -6,6 +6,7 @@ Child processes inherit it.
 
 import os
 import shutil
+import signal
 import tempfile
 from pathlib import Path
 
@@ -22,6 +23,11 @@ os.environ["MPLBACKEND"] = "Agg"
 if "PYTEST_XDIST_WORKER" in os.environ:
     # One thread for each of torch, BLAS and OpenCV: the workers are the parallelism.
     os.environ["OMP_NUM_THREADS"] = "1"
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell without job control starts a background command with Ctrl-C ignored; the children of a test inherit that,
+    # and the tests of Ctrl-C would wait for ever.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("bhd", derandomize=True, deadline=None, database=None)
 settings.load_profile("bhd")
