@@ -10,6 +10,9 @@ from bhd_lerobot.bodies.body import PositionLimits
 _GAIN = 50.0
 # The share of the acceleration limit that approaching a target may count on, so that discrete time leaves room.
 _APPROACH = 0.7
+# Which joints may come near an end of their range is looked up once in so many ticks.
+_LOOK_TICKS = 20
+_NEVER = np.iinfo(np.int64).max
 
 
 class SetpointFilter:
@@ -37,11 +40,22 @@ class SetpointFilter:
         self._hz, self._frame_ticks = control_hz, frame_ticks
         self._slowest = -self._speed
         self._hardest = -self._acceleration
-        # Farther from an end of the range than this, any speed can be stopped in time.
-        room = self._room_for(self._speed)
+        self._closing = 2 * _APPROACH * self._acceleration
+        # Farther from an end of the range than this, any speed can be stopped in time, until the next look, too.
+        room = self._room_for(self._speed) + _LOOK_TICKS * self._speed / control_hz
         self._near_upper, self._near_lower = self._upper - room, self._lower + room
-        self._target, self._step = np.zeros((n, width)), np.zeros((n, width))
-        self._goal, self._left = np.zeros((n, width)), np.zeros(n, np.int64)
+        self._next_look = 0
+        self._upward, self._downward = np.ones((n, width), np.bool_), np.ones((n, width), np.bool_)
+        self._any_upward = self._any_downward = True
+        # Of the frame that has begun; a target that has arrived has a step of 0.
+        self._target, self._goal = np.zeros((n, width)), np.zeros((n, width))
+        self._step, self._feed = np.zeros((n, width)), np.zeros((n, width))
+        self._runs = 0  # ticks so far
+        self._arrival = np.full(n, _NEVER)  # the tick in which each target arrives
+        self._next_arrival = int(_NEVER)
+        self._error, self._size, self._wanted, self._work = np.zeros((4, n, width))
+        self._flags = np.zeros((n, width), np.bool_)
+        self._all_active = False
         self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.limited_position: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.limited_velocity: NDArray[np.bool_] = np.zeros(n, np.bool_)
@@ -57,17 +71,27 @@ class SetpointFilter:
             position: the reference now, shape (n, width): where the target of a robot starts that had none.
         """
         clipped = np.minimum(np.maximum(values, self._lower), self._upper)
-        self.limited = True
-        self.limited_position |= mask & (clipped != values).any(axis=1)
-        np.copyto(self._target, position, where=(mask & ~self.active)[:, None])
-        np.copyto(self._goal, clipped, where=mask[:, None])
-        np.copyto(self._step, (clipped - self._target) / self._frame_ticks, where=mask[:, None])
-        self._left[mask] = self._frame_ticks
-        self.active |= mask
+        where = mask[:, None]
+        outside = (clipped != values) & where
+        if np.count_nonzero(outside):
+            self.limited = True
+            self.limited_position |= outside.any(axis=1)
+        starting = mask > self.active
+        if np.count_nonzero(starting):
+            np.copyto(self._target, position, where=starting[:, None])
+            self.active |= mask
+            self._all_active = bool(self.active.all())
+            self._next_look = self._runs
+        np.copyto(self._goal, clipped, where=where)
+        np.copyto(self._step, (clipped - self._target) / self._frame_ticks, where=where)
+        np.multiply(self._step, self._hz, out=self._feed)
+        self._arrival[mask] = self._runs + self._frame_ticks
+        self._next_arrival = int(self._arrival.min())
 
     def drop(self, mask: NDArray[np.bool_]) -> None:
         """Stop following setpoints."""
         self.active &= ~mask
+        self._all_active = False
 
     def run(
         self, position: NDArray[np.float64], velocity: NDArray[np.float64], acceleration: NDArray[np.float64]
@@ -79,35 +103,67 @@ class SetpointFilter:
             velocity: its speed, shape (n, width).
             acceleration: its acceleration, shape (n, width).
         """
-        moving = self._left > 0
-        np.copyto(self._target, self._target + self._step, where=moving[:, None])
-        arrived = self._left == 1
-        if arrived.any():
-            np.copyto(self._target, self._goal, where=arrived[:, None])  # sums of steps miss it by their rounding
-        feed = np.where(moving[:, None], self._step * self._hz, 0.0)
-        self._left -= moving
-        error = self._target - position
-        size = np.abs(error)
+        # This runs a thousand times a second: each call into numpy counts, and none makes a new array.
+        error, size, wanted, change = self._error, self._size, self._wanted, self._work
+        self._runs += 1
+        self._target += self._step
+        arriving = self._runs == self._next_arrival
+        if arriving:  # sums of steps miss the goal by their rounding
+            np.copyto(self._target, self._goal, where=(self._arrival == self._runs)[:, None])
+        np.subtract(self._target, position, out=error)
+        np.abs(error, out=size)
         # Faster than this it could not slow down in time to stop at the target.
-        closing = np.minimum(_GAIN * size, np.sqrt(2 * _APPROACH * self._acceleration * size))
-        wanted = feed + np.copysign(closing, error)
-        # Near an end of a range, no faster than what can still be stopped before it.
-        if np.count_nonzero((position > self._near_upper) & (wanted > 0)):
-            wanted = np.minimum(wanted, self._stoppable(np.maximum(self._upper - position, 0.0)))
-        if np.count_nonzero((position < self._near_lower) & (wanted < 0)):
-            wanted = np.maximum(wanted, -self._stoppable(np.maximum(position - self._lower, 0.0)))
-        speed = np.minimum(np.maximum(wanted, self._slowest), self._speed)
-        change = (speed - velocity) * self._hz
-        allowed = np.minimum(np.maximum(change, self._hardest), self._acceleration)
+        np.multiply(self._closing, size, out=wanted)
+        np.sqrt(wanted, out=wanted)
+        np.multiply(size, _GAIN, out=size)
+        np.minimum(size, wanted, out=wanted)
+        np.copysign(wanted, error, out=wanted)
+        np.add(wanted, self._feed, out=wanted)
+        if arriving:
+            self._arrive()
+        self._slow_near_ends(position)
+        speed = np.maximum(wanted, self._slowest, out=size)
+        np.minimum(speed, self._speed, out=speed)
+        np.subtract(speed, velocity, out=change)
+        np.multiply(change, self._hz, out=change)
+        allowed = np.maximum(change, self._hardest, out=error)
+        np.minimum(allowed, self._acceleration, out=allowed)
+        self._note(self.limited_velocity, speed, wanted)
+        self._note(self.limited_acceleration, allowed, change)
+        if self._all_active:
+            acceleration[:] = allowed
+            velocity += np.divide(allowed, self._hz, out=allowed)
+            position += np.divide(velocity, self._hz, out=allowed)
+            return
         active = self.active[:, None]
-        faster, harder = speed != wanted, allowed != change
-        if np.count_nonzero(faster) or np.count_nonzero(harder):
-            self.limited = True
-            self.limited_velocity |= self.active & faster.any(axis=1)
-            self.limited_acceleration |= self.active & harder.any(axis=1)
         np.copyto(acceleration, allowed, where=active)
         np.copyto(velocity, velocity + allowed / self._hz, where=active)
         np.copyto(position, position + velocity / self._hz, where=active)
+
+    def _arrive(self) -> None:
+        """Let the targets rest that have arrived."""
+        arrived = self._arrival == self._runs
+        self._step[arrived] = self._feed[arrived] = 0.0
+        self._arrival[arrived] = _NEVER
+        self._next_arrival = int(self._arrival.min())
+
+    def _slow_near_ends(self, position: NDArray[np.float64]) -> None:
+        """Want no more, near an end of a range, than what can still be stopped before it."""
+        if self._runs > self._next_look:
+            self._next_look = self._runs + _LOOK_TICKS - 1
+            self._any_upward = bool(np.greater(position, self._near_upper, out=self._upward).any())
+            self._any_downward = bool(np.less(position, self._near_lower, out=self._downward).any())
+        wanted, flags = self._wanted, self._flags
+        if self._any_upward and np.count_nonzero(np.logical_and(self._upward, wanted > 0, out=flags)):
+            np.minimum(wanted, self._stoppable(np.maximum(self._upper - position, 0.0)), out=wanted)
+        if self._any_downward and np.count_nonzero(np.logical_and(self._downward, wanted < 0, out=flags)):
+            np.maximum(wanted, -self._stoppable(np.maximum(position - self._lower, 0.0)), out=wanted)
+
+    def _note(self, limited: NDArray[np.bool_], got: NDArray[np.float64], wanted: NDArray[np.float64]) -> None:
+        """Flag the robots that did not get what was wanted."""
+        if np.count_nonzero(np.not_equal(got, wanted, out=self._flags)):
+            self.limited = True
+            limited |= self.active & self._flags.any(axis=1)
 
     def _stoppable(self, room: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the largest speed of the next tick that leaves enough room to stop in.
@@ -132,7 +188,9 @@ class SetpointFilter:
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget robots that were put somewhere else."""
-        self.active[ids] = False
-        self._left[ids] = 0
+        self.active[ids] = self._all_active = False
+        self._step[ids] = self._feed[ids] = 0.0
+        self._arrival[ids] = _NEVER
+        self._next_arrival = int(self._arrival.min())
         for flags in (self.limited_position, self.limited_velocity, self.limited_acceleration):
             flags[ids] = False
