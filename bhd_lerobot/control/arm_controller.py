@@ -54,6 +54,7 @@ class ArmController(Controller):
         self._lead = np.asarray(arm.servo_damping) / np.asarray(arm.servo_stiffness)
         self._stiffness, self._damping = np.asarray(arm.servo_stiffness), np.asarray(arm.servo_damping)
         self._effort = np.asarray(limits.effort)
+        self._lowest_effort = -self._effort
         self._largest_error = self._effort / self._stiffness
         self._largest_error[-1] = np.inf  # a gripper that grips asks for more than it has, always
         self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
@@ -63,14 +64,13 @@ class ArmController(Controller):
 
     def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
         """Head for new setpoints; goals that are still followed end, because the newer command counts."""
-        bad = mask & ~np.isfinite(values).all(axis=1)
-        if bad.any():
-            # Commands are checked when they are sent; a queue in shared memory is written by another process.
+        # Commands are checked when they are sent; a queue in shared memory is written by another process.
+        if not np.isfinite(values).all() and (bad := mask & ~np.isfinite(values).all(axis=1)).any():
             self._limited_finite |= bad
             self._any_bad = True
             self.stop(bad, Mode.FAULT)
             mask = mask & ~bad
-        if (self.busy & mask).any():
+        if np.count_nonzero(self.busy & mask):
             self.goals.drop_for_setpoint(mask)
         self.setpoints.head_for(values, mask, self.command)
 
@@ -89,7 +89,8 @@ class ArmController(Controller):
         """Advance by one tick."""
         if np.count_nonzero(self.setpoints.active):
             # A goal that came after them takes over; both in one tick would move the reference twice.
-            self._leave_setpoints(self.goals.busy)
+            if np.count_nonzero(self.busy):
+                self._leave_setpoints(self.busy)
             self.setpoints.run(self.command, self.velocity, self.acceleration)
         self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
         if np.count_nonzero(self._unwatched):
@@ -198,8 +199,11 @@ class ArmController(Controller):
 
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
         """Return the torques that the servos give beyond gravity [N m], the gripper's force last [N]."""
-        asked = (self.actuators - reading.position) * self._stiffness - reading.velocity * self._damping
-        return np.minimum(np.maximum(asked, -self._effort), self._effort)
+        asked = np.subtract(self.actuators, reading.position)
+        asked *= self._stiffness
+        asked -= np.multiply(reading.velocity, self._damping, out=self._work)
+        np.maximum(asked, self._lowest_effort, out=asked)
+        return np.minimum(asked, self._effort, out=asked)
 
     # --- goals -------------------------------------------------------------------------------------------------------
 

@@ -169,20 +169,32 @@ class Cerebellum:
                 # What was sent before and is due later belongs to an action chunk that a newer one took the place of.
                 self.fifo.drop_older(popped[0], self._popped_mask)
             # Modes may have changed since the command was sent.
-            reasons = self._mode_reasons()
-            reasons[(reasons == Reason.ACCEPTED) & (now_ns - due > self._timeout_ns)] = Reason.STALE
-            take = self._popped_mask & (reasons == Reason.ACCEPTED)
-            self._count_refusals(np.where(self._popped_mask, reasons, Reason.ACCEPTED))
-            self._last_due[take] = due
+            take = self._popped_mask
+            if now_ns - due > self._timeout_ns or not self._all_track:
+                take = self._sift(take, now_ns - due)
+                self._last_due[take] = due
+                self._set_mode(take & (self.mode != _TRACKING), Mode.TRACKING)
+            np.copyto(self._last_due, due, where=take)
             np.copyto(self.requested, self._popped, where=take[:, None])
             self.setpoints_taken += int(np.count_nonzero(take))
-            starting = take & (self.mode != Mode.TRACKING)
-            if starting.any():
-                self._set_mode(starting, Mode.TRACKING)
             self._by_goal &= ~take
             self.controller.head_for(self._popped, take)
             self._update_deadline()
             due = self.fifo.next_due()
+
+    @property
+    def _all_track(self) -> bool:
+        """Whether every robot follows commands, and none is to stop."""
+        if np.count_nonzero(self.mode == _TRACKING) < self.n:
+            return False
+        return not (np.count_nonzero(self.estop_word) or np.count_nonzero(self._deactivating))
+
+    def _sift(self, mask: NDArray[np.bool_], age_ns: int) -> NDArray[np.bool_]:
+        """Count the robots that refuse a command of this age; return those that take it."""
+        reasons = self._mode_reasons()
+        reasons[(reasons == Reason.ACCEPTED) & (age_ns > self._timeout_ns)] = Reason.STALE
+        self._count_refusals(np.where(mask, reasons, Reason.ACCEPTED))
+        return mask & (reasons == Reason.ACCEPTED)
 
     def _follow_controller(self) -> None:
         """Keep the modes in step with the controller.
@@ -429,8 +441,11 @@ class Cerebellum:
             self.refusals[reasons, np.arange(self.n)] += reasons != Reason.ACCEPTED
 
     def _update_deadline(self) -> None:
-        tracking = (self.mode == Mode.TRACKING) & ~self._by_goal
-        self._deadline = int(self._last_due[tracking].min()) + self._timeout_ns if tracking.any() else None
+        tracking = (self.mode == _TRACKING) > self._by_goal
+        if np.count_nonzero(tracking):
+            self._deadline = int(self._last_due[tracking].min()) + self._timeout_ns
+        else:
+            self._deadline = None
 
     def _configure(self, mask: NDArray[np.bool_]) -> None:
         self.controller.configure(np.flatnonzero(mask), self.reading)

@@ -109,7 +109,11 @@ class CommandFifo:
         values[:], mask[:] = self._values[slot], self._mask[slot]
         result = int(self._sequence[slot]), int(self._due[slot])
         self._mask[slot] = False
-        self._look()
+        if self._next == int(self._tail[0]) == self._seen_head - 1:  # the only one, as nearly always
+            self._tail[0] = self._seen_head
+            self._next, self._next_due = None, None
+        else:
+            self._look()
         return result
 
     def drop(self, ids: NDArray[np.intp]) -> NDArray[np.int64]:
@@ -143,6 +147,13 @@ class CommandFifo:
         self._seen_head = head
         self._next, self._next_due = None, None
         if tail == head:
+            return
+        if tail == head - 1:
+            slot = tail % self.capacity
+            if np.count_nonzero(self._mask[slot]):
+                self._next, self._next_due = tail, int(self._due[slot])
+            else:
+                self._tail[0] = head
             return
         # All at once: a chunk of actions is a hundred entries, and this is asked within a tick.
         slots = np.arange(tail, head) % self.capacity

@@ -75,12 +75,16 @@ class StatePublisher:
         self._clock = clock
         self._simulation, self._cerebellum, self._ring = simulation, simulation.cerebellum, ring
         self._record = np.zeros(1, state_dtype(simulation))
-        self._field = {name: self._record[name] for name in self._record.dtype.names or ()}
+        # The one robot's values, as views: an index costs as much as a write.
+        self._field = {name: self._record[name][0] for name in self._record.dtype.names or ()}
+        self._state = self._record[0]
+        self._speed = np.zeros_like(simulation.cerebellum.reading.velocity)
         self._numbers = np.frombuffer(self._record.data, np.int64, len(_NUMBERS))  # one write instead of thirteen
-        self._feedback = self._record[0]["feedback"]
+        self._feedback = self._state["feedback"]
         self._touches = np.zeros(len(simulation.touches), np.int64)
         self._limits, self._watchdogs = np.zeros(len(LIMITS), np.int64), np.zeros(len(WATCHDOGS), np.int64)
-        self._nq = simulation.world.qpos.shape[1]
+        nq = simulation.world.qpos.shape[1]
+        self._physics = self._field["physics"][:, :nq], self._field["physics"][:, nq:]
         self._frame = simulation.rates.ticks_per_frame
         self._next_frame = 0
         self.stretch = 0
@@ -103,15 +107,16 @@ class StatePublisher:
         simulation, cerebellum, field = self._simulation, self._cerebellum, self._field
         self._count(slot)
         controller, reading = cerebellum.controller, cerebellum.reading
-        field["joint_positions"][0], field["joint_velocities"][0] = reading.position, reading.velocity
-        field["joint_efforts"][0] = controller.efforts(reading)
-        field["command"][0], field["measured"][0] = cerebellum.command, controller.measured(reading)
-        field["odometry"][0] = controller.odometry()
-        field["mode"][0], field["requested"][0] = cerebellum.mode, cerebellum.requested
-        field["is_moving"][0] = np.abs(reading.velocity).max() > MOVING
-        field["emergency_stop"][0] = cerebellum.estop_latched
-        field["refusals"][0] = cerebellum.refusals[:, 0]
-        field["observation"][0], oldest = simulation.sense()
+        field["joint_positions"][:], field["joint_velocities"][:] = reading.position, reading.velocity
+        field["joint_efforts"][:] = controller.efforts(reading)
+        field["command"][:], field["measured"][:] = cerebellum.command, controller.measured(reading)
+        field["odometry"][:] = controller.odometry()
+        field["mode"][:], field["requested"][:] = cerebellum.mode, cerebellum.requested
+        np.abs(reading.velocity, out=self._speed)
+        field["is_moving"][:] = np.count_nonzero(self._speed > MOVING) > 0
+        field["emergency_stop"][:] = cerebellum.estop_latched
+        field["refusals"][:] = cerebellum.refusals[:, 0]
+        field["observation"][:], oldest = simulation.sense()
         self._numbers[:] = (
             slot.index,
             self.stretch,
@@ -128,9 +133,8 @@ class StatePublisher:
             self._clock() if slot.index >= 0 else slot.due_ns,
             (simulation.tick - int(oldest[0])) * grid.period_ns,
         )
-        physics = field["physics"][0]
-        physics[:, : self._nq], physics[:, self._nq :] = simulation.world.qpos, simulation.world.qvel
-        self._ring.publish(self._record[0])
+        self._physics[0][:], self._physics[1][:] = simulation.world.qpos, simulation.world.qvel
+        self._ring.publish(self._state)
 
     def _count(self, slot: Slot) -> None:
         """Count what was raised since the last tick; limits and watchdogs at the last tick of every frame."""
@@ -138,7 +142,7 @@ class StatePublisher:
         flags = [flag[0] for flag in self._simulation.touches]
         if any(flags):
             self._touches += flags
-            field["touches"][0] = self._touches
+            field["touches"][:] = self._touches
             for flag in self._simulation.touches:
                 flag[0] = False
         # The state that a frame ends with holds all that was raised in it, also if its last tick was skipped.
@@ -151,11 +155,11 @@ class StatePublisher:
         raised = int(limits[0])
         if raised:
             self._limits += [bool(raised & limit) for limit in LIMITS]
-            field["limits"][0] = self._limits
+            field["limits"][:] = self._limits
         raised = int(watchdog[0])
         if raised:
             self._watchdogs += [bool(raised & one) for one in WATCHDOGS]
-            field["watchdogs"][0] = self._watchdogs
+            field["watchdogs"][:] = self._watchdogs
 
 
 def raised(before: Any, after: Any) -> tuple[int, int]:

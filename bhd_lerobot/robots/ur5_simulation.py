@@ -77,6 +77,7 @@ class UR5Simulation(Simulation):
         self.camera_names = ("scene", "wrist") if config.camera else ()
         self._begin()
         self._noise = np.zeros(n)
+        self._now = np.ones(n, np.int64)  # times the tick
         self._arm_on_table, self._arm_on_object, self._self_contact = (np.zeros(n, np.bool_) for _ in range(3))
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[TableScene]) -> None:
@@ -122,7 +123,7 @@ class UR5Simulation(Simulation):
                 noise = self._rngs[sim].normal(0.0, self._noise[sim], (2, joints))
                 state[sim, :joints] += noise[0]
                 state[sim, joints + 1 : -1] += noise[1] * _SPEED_NOISE
-        return state, np.full(self.n, self.tick)
+        return state, self._now * self.tick
 
     @property
     def touches(self) -> tuple[NDArray[np.bool_], ...]:

@@ -207,7 +207,7 @@ class Tabletop:
     @property
     def is_touching_more(self) -> bool:
         """Whether any arm touches more than objects with its gripper; if not, no other flag below is set."""
-        return bool(np.count_nonzero(self._any - self._grip @ self._ones))
+        return bool(np.count_nonzero(self._any) and np.count_nonzero(self._any - self._grip @ self._ones))
 
     @property
     def arm_on_table(self) -> NDArray[np.bool_]:
