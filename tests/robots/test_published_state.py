@@ -1,5 +1,7 @@
 """What a robot publishes at every tick, on a virtual clock: the recorder sees what a lockstep run would have seen."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -96,7 +98,7 @@ def test_a_limit_is_in_the_state_that_its_frame_ends_with() -> None:
         rig.tick()
         if (tick + 1) % F == 0:
             boundaries.append(rig.latest())
-    flags = [raised(before, after)[0] for before, after in zip(boundaries, boundaries[1:], strict=False)]
+    flags = [raised(before, after)[0] for before, after in itertools.pairwise(boundaries)]
     assert flags[0] == 0
     assert flags[1] & Limit.VELOCITY
     assert flags[1] & Limit.ACCELERATION
@@ -116,7 +118,7 @@ def test_a_watchdog_is_in_the_state_that_its_frame_ends_with_also_if_the_last_ti
         if (int(state["tick"]) + 1) // F > frame:
             frame = (int(state["tick"]) + 1) // F
             boundaries.append(state)
-    watched = [raised(before, after)[1] for before, after in zip(boundaries, boundaries[1:], strict=False)]
+    watched = [raised(before, after)[1] for before, after in itertools.pairwise(boundaries)]
     # The command is too old after 0.5 s: 100 ticks, in the sixth frame.
     assert [bool(flags & Watchdog.COMMAND_AGE) for flags in watched].index(True) == 5
     assert sum(bool(flags & Watchdog.COMMAND_AGE) for flags in watched) == 1
