@@ -6,11 +6,12 @@ key, the nearest one that exists, and the valid ones on that level. Both read th
 """
 
 import dataclasses
+import keyword
 import re
 import sys
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,9 @@ def describe(config_class: type, prefix: str = "") -> str:
     )
     for name, kind, default in _fields(config_class):
         key = f"{prefix}{name}"
-        if _choices(kind):
+        if _entries(kind) is not None:
+            lines.append(f"  --{key}.NAME.type  {{{','.join(sorted(_choices(_entries(kind))))}}}, for every NAME")
+        elif _choices(kind):
             lines.append(f"  --{key}.type  {{{','.join(sorted(_choices(kind)))}}}")
             for choice, subclass in sorted(_choices(kind).items()):
                 lines += [f"    {choice}:", *("  " + line for line in describe(subclass, f"{key}.").splitlines())]
@@ -135,27 +138,41 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None
     for key, value in values.items():
         if key not in fields:
             raise ConfigError(unknown_name("option", f"{prefix}{key}", [f"{prefix}{name}" for name in fields]))
-        kind = fields[key]
-        choices = _choices(kind)
-        if choices and isinstance(value, dict):
-            chosen = value.get("type")
-            if chosen is None:
-                raise ConfigError(f"{prefix}{key}.type is missing. Valid: {', '.join(sorted(choices))}.")
-            if chosen not in choices:
-                raise ConfigError(unknown_name(f"{prefix}{key}.type", chosen, choices))
-            _check_keys(choices[chosen], {k: v for k, v in value.items() if k != "type"}, f"{prefix}{key}.")
-        elif dataclasses.is_dataclass(kind) and isinstance(value, dict):
-            _check_keys(typing.cast(type, kind), value, f"{prefix}{key}.")
-        elif dataclasses.is_dataclass(kind) or choices:
-            raise ConfigError(f"{prefix}{key} is {value!r}; it has keys of its own, such as {prefix}{key}.type.")
-        else:
-            values[key] = _checked_value(f"{prefix}{key}", value, kind)
+        values[key] = _checked(f"{prefix}{key}", value, fields[key])
     for name, kind, default in _fields(config_class):
         if default is dataclasses.MISSING and name not in values:
             if dataclasses.is_dataclass(kind) and not _choices(kind):
                 _check_keys(typing.cast(type, kind), {}, f"{prefix}{name}.")  # names what is missing in it
             choice = f".type, one of {', '.join(sorted(_choices(kind)))}" if _choices(kind) else ""
             raise ConfigError(f"The option {prefix}{name} is required; set --{prefix}{name}{choice}.")
+
+
+def _checked(key: str, value: Any, kind: Any) -> Any:
+    """Return the value of an option whose keys, if it has any, all exist."""
+    choices, entries = _choices(kind), _entries(kind)
+    if entries is not None and isinstance(value, dict):
+        # Nothing in the place of an entry takes it out: a command line can drop what a file names.
+        kept = {name: one for name, one in value.items() if one is not None}
+        _check_keys(_keyed(kept, entries), kept, f"{key}.")
+        return kept
+    if choices and isinstance(value, dict):
+        chosen = value.get("type")
+        if chosen is None:
+            raise ConfigError(f"{key}.type is missing. Valid: {', '.join(sorted(choices))}.")
+        if chosen not in choices:
+            raise ConfigError(unknown_name(f"{key}.type", chosen, choices))
+        fields = {k: v for k, v in value.items() if k != "type"}
+        _check_keys(choices[chosen], fields, f"{key}.")
+        return {"type": chosen, **fields}
+    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
+        _check_keys(typing.cast(type, kind), value, f"{key}.")
+        return value
+    if choices and value is None and _allows_none(kind):
+        return None
+    if entries is not None or dataclasses.is_dataclass(kind) or choices:
+        name = ".NAME" if entries is not None else ""
+        raise ConfigError(f"{key} is {value!r}; it has keys of its own, such as {key}{name}.type.")
+    return _checked_value(key, value, kind)
 
 
 def _checked_value(key: str, value: Any, kind: Any) -> Any:
@@ -195,8 +212,28 @@ def _fields(config_class: type) -> list[tuple[str, Any, Any]]:
     return result
 
 
+def _entries(kind: Any) -> Any:
+    """Return the choice type of the entries of a mapping from names to choices, or None if it is none."""
+    arguments = typing.get_args(kind) if typing.get_origin(kind) is dict else ()
+    return arguments[1] if len(arguments) == 2 and _choices(arguments[1]) else None
+
+
+def _keyed(names: Iterable[Any], kind: Any) -> type:
+    """Return a class with a field for each name: what a mapping from these names has to hold."""
+    for name in names:
+        if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name):
+            raise ConfigError(f"{name!r} is no name: names are made of letters, digits and underscores.")
+    return dataclasses.make_dataclass("Entries", [(name, kind) for name in names])
+
+
+def _allows_none(kind: Any) -> bool:
+    return type(None) in typing.get_args(kind)
+
+
 def _choices(kind: Any) -> dict[str, type]:
-    """Return the registered classes of a choice type, or nothing if it is none."""
+    """Return the registered classes of a choice type, or of one that may be nothing; empty if it is none."""
+    if _allows_none(kind) and len(typing.get_args(kind)) == 2:
+        kind = typing.get_args(kind)[0]
     if isinstance(kind, type) and issubclass(kind, draccus.ChoiceRegistry):
         return kind.get_known_choices()
     return {}
