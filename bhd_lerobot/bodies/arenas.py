@@ -31,12 +31,14 @@ class Arena:
         shapes: all obstacles, outer walls included.
         extent: x_min, x_max, y_min, y_max of the inside [m].
         start: x [m], y [m], yaw [rad] of the robot, world frame.
+        goal: likewise, where a task tells the robot to go.
     """
 
     name: str
     shapes: tuple[Shape, ...]
     extent: tuple[float, float, float, float]
     start: tuple[float, float, float]
+    goal: tuple[float, float, float] | None = None
 
     def clearance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the distance from points to the nearest obstacle [m], negative inside one.

@@ -142,6 +142,11 @@ def draw_arena(axes: Axes, arena: Arena) -> None:
                     linewidth=0,
                 )
             )
+    if arena.goal is not None:
+        x, y, yaw = arena.goal
+        axes.plot(x, y, marker="+", color="black", markersize=8, markeredgewidth=1.5)
+        tip = (x + 0.35 * math.cos(yaw), y + 0.35 * math.sin(yaw))  # the heading asked for
+        axes.annotate("", xy=tip, xytext=(x, y), arrowprops={"arrowstyle": "->", "color": "black", "linewidth": 1.2})
     _frame_axes(axes, (x_min - 0.12, x_max + 0.12, y_min - 0.12, y_max + 0.12))
 
 

@@ -71,6 +71,7 @@ def scene_to_json(scene: Any) -> str:
                 "extent": scene.extent,
                 "start": scene.start,
                 "shapes": [[s.kind, s.x, s.y, s.yaw, s.size_x, s.size_y, s.height] for s in scene.shapes],
+                **({} if scene.goal is None else {"goal": scene.goal}),
             }
         )
     return _json(asdict(scene))
@@ -86,7 +87,8 @@ def scene_from_json(text: str) -> Any:
         scene = json.loads(text)
         if "shapes" in scene:
             shapes = tuple(Shape(*row) for row in scene["shapes"])
-            return Arena(scene["name"], shapes, tuple(scene["extent"]), tuple(scene["start"]))
+            goal = tuple(scene["goal"]) if "goal" in scene else None
+            return Arena(scene["name"], shapes, tuple(scene["extent"]), tuple(scene["start"]), goal)
         objects = tuple(TableObject(**_tuples(one)) for one in scene.pop("objects"))
         variation = Variation(**_tuples(scene.pop("variation")))
         return TableScene(objects=objects, variation=variation, **_tuples(scene))
