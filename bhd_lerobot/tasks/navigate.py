@@ -119,8 +119,10 @@ class NavigateTask:
         # Lengths of ways, a grid for each simulation; the grids grow with the largest arena seen.
         self._ways: NDArray[np.float64] = np.zeros((n, 2, 2))
         self._origin = np.zeros((n, 2))
-        self._goal, self._pose = np.zeros((n, 3)), np.zeros((n, 3))
-        self._shortest, self._first, self._left = np.zeros(n), np.ones(n), np.ones(n)
+        self._goal: NDArray[np.float64] = np.zeros((n, 3))
+        self._pose: NDArray[np.float64] = np.zeros((n, 3))
+        self._shortest, self._first = np.zeros(n), np.ones(n)
+        self._left: NDArray[np.float64] = np.ones(n)
         self._path, self._sum = np.zeros(n), np.zeros(n)
         self._history = np.zeros((self._window, n))  # path lengths of the last frames, a ring
         self._within, self._frame = np.zeros(n, np.int64), np.zeros(n, np.int64)
