@@ -1,0 +1,42 @@
+"""What an evaluation tells in the terminal."""
+
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bhd_lerobot.runs.config_eval import EvalConfig
+from bhd_lerobot.runs.eval_text import number, percent
+
+if TYPE_CHECKING:
+    from bhd_lerobot.runs.evaluate import EvalResult
+
+
+def tell_summary(console: Console, config: EvalConfig, result: "EvalResult") -> None:
+    """Print what was found out, and where it is."""
+    results = result.results
+    baseline = config.reference
+    table = Table(title=f"{len(config.indices)} {config.split} episodes, seed {config.seed}", title_justify="left")
+    for heading in ("brain", "success, 95 %", "mean score, 95 %", f"success vs {baseline}", "failures"):
+        table.add_column(escape(heading), justify="left")
+    for label, one in results.brains.items():
+        failures = [f"{name} {count}" for name, count in one.outcomes.items() if name != "success"]
+        pair = results.paired.get(label)
+        table.add_row(
+            escape(label) + (" (baseline)" if label == baseline and len(results.brains) > 1 else ""),
+            f"{one.successes}/{one.episodes}  {percent(one.success)}",
+            number(one.means["score"], 3),
+            percent(pair.success, sign=True) if pair else "",
+            ", ".join(failures) or "none",
+        )
+    console.print(table)
+    if result.estop is not None:
+        console.print(f"[bold]Emergency stop ({escape(result.estop)}).[/bold] No further episode was begun.")
+    if results.is_partial:
+        by = f" by {result.stopped_by.name}" if result.stopped_by else ""
+        console.print(f"Stopped{by}: the results are partial, and hold every episode that was finished.")
+    for label in result.missed:
+        low = results.brains[label].success.low
+        console.print(f"[bold]{escape(label)} missed fail_below:[/bold] {low:.1%} is below {config.fail_below:.1%}.")
+    console.print(f"Report: {escape(str(result.report))}", soft_wrap=True)

@@ -1,0 +1,373 @@
+"""`bhd-eval`: brains beside each other on the same held-out episodes, with intervals, a report and films."""
+
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from bhd_lerobot.control.estop import EstopInputs, estop_signal
+from bhd_lerobot.data.features import PHYSICS_STATE
+from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
+from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.robots.simulation import Simulation, describe
+from bhd_lerobot.runs.config_eval import YARDSTICKS, EvalConfig
+from bhd_lerobot.runs.configuration import encode, run
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
+from bhd_lerobot.runs.eval_console import tell_summary
+from bhd_lerobot.runs.eval_metrics import EpisodeMetrics, JerkMeasure, measure
+from bhd_lerobot.runs.eval_record import BrainRecorder
+from bhd_lerobot.runs.eval_report import Film, ReportInput, write_report
+from bhd_lerobot.runs.eval_results import EvalResults, summarise, write_json, write_table
+from bhd_lerobot.runs.plots import Trajectory
+from bhd_lerobot.runs.preview import Preview
+from bhd_lerobot.runs.provenance import versions
+from bhd_lerobot.runs.record_report import ESTOP_STATUS, tell_refusals
+from bhd_lerobot.runs.registry import make_brain, make_robot, make_simulation, make_task
+from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
+from bhd_lerobot.tasks.task import episode_seed
+
+FILMS = 2  # failures of each brain that are filmed, unless said otherwise
+FAILED_STATUS = 1  # exit status of an evaluation in which a brain missed `fail_below`
+
+
+class TimedBrain:
+    """A brain whose calls are timed; everything else is the brain's own.
+
+    Attributes:
+        times: duration of each call of `act` [s].
+    """
+
+    def __init__(self, brain: Brain) -> None:
+        self._brain = brain
+        self.times: list[float] = []
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the brain has."""
+        return getattr(self._brain, name)
+
+    def act(self, observation: Observation) -> Any:
+        """Return what the brain wants, and remember how long it took."""
+        started = time.perf_counter()
+        try:
+            return self._brain.act(observation)
+        finally:
+            self.times.append(time.perf_counter() - started)
+
+
+@dataclass
+class BrainRun:
+    """What a brain's run leaves for results and report.
+
+    Attributes:
+        label: the brain's name in the evaluation.
+        loop: what runs it.
+        timed: its clock.
+        episodes: the numbers of its episodes.
+        trajectories: its episodes from above, by number.
+        films: what is to be filmed: episode, scene and recorded physics states.
+        initial_states: the simulator's complete states at the episodes' starts.
+        wall_s: duration of the run [s].
+    """
+
+    label: str
+    loop: EpisodeLoop
+    timed: TimedBrain
+    episodes: list[EpisodeMetrics] = field(default_factory=list)
+    trajectories: dict[int, Trajectory] = field(default_factory=dict)
+    films: list[tuple[EpisodeMetrics, Any, NDArray[np.float64]]] = field(default_factory=list)
+    initial_states: list[NDArray[np.float64]] = field(default_factory=list)
+    wall_s: float = 0.0
+
+    def timing(self) -> dict[str, Any]:
+        """Return what was measured on the wall clock, as plain values."""
+        calls = np.array(self.timed.times)
+        simulated = sum(one.length_s for one in self.episodes)
+        quantiles = dict(zip(("p50_s", "p99_s", "max_s"), np.quantile(calls, (0.5, 0.99, 1.0)).tolist(), strict=True))
+        per = self.wall_s if self.wall_s > 0 else np.inf
+        return {
+            "wall_s": self.wall_s,
+            "episodes_per_s": len(self.episodes) / per,
+            "real_time_factor": simulated / per,
+            "act": {"calls": len(calls), "robots_per_call": self.loop.simulation.n, **quantiles},
+            "episodes": {str(one.episode): one.wall for one in self.episodes if one.wall},
+        }
+
+
+@dataclass
+class EvalResult:
+    """What an evaluation found out, and where it is.
+
+    Attributes:
+        output_dir: the folder.
+        results: everything that does not depend on the wall clock.
+        timing: what was measured on the wall clock, by brain.
+        report: the HTML report.
+        missed: brains whose interval of success begins below `fail_below`.
+        stopped_by: the signal that ended the run early, or None.
+        estop: what pressed the emergency stop that ended the run, in words; None if there was none.
+    """
+
+    output_dir: Path
+    results: EvalResults
+    timing: dict[str, Any]
+    report: Path
+    missed: list[str] = field(default_factory=list)
+    stopped_by: StopRequest | None = None
+    estop: str | None = None
+
+    @property
+    def exit_status(self) -> int:
+        """The program's exit status: 0 if all was run, and nothing that was asked for was missed."""
+        if self.estop is not None:
+            return ESTOP_STATUS
+        if self.stopped_by:
+            return self.stopped_by.exit_status
+        return FAILED_STATUS if self.missed else 0
+
+
+def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
+    """Run every brain on the same episodes, write results and report.
+
+    Args:
+        config: what to compare.
+        console: where progress is shown; standard error if None.
+
+    Raises:
+        BhdError: the configuration cannot be honoured; the message names the brain that does not fit.
+    """
+    console = console or Console(stderr=True)
+    is_live = config.robot.clock == "realtime"
+    n = 1 if is_live else min(config.n_envs, len(config.indices))
+    simulation = make_robot(config.robot, n, config.threads)
+    pressed = EstopInputs(simulation.bridge.estop)
+    with closing(simulation), stop_on_signals() as stop, pressed:
+        runs = [_prepare(config, label, simulation) for label in config.chosen]
+        tell_refusals(simulation, console)
+        if simulation.camera_names and (config.record.repo_id or any(one.timed.uses_images for one in runs)):
+            simulation.start_rendering()  # a machine without OpenGL fails here, before the first episode
+        if is_live:
+            number = estop_signal("SIGUSR1")
+            pressed.add_signal(number)
+            key = "space or e, or " if pressed.add_key() else ""
+            console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} this process")
+        preview, no_films = _make_preview(config, console)
+        output_dir = _make_output_dir(config)
+        facts = _facts(config, simulation, runs)
+        with _progress(console) as progress:
+            bars = [progress.add_task(escape(one.label), total=len(config.indices), success="") for one in runs]
+            for one, bar in zip(runs, bars, strict=True):
+                if stop or any(other.loop.emergency_stop for other in runs):
+                    break
+                _run(config, one, lambda: bool(stop), _shower(progress, bar, one))
+        estop = None
+        if any(one.loop.emergency_stop for one in runs):
+            estop = ", ".join(pressed.causes) or "from another process"
+    results = summarise(
+        facts, _versions(), {one.label: one.episodes for one in runs}, len(config.indices), config.reference
+    )
+    timing = {
+        "made": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "n_envs": n,
+        "clock": config.robot.clock,
+        "brains": {one.label: one.timing() for one in runs if one.timed.times},
+    }
+    result = EvalResult(output_dir, results, timing, output_dir / "report.html", stopped_by=stop, estop=estop)
+    result.missed = _missed(config, results)
+    _write(config, result, runs, preview, no_films)
+    tell_summary(console, config, result)
+    return result
+
+
+def _prepare(config: EvalConfig, label: str, simulation: Simulation) -> BrainRun:
+    """Make a brain and what runs it: one that does not fit fails here, before any episode.
+
+    Raises:
+        BhdError: the message names the brain.
+    """
+    robot: Any = config.robot
+    try:
+        timed = TimedBrain(make_brain(config.brains[label]))
+        task = make_task(config.task, simulation.n, robot.fps)
+        return BrainRun(label, EpisodeLoop(simulation, task, cast(Brain, timed)), timed)
+    except BhdError as error:
+        raise type(error)(f"brains.{label}: {error}") from error
+
+
+def _run(config: EvalConfig, one: BrainRun, stop: Callable[[], bool], show: Callable[[], None]) -> None:
+    """Run a brain's episodes and keep what is needed of them."""
+    simulation, loop = one.loop.simulation, one.loop
+    jerk, fps = JerkMeasure.of(simulation.action_names), simulation.rates.fps
+    split: Any = config.split
+    specs = [EpisodeSpec(index, episode_seed(config.seed, index, split)) for index in config.indices]
+    with BrainRecorder.open(config, one.label, loop) as recorder:
+        started = time.perf_counter()
+        for episode in loop.run(specs, stop, recorder.begin):
+            track = simulation.track(episode.columns[PHYSICS_STATE])
+            metrics = measure(one.label, episode, track, jerk, fps)
+            recorder.save(episode)
+            one.episodes.append(metrics)
+            one.initial_states.append(episode.initial_state)
+            _keep(config, one, metrics, episode, track)
+            one.wall_s = time.perf_counter() - started
+            show()
+
+
+def _keep(
+    config: EvalConfig, one: BrainRun, metrics: EpisodeMetrics, episode: Episode, track: NDArray[np.float64]
+) -> None:
+    title = f"{metrics.episode}: {metrics.outcome}, {metrics.score:.2f}"
+    one.trajectories[metrics.episode] = Trajectory(
+        title, episode.scene, track[:, :2].astype(np.float32), metrics.success
+    )
+    failures = sum(not other.success for other in one.episodes)
+    wanted = FILMS if config.videos is None else config.videos
+    if not metrics.success and failures == 1:
+        one.films.clear()  # the first episode, kept in case that no one fails
+    if (not metrics.success and failures <= wanted) or (len(one.episodes) == 1 and wanted):
+        one.films.append((metrics, episode.scene, episode.columns[PHYSICS_STATE]))
+
+
+def _shower(progress: Progress, bar: Any, one: BrainRun) -> Callable[[], None]:
+    def show() -> None:
+        good = sum(metrics.success for metrics in one.episodes)
+        progress.update(bar, completed=len(one.episodes), success=f"{good}/{len(one.episodes)} succeeded")
+
+    return show
+
+
+def _facts(config: EvalConfig, simulation: Simulation, runs: Sequence[BrainRun]) -> dict[str, Any]:
+    """Return what decides the numbers, as plain values; how many run side by side does not."""
+    robot = describe(simulation.config)
+    return {
+        "robot": {key: str(value) if isinstance(value, Path) else value for key, value in robot.items()},
+        "task": runs[0].loop.task.parameters(),
+        "brains": {one.label: one.timed.parameters() for one in runs},
+        "baseline": config.reference,
+        "seed": config.seed,
+        "split": config.split,
+        "episodes": config.indices,
+        "fps": simulation.rates.fps,
+        "jerk": JerkMeasure.of(simulation.action_names).what,
+        "jerk_unit": JerkMeasure.of(simulation.action_names).unit,
+    }
+
+
+def _versions() -> dict[str, str]:
+    return {**versions(), "torch": metadata.version("torch"), "python": platform.python_version()}
+
+
+def _missed(config: EvalConfig, results: EvalResults) -> list[str]:
+    if config.fail_below is None:
+        return []
+    wanted = {label for label, brain in config.chosen.items() if brain.get_choice_name(type(brain)) not in YARDSTICKS}
+    return [label for label, one in results.brains.items() if label in wanted and one.success.low < config.fail_below]
+
+
+def _write(
+    config: EvalConfig, result: EvalResult, runs: Sequence[BrainRun], preview: Preview | None, no_films: str
+) -> None:
+    folder = result.output_dir
+    write_json(folder / "results.json", result.results.plain())
+    write_json(folder / "timing.json", result.timing)
+    write_table(folder / "episodes.parquet", result.results.episodes)
+    states: dict[str, Any] = {f"state_{one.label}": np.array(one.initial_states) for one in runs}
+    states |= {f"episode_{one.label}": np.array([m.episode for m in one.episodes], np.int64) for one in runs}
+    np.savez_compressed(folder / "initial_states.npz", **states)
+    films = _film(config, runs, preview, folder) if preview is not None else []
+    write_report(
+        ReportInput(
+            config=config,
+            results=result.results,
+            timing=result.timing,
+            trajectories={one.label: one.trajectories for one in runs},
+            films=films,
+            no_films=no_films,
+            folder=folder,
+        ),
+        result.report,
+    )
+
+
+def _film(config: EvalConfig, runs: Sequence[BrainRun], preview: Preview, folder: Path) -> list[Film]:
+    films = []
+    robot: Any = config.robot
+    with closing(preview):
+        for one in runs:
+            for metrics, scene, states in one.films:
+                path = folder / "videos" / f"{one.label}_{metrics.episode:04d}.mp4"
+                path.parent.mkdir(exist_ok=True)
+                preview.write(scene, states, robot.fps, path)
+                films.append(Film(one.label, metrics, path))
+    return films
+
+
+def _make_preview(config: EvalConfig, console: Console) -> tuple[Preview | None, str]:
+    """Return what makes films, or None and why not."""
+    if config.videos == 0:
+        return None, "videos was 0."
+    try:
+        return Preview(make_simulation(config.robot)), ""
+    except RenderingError as error:
+        if config.videos:
+            raise
+        console.print(f"No films: {escape(str(error))}")
+        return None, str(error)
+
+
+def _make_output_dir(config: EvalConfig) -> Path:
+    if config.output_dir:
+        folder = Path(config.output_dir).expanduser()
+    else:
+        now = datetime.now()
+        name = f"{now:%H-%M-%S}_{config.robot.type}_{config.task.get_choice_name(type(config.task))}"
+        folder = Path("outputs/eval") / f"{now:%Y-%m-%d}" / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "config.yaml").write_text(yaml.safe_dump(encode(config), sort_keys=False), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
+    return folder
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Progress]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[success]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        yield progress
+
+
+def _main(config: EvalConfig) -> int:
+    return evaluate(config).exit_status
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `bhd-eval`; return the exit status."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    keys = [argument.partition("=")[0] for argument in arguments]
+    if "--brain.path" in keys and "--brain.type" not in keys:
+        arguments.append("--brain.type=learned")  # nothing else is somewhere on the disk
+    return run(_main, EvalConfig, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
