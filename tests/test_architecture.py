@@ -31,7 +31,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "policies": ("bodies", "control.messages", "control.commands", "control.poses"),
     "data": ("tasks", "bodies", "control.messages"),
     "robots": ("tasks", "bodies", "sim", "control"),
-    "envs": ("tasks", "bodies", "sim", "control"),
+    "envs": ("tasks", "bodies", "sim", "control", "robots"),
     "runs": EVERYTHING,
     "plugin": EVERYTHING,
 }

@@ -1,0 +1,129 @@
+"""From an environment's name and some overrides to the configurations of its robot and its task."""
+
+import dataclasses
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from bhd_lerobot.envs.register import ENVIRONMENTS, NAMESPACE
+from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.robots.catalog import robot_config
+from bhd_lerobot.tasks.catalog import robot_of_task
+from bhd_lerobot.tasks.config_task import TaskConfig
+
+Overrides = Mapping[str, Any] | None
+
+OBS_TYPES: dict[str, tuple[str, ...]] = {
+    "state": ("agent_pos", "environment_state"),
+    "environment_state_agent_pos": ("agent_pos", "environment_state"),
+    "pixels": ("pixels",),
+    "pixels_agent_pos": ("pixels", "agent_pos"),
+    "pixels_environment_state_agent_pos": ("pixels", "agent_pos", "environment_state"),
+}
+"""What an observation holds, as far as the task and the robot have it, by LeRobot's names of observation types."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What an environment is made of.
+
+    Attributes:
+        name: the environment's name, without its namespace.
+        robot: the robot's configuration.
+        task: the task's configuration.
+        parts: what an observation holds: some of `agent_pos`, `environment_state` and `pixels`.
+    """
+
+    name: str
+    robot: Any
+    task: Any
+    parts: tuple[str, ...]
+
+
+def make_settings(
+    environment: str,
+    robot: Any = None,
+    task: Any = None,
+    *,
+    cameras: bool | None = None,
+    obs_type: str | None = None,
+) -> Settings:
+    """Return what an environment is made of.
+
+    Args:
+        environment: its name, with or without the namespace.
+        robot: options of the robot that differ from their defaults, by name, nested where they are; or a whole
+            configuration.
+        task: the same of the task.
+        cameras: whether the robot's cameras are observed; the robot's own option if None.
+        obs_type: one of `OBS_TYPES`; all that there is if None.
+
+    Raises:
+        ConfigError: there is no such environment or option, or a value that cannot be honoured.
+    """
+    name = environment.removeprefix(f"{NAMESPACE}/") if isinstance(environment, str) else environment
+    if name not in ENVIRONMENTS:
+        raise ConfigError(unknown_name("environment", environment, ENVIRONMENTS))
+    robot_type, task_type = ENVIRONMENTS[name]
+    made_robot = _configuration(robot_config(robot_type), robot, "robot", robot_type)
+    made_task = _configuration(TaskConfig.get_choice_class(task_type), task, "task", task_type)
+    if robot_of_task(made_task) != robot_type:
+        raise ConfigError(f"The task {task_type!r} is for {robot_of_task(made_task)!r}, not for {robot_type!r}.")
+    if made_robot.clock != "lockstep":
+        raise ConfigError(
+            f"robot.clock is {made_robot.clock!r}; an environment's time goes by when it is stepped: leave it "
+            "'lockstep'. On the wall clock, bhd-eval and lerobot-rollout evaluate policies."
+        )
+    wants_pixels = obs_type in OBS_TYPES and "pixels" in OBS_TYPES[str(obs_type)]
+    if cameras is None:
+        cameras = made_robot.camera or wants_pixels
+    if obs_type is None:
+        obs_type = "pixels_environment_state_agent_pos" if cameras else "state"
+    if obs_type not in OBS_TYPES:
+        raise ConfigError(unknown_name("obs_type", obs_type, OBS_TYPES))
+    if wants_pixels and not cameras:
+        raise ConfigError(f"obs_type is {obs_type!r} and cameras is False; set cameras=True to observe images.")
+    made_robot.camera = cameras and "pixels" in OBS_TYPES[obs_type]
+    return Settings(name, made_robot, made_task, OBS_TYPES[obs_type])
+
+
+def _configuration(kind: Any, given: Any, prefix: str, type_name: str) -> Any:
+    if isinstance(given, kind):
+        return dataclasses.replace(given)  # the caller's own stays as it is
+    values = dict(given or {}) if isinstance(given, Mapping | None) else given
+    if not isinstance(values, dict):
+        raise ConfigError(f"{prefix} is {given!r}; it must be a {kind.__name__} or options of one, by name.")
+    if values.pop("type", type_name) != type_name:
+        raise ConfigError(f"{prefix}.type is {given['type']!r}; this environment's is {type_name!r}.")
+    return _build(kind, values, prefix)
+
+
+def _build(kind: Any, values: Mapping[str, Any], prefix: str) -> Any:
+    """Return a dataclass with some options set; names and types are checked, as on a command line."""
+    hints = typing.get_type_hints(kind)
+    names = [field.name for field in dataclasses.fields(kind) if field.init]
+    made = {}
+    for name, value in values.items():
+        key = f"{prefix}.{name}"
+        if name not in names:
+            raise ConfigError(unknown_name("option", key, [f"{prefix}.{one}" for one in names]))
+        hint = hints[name]
+        if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+            made[name] = _build(hint, value, key)
+        elif _fits(value, hint):
+            made[name] = value
+        else:
+            raise ConfigError(f"{key} is {value!r}; it must be {getattr(hint, '__name__', hint)}.")
+    return kind(**made)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Tell whether a value is of a plain type; what is not plain is checked by the configuration itself."""
+    if isinstance(value, bool):
+        return hint not in (int, float, str)
+    if hint is float:
+        return isinstance(value, int | float)
+    if hint in (int, str, bool):
+        return isinstance(value, hint)
+    return not dataclasses.is_dataclass(hint) or type(value) is hint

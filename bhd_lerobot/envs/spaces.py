@@ -1,0 +1,112 @@
+"""Observation and action spaces."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm, Body, MobileBase
+from bhd_lerobot.errors import ActionError
+from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.tasks.task import Task
+
+
+def observation_space(simulation: Simulation, task: Task, parts: tuple[str, ...]) -> spaces.Dict:
+    """Return the space of one simulation's observations, with LeRobot's keys.
+
+    `agent_pos`: the robot's floats, shape (k,). `environment_state`: what the task tells, shape (e,), if it tells
+    anything. `pixels`: images by camera name, shape (height, width, 3), if cameras are observed.
+    """
+    members: dict[str, spaces.Space[Any]] = {}
+    if "agent_pos" in parts:
+        members["agent_pos"] = _state_space(simulation)
+    if "environment_state" in parts and task.environment_names:
+        members["environment_state"] = spaces.Box(-np.inf, np.inf, (len(task.environment_names),), np.float32)
+    if "pixels" in parts and simulation.camera_names:
+        shape = (simulation.config.camera_height, simulation.config.camera_width, 3)
+        members["pixels"] = spaces.Dict({name: spaces.Box(0, 255, shape, np.uint8) for name in simulation.camera_names})
+    return spaces.Dict(members)
+
+
+def _state_space(simulation: Simulation) -> spaces.Box:
+    names, body = simulation.observation_names, simulation.body
+    low = np.full(len(names), -np.inf, np.float32)
+    high = np.full(len(names), np.inf, np.float32)
+    if isinstance(body, MobileBase) and body.lidar is not None:
+        beams = [column for column, name in enumerate(names) if name.startswith("scan_")]
+        low[beams], high[beams] = body.lidar.range_min, body.lidar.range_max
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+class ActionScale:
+    """The actions' bounds, and how normalised actions become the robot's.
+
+    Attributes:
+        space: the space of one simulation's actions.
+
+    Args:
+        simulation: the robots.
+        normalise: whether actions are in [-1, 1], which is mapped to the bounds.
+    """
+
+    def __init__(self, simulation: Simulation, *, normalise: bool) -> None:
+        self.names = simulation.action_names
+        low, high = action_bounds(simulation.body, simulation.action_names)
+        self._normalise = normalise
+        self._middle, self._half = (low + high) / 2, (high - low) / 2
+        if normalise:
+            self.space = spaces.Box(-1.0, 1.0, (len(low),), np.float32)
+        else:
+            self.space = spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+    def to_robot(self, actions: Any, running: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return actions in the robot's units, in single precision.
+
+        What lies outside of the bounds is passed on: the limits of the cerebellum are the robot's own.
+
+        Args:
+            actions: shape (n, a); those of simulations that do not run mean nothing.
+            running: the simulations that the actions are for, shape (n,).
+
+        Raises:
+            ActionError: another shape, not numbers, or a value that is not finite.
+        """
+        values = np.asarray(actions)
+        shape = (len(running), len(self.names))
+        if values.shape != shape or values.dtype.kind not in "fiu":
+            raise ActionError(
+                f"The action has shape {values.shape} and type {values.dtype}; it needs {shape} numbers: "
+                f"{', '.join(self.names)} of each of {shape[0]} simulation(s)."
+            )
+        # The sum of 0 * x is 0 if and only if every x is finite.
+        if not np.isfinite(values).all():
+            bad = np.argwhere(~np.isfinite(values) & running[:, None])
+            if len(bad):
+                sim, column = bad[0]
+                raise ActionError(
+                    f"The action {self.names[column]!r} of environment {sim} is {values[sim, column]}; "
+                    "actions must be finite numbers."
+                )
+            values = np.where(running[:, None], values, 0.0)
+        if self._normalise:
+            values = self._middle + self._half * values.astype(np.float32).astype(np.float64)
+        return values.astype(np.float32).astype(np.float64)
+
+
+def action_bounds(body: Body, names: tuple[str, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the smallest and the largest of each action, shapes (a,).
+
+    A base: plus and minus its largest speeds. An arm: the range of each joint; or, for tool poses, a cube around the
+    base that holds all that the arm could reach, and the quaternion's -1 to 1.
+    """
+    if not isinstance(body, Arm):
+        largest = np.asarray(body.limits.velocity)
+        return -largest, largest
+    limits = body.limits
+    if names == limits.names:
+        return np.asarray(limits.lower), np.asarray(limits.upper)
+    chain = body.chain
+    reach = float(np.abs(chain.a).sum() + np.abs(chain.d).sum() + np.linalg.norm(chain.tool))
+    low = np.array([*[-reach] * 3, *[-1.0] * 4, limits.lower[-1]])
+    return low, np.array([*[reach] * 3, *[1.0] * 4, limits.upper[-1]])

@@ -1,0 +1,197 @@
+"""n simulations of a robot with a task: the episodes of `runs/episode.py`, stepped from outside."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.messages import Mode
+from bhd_lerobot.errors import BhdError
+from bhd_lerobot.robots.catalog import make_simulation
+from bhd_lerobot.sim.camera import Camera
+from bhd_lerobot.tasks.catalog import make_task
+from bhd_lerobot.tasks.task import Event, Outcome
+
+EVENT_NAMES = np.array([event.cause for event in Event], object)
+"""Names of the events, by their numbers."""
+
+# Tasks whose success is to have lasted until the time was over: nothing ends then but the time.
+_LASTING = ("avoid",)
+_VIEW_WIDTH, _VIEW_HEIGHT = 320, 240
+
+
+class ResetNeededError(BhdError, gymnasium.error.ResetNeeded):
+    """An environment was stepped that is in no episode."""
+
+
+class ClosedError(BhdError, gymnasium.error.ClosedEnvironmentError):
+    """An environment was used after it had been closed."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What n robots see.
+
+    Attributes:
+        state: the robots' floats, shape (n, k).
+        environment_state: what the task tells, shape (n, e), or None.
+        images: by camera name, shape (n, height, width, 3); only those of the simulations that were asked for.
+    """
+
+    state: NDArray[np.float32]
+    environment_state: NDArray[np.float32] | None
+    images: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """What came of a frame; zeros for simulations that did not run.
+
+    Attributes:
+        reward: the task's reward, shape (n,).
+        event: `Event` that ended an episode, shape (n,).
+        terminated: whether it ended because of what happened, shape (n,).
+        truncated: whether it ended because the time was over, and for no other reason, shape (n,).
+    """
+
+    reward: NDArray[np.float64]
+    event: NDArray[np.int64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+
+
+class Stage:
+    """n simulations, each in an episode of its own, or idle.
+
+    Attributes:
+        simulation: the robots.
+        task: what is to be achieved.
+        frames: longest duration of an episode [frames].
+        seeds: seed of the episode that each simulation is in, shape (n,).
+        scenes: its scene, by simulation.
+
+    Args:
+        robot: the robot's configuration.
+        task: the task's configuration.
+        n: how many simulations.
+        threads: threads that step the physics; all processors if None.
+    """
+
+    def __init__(self, robot: Any, task: Any, n: int = 1, threads: int | None = None) -> None:
+        self.n = n
+        self.simulation = make_simulation(robot, n, threads)
+        self.task = make_task(task, n, robot.fps)
+        self.frames = max(1, round(self.task.duration_s * robot.fps))
+        self.seeds = np.zeros(n, np.int64)
+        self.scenes: list[Any] = [None] * n
+        self._truth: Any = None
+        self._lasts = self.task.name in _LASTING
+        self._eyes: Camera | None = None
+        self._view: Camera | None = None
+        self.simulation.stop(np.arange(n))
+
+    @property
+    def running(self) -> NDArray[np.bool_]:
+        """Which simulations are in an episode, shape (n,), live."""
+        return self.simulation.running
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int]) -> None:
+        """Start the episodes with these seeds in these simulations."""
+        scenes = [self.task.sample(seed) for seed in seeds]
+        self.simulation.reset(ids, scenes, seeds)
+        self.task.begin(ids, scenes)
+        self.seeds[ids] = seeds
+        for sim, scene in zip(ids.tolist(), scenes, strict=True):
+            self.scenes[sim] = scene
+        self._truth = None
+
+    def rest(self, ids: NDArray[np.intp]) -> None:
+        """Leave simulations alone until their next `reset`."""
+        self.simulation.stop(ids)
+
+    def observe(self, ids: NDArray[np.intp] | None = None) -> Seen:
+        """Return what the robots see now. Call it once a frame: noisy sensors read something else each time.
+
+        Args:
+            ids: the simulations to look at, all that run if None; rows of others mean nothing.
+        """
+        simulation, running = self.simulation, self.simulation.running
+        if ids is not None:
+            simulation.running = np.zeros(self.n, np.bool_)
+            simulation.running[ids] = True
+        try:
+            state = simulation.observe().state.astype(np.float32)
+            images = self._images(np.flatnonzero(simulation.running)) if simulation.camera_names else {}
+        finally:
+            simulation.running = running
+        told = None
+        if self.task.environment_names:
+            # What is true at the end of a frame is so at the beginning of the next, unless an episode began in between.
+            truth = simulation.truth() if self._truth is None else self._truth
+            told = self.task.environment_state(truth).astype(np.float32)
+        return Seen(state, told, images)
+
+    def step(self, actions: NDArray[np.float64]) -> Stepped:
+        """Let one frame go by. Simulations whose episodes ended go on running until `rest` or `reset`.
+
+        Args:
+            actions: of each robot, shape (n, a), finite and of single precision.
+
+        Raises:
+            SimulationError: the physics diverged.
+        """
+        simulation = self.simulation
+        report = simulation.act(actions)
+        self._truth = simulation.truth(report)
+        reward, event = self.task.judge(self._truth, simulation.running)
+        stopped = report.mode >= Mode.ESTOP
+        if np.count_nonzero(stopped):
+            # As in `runs/episode.py`: a robot that has latched a fault takes no action any more.
+            event = np.where((report.mode == Mode.FAULT) & (event == Event.NOTHING), Event.FAULT, event)
+            event = np.where(report.mode == Mode.ESTOP, Event.ESTOP, event)
+            event = np.where(simulation.running, event, Event.NOTHING)
+        truncated = event == Event.TIMEOUT
+        if self._lasts:
+            truncated |= event == Event.SUCCESS
+        return Stepped(reward, event, (event != Event.NOTHING) & ~truncated, truncated)
+
+    def outcome(self, sim: int, event: Event) -> Outcome:
+        """Return how the episode of one simulation ended."""
+        return self.task.outcome(sim, event)
+
+    def instruction(self, sim: int) -> str:
+        """Return what is asked for in the episode of one simulation; nothing before its first."""
+        scene = self.scenes[sim]
+        return "" if scene is None else self.task.instruction(scene)
+
+    def render(self, sim: int) -> NDArray[np.uint8]:
+        """Return one simulation from outside, shape (240, 320, 3).
+
+        Raises:
+            RenderingError: no image can be rendered here.
+        """
+        if self._view is None:
+            self._view = Camera(self.simulation.world, _VIEW_WIDTH, _VIEW_HEIGHT)
+        return self._view.render(sim, self.simulation.view)
+
+    def _images(self, ids: NDArray[np.intp]) -> dict[str, NDArray[np.uint8]]:
+        config = self.simulation.config
+        if self._eyes is None:
+            self._eyes = Camera(self.simulation.world, config.camera_width, config.camera_height)
+        shape = (self.n, config.camera_height, config.camera_width, 3)
+        images = {name: np.zeros(shape, np.uint8) for name in self.simulation.camera_names}
+        for sim in ids.tolist():
+            for name, image in images.items():
+                self._eyes.render(sim, name, out=image[sim])
+        return images
+
+    def close(self) -> None:
+        """Free the renderers. May be called twice."""
+        for camera in (self._eyes, self._view):
+            if camera is not None:
+                camera.close()
+        self._eyes = self._view = None
+        self.simulation.close()
