@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import ConfigError
 
+ANY_ROBOT = "any"
+"""What a brain for every robot has as its `robot_type`."""
+
 
 @dataclass(frozen=True)
 class Observation:
@@ -66,7 +69,7 @@ class Brain(Protocol):
 
     name: str
     robot_type: str
-    """The robots that it is for."""
+    """The robots that it is for; `ANY_ROBOT` if it finds out when it is bound."""
     uses_images: bool
     """Whether `act` looks at the observation's images. If not, it is not kept waiting for them and may not get any."""
     has_plan: bool

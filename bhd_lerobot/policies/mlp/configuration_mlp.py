@@ -1,0 +1,267 @@
+"""Configuration of `bhd_mlp`: numbers in, a chunk of actions out."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.optim import AdamWConfig, LRSchedulerConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+
+from bhd_lerobot.errors import ConfigError, unknown_name
+
+ACTIVATIONS = ("relu", "tanh", "gelu", "silu", "elu")
+LOSSES = ("l1", "mse", "huber", "nll")
+SCAN_TRANSFORMS = ("none", "inverse", "log")
+SCHEDULES = ("cosine", "constant")
+
+
+@dataclass
+class ScanConfig:
+    """How the beams of a range finder become inputs.
+
+    What decides whether a robot has to turn is near, and normalised metres tell near things badly apart: 0.2 m and
+    0.4 m differ as much as 3.0 m and 3.2 m.
+
+    Attributes:
+        transform: ``"none"``: the beams are normalised like the other numbers; ``"inverse"``: `scale` / range;
+            ``"log"``: log(range / `scale`).
+        start: column of the first beam in `observation.state`; found by its name (`scan_000.pos`) if nothing.
+        beams: how many beams there are, evenly spaced over a full turn; found by their names if 0.
+        scale: range at which the input is 1 or 0 [m].
+        minimum: ranges below this count as this [m].
+        channels: output channels of circular convolutions over the beams, in front of the network; none if empty.
+        kernel_size: width of each convolution [beams], odd.
+        stride: step of each convolution [beams].
+    """
+
+    transform: str = "none"
+    start: int | None = None
+    beams: int = 0
+    scale: float = 0.5
+    minimum: float = 0.05
+    channels: list[int] = field(default_factory=list)
+    kernel_size: int = 5
+    stride: int = 2
+
+    @property
+    def is_used(self) -> bool:
+        """Whether the beams are treated otherwise than the other numbers."""
+        return self.transform != "none" or bool(self.channels)
+
+    def check(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        if self.transform not in SCAN_TRANSFORMS:
+            raise ConfigError(unknown_name("policy.scan.transform", self.transform, SCAN_TRANSFORMS))
+        for name in ("scale", "minimum"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"policy.scan.{name} is {getattr(self, name)}; it must be a positive range [m].")
+        if self.kernel_size < 1 or self.kernel_size % 2 == 0:
+            raise ConfigError(f"policy.scan.kernel_size is {self.kernel_size}; it must be odd: 1, 3, 5, …")
+        if self.stride < 1 or min(self.channels, default=1) < 1:
+            raise ConfigError(f"policy.scan: stride {self.stride} and channels {self.channels} must be at least 1.")
+        if self.beams < 0 or (self.start or 0) < 0 or (self.start is None) != (self.beams == 0):
+            raise ConfigError(
+                f"policy.scan.start is {self.start} and policy.scan.beams is {self.beams}; give both or neither. "
+                "Without them the beams are found by their names in the dataset."
+            )
+
+
+@PreTrainedConfig.register_subclass("bhd_mlp")
+@dataclass
+class MlpConfig(PreTrainedConfig):
+    """Configuration of the policy type ``bhd_mlp``.
+
+    It reads `observation.state` and `observation.environment_state` and nothing else; cameras of a dataset are left
+    alone.
+
+    Attributes:
+        n_obs_steps: observations that it looks at.
+        obs_stride: frames from each of them to the next.
+        chunk_size: actions that it predicts, one a frame.
+        n_action_steps: how many of them are carried out before it looks again.
+        hidden_dims: widths of the hidden layers.
+        activation: ``"relu"``, ``"tanh"``, ``"gelu"``, ``"silu"`` or ``"elu"``.
+        layer_norm: normalise each hidden layer before its activation.
+        dropout: share of hidden values that are dropped in training.
+        feature_clip: normalised inputs beyond ± this count as this: a number that never changed in the dataset has no
+            scale; nothing turns it off.
+        loss: ``"l1"``, ``"mse"``, ``"huber"`` or, with `gaussian`, ``"nll"``; if nothing, ``"nll"`` with `gaussian` and
+            ``"l1"`` without.
+        huber_delta: where ``"huber"`` goes from a square to a line, in normalised actions.
+        gaussian: also learn how much actions scatter, as a standard deviation for every action of the chunk that does
+            not depend on the observation.
+        initial_log_std: its logarithm before training, in normalised actions.
+        sample: with `gaussian`, act on a sample instead of the mean.
+        scan: how a range finder's beams become inputs.
+        optimizer_lr: learning rate of AdamW.
+        optimizer_betas: of AdamW.
+        optimizer_eps: of AdamW.
+        optimizer_weight_decay: of weights; biases and standard deviations do not decay.
+        optimizer_grad_clip_norm: largest norm of the gradient.
+        scheduler: ``"cosine"``: to 0 over the training, after a warm-up; ``"constant"``.
+        scheduler_warmup_steps: steps of the warm-up.
+    """
+
+    n_obs_steps: int = 1
+    obs_stride: int = 1
+    chunk_size: int = 8
+    n_action_steps: int = 1
+    hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
+    activation: str = "relu"
+    layer_norm: bool = False
+    dropout: float = 0.0
+    feature_clip: float | None = 10.0
+    loss: str | None = None
+    huber_delta: float = 0.5
+    gaussian: bool = False
+    initial_log_std: float = 0.0
+    sample: bool = False
+    scan: ScanConfig = field(default_factory=ScanConfig)
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "STATE": NormalizationMode.MEAN_STD,
+            "ENV": NormalizationMode.MEAN_STD,
+            "ACTION": NormalizationMode.MEAN_STD,
+        }
+    )
+
+    optimizer_lr: float = 1e-3
+    optimizer_betas: tuple[float, float] = (0.9, 0.999)
+    optimizer_eps: float = 1e-8
+    optimizer_weight_decay: float = 1e-4
+    optimizer_grad_clip_norm: float = 1.0
+    scheduler: str = "cosine"
+    scheduler_warmup_steps: int = 100
+
+    # LeRobot's class says so as well, but without types.
+    input_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        super().__post_init__()
+        for name in ("n_obs_steps", "obs_stride", "chunk_size", "n_action_steps"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least 1.")
+        if self.n_action_steps > self.chunk_size:
+            raise ConfigError(
+                f"policy.n_action_steps is {self.n_action_steps}, but only policy.chunk_size = {self.chunk_size} "
+                "actions are predicted."
+            )
+        if min(self.hidden_dims, default=1) < 1:
+            raise ConfigError(f"policy.hidden_dims is {self.hidden_dims}; every width must be at least 1.")
+        for name, value, valid in (
+            ("activation", self.activation, ACTIVATIONS),
+            ("loss", self.loss, (None, *LOSSES)),
+            ("scheduler", self.scheduler, SCHEDULES),
+        ):
+            if value not in valid:
+                raise ConfigError(unknown_name(f"policy.{name}", value, [one for one in valid if one]))
+        if not 0 <= self.dropout < 1:
+            raise ConfigError(f"policy.dropout is {self.dropout}; it must be in [0, 1).")
+        if self.feature_clip is not None and not self.feature_clip > 0:
+            raise ConfigError(f"policy.feature_clip is {self.feature_clip}; it must be positive, or nothing.")
+        if not 0 < self.huber_delta < math.inf:
+            raise ConfigError(f"policy.huber_delta is {self.huber_delta}; it must be positive.")
+        for name, asked in (("loss=nll", self.loss == "nll"), ("sample", self.sample)):
+            if asked and not self.gaussian:
+                raise ConfigError(f"policy.{name} needs a distribution; set --policy.gaussian=true.")
+        self.scan.check()
+
+    @property
+    def loss_name(self) -> str:
+        """The loss that is trained with."""
+        return self.loss or ("nll" if self.gaussian else "l1")
+
+    @property
+    def history(self) -> int:
+        """How many frames back it looks, the present one included."""
+        return (self.n_obs_steps - 1) * self.obs_stride + 1
+
+    @property
+    def observation_delta_indices(self) -> list[int] | None:
+        """Which frames it looks at, oldest first, the present one being 0; nothing if only that."""
+        if self.n_obs_steps == 1:
+            return None
+        return [-back * self.obs_stride for back in reversed(range(self.n_obs_steps))]
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """Which actions it predicts, the present frame's being 0."""
+        return list(range(self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """No rewards."""
+        return None
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        """Return AdamW."""
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            betas=self.optimizer_betas,
+            eps=self.optimizer_eps,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        """Return the schedule of the learning rate."""
+        if self.scheduler == "constant":
+            return None
+        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+
+    def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
+        """Find the beams by their names, where they are asked for and not given; LeRobot's `make_policy` calls it.
+
+        Raises:
+            ConfigError: there are none.
+        """
+        if not self.scan.is_used or self.scan.beams:
+            return
+        names = (features.get(OBS_STATE) or {}).get("names")
+        names = list(names) if isinstance(names, list | tuple) else []
+        columns = [i for i, name in enumerate(names) if name.startswith("scan_") and name.endswith(".pos")]
+        if not columns or columns != list(range(columns[0], columns[0] + len(columns))):
+            raise ConfigError(
+                "policy.scan treats the beams of a range finder (scan_000.pos, scan_001.pos, …), which "
+                f"{OBS_STATE} of this dataset does not have. Set --policy.scan.transform=none and leave "
+                "policy.scan.channels empty, or name the columns with policy.scan.start and policy.scan.beams."
+            )
+        self.scan.start, self.scan.beams = columns[0], len(columns)
+
+    def validate_features(self) -> None:
+        """Keep the inputs that it reads, and refuse what it cannot be built for.
+
+        Raises:
+            ConfigError: there is no input or no action, or the beams lie outside the state.
+        """
+        known: dict[str, PolicyFeature] = self.input_features or {}
+        kept = {key: feature for key, feature in known.items() if key in (OBS_STATE, OBS_ENV_STATE)}
+        self.input_features = kept
+        if not kept:
+            raise ConfigError(f"bhd_mlp reads {OBS_STATE} and {OBS_ENV_STATE}; the dataset has neither.")
+        if self.action_feature is None:
+            raise ConfigError("bhd_mlp needs an action to predict; the dataset has none.")
+        for key, feature in {**kept, **(self.output_features or {})}.items():
+            if feature.type != FeatureType.VISUAL and len(feature.shape) != 1:
+                raise ConfigError(f"bhd_mlp reads and writes vectors; {key} has the shape {tuple(feature.shape)}.")
+        if self.scan.is_used:
+            state = self.robot_state_feature
+            width = state.shape[0] if state else 0
+            if not self.scan.beams or self.scan.start is None or self.scan.start + self.scan.beams > width:
+                raise ConfigError(
+                    f"policy.scan has start {self.scan.start} and beams {self.scan.beams}; they must lie among the "
+                    f"{width} columns of {OBS_STATE}."
+                )

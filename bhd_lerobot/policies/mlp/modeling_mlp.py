@@ -1,0 +1,262 @@
+"""`bhd_mlp`: a perceptron from the robot's numbers to a chunk of actions. Small, and fast without a GPU."""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, Self
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
+from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder, other_columns, transformed
+
+_ACTIVATIONS: dict[str, type[nn.Module]] = {
+    "relu": nn.ReLU,
+    "tanh": nn.Tanh,
+    "gelu": nn.GELU,
+    "silu": nn.SiLU,
+    "elu": nn.ELU,
+}
+_LOG_STD = (-5.0, 2.0)  # a standard deviation that goes to 0 makes the loss go to minus infinity
+_PADDING = "action_is_pad"
+
+type Layer = tuple[Tensor, Tensor]
+"""Weight, shape (outputs, inputs), and bias, shape (outputs,), of a linear layer."""
+
+
+class MlpPolicy(PreTrainedPolicy):
+    """The policy type ``bhd_mlp``.
+
+    `features` turns a preprocessed batch into one vector a row, and `net`, a `torch.nn.Sequential` of linear layers and
+    activations, turns that into the chunk. `layers` and `from_layers` copy the linear layers out and in, so that a
+    network of the same shape that was trained elsewhere runs here.
+
+    Args:
+        config: its shape and its features.
+        kwargs: what LeRobot passes to every policy (dataset statistics and metadata); the processors normalise, so
+            nothing of it is needed.
+    """
+
+    config_class = MlpConfig
+    name = "bhd_mlp"
+    config: MlpConfig
+
+    def __init__(self, config: MlpConfig, **kwargs: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        state, environment, action = config.robot_state_feature, config.env_state_feature, config.action_feature
+        if action is None:
+            raise AssertionError("The configuration was validated.")
+        self._action_size = int(action.shape[0])
+        state_size = int(state.shape[0]) if state else 0
+        environment_size = int(environment.shape[0]) if environment else 0
+        self._keys = [key for key, width in ((OBS_STATE, state_size), (OBS_ENV_STATE, environment_size)) if width]
+        scan, steps = config.scan, config.n_obs_steps
+        columns = other_columns(state_size, scan.start or 0, scan.beams if scan.is_used else 0)
+        # Not part of the checkpoint: the configuration says it.
+        self.register_buffer("_columns", torch.tensor(columns, dtype=torch.long), persistent=False)
+        activation = _ACTIVATIONS[config.activation]
+        self.scan_encoder = ScanEncoder(scan, steps, activation) if scan.is_used and scan.channels else None
+        beams = 0 if not scan.is_used else self.scan_encoder.size if self.scan_encoder else steps * scan.beams
+        self.feature_size = steps * (len(columns) + environment_size) + beams
+        self.net = nn.Sequential(*_perceptron(config, self.feature_size, config.chunk_size * self._action_size))
+        self.log_std: nn.Parameter | None = None
+        if config.gaussian:
+            shape = (config.chunk_size, self._action_size)
+            self.log_std = nn.Parameter(torch.full(shape, float(config.initial_log_std)))
+        self.reset()
+
+    @classmethod
+    def from_layers(cls, config: MlpConfig, layers: Sequence[Layer], log_std: Tensor | None = None) -> Self:
+        """Return a policy with weights from elsewhere.
+
+        Args:
+            config: of the same shape, without `scan.channels`.
+            layers: the linear layers, first to last; they are copied.
+            log_std: logarithm of the standard deviations, shape (chunk_size, actions) or (actions,), with `gaussian`.
+
+        Raises:
+            ConfigError: the shapes are not those of the configuration.
+        """
+        policy = cls(config)
+        own = [module for module in policy.net if isinstance(module, nn.Linear)]
+        wanted = [tuple(module.weight.shape) for module in own]
+        given = [tuple(weight.shape) for weight, _ in layers]
+        if given != wanted:
+            raise ConfigError(
+                f"The layers have the shapes {given} (outputs, inputs); this configuration needs {wanted}. "
+                "Check hidden_dims, chunk_size and the features."
+            )
+        if (log_std is not None) != config.gaussian:
+            raise ConfigError(f"policy.gaussian is {config.gaussian}; give log_std if it is true, and only then.")
+        with torch.no_grad():
+            for module, (weight, bias) in zip(own, layers, strict=True):
+                module.weight.copy_(weight)
+                module.bias.copy_(bias)
+            if policy.log_std is not None and log_std is not None:
+                policy.log_std.copy_(log_std.expand_as(policy.log_std))
+        policy.to(config.device)
+        policy.eval()
+        return policy
+
+    def layers(self) -> list[Layer]:
+        """Return copies of the linear layers' weights and biases, first to last."""
+        linear = [module for module in self.net if isinstance(module, nn.Linear)]
+        return [(one.weight.detach().clone(), one.bias.detach().clone()) for one in linear]
+
+    def get_optim_params(self) -> list[dict[str, Any]]:
+        """Return the parameters in two groups: weights, and biases and scales, which do not decay."""
+        weights = [p for p in self.parameters() if p.requires_grad and p.ndim > 1 and p is not self.log_std]
+        others = [p for p in self.parameters() if p.requires_grad and (p.ndim <= 1 or p is self.log_std)]
+        return [{"params": weights}, {"params": others, "weight_decay": 0.0}]
+
+    def reset(self) -> None:
+        """Forget what was seen and planned; at the start of an episode."""
+        self._seen: dict[str, deque[Tensor]] = {}
+        self._planned: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+
+    def features(self, batch: dict[str, Tensor]) -> Tensor:
+        """Return what the network sees.
+
+        Args:
+            batch: `observation.state` and `observation.environment_state` as the preprocessor gives them, shape
+                (batch, width) or, oldest first, (batch, n_obs_steps, width).
+
+        Returns:
+            shape (batch, feature_size): of each observation, oldest first, the state without beams and the environment
+            state; then the beams.
+        """
+        config = self.config
+        rows = {key: self._history(batch, key) for key in self._keys}
+        parts, scan = [], None
+        if OBS_STATE in rows:
+            state = rows[OBS_STATE]
+            if config.scan.is_used:
+                first = config.scan.start or 0
+                scan = self._clipped(state[..., first : first + config.scan.beams])
+                state = state[..., self._columns]
+            parts.append(state)
+        if OBS_ENV_STATE in rows:
+            parts.append(rows[OBS_ENV_STATE])
+        numbers = self._clipped(torch.cat(parts, dim=-1)).flatten(1)
+        if scan is None:
+            return numbers
+        if config.scan.transform != "none":
+            scan = transformed(self._history(batch, OBS_SCAN), config.scan)
+        beams = scan.flatten(1) if self.scan_encoder is None else self.scan_encoder(scan)
+        return torch.cat([numbers, beams], dim=-1)
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Return the loss of a preprocessed batch, and its parts for the log.
+
+        Padded actions, beyond an episode's end, do not count.
+
+        Args:
+            batch: observations as in `features`; `action`, shape (batch, chunk_size, actions); `action_is_pad`, shape
+                (batch, chunk_size), if any is.
+            reduction: ``"mean"``, or ``"none"`` for one loss a row, shape (batch,).
+        """
+        target = batch[ACTION]
+        target = target.unsqueeze(1) if target.ndim == 2 else target
+        mean = self._chunk(batch)
+        loss = self._loss(mean, target)
+        padding = batch.get(_PADDING)
+        valid = torch.ones_like(loss[..., :1]) if padding is None else (~padding).unsqueeze(-1).to(loss.dtype)
+        loss = loss * valid
+        told = {"l1_loss": float(((mean.detach() - target).abs() * valid).sum() / (valid.sum() * target.shape[-1]))}
+        if self.log_std is not None:
+            told["std"] = float(self._std().detach().mean())
+        if reduction == "none":
+            return loss.sum((1, 2)) / (valid.sum((1, 2)) * target.shape[-1]).clamp_min(1), told
+        return loss.sum() / (valid.sum() * target.shape[-1]).clamp_min(1), told
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], noise: Tensor | None = None, **_: Any) -> Tensor:
+        """Return normalised actions, shape (batch, chunk_size, actions).
+
+        Args:
+            batch: observations as in `features`.
+            noise: of a standard normal distribution, in the result's shape: act on the sample that it makes, instead of
+                the mean.
+
+        Raises:
+            ConfigError: noise for a policy that is not Gaussian.
+        """
+        self.eval()
+        mean = self._chunk(batch)
+        if noise is None and self.config.sample:
+            noise = torch.randn_like(mean)
+        if noise is None:
+            return mean
+        if self.log_std is None:
+            raise ConfigError("This bhd_mlp was not trained with gaussian=true: there is nothing to sample from.")
+        return mean + self._std() * noise
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], noise: Tensor | None = None, **_: Any) -> Tensor:
+        """Return the next action, normalised, shape (batch, actions); look again when the last chunk is used up."""
+        for key in (*self._keys, OBS_SCAN):
+            if key not in batch:
+                continue
+            seen = self._seen.setdefault(key, deque(maxlen=self.config.history))
+            # As in the dataset, nothing was before an episode's first frame but that frame.
+            seen.extend([batch[key]] * (1 if seen else self.config.history))
+        if not self._planned:
+            stride = self.config.obs_stride
+            history = {key: torch.stack(list(seen)[::stride], dim=1) for key, seen in self._seen.items()}
+            chunk = self.predict_action_chunk(history, noise)
+            self._planned.extend(chunk[:, : self.config.n_action_steps].transpose(0, 1))
+        return self._planned.popleft()
+
+    def _chunk(self, batch: dict[str, Tensor]) -> Tensor:
+        return self.net(self.features(batch)).unflatten(-1, (self.config.chunk_size, self._action_size))
+
+    def _history(self, batch: dict[str, Tensor], key: str) -> Tensor:
+        """Return an input, shape (batch, n_obs_steps, width)."""
+        values = batch.get(key)
+        if values is None:
+            hint = " Run the policy's own preprocessor first." if key == OBS_SCAN else ""
+            raise ConfigError(f"bhd_mlp was trained with {key!r}, which is not in the batch.{hint}")
+        values = values.unsqueeze(1) if values.ndim == 2 else values
+        if values.shape[1] != self.config.n_obs_steps:
+            raise ConfigError(
+                f"{key} holds {values.shape[1]} observations; policy.n_obs_steps is {self.config.n_obs_steps}."
+            )
+        return values
+
+    def _clipped(self, values: Tensor) -> Tensor:
+        limit = self.config.feature_clip
+        return values if limit is None else values.clamp(-limit, limit)
+
+    def _std(self) -> Tensor:
+        if self.log_std is None:
+            raise AssertionError("Only a Gaussian policy has a standard deviation.")
+        return self.log_std.clamp(*_LOG_STD).exp()
+
+    def _loss(self, mean: Tensor, target: Tensor) -> Tensor:
+        """Return the loss of every number, in the shape of the target."""
+        match self.config.loss_name:
+            case "l1":
+                return functional.l1_loss(mean, target, reduction="none")
+            case "mse":
+                return functional.mse_loss(mean, target, reduction="none")
+            case "huber":
+                return functional.huber_loss(mean, target, reduction="none", delta=self.config.huber_delta)
+        std = self._std()
+        return 0.5 * ((target - mean) / std) ** 2 + std.log() + 0.5 * math.log(2 * math.pi)
+
+
+def _perceptron(config: MlpConfig, inputs: int, outputs: int) -> list[nn.Module]:
+    modules: list[nn.Module] = []
+    for width in config.hidden_dims:
+        modules.append(nn.Linear(inputs, width))
+        modules += [nn.LayerNorm(width)] * config.layer_norm
+        modules.append(_ACTIVATIONS[config.activation]())
+        modules += [nn.Dropout(config.dropout)] * (config.dropout > 0)
+        inputs = width
+    return [*modules, nn.Linear(inputs, outputs)]

@@ -1,0 +1,39 @@
+"""What happens before and after `bhd_mlp`, in LeRobot's own steps."""
+
+from typing import Any
+
+from lerobot.lerobot_types import PolicyAction
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
+from torch import Tensor
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
+from bhd_lerobot.policies.mlp.scan_mlp import ScanProcessorStep
+
+type Pipelines = tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
+]
+
+
+def make_bhd_mlp_pre_post_processors(
+    config: MlpConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
+) -> tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
+]:
+    """Return the pipelines that normalise observations and give actions their units back.
+
+    Args:
+        config: of the policy, which `make_policy` has completed.
+        dataset_stats: mean and standard deviation of every feature.
+
+    Raises:
+        ConfigError: the configuration treats beams and does not know yet where they are.
+    """
+    steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
+    before = [steps.rename_observations, steps.add_batch_dim, steps.to_device]
+    if config.scan.is_used and config.scan.transform != "none":
+        if config.scan.start is None:
+            raise ConfigError("policy.scan.start is not known yet; make the policy before its processors.")
+        before.append(ScanProcessorStep(start=config.scan.start, beams=config.scan.beams))
+    return make_policy_processor_pipelines([*before, steps.normalize], [steps.unnormalize, steps.to_cpu])
