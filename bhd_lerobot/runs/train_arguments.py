@@ -1,0 +1,151 @@
+"""From the command line of `bhd-train` to its configuration.
+
+Adds to `configuration.parse` what LeRobot's training knows beyond plain fields: `policy.path`, and `resume` from the
+configuration that lies in a checkpoint.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import draccus
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.contract import find_checkpoint
+from bhd_lerobot.runs import configuration
+from bhd_lerobot.runs.config_train import OWN_CONFIG_NAME, BhdTrainConfig, plain
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a command line asks for.
+
+    Attributes:
+        config: the configuration, not validated.
+        contract: folder or name of the checkpoint whose contract the dataset must fit; None if there is none.
+    """
+
+    config: BhdTrainConfig
+    contract: str | None = None
+
+
+def parse_train(arguments: Sequence[str]) -> Request:
+    """Return what a command line asks for.
+
+    Args:
+        arguments: `--config_path=FILE` and overrides `--a.b=value`; with `--resume=true`, FILE is a checkpoint's
+            `train_config.json`, or the folder of a checkpoint or of a run.
+
+    Raises:
+        ConfigError: an unknown key or policy, a value of the wrong type, or a file that cannot be read.
+    """
+    overrides = configuration._overrides(arguments)
+    path = overrides.pop(configuration.CONFIG_PATH, None)
+    resume = overrides.get("resume") is True
+    checkpoint: Path | None = None
+    if resume:
+        if path is None:
+            raise ConfigError(f"resume needs --config_path, the {TRAIN_CONFIG_NAME} of a checkpoint or its folder.")
+        checkpoint = resumed_checkpoint(Path(str(path)).expanduser())
+        values = _read_checkpoint(checkpoint)
+        values["output_dir"] = str(checkpoint.parent.parent)  # the run may have been moved
+    else:
+        values = _read(Path(str(path)).expanduser()) if path is not None else {}
+    for key, value in overrides.items():
+        if key.startswith("policy.") and not isinstance(values.get("policy"), dict):
+            values["policy"] = {}
+        configuration._set(values, key.split("."), value, key)
+    return _decoded(values, checkpoint)
+
+
+def resumed_checkpoint(path: Path) -> Path:
+    """Return the folder of the checkpoint that a path means: a file in it, a folder of it, itself, or its run.
+
+    Raises:
+        ConfigError: there is none; names what was looked for.
+    """
+    folder = path.parent if path.is_file() else path
+    for one in (folder.parent, folder, folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK):
+        if (one / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME).is_file():
+            return one.resolve()
+    raise ConfigError(
+        f"No checkpoint to resume at {path}: neither {TRAIN_CONFIG_NAME} in it, nor in {PRETRAINED_MODEL_DIR}/, nor "
+        f"in {CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}/{PRETRAINED_MODEL_DIR}/."
+    )
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if path.suffix != ".json":
+        return configuration._read(path)
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))  # YAML would take JSON's 1e-05 for text
+    except OSError as error:
+        raise ConfigError(f"The configuration {str(path)!r} cannot be read: {error.strerror}.") from error
+    except ValueError as error:
+        raise ConfigError(f"{path} is not a JSON file: {error}") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path} must hold keys and values at its top level, found {type(values).__name__}.")
+    return values
+
+
+def _read_checkpoint(checkpoint: Path) -> dict[str, Any]:
+    folder = checkpoint / PRETRAINED_MODEL_DIR
+    values = _read(folder / TRAIN_CONFIG_NAME)
+    own = folder / OWN_CONFIG_NAME  # a checkpoint of lerobot-train has none
+    return {**values, **(_read(own) if own.is_file() else {})}
+
+
+def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
+    values.pop("checkpoint_path", None)
+    contract = _start_from(values, resume=checkpoint is not None)
+    selection = values.get("selection")
+    if isinstance(selection, dict) and isinstance(selection.get("outcome"), str):
+        selection["outcome"] = [selection["outcome"]]
+    configuration._check_keys(BhdTrainConfig, values, "")
+    try:
+        config = draccus.decode(BhdTrainConfig, values)
+    except Exception as error:  # draccus raises DecodingError, ValueError, TypeError and what our checks raise in it
+        own = configuration._own_error(error)
+        raise ConfigError(str(own) if own else f"The configuration cannot be used: {error}") from error
+    if checkpoint is not None:
+        config.checkpoint_path = checkpoint
+        config.policy.pretrained_path = checkpoint / PRETRAINED_MODEL_DIR
+    return Request(config, contract)
+
+
+def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
+    """Complete the policy's configuration from the checkpoint that a new run starts from; return that checkpoint."""
+    policy = values.get("policy")
+    if policy is not None and not isinstance(policy, dict):
+        raise ConfigError(f"policy is {policy!r}; it has keys of its own, such as policy.type.")
+    policy = dict(policy or {})
+    path = policy.pop("path", None)
+    fine_tune = values.get("fine_tune")
+    source = fine_tune or path
+    if resume or source is None:
+        if policy:
+            policy.setdefault("push_to_hub", bool(policy.get("repo_id")))
+            values["policy"] = policy
+        return None
+    if fine_tune and path and fine_tune != path:
+        raise ConfigError(f"fine_tune is {fine_tune!r} and policy.path is {path!r}; give one of them.")
+    folder = str(find_checkpoint(source))
+    own = _policy_values(folder)
+    wanted = policy.get("type", own["type"])
+    if wanted != own["type"]:
+        raise ConfigError(f"policy.type is {wanted!r}, but the checkpoint {source} is of type {own['type']!r}.")
+    policy.setdefault("push_to_hub", bool(policy.get("repo_id")))
+    values["policy"] = {**own, "repo_id": None, **policy, "pretrained_path": folder}
+    return folder
+
+
+def _policy_values(source: str) -> dict[str, Any]:
+    try:
+        return plain(PreTrainedConfig.from_pretrained(source))
+    except Exception as error:  # draccus, for a type that is not installed or a field that does not exist
+        raise ConfigError(f"The configuration of the checkpoint {source} cannot be used: {error}") from error

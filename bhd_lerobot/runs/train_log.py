@@ -1,0 +1,178 @@
+"""What a training run writes about itself: `metrics.jsonl`, `loss.png`, and the progress on the console."""
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+METRICS_NAME = "metrics.jsonl"
+PLOT_NAME = "loss.png"
+
+Row = dict[str, Any]
+
+TIMING = ("data_s", "update_s", "steps_per_s", "samples_per_s")
+"""Keys of a row that differ between two runs of the same seed."""
+
+
+class MetricsFile:
+    """One JSON object a line, for each step that was logged; a line is complete or, after a kill, left out.
+
+    Attributes:
+        path: the file.
+        rows: what is in it.
+    """
+
+    def __init__(self, path: Path, rows: Sequence[Row] = ()) -> None:
+        """Start a file.
+
+        Args:
+            path: where it goes; what is there is replaced.
+            rows: what it begins with.
+        """
+        self.path = path
+        self.rows = list(rows)
+        part = path.with_name(f".{path.name}.part")
+        part.write_text("".join(_line(row) for row in self.rows), encoding="utf-8")
+        os.replace(part, path)
+
+    def append(self, row: Row) -> None:
+        """Add a row; it is in the file when this returns."""
+        self.rows.append(row)
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(_line(row))
+
+
+def read_metrics(path: Path, last_step: int | None = None) -> list[Row]:
+    """Return the rows of a metrics file, without a last line that a kill tore, and without those after `last_step`."""
+    if not path.is_file():
+        return []
+    rows = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            row = json.loads(line)
+        except ValueError:
+            break
+        if last_step is None or row["step"] <= last_step:
+            rows.append(row)
+    return rows
+
+
+def _line(row: Row) -> str:
+    # JSON has no word for what is not finite.
+    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+    return json.dumps(plain) + "\n"
+
+
+def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
+    """Draw loss and held-out loss over steps, and below them the learning rate.
+
+    Args:
+        rows: rows of a metrics file.
+        path: where the picture goes.
+        heading: what stands above it.
+    """
+    figure = Figure(figsize=(8.5, 5.2), layout="constrained")
+    figure.suptitle(heading, fontsize=11)
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
+    smallest = []
+    for key, label, colour, marker in (
+        ("loss", "training", "#2c3e50", None),
+        ("held_out_loss", "held-out episodes", "#c0392b", "o"),
+    ):
+        points = [(row["step"], row[key]) for row in rows if row.get(key) is not None]
+        if not points:
+            continue
+        steps, values = zip(*points, strict=True)
+        above.plot(
+            steps,
+            values,
+            color=colour,
+            marker="o" if len(points) == 1 else marker,
+            markersize=3.5,
+            linewidth=1.3,
+            label=label,
+        )
+        above.annotate(
+            f"{values[-1]:.3g}",
+            (steps[-1], values[-1]),
+            xytext=(5, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=9,
+            color=colour,
+        )
+        smallest.append(min(values))
+    if smallest and min(smallest) > 0:  # a negative log-likelihood may be below 0
+        above.set_yscale("log")
+    above.set_ylabel("loss")
+    above.grid(alpha=0.3, which="both")
+    if smallest:
+        above.legend(frameon=False, fontsize=9)
+    rates = [(row["step"], row["lr"]) for row in rows if row.get("lr") is not None]
+    if rates:
+        below.plot(*zip(*rates, strict=True), color="#8a8478", linewidth=1.2)
+    below.set_ylim(bottom=0)
+    below.set_ylabel("learning rate")
+    below.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3))
+    below.set_xlabel("step")
+    below.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+
+
+class TrainingProgress:
+    """A bar in a terminal, a line for each logged step elsewhere."""
+
+    def __init__(self, console: Console, steps: int, done: int) -> None:
+        """Prepare it.
+
+        Args:
+            console: where it is shown.
+            steps: steps of the whole run.
+            done: steps that were done before.
+        """
+        self._console, self._steps, self._done = console, steps, done
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[loss]}"),
+            TextColumn("{task.fields[speed]}"),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+
+    def __enter__(self) -> "TrainingProgress":
+        self._bar.start()
+        self._task = self._bar.add_task("training", total=self._steps, completed=self._done, loss="", speed="")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
+
+    def advance(self, step: int) -> None:
+        """Show how far it is."""
+        self._bar.update(self._task, completed=step)
+
+    def log(self, row: Mapping[str, Any]) -> None:
+        """Show what was logged."""
+        parts = [f"{label} {row[key]:.4g}" for key, label in _SHOWN if row.get(key) is not None]
+        speed = (
+            f"{row['steps_per_s']:.3g} steps/s  {row['samples_per_s']:.4g} samples/s" if "steps_per_s" in row else ""
+        )
+        if self._console.is_terminal:
+            self._bar.update(self._task, completed=row["step"], loss="  ".join(parts), speed=speed)
+        else:
+            self._console.print(
+                f"step {row['step']}/{self._steps}  " + "  ".join([*parts, *([speed] if speed else [])])
+            )
+
+
+_SHOWN = (("loss", "loss"), ("held_out_loss", "held-out"), ("success", "success %"))

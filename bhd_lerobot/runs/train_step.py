@@ -1,0 +1,139 @@
+"""One training step: what LeRobot's `update_policy` computes, to the same bits, without waiting for the device."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from lerobot.utils.utils import has_method
+from torch import Tensor
+
+Batch = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What a step measured; tensors on the device, so that nobody waits for them.
+
+    Attributes:
+        loss: before the step, shape ().
+        grad_norm: before clipping, shape ().
+        outputs: what the policy said besides: numbers, or tensors of one number.
+    """
+
+    loss: Tensor
+    grad_norm: Tensor
+    outputs: Mapping[str, Any]
+
+
+class NonFiniteLossError(ArithmeticError):
+    """The loss is not a number; the weights are as they were before the step."""
+
+
+class Learner:
+    """A policy with its optimizer.
+
+    Attributes:
+        policy: as accelerate prepared it.
+        optimizer: likewise.
+        scheduler: of the learning rate, likewise; None if there is none.
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        optimizer: Any,
+        scheduler: Any,
+        accelerator: Any,
+        *,
+        preprocessor: Callable[[Batch], Batch],
+        grad_clip_norm: float,
+        camera_keys: tuple[str, ...] = (),
+    ) -> None:
+        """Keep what a step needs.
+
+        Args:
+            policy: a LeRobot policy.
+            optimizer: its optimizer.
+            scheduler: of the learning rate, or None.
+            accelerator: accelerate's; with several processes or mixed precision it prepares the others.
+            preprocessor: from a batch of the dataset to the policy's input.
+            grad_clip_norm: largest norm of the gradient; not clipped if 0 or less.
+            camera_keys: images in a batch, which come as 8 bit.
+        """
+        self.unwrapped = policy
+        # For one process in full precision, accelerate's wrappers change nothing and take longer than a small network.
+        self._is_plain = accelerator.num_processes == 1 and accelerator.mixed_precision == "no"
+        if not self._is_plain:
+            policy, optimizer, scheduler = accelerator.prepare(policy, optimizer, scheduler)
+        self.policy, self.optimizer, self.scheduler = policy, optimizer, scheduler
+        self._accelerator, self._preprocessor, self._camera_keys = accelerator, preprocessor, camera_keys
+        self._grad_clip_norm = grad_clip_norm
+        self._checks_at_once = accelerator.device.type == "cpu" and accelerator.num_processes == 1
+        self._update_buffers = self.unwrapped.update if has_method(self.unwrapped, "update") else None
+        self.policy.train()
+
+    @property
+    def lr(self) -> float:
+        """The learning rate."""
+        return float(self.optimizer.param_groups[0]["lr"])
+
+    def prepare(self, batch: Batch) -> Batch:
+        """Return the policy's input for a batch of the dataset."""
+        for key in self._camera_keys:
+            if key in batch and batch[key].dtype == torch.uint8:
+                batch[key] = batch[key].to(dtype=torch.float32) / 255.0
+        return self._preprocessor(batch)
+
+    def step(self, batch: Batch) -> StepResult:
+        """Learn from a batch that `prepare` returned.
+
+        Raises:
+            NonFiniteLossError: on a CPU, where looking costs nothing; elsewhere whoever reads the losses has to look.
+        """
+        with nullcontext() if self._is_plain else self._accelerator.autocast():
+            loss, outputs = self.policy.forward(batch)
+        if self._checks_at_once and not bool(torch.isfinite(loss)):
+            raise NonFiniteLossError(float(loss))
+        self._accelerator.backward(loss)
+        if self._grad_clip_norm > 0:
+            clip = torch.nn.utils.clip_grad_norm_ if self._is_plain else self._accelerator.clip_grad_norm_
+            norm = clip(self.policy.parameters(), self._grad_clip_norm)
+        else:
+            norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), float("inf"))
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        if self.scheduler is not None:
+            self.scheduler.step()
+        if self._update_buffers is not None:
+            self._update_buffers()
+        return StepResult(loss.detach(), norm.detach(), outputs or {})
+
+    def held_out_loss(self, batches: Iterator[Batch], seed: int) -> float:
+        """Return the mean loss over samples that are not learned from.
+
+        Dropout is off, and what a policy draws, it draws from `seed`: the same in every evaluation, and the training
+        goes on as if there had been none.
+
+        Args:
+            batches: of the dataset; of this process, if there are several.
+            seed: of the policy's noise.
+        """
+        device = self._accelerator.device
+        total, count = torch.zeros((), dtype=torch.float64, device=device), 0
+        self.policy.eval()
+        try:
+            with torch.random.fork_rng([device] if device.type == "cuda" else []), torch.no_grad():
+                torch.manual_seed(seed)
+                for raw in batches:
+                    size = len(next(one for one in raw.values() if isinstance(one, Tensor)))
+                    with nullcontext() if self._is_plain else self._accelerator.autocast():
+                        loss, _ = self.policy.forward(self.prepare(raw))
+                    total += loss.double() * size
+                    count += size
+        finally:
+            self.policy.train()
+        both = torch.stack([total, torch.tensor(float(count), dtype=torch.float64, device=device)])
+        both = self._accelerator.reduce(both, reduction="sum")
+        return float(both[0] / both[1])

@@ -1,0 +1,76 @@
+"""What `bhd-train` says before and after."""
+
+from typing import TYPE_CHECKING, Any
+
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bhd_lerobot.policies.contract import PolicyContract
+from bhd_lerobot.runs.config_train import BhdTrainConfig
+from bhd_lerobot.runs.registry import SIMULATED_ROBOTS
+from bhd_lerobot.runs.train_checkpoint import resume_command
+from bhd_lerobot.runs.train_data import TrainingData
+from bhd_lerobot.runs.train_log import METRICS_NAME, PLOT_NAME
+
+if TYPE_CHECKING:
+    from bhd_lerobot.runs.train import TrainResult
+
+
+def tell_start(console: Console, config: BhdTrainConfig, policy: Any, data: TrainingData, step: int) -> None:
+    """Say what is about to be trained on what."""
+    learnable = sum(one.numel() for one in policy.parameters() if one.requires_grad)
+    total = sum(one.numel() for one in policy.parameters())
+    frozen = f", {total - learnable:,} more are fixed" if total > learnable else ""
+    held_out = f", {len(data.held_out_episodes)} held out" if data.held_out_episodes else ""
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_row(
+        "policy", escape(f"{policy.config.type}, {learnable:,} parameters{frozen}, on {policy.config.device}")
+    )
+    table.add_row("data", f"{len(data.episodes)} episodes{held_out}, {data.frames:,} samples in an epoch")
+    table.add_row("loader", escape(data.how))
+    epochs = config.steps * config.batch_size / data.frames
+    table.add_row("steps", f"{config.steps:,} of {config.batch_size} samples: {epochs:.3g} epochs")
+    if step:
+        table.add_row("resumed", f"after step {step}")
+    table.add_row("run folder", escape(str(config.output_dir)))
+    console.print(table)
+
+
+def tell_summary(console: Console, config: BhdTrainConfig, result: "TrainResult") -> None:
+    """Say how it ended, where everything is, and how to go on."""
+    losses = [row["loss"] for row in result.rows if row.get("loss") is not None]
+    held_out = [row["held_out_loss"] for row in result.rows if row.get("held_out_loss") is not None]
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_row("steps", f"{result.step:,} of {config.steps:,} in {result.wall_s:.1f} s")
+    if losses:
+        table.add_row("loss", f"{losses[0]:.4g} at first, {losses[-1]:.4g} at the end")
+    if held_out:
+        table.add_row("held-out loss", f"{held_out[0]:.4g} at first, {held_out[-1]:.4g} at the end")
+    table.add_row("metrics", escape(str(result.output_dir / METRICS_NAME)))
+    table.add_row("curve", escape(str(result.output_dir / PLOT_NAME)))
+    if result.checkpoint is not None:
+        table.add_row("checkpoint", escape(str(result.checkpoint / PRETRAINED_MODEL_DIR)))
+    console.print(table)
+    lines = []
+    if result.stopped_by:
+        lines.append(
+            f"Stopped by {result.stopped_by.name}. " + ("Go on with:" if result.checkpoint else "Nothing saved.")
+        )
+        if result.checkpoint is not None:
+            lines.append(f"  {resume_command(result.checkpoint)}")
+    elif result.checkpoint is not None:
+        lines += ["Evaluate it with:", f"  {evaluate_command(result.contract, str(result.checkpoint))}"]
+    for line in lines:
+        console.print(escape(line), soft_wrap=True, highlight=False)
+
+
+def evaluate_command(contract: PolicyContract, checkpoint: str) -> str:
+    """Return the command that evaluates a checkpoint on held-out episodes of what it was trained on."""
+    path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
+    robots = {kind.get_choice_name(kind) for kind in SIMULATED_ROBOTS}
+    task = (contract.task or {}).get("type")
+    if contract.robot_type not in robots or task is None:
+        return f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={path}"
+    return f"bhd-eval --robot.type={contract.robot_type} --task.type={task} --brain.path={path}"
