@@ -67,19 +67,9 @@ class ReportInput:
 
 def write_report(given: ReportInput, path: Path) -> None:
     """Write the report."""
-    sections = [
-        ("Summary", "summary", _summary(given)),
-        ("Beside the baseline", "paired", _paired(given)),
-        ("How episodes ended", "outcomes", _outcomes(given)),
-        ("Distributions", "distributions", _distributions(given)),
-        ("Limits and stops", "safety", _safety(given)),
-        ("From above", "trajectories", _trajectories(given)),
-        ("Films", "films", _films(given)),
-        ("Failed episodes", "failures", _failures(given)),
-        ("Time to decide", "latency", _latency(given)),
-        ("How to cite and repeat", "cite", _cite(given)),
-    ]
-    shown = [one for one in sections if one[2]]
+    cite = ("How to cite and repeat", "cite", _cite(given))
+    shown = [one for one in _sections(given) if one[2]] if given.results.episodes else []
+    shown.append(cite)
     links = "".join(f'<a href="#{key}">{title}</a>' for title, key, _ in shown)
     facts = given.results.config
     title = f"{facts['task']['type'].capitalize()} with {facts['robot']['type']}: {_listed(list(given.results.brains))}"
@@ -94,17 +84,33 @@ def write_report(given: ReportInput, path: Path) -> None:
     path.write_text(page, encoding="utf-8")
 
 
-def replay_command(given: ReportInput, one: EpisodeMetrics) -> str:
-    """Return the command that runs a single episode again, and films it."""
-    folder = given.folder
+def _sections(given: ReportInput) -> list[tuple[str, str, str]]:
+    """Return title, anchor and content of what is told about episodes; what has nothing to say is empty."""
+    return [
+        ("Summary", "summary", _summary(given)),
+        ("Beside the baseline", "paired", _paired(given)),
+        ("How episodes ended", "outcomes", _outcomes(given)),
+        ("Distributions", "distributions", _distributions(given)),
+        ("Limits and stops", "safety", _safety(given)),
+        ("From above", "trajectories", _trajectories(given)),
+        ("Films", "films", _films(given)),
+        ("Failed episodes", "failures", _failures(given)),
+        ("Time to decide", "latency", _latency(given)),
+    ]
+
+
+def replay_command(config: EvalConfig, folder: Path, one: EpisodeMetrics) -> str:
+    """Return the command that runs a single episode again, and films it where films can be made."""
     options = [
         f"--config_path={folder / 'config.yaml'}",
         f"--only=[{one.brain}]",
         f"--episodes=[{one.episode}]",
         f"--output_dir={folder / f'{one.brain}_{one.episode:04d}'}",
     ]
-    if given.config.record.repo_id is not None:
+    if config.record.repo_id is not None:
         options += ["--record.repo_id=null", "--record.root=null"]
+    if config.fail_below is not None:
+        options.append("--fail_below=null")  # one episode proves no rate
     return shlex.join(["bhd-eval", *options])
 
 
@@ -248,7 +254,7 @@ def _failures(given: ReportInput) -> str:
         rows = [
             f"<tr><td>{one.episode}</td><td>{one.outcome.replace('_', ' ')}</td><td>{one.score:.3f}</td>"
             f"<td>{one.length_s:.1f}</td><td><code>{one.seed}</code></td>"
-            f"<td><code>{escape(replay_command(given, one))}</code>{_why(one)}</td></tr>"
+            f"<td><code>{escape(replay_command(given.config, given.folder, one))}</code>{_why(one)}</td></tr>"
             for one in failed[:LISTED]
         ]
         head = "<tr>" + "".join(f"<th>{h}</th>" for h in ("episode", "ended by", "score", "s", "seed", "run it again"))
