@@ -4,10 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 from bhd_lerobot.policies.avoidance import AvoidanceBrain, AvoidanceConfig
-from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
+from bhd_lerobot.policies.brain import ANY_ROBOT, Brain
 from bhd_lerobot.policies.config_brain import BrainConfig
 from bhd_lerobot.policies.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.policies.language_brain import LanguageBrain, LanguageBrainConfig
+from bhd_lerobot.policies.learned import LearnedBrain, LearnedBrainConfig
+from bhd_lerobot.policies.navigator import NavigatorBrain, NavigatorConfig
 from bhd_lerobot.policies.pick import PickBrain, PickBrainConfig
 from bhd_lerobot.policies.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS, SIMULATIONS, make_robot, make_simulation
@@ -30,7 +33,11 @@ _BRAINS: dict[type, Callable[[Any], Brain]] = {
     AvoidanceConfig: AvoidanceBrain,
     GapFollowerConfig: GapFollowerBrain,
     LanguageBrainConfig: LanguageBrain,
+    LearnedBrainConfig: LearnedBrain,
+    NavigatorConfig: NavigatorBrain,
+    NoopConfig: NoopBrain,
     PickBrainConfig: PickBrain,
+    RandomConfig: RandomBrain,
     ReachBrainConfig: ReachBrain,
 }
 
@@ -41,19 +48,24 @@ def make_brain(config: BrainConfig) -> Brain:
 
 
 def action_names_of(config: BrainConfig) -> tuple[str, ...]:
-    """Return the names of the actions of the robots that a brain is for."""
+    """Return the names of the actions of the robots that a brain is for; none if it is for every robot."""
     simulations = {kind.get_choice_name(kind): simulation for kind, simulation in SIMULATIONS.items()}
-    simulation: Any = simulations[robot_of_brain(config)]
-    return tuple(simulation.action_names)
+    simulation: Any = simulations.get(robot_of_brain(config))
+    return tuple(simulation.action_names) if simulation else ()
 
 
 def robot_of_brain(config: BrainConfig) -> str:
-    """Return the type of the robot that a brain is for."""
+    """Return the type of the robot that a brain is for, nothing ("") if it is for every robot.
+
+    Raises:
+        ConfigError: the brain is a trained policy, and there is none where the configuration says.
+    """
     brain: Any = _BRAINS[type(config)]
-    return str(brain.robot_type)
+    robot_type = str(brain.robot_of(config) if hasattr(brain, "robot_of") else brain.robot_type)
+    return "" if robot_type == ANY_ROBOT else robot_type
 
 
 def brains_for(robot_type: str) -> tuple[str, ...]:
     """Return the names of the brains for a type of robot."""
     brains: Any = _BRAINS.values()
-    return tuple(sorted(brain.name for brain in brains if brain.robot_type == robot_type))
+    return tuple(sorted(brain.name for brain in brains if brain.robot_type in (robot_type, ANY_ROBOT)))

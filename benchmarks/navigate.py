@@ -1,0 +1,86 @@
+"""The navigator on held-out scenes: success, collisions, path length, time: `python -m benchmarks.navigate`.
+
+The goal: at least 99 % success, no collision, and a mean SPL (success weighted by path length) above 0.85. Exits with 1
+if it is missed.
+"""
+
+import argparse
+import sys
+import time
+from collections import Counter
+
+import numpy as np
+
+from benchmarks.brains import wilson
+from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.navigator import NavigatorBrain
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import EpisodeSpec
+from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
+from bhd_lerobot.tasks.task import Event, Outcome, episode_seed
+
+GOAL_SUCCESS = 0.99
+GOAL_SPL = 0.85
+SIDE_BY_SIDE = 50
+
+
+class TimedBrain(NavigatorBrain):
+    """The navigator, and how long its calls take [s]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.times: list[float] = []
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """Return the twist, and note how long it took."""
+        started = time.perf_counter()
+        action = super().act(observation)
+        self.times.append(time.perf_counter() - started)
+        return action
+
+
+def main() -> int:
+    """Run the brain, print what came of it, return 0 if the goal is met."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--split", choices=("held_out", "train"), default="held_out")
+    parser.add_argument("--arena", default="random")
+    args = parser.parse_args()
+    task = NavigateConfig(arena=args.arena, random_start=args.arena != "random")
+    seeds = [episode_seed(args.seed, episode, args.split) for episode in range(args.episodes)]
+    print(f"{args.episodes} {args.split} scenes, arena {args.arena}, seed {args.seed}\n")
+    outcomes, times = run(task, seeds, min(SIDE_BY_SIDE, len(seeds)))
+    _, alone = run(task, seeds[:5], 1)
+    causes = Counter(outcome.event.cause for outcome in outcomes)
+    good = [outcome for outcome in outcomes if outcome.success]
+    low, high = wilson(len(good), len(outcomes))
+    spl = np.array([outcome.score for outcome in outcomes])
+    duration = np.array([outcome.details["time_s"] for outcome in good])
+    print(f"success     {len(good) / len(outcomes):.1%} ({low:.1%} to {high:.1%}), goal {GOAL_SUCCESS:.0%}")
+    print(f"ends        {', '.join(f'{cause} {count}' for cause, count in causes.most_common())}")
+    print(f"SPL         mean {spl.mean():.3f}, 5 % below {np.percentile(spl, 5):.3f}, goal {GOAL_SPL}")
+    print(f"time        median {np.median(duration):.1f} s, longest {duration.max():.1f} s")
+    for n, one in ((1, alone), (min(SIDE_BY_SIDE, len(seeds)), times)):
+        print(f"act, n={n:<4} mean {one.mean() * 1e3:.2f} ms, median {np.median(one) * 1e3:.2f} ms")
+    failed = [index for index, outcome in enumerate(outcomes) if not outcome.success]
+    if failed:
+        print("failed      " + ", ".join(f"{index} ({outcomes[index].event.cause})" for index in failed))
+    met = len(good) >= GOAL_SUCCESS * len(outcomes) and not causes[Event.COLLISION.cause] and spl.mean() > GOAL_SPL
+    print("goal met" if met else "GOAL MISSED")
+    return 0 if met else 1
+
+
+def run(config: NavigateConfig, seeds: list[int], n: int) -> tuple[list[Outcome], np.ndarray]:
+    """Run the brain in the scenes of these seeds, n side by side; return the outcomes, and the times of its calls."""
+    robot = TurtleBot3Config()
+    brain = TimedBrain()
+    loop = EpisodeLoop(TurtleBot3Simulation(robot, n), NavigateTask(config, n, robot.fps), brain)
+    specs = [EpisodeSpec(index, seed) for index, seed in enumerate(seeds)]
+    return [episode.outcome for episode in loop.run(specs)], np.array(brain.times)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
