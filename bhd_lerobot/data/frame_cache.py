@@ -2,7 +2,7 @@
 
 import io
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.data.state import corrupt
 from bhd_lerobot.data.table import FrameTable
 from bhd_lerobot.errors import DatasetError
@@ -43,10 +45,25 @@ def image_shape(meta: "LeRobotDatasetMetadata", key: str) -> tuple[int, int, int
     return channels, height, width
 
 
-def frame_bytes(meta: "LeRobotDatasetMetadata", episodes: Sequence[int], cameras: Sequence[str]) -> int:
-    """Return the bytes that the decoded images of some episodes take."""
-    lengths = np.asarray(meta.episodes["length"], dtype=np.int64)[list(episodes)]
-    return int(lengths.sum()) * sum(int(np.prod(image_shape(meta, key))) for key in cameras)
+def needed_bytes(
+    meta: "LeRobotDatasetMetadata", episodes: Sequence[int], cameras: Sequence[str], keys: Collection[str] | None = None
+) -> tuple[int, int]:
+    """Return the bytes that the decoded images and the columns of some episodes take.
+
+    Args:
+        meta: the dataset.
+        episodes: indices of the episodes.
+        cameras: camera features to decode.
+        keys: features to keep besides LeRobot's index columns; None keeps all.
+    """
+    frames = int(np.asarray(meta.episodes["length"], dtype=np.int64)[list(episodes)].sum())
+    sizes = {"float": 4, "int": 8, "uint": 8, "bool": 1}
+    column = 0
+    for key, feature in meta.features.items():
+        if keys is None or key in keys or key in DEFAULT_FEATURES:
+            kind = str(feature["dtype"]).rstrip("0123456789")
+            column += sizes.get(kind, 0) * int(np.prod(feature["shape"]))
+    return frames * sum(int(np.prod(image_shape(meta, key))) for key in cameras), frames * column
 
 
 def available_memory() -> int:
@@ -70,8 +87,9 @@ def check_memory(
     episodes: Sequence[int],
     cameras: Sequence[str],
     budget_gib: float,
+    keys: Collection[str] | None = None,
 ) -> None:
-    """Check that decoded images fit, before any is decoded.
+    """Check that columns and decoded images fit, before anything is read.
 
     Raises:
         DatasetError: a budget that is not positive.
@@ -83,8 +101,12 @@ def check_memory(
     depth = [key for key in cameras if key in meta.depth_keys]
     if depth:
         raise UnsupportedDatasetError(f"Camera {depth[0]!r} of {meta.root} measures depth, which is not kept in memory")
-    needed, free = frame_bytes(meta, episodes, cameras), available_memory()
-    what = f"The decoded images of {meta.root} ({', '.join(cameras)}) take {needed / GIB:.3g} GiB"
+    images, columns = needed_bytes(meta, episodes, cameras, keys)
+    needed, free = images + columns, available_memory()
+    what = (
+        f"{len(episodes)} episodes of {meta.root} take {needed / GIB:.3g} GiB in memory ({columns / GIB:.3g} columns, "
+        f"{images / GIB:.3g} decoded images of {', '.join(cameras) or 'no camera'})"
+    )
     if needed > budget_gib * GIB:
         raise MemoryBudgetError(
             f"{what}, more than the budget of {budget_gib:g} GiB. Raise the budget, or select fewer episodes or cameras"
@@ -136,7 +158,7 @@ class FrameCache:
                 self.images[key] = torch.empty((len(table), *image_shape(table.meta, key)), dtype=torch.uint8)
             self._decode_all()
         except (MemoryError, RuntimeError) as error:
-            if isinstance(error, MemoryError) or "alloc" in str(error):
+            if isinstance(error, MemoryError) or "allocate" in str(error):
                 raise MemoryBudgetError(f"Memory ran out while the images of {table.meta.root} were decoded") from error
             raise
 
@@ -145,25 +167,23 @@ class FrameCache:
         """Bytes that the images take."""
         return sum(images.nbytes for images in self.images.values())
 
-    def gather(self, key: str, rows: Tensor, windowed: bool, return_uint8: bool) -> Tensor:
+    def gather(self, key: str, rows: NDArray, return_uint8: bool) -> Tensor:
         """Return the images of some rows as LeRobot has them.
 
         Args:
             key: the camera.
-            rows: shape (B, n).
-            windowed: whether the camera has delta_timestamps; else n is 1.
+            rows: shape (B,), or (B, n) if the camera has a window in time.
             return_uint8: leave videos as they are stored.
 
         Returns:
-            Shape (B, n, C, H, W), or (B, C, H, W) for a video with n = 1, and without a window.
+            Shape (B, C, H, W), or (B, n, C, H, W); of a video also (B, C, H, W) if n is 1. In [0, 1] if float32.
         """
-        images = self.images[key]
-        found = images.view(len(images), -1).index_select(0, rows.reshape(-1))
+        images = self.images[key].numpy()
         picture = key in self._pictures
+        found = images.take(rows if picture or rows.ndim == 1 or rows.shape[1] > 1 else rows[:, 0], axis=0)
         if picture or not return_uint8:
-            found = found.to(torch.float32).div_(255)
-        window = (rows.shape[1],) if windowed and (picture or rows.shape[1] > 1) else ()
-        return found.view(rows.shape[0], *window, *images.shape[1:])
+            found = np.divide(found, np.float32(255), dtype=np.float32)
+        return torch.from_numpy(found)
 
     def _decode_all(self) -> None:
         jobs = list(self._jobs())
@@ -247,6 +267,11 @@ class FrameCache:
                 frames = decode_video_frames(job.path, times, self._tolerance, self._backend, return_uint8=True)
             except FrameTimestampError as error:
                 raise self._lost(job, begin) from error
+            except (ImportError, RuntimeError, ValueError) as error:
+                reason = str(error).strip().split("\n")[0]
+                raise DatasetError(
+                    f"The video decoder {self._backend!r} does not work here: {reason} Set the video backend to 'pyav'."
+                ) from error
             self.images[job.key][torch.from_numpy(job.rows[part])] = frames
 
     def _decode_pictures(self, key: str) -> None:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bhd_lerobot.data.frame_cache import FrameCache
@@ -31,57 +32,58 @@ class Gatherer:
             deltas: key -> window, in frames relative to the sample.
         """
         self._table, self._frames = table, frames
-        self._windows: dict[tuple[int, ...], Tensor] = {d: torch.tensor(d, dtype=torch.int64) for d in deltas.values()}
         self._deltas = dict(deltas)
-        self._pads = list(deltas)
+        self._windows = {window: np.asarray(window, dtype=np.int64) for window in deltas.values()}
+        self._first, self._last = table.first.numpy(), table.last.numpy()
         self._tasks = [str(task) for task in table.meta.tasks.index]
         # Columns with one number a frame, stacked by type, are gathered together: one call for a dozen keys.
         alone = [key for key, column in table.columns.items() if column.ndim == 1 and key not in deltas]
-        self._stacks: list[tuple[list[str], Tensor]] = []
+        self._stacks: list[tuple[list[str], NDArray]] = []
         for kind in (torch.float32, torch.int64, torch.bool):
             keys = [key for key in alone if table.columns[key].dtype == kind]
             if keys:
-                self._stacks.append((keys, torch.stack([table.columns[key] for key in keys])))
-        self._flat = {key: column.reshape(len(table), -1) for key, column in table.columns.items() if key not in alone}
+                self._stacks.append((keys, torch.stack([table.columns[key] for key in keys]).numpy()))
+        self._wide = {key: column.numpy() for key, column in table.columns.items() if key not in alone}
         # LeRobot puts videos first, then the columns; language columns do not survive its collate.
         videos = [key for key in frames.keys if key not in table.pictures]
         self._order = [*videos, *(key for key in table.keys if key not in table.nested)]
 
     def gather(self, rows: Tensor, return_uint8: bool) -> Batch:
-        """Return the batch of some rows of the table."""
-        table, size = self._table, len(rows)
+        """Return the batch of some rows of the table.
+
+        Args:
+            rows: shape (B,), int64.
+            return_uint8: leave videos 8-bit instead of float32 in [0, 1].
+        """
+        # numpy's `take` copies whole rows in this thread. torch's `index_select` shares a batch of images among
+        # threads, which costs more than the copy, and several hundred times as much while other programs run.
+        at = rows.numpy()
         found: Batch = dict.fromkeys(self._order)
-        windows, pads = self._windowed(rows)
+        windows, pads = self._windowed(at)
         for keys, stack in self._stacks:
-            found.update(zip(keys, stack.index_select(1, rows).unbind(), strict=True))
-        for key, flat in self._flat.items():
-            shape = table.columns[key].shape[1:]
-            if key in self._deltas:
-                window = windows[self._deltas[key]]
-                found[key] = flat.index_select(0, window.view(-1)).view(*window.shape, *shape)
-            else:
-                found[key] = flat.index_select(0, rows).view(size, *shape)
+            found.update(zip(keys, torch.from_numpy(stack.take(at, axis=1)).unbind(), strict=True))
+        for key, column in self._wide.items():
+            found[key] = torch.from_numpy(
+                column.take(windows[self._deltas[key]] if key in self._deltas else at, axis=0)
+            )
         for key in self._frames.keys:
-            window = windows[self._deltas[key]] if key in self._deltas else rows[:, None]
-            found[key] = self._frames.gather(key, window, key in self._deltas, return_uint8)
-        if table.texts:
-            where = rows.numpy()
-            for key, texts in table.texts.items():
-                found[key] = texts[where].tolist()
-        for key in self._pads:
-            found[f"{key}_is_pad"] = pads[self._deltas[key]].clone()
+            window = windows[self._deltas[key]] if key in self._deltas else at
+            found[key] = self._frames.gather(key, window, return_uint8)
+        for key, texts in self._table.texts.items():
+            found[key] = texts.take(at).tolist()
+        for key, delta in self._deltas.items():
+            found[f"{key}_is_pad"] = torch.from_numpy(pads[delta].copy())
         found["task"] = [self._tasks[task] for task in found["task_index"].tolist()]
         return found
 
-    def _windowed(self, rows: Tensor) -> tuple[dict[tuple[int, ...], Tensor], dict[tuple[int, ...], Tensor]]:
+    def _windowed(self, rows: NDArray) -> tuple[dict[tuple[int, ...], NDArray], dict[tuple[int, ...], NDArray]]:
         """Return the rows of every window, clamped to the episode, and which of them were clamped; shape (B, n)."""
         windows, pads = {}, {}
         if self._windows:
-            first = self._table.first.index_select(0, rows)[:, None]
-            last = self._table.last.index_select(0, rows)[:, None]
+            first, last = self._first.take(rows)[:, None], self._last.take(rows)[:, None]
             for name, delta in self._windows.items():
                 asked = rows[:, None] + delta
-                windows[name] = torch.clamp(asked, first, last)
+                windows[name] = np.minimum(np.maximum(asked, first), last)
                 pads[name] = windows[name] != asked
         return windows, pads
 

@@ -1,124 +1,192 @@
-"""Batches for training, from memory; in place of PyTorch's `DataLoader` over a `LeRobotDataset`."""
+"""From the options of a training to its batches: from memory where they fit, else by LeRobot's own loader."""
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+import logging
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from bhd_lerobot.data.batches import BatchLoader, Loader, Placing, first_frames, ordered_samples, per_task_samples
+from bhd_lerobot.data.check import check
+from bhd_lerobot.data.fallback import LeRobotSource, MemorySource, Source, StreamedSource
+from bhd_lerobot.data.frame_cache import MemoryBudgetError, UnsupportedDatasetError
 from bhd_lerobot.data.gather import Batch
 from bhd_lerobot.data.order import BatchOrder
-from bhd_lerobot.data.table import FrameTable
+from bhd_lerobot.data.selection import EpisodeFilter, intervention_weights, split_episodes
+from bhd_lerobot.data.source import local_metadata
+from bhd_lerobot.data.table import FrameTable, checked_episodes
 from bhd_lerobot.data.table_dataset import TableDataset
+from bhd_lerobot.errors import ConfigError
 
-if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+__all__ = [
+    "Batch",
+    "BatchLoader",
+    "EpisodeFilter",
+    "FrameTable",
+    "Loader",
+    "Loaders",
+    "MemoryBudgetError",
+    "TableDataset",
+    "UnsupportedDatasetError",
+    "check",
+    "first_frames",
+    "intervention_weights",
+    "make_loader",
+    "split_episodes",
+]
 
-__all__ = ["Batch", "BatchLoader", "FrameTable", "TableDataset"]
 
+class Loaders(NamedTuple):
+    """What a training reads.
 
-class BatchLoader:
-    """Batches of a `TableDataset` for training; in place of PyTorch's `DataLoader`.
-
-    Iterating gives one epoch; iterating again gives the next. `cycle` never ends. The order is that of stock
-    `lerobot-train` for the same seed. `state_dict` may be taken after any batch.
+    Attributes:
+        dataset: the training samples: a `TableDataset`, or LeRobot's dataset after a fallback.
+        train: its batches, shuffled.
+        held_out: batches of the episodes that are held out, in order; None if none are.
+        message: what a user should know: why LeRobot's own loader is used; empty if it is not.
     """
 
-    def __init__(
-        self,
-        dataset: TableDataset,
-        batch_size: int,
-        seed: int = 0,
-        shuffle: bool = True,
-        *,
-        drop_last: bool = False,
-        weights: Tensor | None = None,
-        device: torch.device | str | None = None,
-        rank: int = 0,
-        world_size: int = 1,
-        pin: bool = False,
-        drop_n_last_frames: int = 0,
-    ) -> None:
-        """Prepare the order.
+    dataset: Any
+    train: Loader
+    held_out: Loader | None
+    message: str
 
-        Args:
-            dataset: where the samples come from.
-            batch_size: samples in a batch of this rank.
-            seed: decides the order, with the number of the epoch.
-            shuffle: False serves the samples in the order of the dataset.
-            drop_last: leave an incomplete batch out.
-            weights: relative frequency of each sample, shape (N,); None takes those of the dataset.
-            device: where batches are put; None leaves them where they are.
-            rank: this process among `world_size`.
-            world_size: processes that train together.
-            pin: page-locked memory, from which a GPU copies while the program goes on.
-            drop_n_last_frames: frames at the end of each episode that no sample starts from; some policies ask for it.
 
-        Raises:
-            ConfigError: a value out of range, or nothing left to draw.
-        """
-        samples = first_frames(dataset, drop_n_last_frames)
-        weights = dataset.weights if weights is None and shuffle else weights
-        self.dataset, self.batch_size = dataset, batch_size
-        self.device = None if device is None else torch.device(device)
-        self.pin = pin and torch.cuda.is_available()
-        self.order = BatchOrder(
-            samples,
-            batch_size,
-            seed,
-            shuffle=shuffle,
-            drop_last=drop_last,
-            weights=None if weights is None else weights[samples],
-            rank=rank,
-            world_size=world_size,
+def make_loader(
+    repo_id: str,
+    *,
+    batch_size: int,
+    seed: int = 0,
+    root: Path | str | None = None,
+    revision: str | None = None,
+    episodes: Sequence[int] | None = None,
+    selection: EpisodeFilter | None = None,
+    intervention_weight: float = 1.0,
+    eval_split: float = 0.0,
+    max_eval_samples: int = 0,
+    delta_timestamps: Mapping[str, Sequence[float]] | None = None,
+    drop_n_last_frames: int = 0,
+    image_transforms: Callable[[Tensor], Tensor] | None = None,
+    use_imagenet_stats: bool = True,
+    return_uint8: bool = True,
+    tolerance_s: float = 1e-4,
+    video_backend: str | None = "pyav",
+    keep: Collection[str] | None = None,
+    budget_gib: float = 4.0,
+    streaming: bool = False,
+    num_workers: int = 0,
+    drop_last: bool = False,
+    device: torch.device | str | None = None,
+    pin: bool = False,
+    rank: int = 0,
+    world_size: int = 1,
+    say: Callable[[str], None] | None = None,
+) -> Loaders:
+    """Return the batches of a training and of what it holds out, as LeRobot's `make_train_eval_datasets` selects them.
+
+    Both share one copy of the data in memory. If that does not fit, or the dataset has something that is not kept in
+    memory, the same samples come in the same order from LeRobot's own dataset and PyTorch's `DataLoader`, and a message
+    says so.
+
+    Args:
+        repo_id: name of the dataset.
+        batch_size: samples in a batch of this rank.
+        seed: decides the order, with the number of the epoch; for the same seed it is that of `lerobot-train`.
+        root: folder of the dataset; None looks where LeRobot keeps datasets.
+        revision: version of the dataset on the Hub.
+        episodes: to choose from; None means all.
+        selection: which episodes; None means all.
+        intervention_weight: how often frames in which somebody intervened are drawn, compared with others; 0 drops
+            them. Held-out samples are not weighted.
+        eval_split: share of the episodes of each task that is held out, from 0 to below 1.
+        max_eval_samples: at most about so many held-out samples, the first of each task; 0 means all.
+        delta_timestamps: key -> times relative to the sample [s], multiples of 1 / fps.
+        drop_n_last_frames: frames at the end of each episode that no training sample starts from.
+        image_transforms: for training images only.
+        use_imagenet_stats: normalise images with the statistics of ImageNet.
+        return_uint8: serve videos as uint8, which `lerobot-train` divides by 255 afterwards, instead of float32.
+        tolerance_s: by how much a video frame may miss its time [s].
+        video_backend: LeRobot's decoder whose images are wanted.
+        keep: features to serve; None serves all. After a fallback all are served.
+        budget_gib: memory that columns and decoded images may take [GiB].
+        streaming: read from the Hub while training, with LeRobot's own dataset.
+        num_workers: processes of PyTorch's `DataLoader`, after a fallback.
+        drop_last: leave an incomplete batch out of the training's epochs.
+        device: where batches are put; None leaves them in memory.
+        pin: copy through page-locked memory.
+        rank: this process among `world_size`.
+        world_size: processes that train together.
+        say: gets the message once; None writes it to the log as a warning.
+
+    Raises:
+        ConfigError: a value out of range.
+        DatasetError: no such dataset, or nothing in it that was asked for; the message names what is there.
+    """
+    meta = local_metadata(repo_id, root, revision, [] if streaming else episodes)
+    chosen = checked_episodes(meta, episodes) if selection is None else selection.select(meta, episodes)
+    train, held_out = split_episodes(meta, chosen, eval_split)
+    weights = intervention_weights(meta, train, intervention_weight)
+    if use_imagenet_stats:
+        imagenet_stats(meta)
+    source: Source
+    if streaming:
+        if held_out or weights is not None:
+            raise ConfigError(
+                "Streaming has no held-out episodes and no weights: set eval_split to 0, the weight to 1."
+            )
+        message = (
+            f"{repo_id} is streamed by LeRobot's own dataset; a resumed training sees its samples in another order."
         )
+        source = StreamedSource(meta, delta_timestamps, tolerance_s, return_uint8, num_workers)
+    else:
+        try:
+            message = ""
+            whole = TableDataset(
+                repo_id,
+                episodes=None if len(chosen) == meta.total_episodes else chosen,
+                delta_timestamps=delta_timestamps,
+                budget_gib=budget_gib,
+                tolerance_s=tolerance_s,
+                video_backend=video_backend,
+                keep=keep,
+                return_uint8=return_uint8,
+                meta=meta,
+            )
+            source = MemorySource(whole)
+        except (MemoryBudgetError, UnsupportedDatasetError) as error:
+            message = f"{error}. LeRobot's own loader serves the same samples, decoding them anew every time."
+            source = LeRobotSource(meta, delta_timestamps, tolerance_s, video_backend, return_uint8, num_workers)
+    if message:
+        (say or logging.getLogger(__name__).warning)(message)
+    placing = Placing(device, pin)
+    dealing: dict[str, Any] = {"rank": rank, "world_size": world_size}
+    dataset, columns = source.open(train, image_transforms)
+    samples = ordered_samples(columns["index"], meta, drop_n_last_frames)
+    order = BatchOrder(
+        samples,
+        batch_size,
+        seed,
+        drop_last=drop_last,
+        weights=None if weights is None else weights[samples],
+        **dealing,
+    )
+    loader = source.loader(dataset, order, placing)
+    if not held_out:
+        return Loaders(dataset, loader, None, message)
+    rest, columns = source.open(held_out, None)
+    order = BatchOrder(
+        per_task_samples(columns["task_index"], max_eval_samples), batch_size, 0, shuffle=False, **dealing
+    )
+    return Loaders(dataset, loader, source.loader(rest, order, placing), message)
 
-    @property
-    def dataset_meta(self) -> "LeRobotDatasetMetadata":
-        """LeRobot's metadata of the dataset."""
-        return self.dataset.meta
 
-    @property
-    def stats(self) -> Any:
-        """Statistics of the dataset, for normalisation."""
-        return self.dataset.meta.stats
+def imagenet_stats(meta: Any) -> None:
+    """Put the statistics of ImageNet's images in place of those of a dataset's cameras, as LeRobot's training does."""
+    from lerobot.utils.constants import IMAGENET_STATS
 
-    def __len__(self) -> int:
-        """Return the number of batches in an epoch."""
-        return len(self.order)
-
-    def __iter__(self) -> Iterator[Batch]:
-        """Return the batches of the next epoch, or of the rest of the one that `load_state_dict` set."""
-        return (self._place(self.dataset.batch(indices)) for indices in iter(self.order))
-
-    def cycle(self) -> Iterator[Batch]:
-        """Return batches for ever, epoch after epoch."""
-        while True:
-            yield from self
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return where the order is, after the last batch that was served."""
-        return self.order.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where `state_dict` was taken."""
-        self.order.load_state_dict(state)
-
-    def _place(self, batch: Batch) -> Batch:
-        if self.pin:
-            batch = {key: value.pin_memory() if isinstance(value, Tensor) else value for key, value in batch.items()}
-        if self.device is not None:
-            batch = {
-                key: value.to(self.device, non_blocking=self.pin) if isinstance(value, Tensor) else value
-                for key, value in batch.items()
-            }
-        return batch
-
-
-def first_frames(dataset: TableDataset, drop_n_last_frames: int = 0) -> Tensor:
-    """Return the indices of the samples that a batch may contain, in the order of the episodes, shape (M,)."""
-    rows = dataset.rows
-    samples = torch.arange(len(rows))
-    if drop_n_last_frames:
-        samples = samples[rows + drop_n_last_frames <= dataset.table.last[rows]]
-    return samples[torch.argsort(dataset.table.columns["index"][rows[samples]], stable=True)]
+    for key in meta.camera_keys if meta.stats else ():
+        if key not in meta.depth_keys:
+            for name, values in IMAGENET_STATS.items():
+                meta.stats[key][name] = torch.tensor(values, dtype=torch.float32)

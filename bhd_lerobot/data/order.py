@@ -1,14 +1,16 @@
 """In which order a training sees the samples: a pure function of seed and epoch, the same on every rank."""
 
 import math
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from bhd_lerobot.errors import ConfigError
+
+T = TypeVar("T")
 
 
 class BatchOrder:
@@ -92,10 +94,18 @@ class BatchOrder:
 
     def __iter__(self) -> Iterator[Tensor]:
         """Return the batches of the epoch, shape (B,) each; the last one may be smaller."""
+        return self.follow(iter)
+
+    def follow(self, fetch: Callable[[Iterator[Tensor]], Iterator[T]]) -> Iterator[T]:
+        """Return what `fetch` makes of the batches of the epoch; the state counts what came out, not what went in.
+
+        Args:
+            fetch: gets the indices of all batches, and yields one result for each, in the same order.
+        """
         if self._running:
             self._epoch, self._position = self._epoch + 1, 0
         self._running = True
-        return self._batches(self._epoch, self._position)
+        return self._follow(self._epoch, self._position, fetch)
 
     def state_dict(self) -> dict[str, Any]:
         """Return where the order is: `epoch`, and `position`, the samples of that epoch that all ranks have had."""
@@ -136,19 +146,23 @@ class BatchOrder:
         draws = torch.rand(count, generator=generator, dtype=torch.float64) * self._cumulated[-1]
         return self.samples[torch.searchsorted(self._cumulated, draws, right=True).clamp_(max=count - 1)]
 
+    def _follow(self, epoch: int, position: int, fetch: Callable[[Iterator[Tensor]], Iterator[T]]) -> Iterator[T]:
+        count = len(self.samples)
+        for result in fetch(self._batches(epoch, position)):
+            position += self.batch_size * self.world_size
+            if self._running and self._epoch == epoch:
+                self._position = min(position, count)
+            yield result
+        if self._running and self._epoch == epoch:
+            self._epoch, self._position, self._running = epoch + 1, 0, False
+
     def _batches(self, epoch: int, position: int) -> Iterator[Tensor]:
         order = self.epoch_order(epoch)
-        size, everyone = self.batch_size, self.batch_size * self.world_size
-        count = len(order)
+        size, everyone, count = self.batch_size, self.batch_size * self.world_size, len(order)
         while position < count and not (self.drop_last and position + everyone > count):
             begin = position + self.rank * size
             position += everyone
             if self.world_size == 1 or position <= count:
-                batch = order[begin : begin + size]
+                yield order[begin : begin + size]
             else:
-                batch = order[torch.arange(begin, begin + size) % count]
-            if self._running and self._epoch == epoch:
-                self._position = min(position, count)
-            yield batch
-        if self._running and self._epoch == epoch:
-            self._epoch, self._position, self._running = epoch + 1, 0, False
+                yield order[torch.arange(begin, begin + size) % count]

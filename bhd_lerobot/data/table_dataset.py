@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from bhd_lerobot.data.frame_cache import FrameCache, check_memory
+from bhd_lerobot.data.frame_cache import FrameCache, MemoryBudgetError, check_memory
 from bhd_lerobot.data.gather import Batch, Gatherer, delta_indices
 from bhd_lerobot.data.source import local_metadata
 from bhd_lerobot.data.table import FrameTable, checked_episodes
 from bhd_lerobot.errors import DatasetError, unknown_name
 
 if TYPE_CHECKING:
-    pass
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 
 class TableDataset:
@@ -45,6 +45,7 @@ class TableDataset:
         keep: Collection[str] | None = None,
         revision: str | None = None,
         return_uint8: bool = False,
+        meta: "LeRobotDatasetMetadata | None" = None,
     ) -> None:
         """Read the dataset, from this machine if it is there, as LeRobot does, and decode its images.
 
@@ -61,14 +62,16 @@ class TableDataset:
                 out are not decoded.
             revision: version of the dataset on the Hub.
             return_uint8: serve videos as uint8 instead of float32 in [0, 1].
+            meta: LeRobot's metadata, if it has been read already; then `root` and `revision` are its own.
 
         Raises:
             DatasetError: no such dataset, episode or feature; delta_timestamps that are no multiples of 1 / fps.
             DatasetCorruptError: a file is missing, unreadable or contradicts the metadata.
+            UnsupportedDatasetError: a depth camera, or images of more than 8 bits.
             MemoryBudgetError: columns and images do not fit the budget or the memory that is free.
         """
         self.repo_id, self.delta_timestamps, self.tolerance_s = repo_id, delta_timestamps, tolerance_s
-        self.meta = local_metadata(repo_id, root, revision, episodes)
+        self.meta = local_metadata(repo_id, root, revision, episodes) if meta is None else meta
         self.root, self.revision = self.meta.root, self.meta.revision
         self.image_transforms, self.return_uint8 = image_transforms, return_uint8
         self.episodes = None if episodes is None else list(episodes)
@@ -76,8 +79,11 @@ class TableDataset:
         wanted = checked_episodes(self.meta, episodes)
         cameras = self._served_cameras(keep)
         deltas = delta_indices(self.meta, delta_timestamps, tolerance_s, keep)
-        check_memory(self.meta, wanted, cameras, budget_gib)
-        self.table = FrameTable.open(self.meta, wanted, keep)
+        check_memory(self.meta, wanted, cameras, budget_gib, keep)
+        try:
+            self.table = FrameTable.open(self.meta, wanted, keep)
+        except MemoryError as error:
+            raise MemoryBudgetError(f"Memory ran out while the columns of {self.root} were read") from error
         self._frames = FrameCache(self.table, cameras, tolerance_s, video_backend or "pyav")
         self._rows: Tensor | None = None  # rows of the samples; None if sample i is row i
         self._store = Gatherer(self.table, self._frames, deltas)
