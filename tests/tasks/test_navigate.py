@@ -1,0 +1,392 @@
+"""The judge, on made-up truth, and the scenes it makes: no simulator, no robot."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bhd_lerobot.bodies.arenas import CLEARANCE, ROBOT_RADIUS, Arena, make_arena, random_arena
+from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.runs.provenance import scene_from_json, scene_to_json
+from bhd_lerobot.tasks.geodesic import WayField, interpolate, way_lengths
+from bhd_lerobot.tasks.navigate import ENVIRONMENT, NavigateConfig, NavigateTask, goal_in_robot
+from bhd_lerobot.tasks.task import BaseTruth, Event
+
+FPS = 10
+GOAL = (2.025, 0.025, 1.0)  # a grid point
+OPEN = replace(make_arena("empty", 0), start=(-0.025, 0.025, 0.0), goal=GOAL)
+
+
+class Run:
+    """Episodes in the open, and what came of them."""
+
+    def __init__(self, config: NavigateConfig | None = None, *scenes: Arena) -> None:
+        scenes = scenes or (OPEN,)
+        self.n = len(scenes)
+        self.task = NavigateTask(config or NavigateConfig(), self.n, FPS)
+        self.task.begin(np.arange(self.n), scenes)
+        self.running = np.ones(self.n, np.bool_)
+        self.rewards, self.events = np.zeros(self.n), np.zeros(self.n, int)
+        self.frames = 0
+
+    def frame(self, *poses: tuple[float, float, float], touched: bool = False) -> np.ndarray:
+        truth = BaseTruth(np.array(poses, float), np.full(self.n, touched))
+        reward, event = self.task.judge(truth, self.running.copy())
+        assert (reward[~self.running] == 0).all()
+        assert (event[~self.running] == Event.NOTHING).all()
+        self.frames += 1
+        self.rewards += reward
+        self.events = np.where(self.running, event, self.events)
+        self.running &= event == Event.NOTHING
+        return reward
+
+    def until_done(self, *poses: tuple[float, float, float]) -> None:
+        while self.running.any():
+            self.frame(*poses)
+
+    def outcome(self, sim: int = 0):
+        return self.task.outcome(sim, Event(int(self.events[sim])))
+
+
+def drive_to_goal(run: Run, steps: int = 50) -> None:
+    """Drive straight along x to the goal's position."""
+    for x in np.linspace(-0.025, GOAL[0], steps + 1)[1:]:
+        run.frame((x, GOAL[1], 0.0))
+
+
+# --- scenes ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        NavigateConfig(),
+        NavigateConfig(min_distance_m=3.0, goal_clearance_m=0.4),
+        NavigateConfig(arena="turtlebot3_world"),
+        NavigateConfig(arena="turtlebot3_world", random_start=True),
+        NavigateConfig(arena="empty"),
+    ],
+)
+def test_goals_are_reachable_far_enough_and_free(config: NavigateConfig) -> None:
+    task = NavigateTask(config, 1, FPS)
+    for seed in range(25):
+        scene = task.sample(seed)
+        goal, start = np.array(scene.goal), np.array(scene.start)
+        assert np.hypot(*(goal - start)[:2]) >= config.min_distance_m
+        assert scene.clearance(goal[:2]) >= config.goal_clearance_m
+        assert -math.pi <= goal[2] <= math.pi
+        task.begin(np.array([0]), [scene])  # refuses a goal without a way
+        shortest = task.outcome(0, Event.NOTHING).details["shortest_m"]
+        assert np.hypot(*(goal - start)[:2]) - 0.05 <= shortest < 20
+
+
+@pytest.mark.parametrize("arena", ["random", "turtlebot3_world", "empty"])
+def test_equal_seeds_give_equal_scenes_and_others_do_not(arena: str) -> None:
+    one, other = (NavigateTask(NavigateConfig(arena=arena), n, FPS) for n in (1, 3))
+    for seed in (0, 1, 2**62 + 1):
+        assert one.sample(seed) == other.sample(seed)
+        assert one.sample(seed).goal != one.sample(seed + 1).goal
+
+
+def test_the_arena_of_a_seed_is_that_of_the_avoid_task() -> None:
+    assert replace(NavigateTask(NavigateConfig(), 1, FPS).sample(5), goal=None) == random_arena(5)
+
+
+def test_an_arena_too_small_for_the_distance_is_drawn_again() -> None:
+    task = NavigateTask(NavigateConfig(min_distance_m=4.5), 1, FPS)
+    scenes = [task.sample(seed) for seed in range(8)]
+    assert any(replace(scene, goal=None) != random_arena(seed) for seed, scene in enumerate(scenes))
+    assert scenes == [task.sample(seed) for seed in range(8)]
+
+
+def test_the_goal_is_kept_with_the_scene() -> None:
+    scene = NavigateTask(NavigateConfig(), 1, FPS).sample(3)
+    assert scene_from_json(scene_to_json(scene)) == scene
+    assert "goal" not in scene_to_json(random_arena(3))  # datasets of the avoid task stay as they were
+
+
+def test_a_distance_that_no_arena_has_is_refused_with_what_it_has() -> None:
+    with pytest.raises(ConfigError, match=r"9.0 m \(task.min_distance_m\).*farthest is 4\.\d\d m"):
+        NavigateTask(NavigateConfig(arena="turtlebot3_world", min_distance_m=9.0), 1, FPS)
+    with pytest.raises(ConfigError, match="choose a smaller distance"):
+        NavigateTask(NavigateConfig(min_distance_m=9.0), 1, FPS).sample(0)
+    with pytest.raises(ConfigError, match="No place has this clearance"):
+        NavigateTask(NavigateConfig(arena="empty", goal_clearance_m=3.5), 1, FPS)
+
+
+# --- what it tells ---------------------------------------------------------------------------------------------------
+
+
+@given(
+    st.lists(st.floats(-5, 5), min_size=4, max_size=4),
+    st.lists(st.floats(-math.pi, math.pi), min_size=3, max_size=3),
+    st.tuples(st.floats(-5, 5), st.floats(-5, 5)),
+)
+def test_turning_and_moving_the_world_changes_nothing_in_the_robots_frame(
+    places: list[float], angles: list[float], shift: tuple[float, float]
+) -> None:
+    goal, pose = np.array([[*places[:2], angles[0]]]), np.array([[*places[2:], angles[1]]])
+    turn = angles[2]
+
+    def moved(pose: np.ndarray) -> np.ndarray:
+        (x, y, yaw), c, s = pose[0], math.cos(turn), math.sin(turn)
+        return np.array([[c * x - s * y + shift[0], s * x + c * y + shift[1], yaw + turn]])
+
+    np.testing.assert_allclose(goal_in_robot(moved(goal), moved(pose)), goal_in_robot(goal, pose), atol=1e-9)
+
+
+def test_the_goal_is_told_in_the_robots_frame() -> None:
+    run = Run()
+    truth = BaseTruth(np.array([[2.025, -0.975, math.pi / 2]]), np.array([False]))
+    told = dict(zip(ENVIRONMENT, run.task.environment_state(truth)[0], strict=True))
+    assert told == pytest.approx(
+        {
+            "goal_x": 1.0,  # straight ahead of a robot that looks along y
+            "goal_y": 0.0,
+            "goal_cos": math.cos(1.0 - math.pi / 2),
+            "goal_sin": math.sin(1.0 - math.pi / 2),
+        }
+    )
+
+
+# --- how it judges ---------------------------------------------------------------------------------------------------
+
+
+def test_success_needs_place_heading_rest_and_time() -> None:
+    run = Run()
+    drive_to_goal(run)
+    for _ in range(20):
+        run.frame((*GOAL[:2], 0.0))  # the wrong heading
+    run.frame(GOAL)  # not at rest: it turned in this frame
+    for _ in range(4):
+        run.frame(GOAL)
+        assert run.running[0]
+    run.frame(GOAL)
+    assert run.events[0] == Event.SUCCESS
+    outcome = run.outcome()
+    assert outcome.success
+    assert outcome.details["time_s"] == pytest.approx(run.frames / FPS)
+    assert outcome.details["error_m"] == outcome.details["error_rad"] == 0
+
+
+def test_the_hold_begins_again_after_a_break() -> None:
+    run = Run()
+    drive_to_goal(run)
+    run.frame(GOAL)
+    for _ in range(4):
+        run.frame(GOAL)
+    run.frame((GOAL[0] + 0.004, *GOAL[1:]))  # 0.04 m/s is no rest
+    for _ in range(4):
+        run.frame((GOAL[0] + 0.004, *GOAL[1:]))
+    assert run.running[0]
+    run.frame((GOAL[0] + 0.004, *GOAL[1:]))
+    assert run.events[0] == Event.SUCCESS
+
+
+@pytest.mark.parametrize(
+    ("off", "event"),
+    [
+        ((0.099, 0.0, 0.0), Event.SUCCESS),
+        ((0.101, 0.0, 0.0), Event.STUCK),
+        ((0.0, 0.0, math.radians(9.9)), Event.SUCCESS),
+        ((0.0, 0.0, math.radians(-10.1)), Event.STUCK),
+        ((0.0, 0.0, 2 * math.pi), Event.SUCCESS),
+    ],
+)
+def test_the_tolerances_are_the_borders(off: tuple[float, float, float], event: Event) -> None:
+    run = Run()
+    drive_to_goal(run)
+    run.until_done((GOAL[0] + off[0], GOAL[1] + off[1], GOAL[2] + off[2]))
+    assert run.events[0] == event
+
+
+def test_a_touch_is_a_collision_before_all_else() -> None:
+    run = Run(NavigateConfig(hold_s=0.1))
+    drive_to_goal(run)
+    run.frame(GOAL)
+    run.frame(GOAL, touched=True)
+    assert run.events[0] == Event.COLLISION
+    assert run.outcome().score == 0
+
+
+def test_the_end_of_time_is_a_time_out_and_standing_still_is_stuck() -> None:
+    run = Run(NavigateConfig(duration_s=5.0))
+    for frame in range(50):
+        run.frame((-0.025 + 0.01 * frame, 0.025, 0.0))
+    assert (run.frames, run.events[0]) == (50, Event.TIMEOUT)
+    run = Run()
+    run.until_done(OPEN.start)
+    assert (run.frames, run.events[0]) == (100, Event.STUCK)
+
+
+def test_score_is_success_weighted_by_path_length() -> None:
+    run = Run()
+    drive_to_goal(run)
+    run.until_done(GOAL)
+    assert run.outcome().details["shortest_m"] == pytest.approx(2.05)
+    assert run.outcome().score == pytest.approx(1.0)
+    run = Run()
+    for y in np.linspace(0, 1.025, 30)[1:]:
+        run.frame((-0.025, 0.025 + y, 0.0))
+    for y in np.linspace(1.025, 0, 30)[1:]:
+        run.frame((-0.025, 0.025 + y, 0.0))
+    drive_to_goal(run)
+    run.until_done(GOAL)
+    assert run.outcome().details["path_m"] == pytest.approx(4.1)
+    assert run.outcome().score == pytest.approx(0.5)
+
+
+# --- reward ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_rewards_of_a_success_sum_to_one_whatever_the_way() -> None:
+    for detour in (0.0, 1.0, -2.9):
+        run = Run()
+        run.frame((-0.025, 0.025 + detour, 0.0))
+        run.frame((-1.0, 0.025 + detour, 2.0))
+        drive_to_goal(run)
+        run.until_done(GOAL)
+        assert run.rewards[0] == pytest.approx(1.0, abs=1e-12)
+
+
+@settings(max_examples=30)
+@given(
+    st.lists(st.tuples(st.floats(-4, 4), st.floats(-4, 4), st.floats(-4, 4)), min_size=1, max_size=20), st.booleans()
+)
+def test_without_success_the_sum_stays_in_its_bounds(poses: list[tuple[float, float, float]], crash: bool) -> None:
+    scene = NavigateTask(NavigateConfig(), 1, FPS).sample(11)
+    run = Run(None, scene)
+    for pose in poses:
+        run.frame(pose)
+    assert -0.5 <= run.rewards[0] <= 0.5
+    before = run.rewards[0]
+    if crash:
+        assert run.frame(poses[0], touched=True)[0] == -0.5
+        assert run.rewards[0] == before - 0.5
+
+
+def test_the_reward_is_the_share_of_the_way_that_was_covered() -> None:
+    run = Run()
+    reward = run.frame((0.975, 0.025, 0.0))
+    assert reward[0] == pytest.approx(0.5 * 1.0 / 2.05)
+    assert run.frame((0.975, 0.025, 3.0))[0] == pytest.approx(0.0)  # a turn far from the goal
+    assert run.frame((-0.025, 0.025, 0.0))[0] == pytest.approx(-0.5 * 1.0 / 2.05)
+
+
+def test_near_the_goal_turning_to_its_heading_is_rewarded() -> None:
+    run = Run()
+    drive_to_goal(run)
+    assert run.frame((*GOAL[:2], 0.5))[0] > 0.005
+    assert run.frame((*GOAL[:2], 0.0))[0] < -0.005
+
+
+def test_episodes_are_independent() -> None:
+    scenes = [NavigateTask(NavigateConfig(), 1, FPS).sample(seed) for seed in range(2)] + [OPEN]
+    together, alone = Run(None, *scenes), [Run(None, scene) for scene in scenes]
+    rng = np.random.default_rng(0)
+    poses = np.array([scene.start for scene in scenes])
+    for frame in range(40):
+        poses = poses + rng.normal(0, 0.03, poses.shape)
+        if frame == 20:
+            for run in (together, alone[0]):
+                run.task.begin(np.array([0]), scenes[1:2])
+        reward = together.frame(*poses)
+        for sim, run in enumerate(alone):
+            assert run.frame(poses[sim])[0] == reward[sim]
+    for sim, run in enumerate(alone):
+        assert together.outcome(sim) == run.outcome()
+
+
+# --- shortest ways ---------------------------------------------------------------------------------------------------
+
+
+def test_a_way_around_a_wall_is_as_long_as_geometry_says() -> None:
+    wall = Shape("box", 0.0, -1.0, 0.0, 0.03, 2.0)  # leaves an opening at y > 1
+    arena = replace(make_arena("empty", 0), start=(-1.0, -1.0, 0.0), goal=(1.025, -0.975, 0.0))
+    arena = replace(arena, shapes=(*arena.shapes, wall))
+    task = NavigateTask(NavigateConfig(), 1, FPS)
+    task.begin(np.array([0]), [arena])
+    # Straight to a circle around the wall's corner, around it, along the wall's end, and the same again.
+    around, apart = ROBOT_RADIUS + CLEARANCE, math.hypot(0.97, 2.0)
+    turned = math.atan2(2.0, 0.97) + math.asin(around / apart)
+    geometry = 2 * (math.sqrt(apart**2 - around**2) + turned * around) + 0.06
+    assert task.outcome(0, Event.NOTHING).details["shortest_m"] == pytest.approx(geometry, rel=0.04)
+
+
+@given(st.integers(0, 10_000))
+def test_ways_are_at_least_straight_and_at_most_a_little_longer_in_the_open(seed: int) -> None:
+    goal = tuple(np.random.default_rng(seed).integers(0, 30, 2))
+    lengths = way_lengths(np.ones((30, 30), np.bool_), goal)
+    rows, columns = np.mgrid[:30, :30]
+    straight = np.hypot(rows - goal[0], columns - goal[1])
+    assert (lengths >= straight - 1e-9).all()
+    assert (lengths <= 1.028 * straight + 1e-9).all()
+
+
+def test_no_way_squeezes_between_two_cells_that_meet_at_a_corner() -> None:
+    free = np.ones((4, 4), np.bool_)
+    free[[0, 1, 2, 3], [2, 2, 1, 1]] = False  # two walls that meet diagonally
+    assert np.isinf(way_lengths(free, (0, 0))[:, 3]).all()
+
+
+def test_between_grid_points_lengths_are_linear_and_outside_as_at_the_border() -> None:
+    field = WayField(OPEN, GOAL[:2])
+    fields, origin = field.lengths[None], field.origin[None]
+    points = OPEN.reachable[0]
+    assert interpolate(fields, origin, points[50:51, 70])[0] == pytest.approx(field.lengths[50, 70])
+    middle = (points[50, 70] + points[50, 71]) / 2
+    mean = field.lengths[50, 70:72].mean()
+    assert interpolate(fields, origin, middle[None])[0] == pytest.approx(mean)
+    assert interpolate(fields, origin, np.array([[99.0, -99.0]]))[0] == field.lengths[0, -1]
+
+
+# --- wrong inputs ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"tolerance_m": 0.0},
+        {"tolerance_m": math.nan},
+        {"tolerance_deg": -1.0},
+        {"tolerance_deg": 181.0},
+        {"tolerance_m": 2.0},
+        {"hold_s": 60.0},
+        {"rest_speed": 0.0},
+        {"duration_s": math.inf},
+        {"min_distance_m": math.nan},
+        {"goal_clearance_m": -0.1},
+        {"stuck_time_s": 0.0},
+    ],
+)
+def test_impossible_values_are_refused_by_name(change: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=f"task.{next(iter(change))}"):
+        NavigateConfig(**change)  # type: ignore[arg-type]
+
+
+def test_an_unknown_arena_is_an_error_with_the_near_miss() -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'random'"):
+        NavigateConfig(arena="randon")
+
+
+@pytest.mark.parametrize("goal", [None, (math.nan, 0.0, 0.0), (1.0, 0.0, math.inf)])
+def test_a_scene_without_a_goal_or_with_one_that_is_no_number_is_refused(goal: tuple[float, ...] | None) -> None:
+    with pytest.raises(ConfigError, match="The goal of the arena 'empty' is"):
+        Run(None, replace(OPEN, goal=goal))
+
+
+@pytest.mark.parametrize("goal", [(9.0, 0.0, 0.0), (3.0, 0.0, 0.0)])
+def test_a_goal_that_no_way_leads_to_is_refused(goal: tuple[float, float, float]) -> None:
+    with pytest.raises(ConfigError, match="No way leads from the start"):
+        Run(None, replace(OPEN, goal=goal))
+
+
+def test_parameters_are_plain_values_that_define_the_task() -> None:
+    config = NavigateConfig(arena="empty", tolerance_m=0.2)
+    parameters = NavigateTask(config, 1, FPS).parameters()
+    assert parameters.pop("type") == "navigate"
+    assert NavigateConfig(**parameters) == config
