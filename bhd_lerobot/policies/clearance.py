@@ -69,10 +69,15 @@ class Paths:
     ratio: float
 
     def points(self, length: Array) -> tuple[Array, Array]:
-        """Return x and y of the robot after some lengths [m], each of shape (lengths, K)."""
+        """Return x and y of the robot after some lengths [m], each of shape (lengths, K).
+
+        Args:
+            length: the same for all paths, shape (lengths,), or for each its own, shape (lengths, K).
+        """
+        length = length[:, None] if length.ndim == 1 else length
         rate, side = _rate(self.radius, self.ratio), np.sign(self.heading)
-        angle = np.minimum(length[:, None] / rate, np.abs(self.heading))
-        ahead = np.maximum(length[:, None] - self.turn, 0.0)
+        angle = np.minimum(length / rate, np.abs(self.heading))
+        ahead = np.maximum(length - self.turn, 0.0)
         x = self.radius * np.sin(angle) + ahead * np.cos(angle)
         y = side * (self.radius * (1 - np.cos(angle)) + ahead * np.sin(angle))
         return x, y

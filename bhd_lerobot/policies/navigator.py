@@ -122,14 +122,15 @@ class NavigatorBrain:
     def __init__(self, config: NavigatorConfig | None = None) -> None:
         self.config = config = config or NavigatorConfig()
         self._paths = paths = make_paths(config.forward_speed, config.rim_speed)
-        length = np.append(0.1, _STEP * np.arange(1, int(config.horizon_m / _STEP + 1e-9) + 1))
-        self._reach = np.ceil(length / QUANTUM - 1e-9).astype(np.uint8)[:, None]  # (points, 1)
+        # Places after the turn: before its end, all paths to one side are alike.
+        after = np.append(_STEP / 2, _STEP * np.arange(1, int(config.horizon_m / _STEP + 1e-9) + 1))
+        length = np.minimum(paths.turn + after[:, None], LONGEST)  # (points, K)
+        self._reach = np.ceil(length / QUANTUM - 1e-9).astype(np.uint8)
         x, y = paths.points(length)
-        self._path_x, self._path_y = x.astype(np.float32), y.astype(np.float32)  # (points, K)
+        self._path_x, self._path_y = x.astype(np.float32), y.astype(np.float32)
         # What a turn takes in time, beyond the way that it goes.
-        arc = np.abs(paths.heading) * paths.radius / np.maximum(paths.turn, 1e-9)  # of a turn's length, what is a way
-        lost = np.minimum(length[:, None], paths.turn) * (1 - arc)
-        self._length = (length[:, None] - (1 - config.turn_weight) * lost).astype(np.float32)
+        lost = paths.turn - np.abs(paths.heading) * paths.radius
+        self._length = (length - (1 - config.turn_weight) * lost).astype(np.float32)
         # The turn on the spot to each heading, by number; half a turn is both the last and the first of them.
         number = np.round(paths.heading / SPACING).astype(np.int64) % HEADINGS
         spot = (paths.radius == 0) | (number == 0)
