@@ -1,0 +1,119 @@
+"""Doing nothing and moving at random, on both robots."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
+from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
+from bhd_lerobot.runs.registry import brains_for, make_brain, make_simulation, make_task, robot_of_brain
+from bhd_lerobot.tasks.avoid import AvoidConfig
+from bhd_lerobot.tasks.reach import ReachConfig
+
+BASE = turtlebot3_burger().limits.names
+ARM = ur5().limits.names
+
+
+def actions(brain: Any, names: tuple[str, ...], frames: int, seeds: list[int], fps: int = 10) -> np.ndarray:
+    """Return what a brain wants when the robots stand at 0.5, 1.5, …, shape (frames, n, actions)."""
+    n = len(seeds)
+    brain.bind(("other", *names), names, fps)
+    brain.reset(np.arange(n), seeds, n)
+    state = np.tile(0.01 * np.arange(n)[:, None], (1, len(names) + 1))
+    return np.array([brain.act(Observation(("other", *names), state + 0.001 * frame)) for frame in range(frames)])
+
+
+def run(kind: str, brain: Any, n: int, episodes: int = 3) -> list[Episode]:
+    if kind == "ur5":
+        simulation, task = make_simulation(UR5Config(), n), make_task(ReachConfig(duration_s=1), n, 25)
+    else:
+        simulation, task = make_simulation(TurtleBot3Config(beams=12), n), make_task(AvoidConfig(duration_s=2), n, 10)
+    return list(EpisodeLoop(simulation, task, brain).run([EpisodeSpec(i, 2 * i) for i in range(episodes)]))
+
+
+def test_nothing_is_no_speed_and_the_positions_of_the_beginning() -> None:
+    assert np.array_equal(actions(NoopBrain(), BASE, 3, [0, 1]), np.zeros((3, 2, 2)))
+    held = actions(NoopBrain(), ARM, 3, [0, 1])
+    assert np.array_equal(held, np.tile(np.array([0.0, 0.01])[:, None], (3, 1, 7)))
+
+
+def test_a_new_episode_is_held_where_it_begins() -> None:
+    brain = NoopBrain()
+    actions(brain, ARM, 2, [0, 1])
+    brain.reset(np.array([1]), [5], 2)
+    held = brain.act(Observation(("other", *ARM), np.ones((2, 8)), running=np.array([True, False])))
+    assert held[0] == pytest.approx(0)
+    assert held[1] == pytest.approx(0.01)  # not looked at before it runs
+    assert brain.act(Observation(("other", *ARM), np.ones((2, 8))))[1] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("kind", ["ur5", "turtlebot3"])
+def test_a_robot_that_does_nothing_stays_where_it_is(kind: str) -> None:
+    for episode in run(kind, NoopBrain(), 2):
+        state = episode.columns["observation.state"]
+        columns = slice(0, 6) if kind == "ur5" else slice(0, 2)
+        assert np.abs(state[:, columns] - state[0, columns]).max() < 1e-3
+
+
+@pytest.mark.parametrize("names", [BASE, ARM])
+@pytest.mark.parametrize(("period", "scale"), [(0, 1), (0.7, 1), (0.7, 0.25)])
+def test_random_actions_stay_within_the_limits(names: tuple[str, ...], period: float, scale: float) -> None:
+    limits: Any = turtlebot3_burger().limits if names == BASE else ur5().limits
+    upper = np.array(limits.upper if names == ARM else limits.velocity)
+    lower = np.array(limits.lower) if names == ARM else -upper
+    wanted = actions(RandomBrain(RandomConfig(period, scale)), names, 200, [1, 2, 3])
+    assert (wanted >= lower - 1e-9).all()
+    assert (wanted <= upper + 1e-9).all()
+    half = scale * (upper - lower) / 2
+    used = np.abs(wanted - (0.01 * np.arange(3)[:, None] if names == ARM else 0)).max((0, 1))
+    assert (used <= half + 1e-9).all()
+    assert (used > 0.5 * half).all()
+
+
+def test_between_two_random_actions_it_goes_in_a_straight_line() -> None:
+    smooth = actions(RandomBrain(RandomConfig(period_s=0.5)), BASE, 31, [4])[:, 0]
+    steps = np.diff(np.concatenate([np.zeros((1, 2)), smooth]), axis=0)[:30].reshape(6, 5, 2)
+    assert steps == pytest.approx(np.repeat(steps[:, :1], 5, axis=1))
+    assert len(np.unique(steps[:, 0, 0])) == 6
+
+
+def test_random_actions_follow_from_the_seed_alone() -> None:
+    three = actions(RandomBrain(), BASE, 20, [1, 2, 3])
+    assert np.array_equal(three[:, 1], actions(RandomBrain(), BASE, 20, [2])[:, 0])
+    assert not np.array_equal(three[:, 0], three[:, 1])
+
+
+@pytest.mark.parametrize("kind", ["ur5", "turtlebot3"])
+def test_random_episodes_are_the_same_for_any_number_side_by_side(kind: str) -> None:
+    one, three = run(kind, RandomBrain(), 1), run(kind, RandomBrain(), 3)
+    for a, b in zip(one, three, strict=True):
+        assert np.array_equal(a.columns["action"], b.columns["action"])
+        assert np.array_equal(a.columns["observation.state"], b.columns["observation.state"])
+
+
+def test_they_drive_every_robot() -> None:
+    for config, name in ((NoopConfig(), "noop"), (RandomConfig(), "random")):
+        assert robot_of_brain(config) == ""
+        assert make_brain(config).parameters()["type"] == name
+        assert name in brains_for("ur5")
+        assert name in brains_for("turtlebot3")
+
+
+def test_what_they_cannot_do_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"hold the action 'grip\.force'"):
+        NoopBrain().bind(("a.pos",), ("grip.force",), 10)
+    with pytest.raises(ConfigError, match=r"tool_x\.pos"):
+        NoopBrain().bind(("a.pos",), ("tool_x.pos",), 10)
+    with pytest.raises(ConfigError, match=r"knows no range for the actions x\.vel"):
+        RandomBrain().bind(("x.vel",), ("x.vel",), 10)
+    for options, match in (({"period_s": -1}, "period_s is -1"), ({"scale": 0}, "scale is 0"), ({"scale": 2}, "is 2")):
+        with pytest.raises(ConfigError, match=match):
+            RandomConfig(**options)

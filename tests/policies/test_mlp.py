@@ -1,0 +1,365 @@
+"""`bhd_mlp`: its inputs, its losses, weights in and out, and what it refuses."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from torch import Tensor, nn
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.mlp.configuration_mlp import ACTIVATIONS, MlpConfig, ScanConfig
+from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
+from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder
+
+NAMES = ["x.vel", *(f"scan_{i:03}.pos" for i in range(8)), "theta.vel"]
+
+
+def config(environment: int = 3, **options: Any) -> MlpConfig:
+    inputs = {OBS_STATE: PolicyFeature(FeatureType.STATE, (10,))}
+    if environment:
+        inputs[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (environment,))
+    made = MlpConfig(
+        device="cpu",
+        input_features=inputs,
+        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (2,))},
+        **{"hidden_dims": [16], "chunk_size": 4, **options},
+    )
+    made.set_dataset_feature_metadata({OBS_STATE: {"names": NAMES}})
+    return made
+
+
+def batch(made: MlpConfig, rows: int = 5, seed: int = 0) -> dict[str, Tensor]:
+    """Return what LeRobot's loader and the preprocessor give, in normalised units."""
+    generator = torch.Generator().manual_seed(seed)
+    steps = () if made.n_obs_steps == 1 else (made.n_obs_steps,)
+    result = {
+        key: torch.randn(rows, *steps, ft.shape[0], generator=generator) for key, ft in made.input_features.items()
+    }
+    result[OBS_SCAN] = torch.rand(rows, *steps, 8, generator=generator) * 3 + 0.1
+    result[ACTION] = torch.randn(rows, made.chunk_size, 2, generator=generator)
+    result["action_is_pad"] = torch.zeros(rows, made.chunk_size, dtype=torch.bool)
+    return result
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+# --- inputs -----------------------------------------------------------------------------------------------------------
+
+
+def test_it_sees_every_number_once_oldest_first() -> None:
+    made = config(n_obs_steps=2)
+    policy, given = MlpPolicy(made), batch(made)
+    wanted = torch.cat([given[OBS_STATE], given[OBS_ENV_STATE]], dim=-1).flatten(1)
+    assert policy.feature_size == 26
+    assert torch.equal(policy.features(given), wanted)
+
+
+def test_beams_are_transformed_and_the_rest_is_not() -> None:
+    for transform, function in (("inverse", lambda r: 0.5 / r), ("log", lambda r: torch.log(r / 0.5))):
+        made = config(scan=ScanConfig(transform=transform), n_obs_steps=2)
+        policy, given = MlpPolicy(made), batch(made)
+        seen = policy.features(given)
+        others = torch.cat([given[OBS_STATE][..., [0, 9]], given[OBS_ENV_STATE]], dim=-1).flatten(1)
+        assert (made.scan.start, made.scan.beams) == (1, 8)
+        assert torch.equal(seen[:, :10], others)
+        assert torch.allclose(seen[:, 10:], function(given[OBS_SCAN]).flatten(1))
+        assert policy.feature_size == seen.shape[1] == 26
+
+
+def test_a_range_of_nothing_stays_finite() -> None:
+    made = config(scan=ScanConfig(transform="inverse", minimum=0.1))
+    given = batch(made)
+    given[OBS_SCAN][:] = 0
+    assert torch.equal(MlpPolicy(made).features(given)[:, 5:], torch.full((5, 8), 5.0))
+
+
+def test_the_preprocessor_hands_the_ranges_over_in_metres(tmp_path: Path) -> None:
+    made = config(scan=ScanConfig(transform="inverse"))
+    MlpPolicy(made)
+    stats = {
+        key: {"mean": np.full(size, 1.5), "std": np.full(size, 0.5)} for key, size in ((OBS_STATE, 10), (ACTION, 2))
+    }
+    before, after = make_pre_post_processors(made, dataset_stats=stats)
+    before.save_pretrained(tmp_path)
+    after.save_pretrained(tmp_path)
+    again, _ = make_pre_post_processors(made, pretrained_path=str(tmp_path))
+    state = torch.rand(4, 10)
+    for one in (before, again):
+        done = one({OBS_STATE: state, OBS_ENV_STATE: torch.zeros(4, 3)})
+        assert torch.equal(done[OBS_SCAN], state[:, 1:9])
+        assert torch.allclose(done[OBS_STATE], (state - 1.5) / 0.5, atol=1e-6)
+
+
+def test_turning_the_robot_turns_what_the_convolutions_see() -> None:
+    torch.manual_seed(0)
+    encoder = ScanEncoder(ScanConfig(channels=[4, 6], beams=16, start=0, stride=2), 1, nn.ReLU)
+    scan = torch.rand(3, 1, 16)
+    seen, turned = encoder(scan).unflatten(1, (6, 4)), encoder(scan.roll(4, -1)).unflatten(1, (6, 4))
+    assert encoder.size == 24
+    assert torch.allclose(seen.roll(1, -1), turned, atol=1e-6)
+    assert not torch.allclose(seen, turned, atol=1e-3)
+
+
+def test_what_never_changed_in_the_data_does_not_blow_up() -> None:
+    made = config()
+    given = batch(made)
+    given[OBS_STATE][:, 3] = 1e8
+    assert float(MlpPolicy(made).features(given).abs().max()) == 10
+    assert float(MlpPolicy(config(feature_clip=None)).features(given).abs().max()) == 1e8
+
+
+def test_cameras_are_left_alone() -> None:
+    made = config()
+    made.input_features["observation.images.front"] = PolicyFeature(FeatureType.VISUAL, (3, 8, 8))
+    MlpPolicy(made)
+    assert set(made.input_features) == {OBS_STATE, OBS_ENV_STATE}
+    assert made.image_features == {}
+
+
+@pytest.mark.parametrize(
+    ("options", "observations", "actions"),
+    [
+        ({}, None, [0, 1, 2, 3]),
+        ({"n_obs_steps": 3}, [-2, -1, 0], [0, 1, 2, 3]),
+        ({"n_obs_steps": 3, "obs_stride": 4, "chunk_size": 1}, [-8, -4, 0], [0]),
+    ],
+)
+def test_which_frames_it_asks_the_dataset_for(options: Any, observations: Any, actions: Any) -> None:
+    made = config(**options)
+    assert made.observation_delta_indices == observations
+    assert made.action_delta_indices == actions
+    assert made.reward_delta_indices is None
+
+
+# --- losses -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loss", ["l1", "mse", "huber", "nll"])
+def test_the_loss_is_what_its_name_says_and_leaves_padding_out(loss: str) -> None:
+    made = config(loss=loss, gaussian=loss == "nll", initial_log_std=-0.3)
+    policy, given = MlpPolicy(made), batch(made)
+    given["action_is_pad"][0, 1:] = True
+    given["action_is_pad"][3, 3] = True
+    with torch.no_grad():
+        error = policy.predict_action_chunk(given) - given[ACTION]
+        value, told = policy(given)
+        each, _ = policy(given, reduction="none")
+    wanted = {
+        "l1": error.abs(),
+        "mse": error**2,
+        "huber": torch.where(error.abs() < 0.5, 0.5 * error**2, 0.5 * (error.abs() - 0.25)),
+        "nll": -torch.distributions.Normal(0.0, math.exp(-0.3)).log_prob(error),
+    }[loss]
+    keep = ~given["action_is_pad"]
+    assert float(value) == pytest.approx(float(wanted[keep].mean()), rel=1e-5)
+    assert told["l1_loss"] == pytest.approx(float(error[keep].abs().mean()), rel=1e-5)
+    rows = torch.stack([wanted[i][keep[i]].mean() for i in range(5)])
+    assert torch.allclose(each, rows, rtol=1e-5)
+    given[ACTION][~keep] = 1e6
+    assert float(policy(given)[0].detach()) == pytest.approx(float(value))
+
+
+def test_a_row_of_padding_alone_has_no_loss() -> None:
+    made = config()
+    given = batch(made)
+    given["action_is_pad"][:] = True
+    value, _ = MlpPolicy(made)(given)
+    assert value.item() == 0
+
+
+def test_it_learns_a_function_and_how_much_it_scatters() -> None:
+    torch.manual_seed(0)
+    made = config(0, gaussian=True, hidden_dims=[32], chunk_size=1, optimizer_lr=1e-2, layer_norm=True, dropout=0.1)
+    policy = MlpPolicy(made)
+    optimizer = made.get_optimizer_preset().build(policy.get_optim_params())
+    noise = torch.tensor([0.1, 0.4])
+    for step in range(250):
+        policy.train()
+        state = torch.randn(128, 10, generator=torch.Generator().manual_seed(step))
+        action = state[:, :2].sin() + noise * torch.randn(128, 2, generator=torch.Generator().manual_seed(1000 + step))
+        loss, told = policy({OBS_STATE: state, ACTION: action.unsqueeze(1)})
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    state = torch.randn(256, 10, generator=torch.Generator().manual_seed(9999))
+    error = policy.predict_action_chunk({OBS_STATE: state})[:, 0] - state[:, :2].sin()
+    assert float(error.abs().mean()) < 0.15
+    assert policy.log_std is not None
+    assert policy.log_std.detach().exp()[0] == pytest.approx(noise.numpy(), abs=0.2)
+    assert told["std"] == pytest.approx(float(policy.log_std.detach().exp().mean()), abs=0.05)
+
+
+def test_biases_and_deviations_do_not_decay() -> None:
+    policy = MlpPolicy(config(gaussian=True, layer_norm=True, scan=ScanConfig(channels=[2])))
+    weights, others = policy.get_optim_params()
+    assert others["weight_decay"] == 0
+    assert {id(p) for p in (*weights["params"], *others["params"])} == {id(p) for p in policy.parameters()}
+    assert any(p is policy.log_std for p in others["params"])
+    assert all(p.ndim > 1 for p in weights["params"])
+
+
+# --- acting -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{}, {"n_obs_steps": 3, "obs_stride": 2, "n_action_steps": 3}])
+def test_frame_by_frame_it_acts_as_on_the_rows_of_a_dataset(options: Any) -> None:
+    made = config(**options)
+    policy = MlpPolicy(made)
+    states, told = torch.randn(9, 2, 10), torch.randn(9, 2, 3)
+    rows_seen = [{OBS_STATE: state, OBS_ENV_STATE: one} for state, one in zip(states, told, strict=True)]
+    chosen = torch.stack([policy.select_action(row) for row in rows_seen])
+    for frame in range(9):
+        looked = frame - frame % made.n_action_steps
+        rows = [max(0, looked + delta) for delta in made.observation_delta_indices or [0]]
+        given = {OBS_STATE: states[rows].transpose(0, 1), OBS_ENV_STATE: told[rows].transpose(0, 1)}
+        assert torch.allclose(chosen[frame], policy.predict_action_chunk(given)[:, frame - looked], atol=1e-6)
+
+
+def test_reset_forgets_the_history_and_the_plan() -> None:
+    made = config(n_obs_steps=2, n_action_steps=4)
+    policy, one, two = MlpPolicy(made), torch.randn(1, 10), torch.randn(1, 10)
+    told = torch.zeros(1, 3)
+    first = policy.select_action({OBS_STATE: one, OBS_ENV_STATE: told})
+    policy.select_action({OBS_STATE: two, OBS_ENV_STATE: told})
+    policy.reset()
+    assert torch.equal(first, policy.select_action({OBS_STATE: one, OBS_ENV_STATE: told}))
+
+
+def test_samples_scatter_as_the_deviation_says() -> None:
+    made = config(gaussian=True, initial_log_std=math.log(0.2))
+    policy, given = MlpPolicy(made), batch(made, rows=1)
+    mean = policy.predict_action_chunk(given)
+    noise = torch.randn(mean.shape)
+    assert torch.allclose(policy.predict_action_chunk(given, noise=noise), mean + 0.2 * noise)
+    made.sample = True
+    torch.manual_seed(1)
+    drawn = torch.stack([policy.predict_action_chunk(given) for _ in range(500)])
+    assert drawn.std(0).mean().item() == pytest.approx(0.2, rel=0.1)
+
+
+# --- weights in and out -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_layers_go_out_and_in_exactly(activation: str) -> None:
+    made = config(hidden_dims=[16, 8], activation=activation, gaussian=True)
+    policy, given = MlpPolicy(made), batch(made)
+    log_std = torch.tensor([-1.0, -2.0])
+    other = config(hidden_dims=[16, 8], activation=activation, gaussian=True)
+    again = MlpPolicy.from_layers(other, policy.layers(), log_std)
+    assert torch.equal(policy.predict_action_chunk(given), again.predict_action_chunk(given))
+    assert again.log_std is not None
+    assert torch.equal(again.log_std.detach(), log_std.expand(4, 2))
+
+
+def test_an_actor_of_stable_baselines_runs_here_unchanged() -> None:
+    gymnasium = pytest.importorskip("gymnasium")
+    policies = pytest.importorskip("stable_baselines3.common.policies")
+    box = gymnasium.spaces.Box(-np.inf, np.inf, (10,), np.float32)
+    hand = gymnasium.spaces.Box(-np.ones(2, np.float32), np.ones(2, np.float32))
+    torch.manual_seed(0)
+    actor = policies.ActorCriticPolicy(box, hand, lambda _: 1e-3, net_arch=[32, 16], activation_fn=nn.Tanh)
+    linear = [m for m in actor.mlp_extractor.policy_net if isinstance(m, nn.Linear)] + [actor.action_net]
+    made = config(0, hidden_dims=[32, 16], activation="tanh", chunk_size=1, gaussian=True, feature_clip=None)
+    policy = MlpPolicy.from_layers(made, [(m.weight, m.bias) for m in linear], actor.log_std)
+    seen = torch.randn(20, 10)
+    with torch.no_grad():
+        wanted = actor.get_distribution(seen).distribution
+    assert torch.equal(policy.predict_action_chunk({OBS_STATE: seen})[:, 0], wanted.mean)
+    assert torch.equal(policy._std()[0], wanted.stddev[0])
+
+
+def test_layers_of_another_shape_are_refused() -> None:
+    policy = MlpPolicy(config(hidden_dims=[16]))
+    with pytest.raises(ConfigError, match=r"\(16, 13\).*needs \[\(8, 13\), \(8, 8\)\]"):
+        MlpPolicy.from_layers(config(hidden_dims=[8]), policy.layers())
+    with pytest.raises(ConfigError, match="give log_std"):
+        MlpPolicy.from_layers(config(gaussian=True), policy.layers())
+
+
+def test_it_is_saved_and_loaded_as_a_lerobot_policy(tmp_path: Path) -> None:
+    made = config(scan=ScanConfig(transform="log", channels=[3]), gaussian=True, n_obs_steps=2)
+    policy, given = MlpPolicy(made), batch(made)
+    policy.save_pretrained(tmp_path)
+    loaded = PreTrainedConfig.from_pretrained(tmp_path)
+    assert loaded.type == "bhd_mlp"
+    assert get_policy_class("bhd_mlp") is MlpPolicy
+    assert loaded == made
+    again = MlpPolicy.from_pretrained(tmp_path, strict=True)
+    assert torch.equal(policy.predict_action_chunk(given), again.predict_action_chunk(given))
+
+
+# --- refused ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n_obs_steps": 0}, "policy.n_obs_steps is 0"),
+        ({"n_action_steps": 5}, "policy.n_action_steps is 5"),
+        ({"hidden_dims": [8, 0]}, "policy.hidden_dims"),
+        ({"activation": "rely"}, "Did you mean 'relu'"),
+        ({"loss": "l3"}, "policy.loss"),
+        ({"loss": "nll"}, "--policy.gaussian=true"),
+        ({"sample": True}, "--policy.gaussian=true"),
+        ({"scheduler": "cosin"}, "Did you mean 'cosine'"),
+        ({"dropout": 1.0}, "policy.dropout"),
+        ({"feature_clip": 0.0}, "policy.feature_clip"),
+        ({"huber_delta": 0.0}, "policy.huber_delta"),
+        ({"scan": ScanConfig(transform="invers")}, "Did you mean 'inverse'"),
+        ({"scan": ScanConfig(scale=0)}, "policy.scan.scale"),
+        ({"scan": ScanConfig(kernel_size=4)}, "policy.scan.kernel_size is 4"),
+        ({"scan": ScanConfig(stride=0)}, "stride 0"),
+        ({"scan": ScanConfig(beams=4)}, "give both or neither"),
+    ],
+)
+def test_values_that_cannot_be_honoured(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        config(**options)
+    assert message in str(error.value)
+
+
+def test_features_that_it_cannot_be_built_for() -> None:
+    with pytest.raises(ConfigError, match="the dataset has neither"):
+        MlpPolicy(MlpConfig(device="cpu", output_features={ACTION: PolicyFeature(FeatureType.ACTION, (2,))}))
+    made = config()
+    made.output_features = {}
+    with pytest.raises(ConfigError, match="needs an action"):
+        MlpPolicy(made)
+    made = config()
+    made.input_features[OBS_STATE] = PolicyFeature(FeatureType.STATE, (2, 5))
+    with pytest.raises(ConfigError, match=r"observation\.state has the shape \(2, 5\)"):
+        MlpPolicy(made)
+    with pytest.raises(ConfigError, match="10 columns"):
+        MlpPolicy(config(scan=ScanConfig(transform="log", start=4, beams=8)))
+    made = MlpConfig(device="cpu", scan=ScanConfig(transform="inverse"))
+    with pytest.raises(ConfigError, match="does not have"):
+        made.set_dataset_feature_metadata({OBS_STATE: {"names": ["a", "b"]}})
+    with pytest.raises(ConfigError, match="make the policy before its processors"):
+        make_pre_post_processors(made)
+
+
+def test_batches_that_it_cannot_read() -> None:
+    made = config(scan=ScanConfig(transform="log"), n_obs_steps=2)
+    policy, given = MlpPolicy(made), batch(made)
+    with pytest.raises(ConfigError, match="Run the policy's own preprocessor"):
+        policy.features({key: value for key, value in given.items() if key != OBS_SCAN})
+    with pytest.raises(ConfigError, match=r"trained with 'observation\.environment_state'"):
+        policy.features({key: value for key, value in given.items() if key != OBS_ENV_STATE})
+    with pytest.raises(ConfigError, match=r"holds 1 observations; policy\.n_obs_steps is 2"):
+        policy.features({key: value[:, 0] for key, value in given.items()})
+    with pytest.raises(ConfigError, match="nothing to sample from"):
+        policy.predict_action_chunk(given, noise=torch.zeros(5, 4, 2))
