@@ -11,13 +11,12 @@ import draccus
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 
+from bhd_lerobot.data.selection import EpisodeFilter
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.tasks.task import Event
 
 OWN_CONFIG_NAME = "bhd_train.json"
 """The fields that LeRobot's `train_config.json` has no place for; beside it in every checkpoint."""
 
-OUTCOMES = tuple(event.cause for event in Event if event not in (Event.NOTHING, Event.INTERVENTION))
 STATISTICS = ("checkpoint", "dataset")
 
 
@@ -28,12 +27,14 @@ class SelectionConfig:
     Attributes:
         outcome: episodes that ended so: `all`, or events that an episode can end with, such as `success`.
         min_score: episodes with at least this score, 0 to 1; any if nothing.
+        exclude_late: leave out episodes with more late frames than their recording tolerated.
         intervention_weight: how often frames in which somebody intervened are drawn, compared with others; 0 drops
             them.
     """
 
     outcome: list[str] = field(default_factory=lambda: ["all"])
     min_score: float | None = None
+    exclude_late: bool = False
     intervention_weight: float = 1.0
 
     def __post_init__(self) -> None:
@@ -42,25 +43,19 @@ class SelectionConfig:
         Raises:
             ConfigError: names the value and the valid ones.
         """
-        if not self.outcome:
-            raise ConfigError(f"selection.outcome is empty. Valid: all, {', '.join(OUTCOMES)}.")
-        for outcome in self.outcome:
-            if outcome not in ("all", *OUTCOMES):
-                raise ConfigError(unknown_name("selection.outcome", outcome, ["all", *OUTCOMES]))
-        if self.min_score is not None and not 0 <= self.min_score <= 1:
-            raise ConfigError(f"selection.min_score is {self.min_score}; scores go from 0 to 1.")
+        _ = self.filter
         if not 0 <= self.intervention_weight < float("inf"):
             raise ConfigError(f"selection.intervention_weight is {self.intervention_weight}; it must be 0 or more.")
 
     @property
-    def outcomes(self) -> list[str] | None:
-        """The outcomes that are wanted; None if all are."""
-        return None if "all" in self.outcome else list(self.outcome)
+    def filter(self) -> EpisodeFilter:
+        """Which episodes are wanted."""
+        return EpisodeFilter(outcome=self.outcome, min_score=self.min_score, exclude_late=self.exclude_late)
 
     @property
     def is_everything(self) -> bool:
         """Whether no episode is left out."""
-        return self.outcomes is None and self.min_score is None
+        return self.filter.outcomes is None and self.min_score is None and not self.exclude_late
 
 
 @dataclass

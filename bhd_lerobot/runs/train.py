@@ -26,7 +26,7 @@ from bhd_lerobot.runs.configuration import describe
 from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
 from bhd_lerobot.runs.train_arguments import Request, parse_train
 from bhd_lerobot.runs.train_checkpoint import TrainingParts, resume_command
-from bhd_lerobot.runs.train_data import TrainingData, choose_episodes, open_data, open_metadata
+from bhd_lerobot.runs.train_data import TrainingData, open_data, open_metadata
 from bhd_lerobot.runs.train_env import EnvEvaluation
 from bhd_lerobot.runs.train_log import (
     METRICS_NAME,
@@ -98,8 +98,8 @@ def train(request: Request, console: Console | None = None) -> TrainResult:
         meta = open_metadata(config)
     if request.contract is not None:
         check_contract(request.contract, meta)
-    if not config.selection.is_everything:
-        config.dataset.episodes = choose_episodes(meta, config.selection, config.dataset.episodes)
+    if not config.selection.is_everything:  # resolved, so that lerobot-train can go on with the same episodes
+        config.dataset.episodes = config.selection.filter.select(meta, config.dataset.episodes)
     policy = build_policy(config, meta, accelerator)
     keep = config.resume or (request.contract is not None and config.fine_tune_statistics == "checkpoint")
     preprocessor, postprocessor = build_processors(config, policy, meta, accelerator.device, keep_statistics=keep)
@@ -111,17 +111,28 @@ def train(request: Request, console: Console | None = None) -> TrainResult:
         device=accelerator.device,
         rank=accelerator.process_index,
         world_size=accelerator.num_processes,
+        say=lambda message: console.print(escape(message), soft_wrap=True, highlight=False),
     )
     contract = PolicyContract.from_dataset(meta, trainer="bhd-train")
     parts = TrainingParts(policy, optimizer, scheduler, preprocessor, postprocessor, contract)
     step, state = train_checkpoint.load(config.checkpoint_path, parts) if config.checkpoint_path else (0, {})
-    return _run(config, accelerator, parts, data, step, state, tuple(meta.camera_keys), console)
+    return _run(
+        config,
+        accelerator,
+        parts,
+        data=data,
+        step=step,
+        state=state,
+        camera_keys=tuple(meta.camera_keys),
+        console=console,
+    )
 
 
 def _run(
     config: BhdTrainConfig,
     accelerator: Any,
     parts: TrainingParts,
+    *,
     data: TrainingData,
     step: int,
     state: dict[str, Any],
@@ -151,7 +162,10 @@ def _run(
     )
     result = TrainResult(Path(str(config.output_dir)), step, config.checkpoint_path, contract=parts.contract)
     environment = EnvEvaluation(config, parts, accelerator) if config.env and config.env_eval_freq > 0 else None
-    hooks = Hooks(held_out=data.held_out, evaluate=None if environment is None else environment.run)
+    hooks = Hooks(
+        held_out=None if data.held_out is None else data.held_out.__iter__,
+        evaluate=None if environment is None else environment.run,
+    )
     loop = TrainingLoop(learner, data.train, options, hooks)
     if config.checkpoint_path:
         loop.load_state_dict(step, state)
@@ -192,7 +206,8 @@ def _run(
                 result.rows = metrics.rows
                 draw_loss(metrics.rows, result.output_dir / PLOT_NAME, _heading(config, loop.step))
     tell_summary(console, config, result)
-    if not loop.interrupted and accelerator.is_main_process and config.policy.push_to_hub:  # type: ignore[union-attr]
+    push = config.policy is not None and config.policy.push_to_hub
+    if not loop.interrupted and accelerator.is_main_process and push:
         _push(config, parts, result)
     accelerator.wait_for_everyone()
     accelerator.end_training()
@@ -200,7 +215,7 @@ def _run(
 
 
 def _agreement(stop: StopRequest, accelerator: Any) -> Any:
-    """Return whether to stop after a step; several processes ask each other now and then, so that they stop together."""
+    """Return whether to stop after a step; several processes ask each other now and then, to stop together."""
     if accelerator.num_processes == 1:
         return lambda step: bool(stop)
 
@@ -240,9 +255,9 @@ def _wandb(config: BhdTrainConfig) -> Any:
 
 
 def _share(config: BhdTrainConfig, checkpoint: Path, wandb: Any) -> None:
-    if config.save_checkpoint_to_hub:
+    if config.save_checkpoint_to_hub and config.policy is not None:
         try:
-            push_checkpoint_to_hub(checkpoint, config.policy.repo_id, private=config.policy.private)  # type: ignore[union-attr]
+            push_checkpoint_to_hub(checkpoint, config.policy.repo_id, private=config.policy.private)
         except Exception as error:  # of the Hub's client or the network
             raise BhdError(f"The checkpoint is complete at {checkpoint}, but it was not uploaded: {error}") from error
     if wandb is not None:

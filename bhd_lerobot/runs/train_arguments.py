@@ -5,6 +5,7 @@ configuration that lies in a checkpoint.
 """
 
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import draccus
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot.utils.device_utils import auto_select_torch_device
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.contract import find_checkpoint
@@ -44,6 +46,8 @@ def parse_train(arguments: Sequence[str]) -> Request:
     Raises:
         ConfigError: an unknown key or policy, a value of the wrong type, or a file that cannot be read.
     """
+    # LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     overrides = configuration._overrides(arguments)
     path = overrides.pop(configuration.CONFIG_PATH, None)
     resume = overrides.get("resume") is True
@@ -106,6 +110,7 @@ def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
     selection = values.get("selection")
     if isinstance(selection, dict) and isinstance(selection.get("outcome"), str):
         selection["outcome"] = [selection["outcome"]]
+    _drop_defaults(BhdTrainConfig, values)
     configuration._check_keys(BhdTrainConfig, values, "")
     try:
         config = draccus.decode(BhdTrainConfig, values)
@@ -118,6 +123,24 @@ def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
     return Request(config, contract)
 
 
+def _drop_defaults(config_class: type, values: dict[str, Any]) -> None:
+    """Leave out what the chosen classes say themselves: LeRobot's defaults do not all have the type of their field."""
+    for key, kind, _ in configuration._fields(config_class):
+        value = values.get(key)
+        chosen = configuration._choices(kind).get(value.get("type")) if isinstance(value, dict) else None
+        if chosen is not None:
+            defaults = {name: default for name, _, default in configuration._fields(chosen)}
+            values[key] = {
+                name: one
+                for name, one in value.items()
+                if name == "type" or name not in defaults or not _is_same(one, defaults[name])
+            }
+
+
+def _is_same(value: Any, default: Any) -> bool:
+    return type(value) is type(default) and bool(value == default)
+
+
 def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
     """Complete the policy's configuration from the checkpoint that a new run starts from; return that checkpoint."""
     policy = values.get("policy")
@@ -127,6 +150,8 @@ def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
     path = policy.pop("path", None)
     fine_tune = values.get("fine_tune")
     source = fine_tune or path
+    if "type" in policy or source is not None:
+        policy.setdefault("device", auto_select_torch_device().type)  # what LeRobot does, but it warns of it
     if resume or source is None:
         if policy:
             policy.setdefault("push_to_hub", bool(policy.get("repo_id")))

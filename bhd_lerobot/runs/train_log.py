@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -82,6 +83,7 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
     smallest = []
     for key, label, colour, marker in (
+        *((key, f"training, {key}", colour, None) for key, colour in zip(_parts(rows), _PART_COLOURS, strict=False)),
         ("loss", "training", "#2c3e50", None),
         ("held_out_loss", "held-out episodes", "#c0392b", "o"),
     ):
@@ -98,18 +100,12 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
             linewidth=1.3,
             label=label,
         )
-        above.annotate(
-            f"{values[-1]:.3g}",
-            (steps[-1], values[-1]),
-            xytext=(5, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=9,
-            color=colour,
-        )
         smallest.append(min(values))
     if smallest and min(smallest) > 0:  # a negative log-likelihood may be below 0
         above.set_yscale("log")
+        above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        above.yaxis.set_minor_locator(NullLocator())
+        above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     above.set_ylabel("loss")
     above.grid(alpha=0.3, which="both")
     if smallest:
@@ -123,6 +119,15 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
     below.set_xlabel("step")
     below.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
+
+
+_PART_COLOURS = ("#2980b9", "#8e9a3b", "#8e44ad", "#d68910")
+
+
+def _parts(rows: Sequence[Row]) -> list[str]:
+    """Return the keys of what a loss is the sum of, if the policy says so; a held-out loss may be one of them only."""
+    keys = [key for key in (rows[0] if rows else {}) if key.endswith("_loss") and key != "held_out_loss"]
+    return keys if len(keys) > 1 else []
 
 
 class TrainingProgress:

@@ -78,8 +78,8 @@ class Window:
         batches: where each step's samples come from: `episode_index` and `frame_index`.
         data_s: time that went into getting batches [s].
         update_s: time that went into learning from them [s].
+        other_s: time that went into what is neither, such as checkpoints [s].
         started: when it began, in this process.
-        steps: steps in this process.
     """
 
     results: list[StepResult] = field(default_factory=list)
@@ -87,6 +87,7 @@ class Window:
     batches: list[tuple[Any, Any]] = field(default_factory=list)
     data_s: float = 0.0
     update_s: float = 0.0
+    other_s: float = 0.0
     started: float = field(default_factory=time.perf_counter)
 
     def numbers(self) -> list[dict[str, float]]:
@@ -181,6 +182,7 @@ class TrainingLoop:
         row: Row = {"step": step, "epoch": step * options.batch_size / options.frames}
         if is_log:
             row |= self._measured()
+        began = time.perf_counter()
         if is_eval and hooks.held_out is not None:
             self._check()
             row["held_out_loss"] = self.learner.held_out_loss(hooks.held_out(), options.seed)
@@ -188,18 +190,18 @@ class TrainingLoop:
             row |= hooks.evaluate(step)
         if len(row) > 2:
             hooks.log(row)
-            self._window.started = time.perf_counter()  # evaluating is not training
         hooks.progress(step)
         if hooks.save is not None and (is_saving or self.interrupted) and self._saved != step:
             self._check()
             hooks.save(step, self.state_dict())
             self._saved = step
+        self._window.other_s += time.perf_counter() - began
 
     def _measured(self) -> Row:
         """Return the means over the window, and start a new one."""
         self._check()
         window, rows = self._window, self._window.numbers()
-        elapsed = time.perf_counter() - window.started
+        elapsed = time.perf_counter() - window.started - window.other_s
         keys = ["loss", "grad_norm", *(key for key in rows[-1] if key not in ("loss", "grad_norm"))]
         means = torch.tensor(
             [math.fsum(row.get(key, 0.0) for row in rows) / len(rows) for key in keys], dtype=torch.float64

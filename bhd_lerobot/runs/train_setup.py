@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from accelerate import Accelerator
-from accelerate.utils import DistributedDataParallelKwargs, DistributedType
+from accelerate import Accelerator  # type: ignore[import-untyped]
+from accelerate.utils import DistributedDataParallelKwargs, DistributedType  # type: ignore[import-untyped]
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -108,7 +108,7 @@ def check_features(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, renam
     if not any(one.type is FeatureType.ACTION for one in features.values()):
         raise DatasetError(f"{meta.root} has no {ACTION!r}, so there is nothing to imitate. It has {there}.")
     for key, wanted in {**(policy.input_features or {}), **(policy.output_features or {})}.items():
-        if wanted.type is FeatureType.VISUAL and key not in features and getattr(policy, "empty_cameras", 0):
+        if wanted.type is FeatureType.VISUAL and key not in features and getattr(policy, "empty_cameras", 0) > 0:
             continue
         if key not in features:
             raise DatasetError(

@@ -23,12 +23,12 @@ def tell_start(console: Console, config: BhdTrainConfig, policy: Any, data: Trai
     learnable = sum(one.numel() for one in policy.parameters() if one.requires_grad)
     total = sum(one.numel() for one in policy.parameters())
     frozen = f", {total - learnable:,} more are fixed" if total > learnable else ""
-    held_out = f", {len(data.held_out_episodes)} held out" if data.held_out_episodes else ""
+    held_out = f", {data.held_out_episodes} held out" if data.held_out_episodes else ""
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_row(
         "policy", escape(f"{policy.config.type}, {learnable:,} parameters{frozen}, on {policy.config.device}")
     )
-    table.add_row("data", f"{len(data.episodes)} episodes{held_out}, {data.frames:,} samples in an epoch")
+    table.add_row("data", f"{data.episodes} episodes{held_out}, {data.frames:,} samples in an epoch")
     table.add_row("loader", escape(data.how))
     epochs = config.steps * config.batch_size / data.frames
     table.add_row("steps", f"{config.steps:,} of {config.batch_size} samples: {epochs:.3g} epochs")
