@@ -11,7 +11,6 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 
-from benchmarks.brains import wilson
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.policies.language_brain import LanguageBrain
 from bhd_lerobot.policies.pick import PickBrain
@@ -20,6 +19,7 @@ from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
+from bhd_lerobot.runs.eval_statistics import wilson
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Task, episode_seed
@@ -85,12 +85,12 @@ def main() -> int:
         episodes = run(case, seeds)
         took = time.perf_counter() - started
         good = sum(episode.outcome.success for episode in episodes)
-        low, high = wilson(good, len(episodes))
+        rate = wilson(good, len(episodes))
         causes = Counter(episode.outcome.event.cause for episode in episodes if not episode.outcome.success)
         seconds = sum(episode.frames for episode in episodes) / _FPS
         by_cause = ", ".join(f"{cause} {count}" for cause, count in causes.most_common()) or "none"
         print(
-            f"{case.name:20}{good / len(episodes):>9.2%}{f'{low:.2%} to {high:.2%}':>20}{case.goal:>8.1%}"
+            f"{case.name:20}{rate.value:>9.2%}{f'{rate.low:.2%} to {rate.high:.2%}':>20}{case.goal:>8.1%}"
             f"{seconds / len(episodes):>9.2f} s{seconds / took:>9.0f} x  {by_cause}"
         )
         for episode in episodes:

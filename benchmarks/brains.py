@@ -5,7 +5,6 @@ The goal: gap_follower fails no more often than avoidance, at most a third as of
 """
 
 import argparse
-import math
 import sys
 import time
 from collections import Counter
@@ -20,6 +19,7 @@ from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
 from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import EpisodeSpec
+from bhd_lerobot.runs.eval_statistics import mean, ratio_of_means, wilson
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import Event, Outcome, episode_seed
 
@@ -65,12 +65,12 @@ def main() -> int:
     print(f"{'':14}{'failures':>9}{'by cause':>24}{'share, 95 %':>22}{'score, 95 %':>28}{'act, n=1':>11}{'n=64':>10}")
     for brain, result in zip(brains, results, strict=True):
         print(row(brain.name, result))
-    ratio = new.scores.mean() / old.scores.mean()
-    low, high = bootstrap_ratio(old.scores, new.scores)
-    print(f"\nscore ratio {ratio:.3f}, 95 % {low:.3f} to {high:.3f} (paired bootstrap); goal: {GOAL_RATIO}")
+    ratio = ratio_of_means(new.scores, old.scores)
+    interval = f"95 % {ratio.low:.3f} to {ratio.high:.3f} (paired bootstrap)"
+    print(f"\nscore ratio {ratio.value:.3f}, {interval}; goal: {GOAL_RATIO}")
     allowed = old.failures // 3 if old.failures > 0.05 * args.episodes else old.failures
     print(f"failures {new.failures}; allowed: {allowed}")
-    met = ratio >= GOAL_RATIO and new.failures <= allowed
+    met = ratio.value >= GOAL_RATIO and new.failures <= allowed
     print("goal met" if met else "GOAL MISSED")
     return 0 if met else 1
 
@@ -104,28 +104,11 @@ def row(name: str, result: Result) -> str:
     count = len(result.outcomes)
     causes = Counter(outcome.event.cause for outcome in result.outcomes if outcome.event != Event.SUCCESS)
     by_cause = ", ".join(f"{cause} {number}" for cause, number in sorted(causes.items())) or "none"
-    low, high = wilson(result.failures, count)
-    share = f"{result.failures / count:.1%} ({low:.1%} to {high:.1%})"
-    mean, error = result.scores.mean(), 1.96 * result.scores.std(ddof=1) / math.sqrt(count)
-    score = f"{mean:.4f} ({mean - error:.4f} to {mean + error:.4f})"
+    failed, scored = wilson(result.failures, count), mean(result.scores)
+    share = f"{failed.value:.1%} ({failed.low:.1%} to {failed.high:.1%})"
+    score = f"{scored.value:.4f} ({scored.low:.4f} to {scored.high:.4f})"
     times = f"{result.act_ms[1]:>8.3f} ms{result.act_ms[64]:>7.2f} ms"
     return f"{name:14}{result.failures:>9}{by_cause:>24}{share:>22}{score:>28}{times}"
-
-
-def wilson(failures: int, count: int, z: float = 1.96) -> tuple[float, float]:
-    """Return the Wilson 95 % interval of a share."""
-    share = failures / count
-    middle = share + z * z / (2 * count)
-    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    scale = 1 + z * z / count
-    return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
-
-
-def bootstrap_ratio(old: np.ndarray, new: np.ndarray) -> tuple[float, float]:
-    """Return the 95 % interval of the ratio of two means over the same arenas."""
-    pick = np.random.default_rng(0).integers(0, len(old), (10_000, len(old)))
-    low, high = np.percentile(new[pick].mean(axis=1) / old[pick].mean(axis=1), (2.5, 97.5))
-    return float(low), float(high)
 
 
 if __name__ == "__main__":

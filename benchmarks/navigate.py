@@ -11,13 +11,13 @@ from collections import Counter
 
 import numpy as np
 
-from benchmarks.brains import wilson
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.navigator import NavigatorBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
 from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import EpisodeSpec
+from bhd_lerobot.runs.eval_statistics import wilson
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, Outcome, episode_seed
 
@@ -56,10 +56,10 @@ def main() -> int:
     _, alone = run(task, seeds[:5], 1)
     causes = Counter(outcome.event.cause for outcome in outcomes)
     good = [outcome for outcome in outcomes if outcome.success]
-    low, high = wilson(len(good), len(outcomes))
+    rate = wilson(len(good), len(outcomes))
     spl = np.array([outcome.score for outcome in outcomes])
     duration = np.array([outcome.details["time_s"] for outcome in good])
-    print(f"success     {len(good) / len(outcomes):.1%} ({low:.1%} to {high:.1%}), goal {GOAL_SUCCESS:.0%}")
+    print(f"success     {rate.value:.1%} ({rate.low:.1%} to {rate.high:.1%}), goal {GOAL_SUCCESS:.0%}")
     print(f"ends        {', '.join(f'{cause} {count}' for cause, count in causes.most_common())}")
     print(f"SPL         mean {spl.mean():.3f}, 5 % below {np.percentile(spl, 5):.3f}, goal {GOAL_SPL}")
     print(f"time        median {np.median(duration):.1f} s, longest {duration.max():.1f} s")

@@ -89,8 +89,11 @@ class EvalConfig:
                 "There is no brain to evaluate; set --brains.NAME.type, or --brain.path for a checkpoint."
             )
         for label, brain in self.brains.items():
-            driven = robot_of_brain(brain)
-            if driven not in ("", self.robot.type):
+            try:
+                driven = robot_of_brain(brain)
+            except ConfigError as error:
+                raise ConfigError(f"brains.{label}: {error}") from error
+            if driven and driven != self.robot.type:
                 kind = brain.get_choice_name(type(brain))
                 raise ConfigError(
                     f"brains.{label}.type is {kind!r}, which drives a {driven}; robot.type is {self.robot.type!r}."

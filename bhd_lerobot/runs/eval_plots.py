@@ -156,10 +156,15 @@ def trajectory_grid(trajectories: Mapping[str, Mapping[int, Trajectory]]) -> str
 
 
 def telling_episodes(trajectories: Mapping[str, Mapping[int, Trajectory]], shown: int = SHOWN) -> list[int]:
-    """Return the episodes that tell most: first those in which brains differ in success, then any; in order."""
+    """Return the episodes that tell most, in order: those that ended unlike most of a brain's, and the first ones."""
     numbers = sorted({number for ran in trajectories.values() for number in ran})
-    differ = [n for n in numbers if len({ran[n].success for ran in trajectories.values() if n in ran}) > 1]
-    return sorted((differ + [n for n in numbers if n not in set(differ)])[:shown])
+    unusual = dict.fromkeys(numbers, 0)
+    for ran in trajectories.values():
+        mostly = 2 * sum(one.success for one in ran.values()) >= len(ran)
+        for number, one in ran.items():
+            unusual[number] += one.success != mostly
+    ranked = [n for n in sorted(numbers, key=lambda n: (-unusual[n], n)) if unusual[n]][: (shown + 1) // 2]
+    return sorted([*ranked, *(n for n in numbers if n not in ranked)][:shown])
 
 
 def _draw_trajectory(axes: Axes, trajectory: Trajectory) -> None:

@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import io
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -218,8 +219,9 @@ def _trajectories(given: ReportInput) -> str:
     if not ran:
         return ""
     note = (
-        "A column is an episode, a row a brain; above each panel the episode, how it ended, and its score. First come "
-        "episodes in which brains differ in success. Solid blue: success; dashed orange with a cross: failure."
+        "A column is an episode, a row a brain; above each panel the episode, how it ended, and its score. Half of "
+        "them are episodes that ended unlike most of a brain's, if there are any; the others are the first. "
+        "Solid blue: success; dashed orange with a cross: failure."
     )
     return f'<p class="note">{note}</p>' + _chart(plots.trajectory_grid(ran), "Trajectories from above")
 
@@ -232,7 +234,10 @@ def _films(given: ReportInput) -> str:
         content = film.path.read_bytes()
         room -= len(content)
         data = base64.b64encode(content).decode("ascii") if room >= 0 else ""
-        player = f'<video controls muted playsinline preload="metadata" src="data:video/mp4;base64,{data}"></video>'
+        player = (
+            f'<video controls muted playsinline preload="metadata" poster="{_last_picture(film.path)}" '
+            f'src="data:video/mp4;base64,{data}"></video>'
+        )
         name = escape(str(film.path.relative_to(given.folder)))
         ended = film.metrics.outcome.replace("_", " ")
         figures.append(
@@ -240,8 +245,19 @@ def _films(given: ReportInput) -> str:
             f"{ended}, after {film.metrics.length_s:.1f} s. File {name}{'' if data else ', too large for this page'}."
             "</figcaption></figure>"
         )
-    note = "The first failures of each brain; of a brain without failures its first episode."
+    note = "The first failures of each brain; of a brain without failures its first episode. The picture is the end."
     return f'<p class="note">{note}</p><div class="films">{"".join(figures)}</div>'
+
+
+def _last_picture(film: Path) -> str:
+    """Return how a film ends, as a JPEG for a page."""
+    import av
+
+    with av.open(str(film)) as container:
+        *_, last = container.decode(video=0)
+        picture = io.BytesIO()
+        last.to_image().save(picture, format="JPEG", quality=80)
+    return f"data:image/jpeg;base64,{base64.b64encode(picture.getvalue()).decode('ascii')}"
 
 
 def _failures(given: ReportInput) -> str:

@@ -13,7 +13,7 @@ def percent(estimate: Estimate, *, sign: bool = False) -> str:
     form = "+.1f" if sign else ".1f"
     unit = " points" if sign else " %"
     value, low, high = (format(100 * one + 0.0, form) for one in (estimate.value, estimate.low, estimate.high))
-    return f"{value}{unit} ({low} to {high})"
+    return f"{value}{unit} ({low} to {high})".replace("-", "−")
 
 
 def number(estimate: Estimate, digits: int, *, sign: bool = False) -> str:
@@ -22,8 +22,8 @@ def number(estimate: Estimate, digits: int, *, sign: bool = False) -> str:
         return "–"
     form = f"{'+' if sign else ''}.{digits}f"
     if math.isnan(estimate.low):
-        return format(estimate.value, form)
-    return f"{estimate.value:{form}} ({estimate.low:{form}} to {estimate.high:{form}})"
+        return format(estimate.value, form).replace("-", "−")
+    return f"{estimate.value:{form}} ({estimate.low:{form}} to {estimate.high:{form}})".replace("-", "−")
 
 
 def sentences(results: EvalResults) -> list[str]:
