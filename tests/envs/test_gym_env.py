@@ -1,0 +1,171 @@
+"""One environment: Gymnasium's and Stable-Baselines3's own checks, what it tells, and what it refuses."""
+
+import pickle
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+from bhd_lerobot.envs.gym_env import BhdEnv
+from bhd_lerobot.envs.register import ENVIRONMENTS, register
+from bhd_lerobot.envs.stage import ClosedError, ResetNeededError
+from bhd_lerobot.errors import ActionError, ConfigError
+from bhd_lerobot.tasks.task import episode_seed
+from tests.envs.support import NAMES, assert_same, short, some_actions
+
+AVOID = "TurtleBot3Avoid-v0"
+
+
+def make(**arguments: Any) -> BhdEnv:
+    return BhdEnv(AVOID, **short(AVOID, **arguments))
+
+
+@pytest.mark.parametrize("normalise", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_it_passes_the_checks_of_gymnasium_and_stable_baselines3(name: str, normalise: bool) -> None:
+    env = gymnasium.make(f"bhd_lerobot/{name}", normalise_actions=normalise, **short(name))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # they would rather have bounded and normalised spaces
+        check_env(env.unwrapped, skip_render_check=True)
+        sb3_check_env(env, skip_render_check=True)
+    env.close()
+
+
+def test_registering_twice_changes_nothing() -> None:
+    before = dict(gymnasium.registry)
+    register()
+    assert dict(gymnasium.registry) == before
+    assert {f"bhd_lerobot/{name}" for name in ENVIRONMENTS} <= before.keys()
+
+
+def test_equal_seeds_and_actions_give_equal_episodes_and_the_next_reset_goes_on() -> None:
+    first, second = make(seed=7), make(seed=7)
+    assert_same(first.reset(seed=4), second.reset(seed=4))
+    for action in some_actions(AVOID, 5)[:, 0]:
+        assert_same(first.step(action), second.step(action))
+    _, info = first.reset()
+    assert info["episode"] == 5
+    assert info["seed"] == episode_seed(7, 5, "train")
+    assert_same(second.reset(seed=5), first.reset(seed=5))
+
+
+def test_splits_are_other_episodes() -> None:
+    train, held_out = make(split="train"), make(split="held_out")
+    assert train.reset(seed=0)[1]["seed"] % 2 == 0
+    assert held_out.reset(seed=0)[1]["seed"] % 2 == 1
+
+
+def test_normalised_actions_span_the_bounds() -> None:
+    plain, normalised = make(), make(normalise_actions=True)
+    for corner in ([1, -1], [-1, 1], [0, 0], [0.5, 0.25]):
+        plain.reset(seed=1)
+        normalised.reset(seed=1)
+        action = np.array(corner, np.float32)
+        assert_same(normalised.step(action), plain.step(action * plain.action_space.high))
+
+
+def test_it_tells_lerobot_what_it_asks_for() -> None:
+    env = BhdEnv("UR5Pick-v0", task={"duration_s": 2.0})
+    assert env.task_description == ""
+    env.reset(seed=0)
+    assert env._max_episode_steps == 50
+    assert env.task == "UR5Pick-v0"
+    scene = env.stage.scenes[0]
+    assert scene.objects[scene.target_object].name in env.task_description
+    assert env.metadata["render_fps"] == 25
+
+
+def test_observations_hold_what_was_asked_for() -> None:
+    assert set(BhdEnv("UR5Reach-v0").observation_space) == {"agent_pos", "environment_state"}
+    pixels = BhdEnv("UR5Reach-v0", {"camera_width": 64, "camera_height": 48}, obs_type="pixels_agent_pos")
+    assert set(pixels.observation_space) == {"agent_pos", "pixels"}
+    assert pixels.observation_space["pixels"]["wrist"].shape == (48, 64, 3)
+    observation, _ = pixels.reset(seed=0)
+    assert pixels.observation_space.contains(observation)
+    assert observation["pixels"]["scene"].std() > 0
+    pixels.close()
+
+
+def test_it_renders_when_asked_to() -> None:
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture is not None
+    assert picture.shape == (240, 320, 3)
+    assert picture.std() > 0
+    env.close()
+    assert make().render() is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"environment": "TurtleBot3Avoyd-v0"}, "Did you mean 'TurtleBot3Avoid-v0'"),
+        ({"robot": {"beems": 36}}, "robot.beems"),
+        ({"robot": {"beams": "many"}}, "robot.beams is 'many'; it must be int"),
+        ({"robot": {"beams": 36.0}}, "robot.beams is 36.0"),
+        ({"robot": {"fps": 7}}, "fps is 7"),
+        ({"robot": {"fps": 0}}, "fps is 0"),
+        ({"robot": {"clock": "realtime"}}, "robot.clock is 'realtime'"),
+        ({"robot": {"type": "ur5"}}, "robot.type is 'ur5'"),
+        ({"robot": 5}, "robot is 5"),
+        ({"task": {"durations_s": 1.0}}, "Did you mean 'task.duration_s'"),
+        ({"task": {"duration_s": -1.0}}, "task.duration_s is -1.0"),
+        ({"seed": -1}, "seed is -1"),
+        ({"split": "test"}, "split is 'test'"),
+        ({"obs_type": "images"}, "Unknown obs_type 'images'"),
+        ({"obs_type": "pixels", "cameras": False}, "cameras is False"),
+        ({"render_mode": "human"}, "Unknown render_mode 'human'"),
+        ({"episode_stride": 0}, "episode_stride is 0"),
+    ],
+)
+def test_what_cannot_be_honoured_is_named(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        BhdEnv(**{"environment": AVOID, **arguments})
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([0.1, np.nan], "'theta.vel' of environment 0 is nan"),
+        ([np.inf, 0.0], "'x.vel' of environment 0 is inf"),
+        ([0.1], "shape (1, 1)"),
+        (0.1, "shape (1,)"),
+        (["fast", "left"], "needs (1, 2) numbers: x.vel, theta.vel"),
+    ],
+)
+def test_a_wrong_action_is_refused_and_does_nothing(action: Any, message: str) -> None:
+    env, other = make(), make()
+    env.reset(seed=0)
+    other.reset(seed=0)
+    with pytest.raises(ActionError) as caught:
+        env.step(action)
+    assert message in str(caught.value)
+    good = np.array([0.1, 0.2], np.float32)
+    assert_same(env.step(good), other.step(good))
+
+
+def test_it_must_be_reset_before_and_after_an_episode_and_not_be_closed() -> None:
+    env = make(task={"duration_s": 0.1})
+    with pytest.raises(ResetNeededError, match="call reset"):
+        env.step(np.zeros(2, np.float32))
+    env.reset()
+    env.step(np.zeros(2, np.float32))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(2, np.float32))
+    env.close()
+    env.close()
+    for use in (env.reset, env.render, lambda: env.step(np.zeros(2, np.float32))):
+        with pytest.raises(ClosedError, match="was closed"):
+            use()
+
+
+def test_its_specification_survives_pickling() -> None:
+    spec = pickle.loads(pickle.dumps(gymnasium.spec(f"bhd_lerobot/{AVOID}")))
+    env = gymnasium.make(spec, **short(AVOID))
+    assert env.reset(seed=0)[1]["episode"] == 0

@@ -1,0 +1,114 @@
+"""An episode stepped from outside is the episode that the loop runs."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.control.messages import Mode, Watchdog
+from bhd_lerobot.data import features as keys
+from bhd_lerobot.envs.gym_env import BhdEnv
+from bhd_lerobot.envs.settings import make_settings
+from bhd_lerobot.envs.stage import Stage
+from bhd_lerobot.robots.catalog import make_simulation
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import EpisodeSpec
+from bhd_lerobot.tasks.catalog import make_task
+from bhd_lerobot.tasks.task import Event, episode_seed
+from tests.envs.support import NAMES, short, some_actions
+
+ONE = np.zeros(1, np.intp)
+
+
+class Script:
+    """Plays rows of actions, the same in every simulation, from each episode's start."""
+
+    name, robot_type, uses_images, has_plan = "script", "any", False, False
+
+    def __init__(self, rows: np.ndarray) -> None:
+        self.rows = rows
+
+    def bind(self, *args: Any) -> None:
+        pass
+
+    def reset(self, ids: np.ndarray, seeds: Any, n: int, instructions: Any = ()) -> None:
+        if not hasattr(self, "frame"):
+            self.frame = np.zeros(n, int)
+        self.frame[ids] = 0
+
+    def act(self, observation: Any) -> np.ndarray:
+        actions = self.rows[self.frame].astype(np.float64)
+        self.frame += 1
+        self.frame %= len(self.rows)
+        return actions
+
+    def parameters(self) -> dict[str, Any]:
+        return {}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_episode_is_that_of_the_loop_bit_for_bit(name: str) -> None:
+    arguments = short(name)
+    settings = make_settings(name, arguments.get("robot"), arguments["task"])
+    n = 2
+    task = make_task(settings.task, n, settings.robot.fps)
+    brain = Script(some_actions(name, 40)[:, 0])
+    specs = [EpisodeSpec(k, episode_seed(3, k, "held_out")) for k in range(3)]
+    episodes = list(EpisodeLoop(make_simulation(settings.robot, n), task, brain).run(specs))
+    env = BhdEnv(name, seed=3, split="held_out", **arguments)
+    for episode in episodes:
+        columns = episode.columns
+        observation, info = env.reset(seed=episode.spec.index)
+        assert info["seed"] == episode.spec.seed
+        for frame in range(episode.frames):
+            np.testing.assert_array_equal(observation["agent_pos"], columns[keys.OBSERVATION_STATE][frame])
+            if keys.ENVIRONMENT_STATE in columns:
+                np.testing.assert_array_equal(observation["environment_state"], columns[keys.ENVIRONMENT_STATE][frame])
+            np.testing.assert_array_equal(env.stage.simulation.physics_state[0], columns[keys.PHYSICS_STATE][frame])
+            observation, reward, terminated, truncated, info = env.step(columns[keys.ACTION][frame])
+            assert np.float32(reward) == columns[keys.REWARD][frame]
+            assert (terminated or truncated) == bool(columns[keys.DONE][frame])
+            assert info["event"] == Event(columns[keys.EVENT][frame]).cause
+        assert info["score"] == episode.outcome.score
+        assert info["details"] == episode.outcome.details
+        assert info["is_success"] == episode.outcome.success
+    env.close()
+
+
+def test_time_truncates_and_what_happens_terminates() -> None:
+    still = BhdEnv("TurtleBot3Avoid-v0", {"beams": 36}, {"duration_s": 0.5})
+    lasting = BhdEnv("TurtleBot3Avoid-v0", {"beams": 36}, {"duration_s": 0.5, "min_path_m": 0.0})
+    ends = []
+    for env, action in ((still, [0.0, 0.0]), (lasting, [0.1, 0.0])):
+        env.reset(seed=0)
+        last: Any = (None, 0.0, False, False, {})
+        while not (last[2] or last[3]):
+            last = env.step(np.array(action, np.float32))
+        ends.append((last[2], last[3], last[4]["event"], last[4]["is_success"]))
+    # Neither robot did anything that ended its episode: it could have gone on.
+    assert ends == [(False, True, "timeout", False), (False, True, "success", True)]
+
+
+def test_a_success_that_is_an_achievement_terminates() -> None:
+    stage = Stage(make_settings("UR5Reach-v0").robot, make_settings("UR5Reach-v0").task)
+    stage.reset(ONE, [0])
+    stage.task.judge = lambda truth, running: (np.ones(1), np.full(1, int(Event.SUCCESS)))  # type: ignore[method-assign]
+    stepped = stage.step(np.array(stage.simulation.body.home)[None])
+    assert stepped.terminated.all()
+    assert not stepped.truncated.any()
+
+
+@pytest.mark.parametrize(("mode", "event"), [(Mode.FAULT, Event.FAULT), (Mode.ESTOP, Event.ESTOP)])
+def test_a_robot_that_has_latched_a_stop_terminates(mode: Mode, event: Event) -> None:
+    settings = make_settings("TurtleBot3Avoid-v0", {"beams": 36})
+    stage = Stage(settings.robot, settings.task, 2)
+    stage.reset(np.arange(2), [0, 2])
+    if mode == Mode.ESTOP:
+        stage.simulation.bridge.estop(np.array([1]))
+    else:
+        stage.simulation.cerebellum.interrupt(Watchdog.PLANT, Mode.FAULT)
+    stepped = stage.step(np.zeros((2, 2)))
+    assert stepped.event[1] == event
+    assert stepped.terminated[1]
+    assert not stepped.truncated[1]
+    assert (stepped.event[0] == event) == (mode == Mode.FAULT)
