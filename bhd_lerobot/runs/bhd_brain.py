@@ -45,7 +45,7 @@ class BhdBrain(Teleoperator):
         """The actions that it gives: those of the robot that it drives, if that is connected already."""
         names = action_names_of(self.config.brain)
         robots = connected_robots()
-        if len(robots) == 1 and robot_of_brain(self.config.brain) in (None, robots[0].name):
+        if len(robots) == 1 and robot_of_brain(self.config.brain) in ("", robots[0].name):
             names = robots[0].action_names
         return dict.fromkeys(names, float)
 
@@ -91,7 +91,7 @@ class BhdBrain(Teleoperator):
             raise DeviceNotConnectedError(f"{self} is not connected. Call connect() first.")
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
-            if robot_of_brain(self.config.brain) not in (None, robot.name):
+            if robot_of_brain(self.config.brain) not in ("", robot.name):
                 raise ConfigError(
                     f"The brain {self._brain_name!r} does not drive a {robot.name}. Choose one that does by "
                     f"--teleop.brain.type: {', '.join(brains_for(robot.name))}."

@@ -113,7 +113,7 @@ class RecordConfig:
                 f"task.type is {task!r}, which is for robot.type = {wanted!r}; robot.type is {self.robot.type!r}."
             )
         driven = robot_of_brain(self.brain)
-        if driven not in (None, self.robot.type):
+        if driven not in ("", self.robot.type):
             brain = self.brain.get_choice_name(type(self.brain))
             raise ConfigError(
                 f"brain.type is {brain!r}, which drives a {driven}; robot.type is {self.robot.type!r}. "
