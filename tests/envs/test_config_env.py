@@ -1,0 +1,144 @@
+"""LeRobot's side: its configuration, its features, and its own evaluation loop."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from lerobot.configs import FeatureType
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.factory import make_env, make_env_config
+from lerobot.envs.utils import close_envs, env_to_policy_features
+from torch import nn
+
+from bhd_lerobot.envs.config_env import BhdEnvConfig
+from bhd_lerobot.envs.vector import BhdVectorEnv
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.tasks.task import episode_seed
+from tests.envs.support import NAMES, assert_same
+
+AVOID = "TurtleBot3Avoid-v0"
+SHORT: dict[str, Any] = {"robot": {"beams": 36}, "task_options": {"duration_s": 1.0}}
+
+
+def test_lerobot_finds_it_by_its_type() -> None:
+    config = make_env_config("bhd", task=f"bhd_lerobot/{AVOID}", **SHORT)
+    assert isinstance(config, BhdEnvConfig)
+    assert config.type == "bhd"
+    assert config.gym_id == f"bhd_lerobot/{AVOID}"
+    assert config.split == "held_out"
+    assert EnvConfig.get_choice_class("bhd") is BhdEnvConfig
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_features_are_those_of_the_datasets(name: str) -> None:
+    config = BhdEnvConfig(task=name)
+    with_state = {"observation.state": FeatureType.STATE, "action": FeatureType.ACTION}
+    features = env_to_policy_features(config)
+    assert {key: features[key].type for key in with_state} == with_state
+    assert ("observation.environment_state" in features) == (name != AVOID)
+    assert config.fps == (10 if name.startswith("TurtleBot3") else 25)
+
+
+def test_images_are_features_too() -> None:
+    config = BhdEnvConfig(task="UR5Pick-v0", cameras=True, robot={"camera_width": 96, "camera_height": 64})
+    features = env_to_policy_features(config)
+    assert features["observation.images.scene"].type == FeatureType.VISUAL
+    assert features["observation.images.wrist"].shape == (3, 64, 96)
+    assert features["observation.environment_state"].shape == (80,)
+    only = env_to_policy_features(BhdEnvConfig(task="UR5Pick-v0", obs_type="pixels"))
+    assert set(only) == {"action", "observation.images.scene", "observation.images.wrist"}
+
+
+@pytest.mark.parametrize(
+    ("vector", "kind"), [("bhd", BhdVectorEnv), ("sync", SyncVectorEnv), ("async", AsyncVectorEnv)]
+)
+def test_it_makes_the_vector_environment_that_was_asked_for(vector: str, kind: type) -> None:
+    envs = make_env(BhdEnvConfig(task=AVOID, vector=vector, seed=3, **SHORT), n_envs=2, use_async_envs=True)
+    env = envs["bhd"][0]
+    try:
+        assert isinstance(env, kind)
+        assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+        _, infos = env.reset(seed=[0, 1])
+        assert infos["seed"].tolist() == [episode_seed(3, 0, "held_out"), episode_seed(3, 1, "held_out")]
+        assert tuple(env.call("_max_episode_steps")) == (10, 10)
+    finally:
+        close_envs(envs)
+
+
+class Wander(nn.Module):
+    """A policy that turns away from what is near."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = 0
+
+    def reset(self) -> None:
+        self.calls = 0
+
+    def select_action(self, batch: dict[str, Any]) -> torch.Tensor:
+        self.calls += 1
+        state = batch["observation.state"]
+        assert batch["task"] == ["Roam without touching anything."] * len(state)
+        return torch.stack([torch.full((len(state),), 0.2), (state[:, 5] - state[:, -5]) * 0.5 + 0.3], dim=1)
+
+
+def test_lerobots_rollout_sees_the_same_with_ours_and_with_gymnasiums() -> None:
+    lerobot_eval = pytest.importorskip("lerobot.scripts.lerobot_eval")
+    results = []
+    for vector in ("bhd", "sync"):
+        config = BhdEnvConfig(task=AVOID, vector=vector, robot={"beams": 36}, task_options={"duration_s": 8.0})
+        env = make_env(config, n_envs=4)["bhd"][0]
+
+        def unchanged(value: Any) -> Any:
+            return value
+
+        rollout = lerobot_eval.rollout(env, Wander(), *[unchanged] * 4, seeds=[0, 1, 2, 3])  # type: ignore[arg-type]
+        first = rollout["done"].int().argmax(dim=1)
+        before = torch.arange(rollout["done"].shape[1]) <= first[:, None]
+        results.append(
+            {
+                "first": first.numpy(),
+                "reward": (rollout["reward"] * before).numpy(),
+                "success": (rollout["success"] & before).any(dim=1).numpy(),
+                "action": (rollout["action"] * before[..., None]).numpy(),
+            }
+        )
+        env.close()
+    assert_same(*results)
+    assert np.abs(results[0]["reward"]).sum() > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"task": "Avoid-v0"}, "Unknown environment 'Avoid-v0'"),
+        ({"task": None}, "Unknown environment ''"),
+        ({"fps": 7}, "fps is 7"),
+        ({"fps": 5, "robot": {"fps": 10}}, "env.fps is 5 and env.robot.fps is 10"),
+        ({"robot": {"legs": 2}}, "robot.legs"),
+        ({"task_options": {"legs": 2}}, "task.legs"),
+        ({"vector": "parallel"}, "Unknown env.vector 'parallel'"),
+        ({"split": "test"}, "split is 'test'"),
+        ({"seed": -1}, "seed is -1"),
+        ({"threads": 0}, "env.threads is 0"),
+    ],
+)
+def test_what_cannot_be_honoured_is_named(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        BhdEnvConfig(**{"task": AVOID, **arguments})
+    assert message in str(caught.value)
+
+
+def test_no_environments_are_refused() -> None:
+    with pytest.raises(ConfigError, match="batch_size.* is 0"):
+        BhdEnvConfig(task=AVOID).create_envs(0)
+
+
+def test_another_rate_is_the_robots() -> None:
+    config = BhdEnvConfig(task=AVOID, fps=5, **SHORT)
+    env = config.create_envs(1)["bhd"][0]
+    assert env.metadata["render_fps"] == 5
+    assert env.call("_max_episode_steps") == (5,)
+    env.close()
