@@ -60,6 +60,21 @@ class Chunk:
     actions: NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Mixed:
+    """What a brain wants that gives setpoints to some robots and goals to others, or first the one and then the other.
+
+    Attributes:
+        actions: setpoints for this frame, shape (n, actions); the rows of those that follow goals mean nothing.
+        by_goals: which robots follow goals in this frame, shape (n,).
+        commands: new goals, by simulation; one that follows goals without a new one goes on with what it does.
+    """
+
+    actions: NDArray[np.float64]
+    by_goals: NDArray[np.bool_]
+    commands: Mapping[int, Sequence[BrainCommand]]
+
+
 class Brain(Protocol):
     """A rule or a network that drives n robots.
 
@@ -104,15 +119,25 @@ class Brain(Protocol):
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the plan of one simulation, as plain values; of a brain that `has_plan`."""
 
-    def act(self, observation: Observation) -> "NDArray[np.float64] | Goals | Chunk | None":
+    def act(self, observation: Observation) -> "NDArray[np.float64] | Goals | Chunk | Mixed | None":
         """Return what the robots are to do.
 
         Setpoints for this frame, shape (n, actions), in the order of the action features; or a chunk of them, or None
-        to go on with the last chunk; or goals. A brain gives goals always or never.
+        to go on with the last chunk; or goals. A brain gives goals always or never, unless what it gives is `Mixed`.
         """
 
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the brain, as plain values."""
+
+
+class Intervening(Protocol):
+    """A brain in which somebody sometimes takes over; what it says is about the frame that `act` decided last."""
+
+    def interventions(self) -> NDArray[np.bool_]:
+        """Return which robots are driven by the one who takes over, shape (n,)."""
+
+    def causes(self) -> Sequence[str]:
+        """Return why, in words, of each simulation; empty where nobody took over in this episode."""
 
 
 def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: str) -> NDArray[np.intp]:

@@ -224,7 +224,11 @@ class Simulation(ABC):
             action: the actions, shape (n, actions).
             mask: the robots that it is for, shape (n,); all that run if None.
         """
-        mask = self.running if mask is None else mask & self.running
+        sent, refusals = self._send(action, self.running if mask is None else mask & self.running)
+        return self.wait(sent, refusals=refusals)
+
+    def _send(self, action: NDArray[np.float64], mask: NDArray[np.bool_]) -> tuple[SendResult, dict[int, str]]:
+        """Send a setpoint; return what became of it, and in words why it was refused, by simulation."""
         setpoints, refused = self.to_setpoints(action, mask)
         if refused:
             mask = mask.copy()
@@ -232,7 +236,7 @@ class Simulation(ABC):
         sent = self.bridge.send(setpoints, mask)
         for sim, (reason, _) in refused.items():
             sent.reasons[sim] = reason
-        return self.wait(sent, refusals={sim: message for sim, (_, message) in refused.items()})
+        return sent, {sim: message for sim, (_, message) in refused.items()}
 
     def follow(self, actions: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> FrameReport:
         """Send an action chunk to running robots and let one frame go by; `wait` goes on with it.
@@ -265,13 +269,39 @@ class Simulation(ABC):
         Args:
             commands: new goals, by simulation; a robot without one goes on with what it does.
         """
+        return self.wait(SendResult(np.zeros(self.n, np.int8)), refused=self._submit(commands))
+
+    def divide(
+        self,
+        action: NDArray[np.float64],
+        by_goals: NDArray[np.bool_],
+        commands: Mapping[int, Sequence[BrainCommand]],
+    ) -> FrameReport:
+        """Send setpoints to some running robots and goals to the others, and let one frame go by.
+
+        Args:
+            action: the actions, shape (n, actions).
+            by_goals: the robots that follow goals, shape (n,).
+            commands: new goals, by simulation; a robot without one goes on with what it does.
+        """
+        mask = self.running & ~by_goals
+        if not mask.any():
+            return self.pursue(commands)
+        if not (self.running & by_goals).any():
+            return self.act(action)
+        refused = self._submit(commands)
+        sent, refusals = self._send(action, mask)
+        return self.wait(sent, refused, refusals)
+
+    def _submit(self, commands: Mapping[int, Sequence[BrainCommand]]) -> dict[int, list[CommandResult]]:
+        """Send goals; return those that were refused, by simulation."""
         refused: dict[int, list[CommandResult]] = {}
         for sim, goals in commands.items():
             for goal in goals:
                 refusal = self.bridge.submit(goal, sim)
                 if refusal is not None:
                     refused.setdefault(sim, []).append(refusal)
-        return self.wait(SendResult(np.zeros(self.n, np.int8)), refused=refused)
+        return refused
 
     def wait(
         self,

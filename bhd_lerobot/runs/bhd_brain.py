@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import CommandResult
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Observation
+from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Mixed, Observation
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
 from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
 from bhd_lerobot.runs.goal_streamer import GoalStreamer
@@ -109,6 +109,11 @@ class BhdBrain(Teleoperator):
             robot.observation_names, state, images, told[None] if names else None, {0: self._results}
         )
         wanted = self._brain.act(observation)
+        if isinstance(wanted, Mixed):
+            raise ConfigError(
+                f"The brain {self._brain_name!r} gives goals in some frames and setpoints in others, which "
+                "`lerobot-teleoperate` and `lerobot-record` cannot do. Use bhd-record."
+            )
         if isinstance(wanted, Goals):
             action, self._results = self._stream(robot, wanted)
         else:

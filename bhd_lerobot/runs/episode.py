@@ -12,8 +12,9 @@ from bhd_lerobot.control.messages import NANOSECONDS, Mode, SendResult
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.data import features as keys
-from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Observation
+from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Mixed, Observation
 from bhd_lerobot.robots.simulation import FrameReport, Simulation
+from bhd_lerobot.runs.drivers import DriverLog, flagged
 from bhd_lerobot.runs.episode_images import EpisodeImages, Observer
 from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Event, Task
@@ -59,7 +60,7 @@ class EpisodeLoop:
         self._columns: dict[str, NDArray] = {}
         self._length = np.zeros(simulation.n, np.int64)
         self.frames = 0
-        self._gives_goals = False
+        self._drivers = DriverLog(brain, simulation.n, self._frames)
         self._truth: Any = None
         self._results: Mapping[int, Sequence[CommandResult]] = {}
         environment = task.environment_names
@@ -140,6 +141,7 @@ class EpisodeLoop:
                 self._open_images() if self._open_images and self.simulation.camera_names else None
             )
         self._length[ids] = 0
+        self._drivers.start(ids)
         self._truth = None
 
     def _frame(self) -> list[tuple[int, Event]]:
@@ -171,6 +173,9 @@ class EpisodeLoop:
         if isinstance(decision, Goals):
             report = simulation.pursue(decision.commands)
             action = report.applied.astype(np.float32)
+        elif isinstance(decision, Mixed):
+            action = np.asarray(decision.actions).astype(np.float32)
+            report = simulation.divide(action.astype(np.float64), decision.by_goals, decision.commands)
         elif decision is None or isinstance(decision, Chunk):
             if decision is None:
                 report = simulation.wait(SendResult(np.zeros(simulation.n, np.int8)))
@@ -196,12 +201,14 @@ class EpisodeLoop:
         for one in (*report.missed, report):
             if one.live is not None:
                 values |= self._live_values(one, is_first=one is (report.missed or [report])[0])
-            finished = self._end_frame(one, values)
+            finished = self._end_frame(one, values, is_missed=one is not report)
             if finished:
                 break  # what a robot did after its episode's end is not part of it
         return finished
 
-    def _end_frame(self, report: FrameReport, values: dict[str, NDArray]) -> list[tuple[int, Event]]:
+    def _end_frame(
+        self, report: FrameReport, values: dict[str, NDArray], *, is_missed: bool
+    ) -> list[tuple[int, Event]]:
         """Judge and store a frame; return the episodes that ended with it."""
         simulation = self.simulation
         running = np.flatnonzero(simulation.running)
@@ -213,14 +220,17 @@ class EpisodeLoop:
             # an emergency stop comes before all else.
             event = np.where((report.mode == Mode.FAULT) & (event == Event.NOTHING), Event.FAULT, event)
             event = np.where(report.mode == Mode.ESTOP, Event.ESTOP, event)
+        taken, by_goals = self._drivers.frame(running, self._length, is_missed=is_missed)
         values |= {
+            # While a goal is followed, what a policy learns from is where the reference was.
+            keys.ACTION: np.where(by_goals[:, None], report.applied.astype(np.float32), values[keys.ACTION]),
             keys.APPLIED_ACTION: report.applied,
             keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,
             keys.LIMITS: report.limits,
             keys.WATCHDOG: report.watchdog,
             keys.MODE: report.mode,
             keys.REWARD: reward,
-            keys.EVENT: event,
+            keys.EVENT: flagged(event, taken),
         }
         self._store(running, values)
         if self.observer is not None:
@@ -259,8 +269,8 @@ class EpisodeLoop:
 
     def _log(self, decision: Any, report: FrameReport) -> None:
         """Remember goals and how they ended, for the episode's metadata and for the brain."""
-        self._gives_goals = isinstance(decision, Goals)
-        if isinstance(decision, Goals):
+        self._drivers.decided(decision, self._length)
+        if isinstance(decision, Goals | Mixed):
             for sim, commands in decision.commands.items():
                 self._commands[sim] += [(int(self._length[sim]), command) for command in commands]
         for sim, results in report.results.items():
@@ -322,8 +332,10 @@ class EpisodeLoop:
             outcome=outcome,
             timing=timing,
             writer=writer,
-            commands=self._commands[sim] if self._gives_goals else None,
+            commands=self._commands[sim] if self._drivers.gives_goals else None,
             results=self._ends[sim],
             plan=plan,
             realtime=self.simulation.grants,
+            interventions=self._drivers.interventions(sim, length),
+            goal_frames=self._drivers.goal_frames(sim, length),
         )

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.data import features as keys
+from bhd_lerobot.runs.drivers import Intervention
 from bhd_lerobot.tasks.task import Outcome
 
 
@@ -41,6 +42,9 @@ class Episode:
         results: how goals ended, each with the frame in which it did.
         plan: the brain's plan, as plain values, if it has one.
         realtime: what the real-time process was granted and refused; None on the lockstep clock.
+        interventions: when somebody else than the brain drove, in order; None if there was nobody to take over.
+        goal_frames: in which frames goals were followed, as first frames and those after the last; None if always, or
+            never.
     """
 
     spec: EpisodeSpec
@@ -55,6 +59,8 @@ class Episode:
     results: list[tuple[int, CommandResult]] = field(default_factory=list)
     plan: dict[str, Any] = field(default_factory=dict)
     realtime: list[dict[str, Any]] | None = None
+    interventions: list[Intervention] | None = None
+    goal_frames: list[tuple[int, int]] | None = None
 
     @property
     def frames(self) -> int:

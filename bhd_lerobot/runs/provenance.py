@@ -46,6 +46,7 @@ def episode_metadata(episode: Episode, *, split: str, task: dict[str, Any], brai
         "versions": _json(versions()),
         **({} if episode.realtime is None else {"realtime": _json(episode.realtime)}),
         **_goals(episode),
+        **_interventions(episode),
     }
 
 
@@ -59,7 +60,19 @@ def _goals(episode: Episode) -> dict[str, Any]:
         columns["results"] = _json(
             [[frame, one.task_id, one.success, one.code.name.lower(), one.message] for frame, one in episode.results]
         )
+    if episode.goal_frames is not None:
+        columns["goal_frames"] = _json(episode.goal_frames)
     return columns
+
+
+def _interventions(episode: Episode) -> dict[str, Any]:
+    """Return when somebody else than the brain drove, if there was anybody to do so."""
+    if episode.interventions is None:
+        return {}
+    return {
+        "intervened_frames": sum(one.end - one.first for one in episode.interventions),
+        "interventions": _json([[one.first, one.end, one.cause] for one in episode.interventions]),
+    }
 
 
 def scene_to_json(scene: Any) -> str:

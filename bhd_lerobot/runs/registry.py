@@ -7,6 +7,7 @@ from bhd_lerobot.policies.avoidance import AvoidanceBrain, AvoidanceConfig
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import ANY_ROBOT, Brain
 from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.corrected import CorrectedBrain, CorrectedConfig, robot_of_both
 from bhd_lerobot.policies.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.policies.language_brain import LanguageBrain, LanguageBrainConfig
 from bhd_lerobot.policies.learned import LearnedBrain, LearnedBrainConfig
@@ -28,9 +29,23 @@ __all__ = [
     "robot_of_task",
 ]
 
+
+class _Corrected(CorrectedBrain):
+    """A corrected brain, made of two of the brains below."""
+
+    def __init__(self, config: CorrectedConfig) -> None:
+        super().__init__(config, make_brain(config.learner), make_brain(config.expert))
+
+    @staticmethod
+    def robot_of(config: CorrectedConfig) -> str:
+        """Return the robot that both drive."""
+        return robot_of_both(*(robot_of_brain(one) or ANY_ROBOT for one in (config.learner, config.expert)))
+
+
 # Importing this module registers every configuration that it names.
 _BRAINS: dict[type, Callable[[Any], Brain]] = {
     AvoidanceConfig: AvoidanceBrain,
+    CorrectedConfig: _Corrected,
     GapFollowerConfig: GapFollowerBrain,
     LanguageBrainConfig: LanguageBrain,
     LearnedBrainConfig: LearnedBrain,

@@ -137,6 +137,12 @@ class Replay:
             self.goals = {}
             for frame, fields_ in json.loads(metadata["goals"]):
                 self.goals.setdefault(frame, []).append(command_from_json(fields_))
+        # Frames in which goals were followed; in the others, the recorded actions were the setpoints.
+        self._by_goals = np.full(len(self.columns[keys.ACTION]), self.goals is not None)
+        if metadata.get("goal_frames"):
+            self._by_goals[:] = False
+            for first, end in json.loads(metadata["goal_frames"]):
+                self._by_goals[first:end] = True
         self._initial = np.asarray(metadata["initial_state"], np.float64)
         self.is_live = summary.recording["robot"].get("clock") == "realtime"
 
@@ -150,7 +156,7 @@ class Replay:
     def open_loop(self) -> Divergence:
         """Replay the recorded commands from the recorded initial state.
 
-        They are the recorded actions, or, of an episode that was driven by goals, the goals.
+        They are the recorded actions, or, where the robot was driven by goals, the goals.
         """
         simulation = self._start()
         actions = self.columns[keys.ACTION].astype(np.float64)
@@ -158,7 +164,7 @@ class Replay:
         for frame, action in enumerate(actions):
             states.append(simulation.physics_state[0])
             observations.append(simulation.observe().state[0])
-            if self.goals is not None:
+            if self.goals is not None and self._by_goals[frame]:
                 simulation.pursue({0: self.goals.get(frame, [])})
             else:
                 simulation.act(action[None])

@@ -1,0 +1,123 @@
+"""Who drives in each frame: the brain or one who took over, by setpoints or by goals."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.policies.brain import Goals, Mixed
+from bhd_lerobot.tasks.task import Event
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Intervention:
+    """Frames in which somebody else drove.
+
+    Attributes:
+        first: the first frame.
+        end: the frame after the last.
+        cause: why, in words.
+    """
+
+    first: int
+    end: int
+    cause: str
+
+
+class DriverLog:
+    """Who drives n simulations, from one decision of a brain to the next.
+
+    Attributes:
+        intervenes: whether the brain is one in which somebody takes over.
+        is_mixed: whether it gives setpoints in some frames and goals in others.
+        gives_goals: whether it gives goals at all.
+
+    Args:
+        brain: the brain; an `Intervening` if somebody takes over in it.
+        n: number of simulations.
+        frames: longest episode, in frames.
+    """
+
+    def __init__(self, brain: Any, n: int, frames: int) -> None:
+        # Not isinstance: a brain may be wrapped in one that passes on what it does not know.
+        self.intervenes = hasattr(brain, "interventions")
+        self.is_mixed = self.gives_goals = False
+        self._brain = brain
+        self._taken, self._by_goals = np.zeros((2, n, frames), np.bool_)
+        self._now, self._before = np.zeros((2, 2, n), np.bool_)  # taken over, by goals
+        self._fresh = np.ones(n, np.bool_)
+        self._causes: list[dict[int, str]] = [{} for _ in range(n)]
+
+    def start(self, ids: NDArray[np.intp]) -> None:
+        """Start episodes in some simulations."""
+        self._fresh[ids] = True
+        for sim in ids.tolist():
+            self._causes[sim] = {}
+
+    def decided(self, decision: Any, length: NDArray[np.int64]) -> None:
+        """Take note of what the brain wants.
+
+        Args:
+            decision: what `act` returned.
+            length: frames of each simulation's episode so far, shape (n,).
+        """
+        self.is_mixed = isinstance(decision, Mixed)
+        self.gives_goals = self.is_mixed or isinstance(decision, Goals)
+        self._before = self._now
+        taken = np.array(self._brain.interventions(), np.bool_) if self.intervenes else np.zeros(len(length), np.bool_)
+        by_goals = decision.by_goals if self.is_mixed else np.full(len(length), self.gives_goals)
+        self._now = np.stack([taken, by_goals])
+        self._before[:, self._fresh] = self._now[:, self._fresh]
+        self._fresh[:] = False
+        if np.count_nonzero(taken):
+            causes = self._brain.causes()
+            for sim in np.flatnonzero(taken).tolist():
+                self._causes[sim][int(length[sim])] = causes[sim]
+
+    def frame(self, running: NDArray[np.intp], length: NDArray[np.int64], *, is_missed: bool) -> tuple[Mask, Mask]:
+        """Note who drove in a frame that just ended.
+
+        Args:
+            running: the simulations that are in an episode.
+            length: frames of each episode before this one, shape (n,).
+            is_missed: whether the frame went by, on the wall clock, while the brain was thinking: what it had decided
+                before was still in force.
+
+        Returns:
+            Which simulations somebody had taken over, and which followed goals, each of shape (n,).
+        """
+        taken, by_goals = self._before if is_missed else self._now
+        rows = length[running]
+        self._taken[running, rows], self._by_goals[running, rows] = taken[running], by_goals[running]
+        return taken, by_goals
+
+    def interventions(self, sim: int, length: int) -> list[Intervention] | None:
+        """Return the interventions of an episode that has ended; None if there is nobody to intervene."""
+        if not self.intervenes:
+            return None
+        found = []
+        for first, end in spans(self._taken[sim, :length]):
+            noted = [cause for frame, cause in sorted(self._causes[sim].items()) if first - 1 <= frame < end]
+            found.append(Intervention(first, end, noted[-1] if noted else ""))
+        return found
+
+    def goal_frames(self, sim: int, length: int) -> list[tuple[int, int]] | None:
+        """Return when an episode followed goals, as first frames and those after the last.
+
+        None if it did so always, or never.
+        """
+        return spans(self._by_goals[sim, :length]) if self.is_mixed else None
+
+
+def flagged(event: NDArray[np.int64], taken: Mask) -> NDArray[np.int64]:
+    """Return the events of a frame with the interventions among them: what ends an episode says more, and stays."""
+    return np.where(taken & (event == Event.NOTHING), int(Event.INTERVENTION), event)
+
+
+def spans(mask: Mask) -> list[tuple[int, int]]:
+    """Return where a mask of shape (frames,) is true, as first frames and those after the last."""
+    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
+    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
