@@ -106,10 +106,7 @@ def delta_indices(
         if keep is not None and key not in keep and key not in DEFAULT_FEATURES:
             raise DatasetError(f"delta_timestamps names {key!r}, which is not among the features to keep: {keep}.")
         if meta.features[key]["dtype"] in ("string", "language"):
-            kind = meta.features[key]["dtype"]
-            raise DatasetError(
-                f"delta_timestamps names {key!r}, a feature of dtype {kind}; only numbers and images work."
-            )
+            raise DatasetError(f"delta_timestamps names {key!r}, which is text; only numbers and images have a window.")
         frames = np.asarray(list(times), dtype=np.float64) * meta.fps
         off = np.abs(frames - np.round(frames)) / meta.fps > tolerance_s
         if off.any() or not len(frames):

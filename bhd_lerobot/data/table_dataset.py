@@ -178,10 +178,13 @@ class TableDataset:
             raise IndexError(f"Sample {index} of a dataset with {len(self)} samples.")
         batch = self.batch(torch.tensor([index % len(self)]))
         row = int(self.rows[index])
-        task = batch.pop("task")[0]
         sample = {key: values[0] for key, values in batch.items()}
-        sample |= {key: column[row].as_py() for key, column in self.table.nested.items()}
-        return {**sample, "task": task}
+        if not self.table.nested:
+            return sample
+        said = {key: column[row].as_py() for key, column in self.table.nested.items()}
+        own = {key: said[key] if key in said else sample[key] for key in self.table.keys}
+        videos = {key: sample[key] for key in self._frames.keys if key not in own}
+        return {**videos, **own, **{key: value for key, value in sample.items() if key not in own}}
 
     def batch(self, indices: Tensor) -> Batch:
         """Return the samples with these indices as one batch.
