@@ -29,6 +29,7 @@ GOAL = ("goal_x", "goal_y", "goal_cos", "goal_sin")
 
 _STEP = 0.2  # [m] between two places of a path where the map is asked
 _OPEN_M = 0.05  # [m] that a path is worth which is free as far as it is judged
+_BEND = 0.02  # [m/rad] that turning costs beyond its way and time: what the map tells is right to half a cell
 _NO_WAY = np.float32(200.0)  # [m] that a path without a free place costs
 _DETOUR = 0.15  # [m] that a way is longer, it is worth to pass through less room
 _TIGHT_M = 0.5  # [m] from something seen, there may be less room than usual
@@ -130,7 +131,8 @@ class NavigatorBrain:
         self._path_x, self._path_y = x.astype(np.float32), y.astype(np.float32)
         # What a turn takes in time, beyond the way that it goes.
         lost = paths.turn - np.abs(paths.heading) * paths.radius
-        self._length = (length - (1 - config.turn_weight) * lost).astype(np.float32)
+        price = _BEND * np.abs(paths.heading) - (1 - config.turn_weight) * lost
+        self._length = (length + price).astype(np.float32)
         # The turn on the spot to each heading, by number; half a turn is both the last and the first of them.
         number = np.round(paths.heading / SPACING).astype(np.int64) % HEADINGS
         spot = (paths.radius == 0) | (number == 0)
@@ -224,11 +226,11 @@ class NavigatorBrain:
             self._scan = np.full(scan.shape, math.nan)
         new = (scan != self._scan).any(axis=1) & awake
         self._scan = scan
-        rate = np.where(np.isfinite(rate), np.abs(rate), math.inf)
-        hit = self._reader.valid(scan) & (scan < self.config.range_max_m - 1e-3)
-        # A scan is up to a frame old.
-        hit &= new[:, None] & ~(scan * (rate * self._dt)[:, None] > _SMEAR)
+        hit = self._reader.valid(scan) & (scan < self.config.range_max_m - 1e-3) & new[:, None]
         ranges = np.where(hit, scan, 0.0)
+        # A scan is up to a frame old.
+        smear = np.where(np.isfinite(rate), np.abs(rate), 1e3) * self._dt
+        hit &= ranges * smear[:, None] <= _SMEAR
         px, py = LIDAR_X + ranges * np.cos(self._reader.angles), ranges * np.sin(self._reader.angles)
         self._map.mark(*_to_goal(px, py, pose[:, :, None]), hit)
 

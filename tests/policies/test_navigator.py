@@ -1,0 +1,248 @@
+"""Laws of the navigator: limits, symmetry, the last turn, its map, independence of n, and what it achieves."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.arenas import Arena, make_arena
+from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.goal_map import CELL, GoalMap
+from bhd_lerobot.policies.navigator import GOAL, NavigatorBrain, NavigatorConfig
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
+from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
+from bhd_lerobot.tasks.task import Event, episode_seed
+
+ACTIONS = ("x.vel", "theta.vel")
+OPEN = np.full(360, 3.5)
+
+
+def names_of(beams: int) -> tuple[str, ...]:
+    return ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(beams)))
+
+
+def bound(n: int = 1, beams: int = 360, config: NavigatorConfig | None = None) -> NavigatorBrain:
+    brain = NavigatorBrain(config)
+    brain.bind(names_of(beams), ACTIONS, 10, GOAL)
+    brain.reset(np.arange(n), [0] * n, n)
+    return brain
+
+
+def goal_at(x: float, y: float, yaw: float = 0.0) -> np.ndarray:
+    return np.array([[x, y, math.cos(yaw), math.sin(yaw)]])
+
+
+def see(brain: NavigatorBrain, goal: np.ndarray, scan: np.ndarray = OPEN) -> np.ndarray:
+    scan = np.atleast_2d(scan)
+    state = np.hstack([np.zeros((len(scan), 2)), scan])
+    return brain.act(Observation(names_of(scan.shape[1]), state, environment_state=goal))
+
+
+def run(scenes: list[Arena] | list[int], n: int = 8) -> list[Episode]:
+    """Drive in scenes, or in those that the task makes from seeds."""
+
+    class Task(NavigateTask):
+        def sample(self, seed: int) -> Arena:
+            scene = scenes[seed]
+            return scene if isinstance(scene, Arena) else super().sample(scene)
+
+    config, n = TurtleBot3Config(), min(n, len(scenes))
+    loop = EpisodeLoop(TurtleBot3Simulation(config, n), Task(NavigateConfig(), n, config.fps), NavigatorBrain())
+    return list(loop.run([EpisodeSpec(index, index) for index in range(len(scenes))]))
+
+
+# --- decisions -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("beams", [36, 90, 360])
+def test_it_drives_to_a_goal_ahead(beams: int) -> None:
+    forward, turn = see(bound(beams=beams), goal_at(3.0, 0.0), np.full(beams, 3.5))[0]
+    assert forward > 0.19
+    assert abs(turn) < 0.4  # at most to the heading beside it: the map's cells do not tell the two apart
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("distance", [0.5, 2.0])
+def test_it_turns_to_a_goal_beside_it(side: int, distance: float) -> None:
+    assert side * see(bound(), goal_at(0.0, side * distance))[0, 1] > 0.5
+
+
+def test_a_mirrored_scene_is_driven_mirrored() -> None:
+    rng = np.random.default_rng(4)
+    n = 40
+    scan = np.clip(np.cumsum(rng.normal(0, 0.1, (n, 360)), axis=1) / 2 + 1.5, 0.3, 3.5)
+    goal = np.vstack([goal_at(*rng.uniform(-3, 3, 2), rng.uniform(-3, 3)) for _ in range(n)])
+    mirrored_scan = np.roll(scan[:, ::-1], 1, axis=1)
+    mirrored_goal = goal * (1, -1, 1, -1)
+    action, mirrored = see(bound(n), goal, scan), see(bound(n), mirrored_goal, mirrored_scan)
+    same = np.isclose(action[:, 0], mirrored[:, 0]) & np.isclose(action[:, 1], -mirrored[:, 1])
+    # Two paths of one price are told apart by their order alone.
+    assert same.mean() > 0.9
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_at_the_goal_it_turns_to_its_heading_and_rests(side: int) -> None:
+    brain = bound()
+    forward, turn = see(brain, goal_at(0.03, 0.0, side * 1.0))[0]
+    assert (forward, np.sign(turn)) == (0.0, side)
+    assert see(brain, goal_at(0.03, 0.0, side * 0.02))[0].tolist() == [0.0, 0.0]
+    assert see(brain, goal_at(0.07, 0.0, 0.0))[0].tolist() == [0.0, 0.0]  # a little off, it stays
+    assert see(brain, goal_at(0.09, 0.0, 0.0))[0, 0] > 0
+
+
+def test_it_never_asks_for_more_than_the_robot_can() -> None:
+    rng = np.random.default_rng(1)
+    n = 60
+    brain, rim = bound(n), MAX_ANGULAR * WHEEL_SEPARATION / 2
+    for _ in range(3):
+        scan = np.clip(rng.uniform(0.1, 4.0, (n, 1)) + rng.normal(0, 0.3, (n, 360)), 0.12, 3.5)
+        goal = np.vstack([goal_at(*rng.uniform(-20, 20, 2), rng.uniform(-3, 3)) for _ in range(n)])
+        action = see(brain, goal, scan)
+        assert np.isfinite(action).all()
+        assert (np.abs(action[:, 0]) <= MAX_LINEAR).all()
+        assert (np.abs(action[:, 0]) + np.abs(action[:, 1]) * WHEEL_SEPARATION / 2 <= rim + 1e-9).all()
+
+
+@pytest.mark.parametrize("distance", [0.12, 0.2])
+def test_it_does_not_drive_into_a_wall_before_the_goal(distance: float) -> None:
+    scan = OPEN.copy()
+    scan[-45:] = scan[:46] = distance
+    assert see(bound(), goal_at(2.0, 0.0), scan)[0, 0] <= 0
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("column", range(4))
+def test_without_a_goal_it_stands_and_goes_on_with_one(bad: float, column: int) -> None:
+    brain, goal = bound(2), np.vstack([goal_at(2.0, 0.0)] * 2)
+    lost = goal.copy()
+    lost[0, column] = bad
+    scan = np.vstack([OPEN, OPEN])
+    action = see(brain, lost, scan)
+    assert action[0].tolist() == [0.0, 0.0]
+    assert action[1, 0] > 0.19
+    assert (see(brain, goal, scan)[:, 0] > 0.19).all()
+
+
+@pytest.mark.parametrize("blind", [np.nan, np.inf, 0.0, 3.6])
+def test_blind_it_stops_and_sees_again(blind: float) -> None:
+    brain = bound()
+    assert see(brain, goal_at(2.0, 0.0), np.full(360, blind)).tolist() == [[0.0, 0.0]]
+    assert see(brain, goal_at(2.0, 0.0))[0, 0] > 0.19
+
+
+# --- map -------------------------------------------------------------------------------------------------------------
+
+
+def test_ways_lead_around_what_was_seen_and_are_planned_again_only_where_it_is_in_the_way() -> None:
+    goal_map = GoalMap(1)
+    assert goal_map.blocked[0]
+    assert goal_map.plan(0, -2.0, 0.0)
+    assert goal_map.way_left(np.array([[-2.0]]), np.array([[0.0]]))[0, 0] == pytest.approx(2.0, rel=0.01)
+    far = np.linspace(1.5, 2.0, 20)[None]
+    goal_map.mark(np.zeros((1, 20)) - 1.0, far, np.ones((1, 20), np.bool_))
+    assert not goal_map.blocked[0]
+    assert goal_map.news[0] > 5
+    wall = np.linspace(-1.0, 1.0, 81)[None]
+    goal_map.mark(np.zeros((1, 81)) - 1.0, wall, np.ones((1, 81), np.bool_))
+    assert goal_map.blocked[0]
+    assert goal_map.plan(0, -2.0, 0.0)
+    assert not goal_map.blocked[0]
+    assert goal_map.way_left(np.array([[-2.0]]), np.array([[0.0]]))[0, 0] > 2 * math.hypot(1.0, 1.0)
+    goal_map.forget(np.array([0]))
+    assert goal_map.plan(0, -2.0, 0.0)
+    assert goal_map.way_left(np.array([[-2.0]]), np.array([[0.0]]))[0, 0] == pytest.approx(2.0, rel=0.01)
+
+
+def test_a_closed_ring_around_the_robot_is_no_way() -> None:
+    goal_map = GoalMap(1)
+    angle = np.linspace(0, 2 * math.pi, 400)[None]
+    goal_map.mark(-2.0 + 0.5 * np.cos(angle), 0.5 * np.sin(angle), np.ones((1, 400), np.bool_))
+    assert not goal_map.plan(0, -2.0, 0.0)
+
+
+def test_beyond_the_map_the_distance_counts() -> None:
+    goal_map = GoalMap(1)
+    assert not goal_map.plan(0, 30.0, 0.0)
+    near, far = goal_map.way_left(np.array([[20.0, 30.0]]), np.array([[0.0, 0.0]]))[0]
+    assert far - near == pytest.approx(10.0, abs=CELL)
+    assert see(bound(), goal_at(30.0, 0.0))[0, 0] > 0.19  # it sets off
+
+
+# --- what it achieves ------------------------------------------------------------------------------------------------
+
+
+def test_it_reaches_goals_without_touching_anything() -> None:
+    seeds = [episode_seed(0, episode, "held_out") for episode in range(6)]
+    outcomes = [episode.outcome for episode in run(seeds)]
+    assert [outcome.event for outcome in outcomes] == [Event.SUCCESS] * 6
+    assert np.mean([outcome.score for outcome in outcomes]) > 0.85
+
+
+def test_it_gets_out_of_a_dead_end_to_a_goal_behind_its_wall() -> None:
+    walls = [Shape("box", 0.5, 0.0, 0.0, 0.03, 0.6)]
+    walls += [Shape("box", -0.1, side * 0.6, 0.0, 0.6, 0.03) for side in (-1, 1)]
+    empty = make_arena("empty", 0)
+    scene = replace(empty, shapes=(*empty.shapes, *walls), start=(0.0, 0.0, 0.0), goal=(1.525, 0.025, 2.0))
+    (episode,) = run([scene])
+    assert episode.outcome.success
+    assert episode.outcome.score > 0.8
+
+
+def test_an_episode_does_not_depend_on_how_many_run_beside_it() -> None:
+    seeds = [episode_seed(1, episode, "train") for episode in range(2)]
+    for one, other in zip(run(seeds, 1), run(seeds, 2), strict=True):
+        assert one.outcome == other.outcome
+        assert all(np.array_equal(value, other.columns[key]) for key, value in one.columns.items())
+
+
+# --- wrong inputs ----------------------------------------------------------------------------------------------------
+
+
+def test_a_task_without_a_goal_is_refused_with_what_is_missing() -> None:
+    with pytest.raises(ConfigError, match=r"'navigator' needs the environment feature.*goal_x.*does not tell"):
+        NavigatorBrain().bind(names_of(90), ACTIONS, 10, ())
+    with pytest.raises(ConfigError, match="is told none"):
+        bound().act(Observation(names_of(360), np.zeros((1, 362))))
+
+
+def test_a_robot_without_a_scan_or_with_few_beams_is_refused() -> None:
+    with pytest.raises(ConfigError, match="needs a range scan"):
+        NavigatorBrain().bind(("x.vel", "theta.vel"), ACTIONS, 10, GOAL)
+    with pytest.raises(ConfigError, match="needs at least 36 beams"):
+        bound(beams=20)
+
+
+def test_another_number_of_robots_than_it_was_reset_for_is_refused() -> None:
+    with pytest.raises(ConfigError, match="reset for 1 robots and sees 2"):
+        see(bound(), np.vstack([goal_at(1, 0)] * 2), np.vstack([OPEN] * 2))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"forward_speed": 0.0},
+        {"turn_speed": math.nan},
+        {"arrive_m": -0.1},
+        {"forward_speed": 0.3},
+        {"horizon_m": 9.0},
+        {"stop_m": 1.5},
+        {"range_min_m": 4.0},
+    ],
+)
+def test_impossible_values_are_refused_by_name(change: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=f"brain.{next(iter(change))}"):
+        NavigatorConfig(**change)
+
+
+def test_parameters_are_plain_values_that_define_the_brain() -> None:
+    config = NavigatorConfig(margin_m=0.05)
+    parameters = NavigatorBrain(config).parameters()
+    assert parameters.pop("type") == "navigator"
+    assert NavigatorConfig(**parameters) == config
