@@ -122,7 +122,10 @@ class BhdTrainConfig(TrainPipelineConfig):
         if self.policy.push_to_hub and not self.policy.repo_id:
             raise ConfigError("policy.push_to_hub is true: set --policy.repo_id=user/name, or push_to_hub to false.")
         given = self.optimizer, self.scheduler
-        super().validate()
+        try:
+            super().validate()
+        except (ValueError, FileExistsError, NotImplementedError) as error:
+            raise ConfigError(f"The configuration cannot be used: {error}") from error
         if self.use_policy_training_preset and not self.resume:
             for name, wanted, used in zip(
                 ("optimizer", "scheduler"), given, (self.optimizer, self.scheduler), strict=True

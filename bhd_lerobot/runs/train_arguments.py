@@ -171,6 +171,7 @@ def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
 
 def _policy_values(source: str) -> dict[str, Any]:
     try:
-        return plain(PreTrainedConfig.from_pretrained(source))
+        config = PreTrainedConfig.from_pretrained(source)
+        return {"type": config.type, **plain(config)}
     except Exception as error:  # draccus, for a type that is not installed or a field that does not exist
         raise ConfigError(f"The configuration of the checkpoint {source} cannot be used: {error}") from error

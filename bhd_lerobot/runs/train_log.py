@@ -98,7 +98,7 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
             marker="o" if len(points) == 1 else marker,
             markersize=3.5,
             linewidth=1.3,
-            label=label,
+            label=f"{label}: {values[-1]:.3g}",
         )
         smallest.append(min(values))
     if smallest and min(smallest) > 0:  # a negative log-likelihood may be below 0

@@ -246,8 +246,13 @@ class TrainingLoop:
         )
 
     def _batches(self) -> Iterator[Batch]:
+        is_new_epoch = self.loader.state_dict().get("position", 0) == 0
         while True:
+            if is_new_epoch:
+                # As PyTorch's DataLoader does, so that dropout and noise are those of lerobot-train for the same seed.
+                torch.empty((), dtype=torch.int64).random_()
             yield from self.loader
+            is_new_epoch = True
 
 
 def _is_due(step: int, frequency: int) -> bool:

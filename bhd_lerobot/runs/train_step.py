@@ -95,7 +95,7 @@ class Learner:
         with nullcontext() if self._is_plain else self._accelerator.autocast():
             loss, outputs = self.policy.forward(batch)
         if self._checks_at_once and not bool(torch.isfinite(loss)):
-            raise NonFiniteLossError(float(loss))
+            raise NonFiniteLossError(float(loss.detach()))
         self._accelerator.backward(loss)
         if self._grad_clip_norm > 0:
             clip = torch.nn.utils.clip_grad_norm_ if self._is_plain else self._accelerator.clip_grad_norm_

@@ -6,6 +6,7 @@ import sys
 import time
 from pathlib import Path
 
+import draccus
 import pytest
 import torch
 import yaml
@@ -51,7 +52,8 @@ def test_a_checkpoint_is_what_stock_lerobot_reads(data: Path, tmp_path: Path) ->
     assert result.checkpoint is not None
     folder = result.checkpoint / "pretrained_model"
     assert get_policy_class("act").from_pretrained(folder).config.chunk_size == 5
-    assert TrainPipelineConfig.from_pretrained(folder).steps == 5  # refuses keys that it does not know
+    values = json.loads((folder / "train_config.json").read_text())
+    assert draccus.decode(TrainPipelineConfig, values).steps == 5  # refuses keys that it does not know
     contract = json.loads((folder / "bhd.json").read_text())
     assert (contract["robot_type"], contract["fps"], contract["action_names"]) == ("toy", 10, ["a.pos", "b.pos"])
 
@@ -67,11 +69,10 @@ def test_config_yaml_gives_the_same_run_again(data: Path, tmp_path: Path) -> Non
 def test_the_first_losses_are_those_of_lerobot_train(
     data: Path, tmp_path: Path, policy: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arguments = options(data, tmp_path / "ours", policy, steps=14, log_freq=1, save_freq=0)
-    run_train(arguments)
-    stock = [one for one in arguments if not one.startswith(("--threads", "--output_dir"))]
-    stock += [f"--output_dir={tmp_path / 'stock'}", "--policy.push_to_hub=false", "--dataset.video_backend=pyav"]
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", *stock])
+    result, _ = run_train(options(data, tmp_path / "ours", policy, steps=14, log_freq=1, save_freq=0))
+    values = json.loads((result.output_dir / "train_config.json").read_text())
+    values |= {"output_dir": str(tmp_path / "stock"), "checkpoint_path": None, "optimizer": None, "scheduler": None}
+    monkeypatch.setattr(sys, "argv", ["lerobot-train"])
     losses: list[float] = []
     original = lerobot_train.update_policy
 
@@ -81,7 +82,7 @@ def test_the_first_losses_are_those_of_lerobot_train(
         return tracker, outputs
 
     monkeypatch.setattr(lerobot_train, "update_policy", spy)
-    lerobot_train.train()
+    lerobot_train.train(draccus.decode(TrainPipelineConfig, values))
     assert [row["loss"] for row in curve(tmp_path / "ours")] == losses
     path = "checkpoints/last/pretrained_model/model.safetensors"
     assert (tmp_path / "ours" / path).read_bytes() == (tmp_path / "stock" / path).read_bytes()

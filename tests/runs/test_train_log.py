@@ -1,0 +1,63 @@
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from bhd_lerobot.runs import train_log
+from bhd_lerobot.runs.train_log import MetricsFile, draw_loss, read_metrics
+
+ROWS = [{"step": step, "loss": 1 / step, "lr": 1e-3, "held_out_loss": 2 / step} for step in (10, 20, 30)]
+
+
+def test_rows_come_back_with_all_their_bits(tmp_path: Path) -> None:
+    file = MetricsFile(tmp_path / "metrics.jsonl")
+    for row in ROWS:
+        file.append(row)
+    assert read_metrics(file.path) == ROWS == file.rows
+    assert read_metrics(file.path, 20) == ROWS[:2]
+
+
+def test_a_torn_line_is_left_out(tmp_path: Path) -> None:
+    file = MetricsFile(tmp_path / "metrics.jsonl", ROWS)
+    with file.path.open("a") as stream:
+        stream.write('{"step": 40, "lo')
+    assert read_metrics(file.path) == ROWS
+
+
+def test_what_is_not_finite_is_null(tmp_path: Path) -> None:
+    file = MetricsFile(tmp_path / "metrics.jsonl", [{"step": 1, "grad_norm": float("inf")}])
+    assert read_metrics(file.path) == [{"step": 1, "grad_norm": None}]
+
+
+def test_there_are_no_metrics_before_the_first(tmp_path: Path) -> None:
+    assert read_metrics(tmp_path / "metrics.jsonl") == []
+
+
+def drawn(rows: list[dict], path: Path, monkeypatch) -> Figure:
+    figures = []
+
+    class Spy(Figure):
+        def __init__(self, *args, **kwargs) -> None:
+            super().__init__(*args, **kwargs)
+            figures.append(self)
+
+    monkeypatch.setattr(train_log, "Figure", Spy)
+    draw_loss(rows, path, "toy")
+    assert path.stat().st_size > 1000
+    return figures[0]
+
+
+def test_the_curve_shows_both_losses_on_a_log_scale(tmp_path: Path, monkeypatch) -> None:
+    above, below = drawn(ROWS, tmp_path / "loss.png", monkeypatch).axes
+    assert above.get_yscale() == "log"
+    assert [line.get_label() for line in above.lines] == ["training: 0.0333", "held-out episodes: 0.0667"]
+    assert above.lines[1].get_ydata().tolist() == [0.2, 0.1, 2 / 30]
+    assert below.lines[0].get_xdata().tolist() == [10, 20, 30]
+
+
+def test_a_negative_log_likelihood_has_a_linear_scale(tmp_path: Path, monkeypatch) -> None:
+    rows = [{"step": 1, "loss": 1.0}, {"step": 2, "loss": -1.0}]
+    assert drawn(rows, tmp_path / "loss.png", monkeypatch).axes[0].get_yscale() == "linear"
+
+
+def test_no_row_at_all_can_be_drawn(tmp_path: Path, monkeypatch) -> None:
+    assert drawn([], tmp_path / "loss.png", monkeypatch).axes[0].lines[:] == []
