@@ -1,5 +1,6 @@
 """The environments as LeRobot's environment type `bhd`."""
 
+import multiprocessing
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any
@@ -116,6 +117,8 @@ class BhdEnvConfig(EnvConfig):
             if self.vector == "sync":
                 vector = SyncVectorEnv(makers, autoreset_mode=mode)
             else:
+                # What is imported before the processes part need not be imported in each.
+                multiprocessing.set_forkserver_preload(["__main__", BhdEnv.__module__])
                 vector = AsyncVectorEnv(makers, context="forkserver", autoreset_mode=mode)
         return {self.type: {0: vector}}
 

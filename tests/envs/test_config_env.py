@@ -16,7 +16,7 @@ from bhd_lerobot.envs.config_env import BhdEnvConfig
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.task import episode_seed
-from tests.envs.support import NAMES, assert_same
+from tests.envs.support import NAMES, assert_same, some_actions
 
 AVOID = "TurtleBot3Avoid-v0"
 SHORT: dict[str, Any] = {"robot": {"beams": 36}, "task_options": {"duration_s": 1.0}}
@@ -51,17 +51,24 @@ def test_images_are_features_too() -> None:
     assert set(only) == {"action", "observation.images.scene", "observation.images.wrist"}
 
 
-@pytest.mark.parametrize(
-    ("vector", "kind"), [("bhd", BhdVectorEnv), ("sync", SyncVectorEnv), ("async", AsyncVectorEnv)]
-)
-def test_it_makes_the_vector_environment_that_was_asked_for(vector: str, kind: type) -> None:
+KINDS = {"bhd": BhdVectorEnv, "sync": SyncVectorEnv, "async": AsyncVectorEnv}
+
+
+@pytest.mark.parametrize("vector", KINDS)
+def test_all_kinds_of_vector_environments_do_the_same(vector: str) -> None:
     envs = make_env(BhdEnvConfig(task=AVOID, vector=vector, seed=3, **SHORT), n_envs=2, use_async_envs=True)
     env = envs["bhd"][0]
+    ours = BhdVectorEnv(
+        2, AVOID, SHORT["robot"], SHORT["task_options"], seed=3, split="held_out", autoreset_mode="SameStep"
+    )
     try:
-        assert isinstance(env, kind)
+        assert isinstance(env, KINDS[vector])
         assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
-        _, infos = env.reset(seed=[0, 1])
-        assert infos["seed"].tolist() == [episode_seed(3, 0, "held_out"), episode_seed(3, 1, "held_out")]
+        theirs = env.reset(seed=[0, 4])
+        assert theirs[1]["seed"].tolist() == [episode_seed(3, 0, "held_out"), episode_seed(3, 4, "held_out")]
+        assert_same(theirs, ours.reset(seed=[0, 4]))
+        for action in some_actions(AVOID, 25, 2):
+            assert_same(env.step(action), ours.step(action))
         assert tuple(env.call("_max_episode_steps")) == (10, 10)
     finally:
         close_envs(envs)
@@ -132,7 +139,7 @@ def test_what_cannot_be_honoured_is_named(arguments: dict[str, Any], message: st
 
 
 def test_no_environments_are_refused() -> None:
-    with pytest.raises(ConfigError, match="batch_size.* is 0"):
+    with pytest.raises(ConfigError, match=r"batch_size.* is 0"):
         BhdEnvConfig(task=AVOID).create_envs(0)
 
 
