@@ -37,7 +37,7 @@ _ELEMENTWISE = (
     ScanProcessorStep,
 )
 _SMALL = 2_000_000  # parameters; below, a second thread costs more than it does
-_BLOCK, _BLOCK_LARGE = 16, 4
+_BLOCK, _BLOCK_LARGE = 64, 8
 
 
 class Inference(Protocol):

@@ -1,0 +1,85 @@
+"""Where a trained policy lies: in which folder of a run, or on the Hub."""
+
+import re
+from pathlib import Path
+
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+
+from bhd_lerobot.errors import ConfigError
+
+CONFIG_FILE = "config.json"
+"""LeRobot's name of a policy's configuration."""
+
+WEIGHT_FILES = ("model.safetensors", "adapter_model.safetensors")
+"""LeRobot's and PEFT's names of a policy's weights."""
+
+_HUB_ID = re.compile(r"[\w][\w.-]*/[\w][\w.-]*")
+
+
+def find_checkpoint(path: str | Path) -> Path:
+    """Return the folder with a policy's configuration and weights.
+
+    Args:
+        path: that folder; a checkpoint's or a training run's folder, then its last checkpoint; or the name of a model
+            on the Hub, `user/name`.
+
+    Raises:
+        ConfigError: there is none, or it is not complete; the message says what was looked for.
+    """
+    text, folder = str(path), Path(path).expanduser()
+    if folder.is_dir():
+        return _complete(_in_folder(folder))
+    if folder.exists():
+        raise ConfigError(f"{text} is a file; name the folder that it is in, {str(folder.parent)!r}.")
+    if not _HUB_ID.fullmatch(text):
+        raise ConfigError(
+            f"There is no policy at {text!r}: the folder does not exist. Name a training run's folder, one of its "
+            "checkpoints, or a model on the Hub (user/name)."
+        )
+    from huggingface_hub import snapshot_download
+
+    try:
+        # What a policy consists of: neither the optimizer's state nor videos.
+        patterns = ["*.json", "*.safetensors", "*.model", "*.txt"]
+        return _complete(_in_folder(Path(snapshot_download(text, allow_patterns=patterns))))
+    except ConfigError:
+        raise
+    except Exception as error:  # the Hub's client lets through whatever its transport raises
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise ConfigError(
+            f"There is no policy at {text!r}: no such folder is here, and as a model on the Hub it cannot be had "
+            f"({reason}) Check the name, your login (hf auth login) and the network, or copy the checkpoint here."
+        ) from error
+
+
+def _in_folder(folder: Path) -> Path:
+    if (folder / CONFIG_FILE).is_file():
+        return folder
+    if (folder / PRETRAINED_MODEL_DIR).is_dir():
+        return folder / PRETRAINED_MODEL_DIR
+    checkpoints = folder if folder.name == CHECKPOINTS_DIR else folder / CHECKPOINTS_DIR
+    last = checkpoints / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
+    if last.is_dir():
+        return last
+    # A copy may have lost the link.
+    steps = [one for one in checkpoints.glob(f"*/{PRETRAINED_MODEL_DIR}") if one.parent.name.isdigit()]
+    if steps:
+        return max(steps, key=lambda one: int(one.parent.name))
+    found = ", ".join(sorted(one.name for one in folder.iterdir())[:8]) or "nothing"
+    raise ConfigError(
+        f"There is no policy in {folder}: neither {CONFIG_FILE}, {PRETRAINED_MODEL_DIR}/ nor "
+        f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}/{PRETRAINED_MODEL_DIR}/. There is: {found}. "
+        "A training run that has not saved yet has none."
+    )
+
+
+def _complete(folder: Path) -> Path:
+    missing = [] if (folder / CONFIG_FILE).is_file() else [CONFIG_FILE]
+    if not any((folder / name).is_file() for name in WEIGHT_FILES):
+        missing.append(WEIGHT_FILES[0])
+    if missing:
+        raise ConfigError(
+            f"The checkpoint {folder} is not complete: {' and '.join(missing)} missing. It was perhaps interrupted "
+            "while it was written or copied; use an earlier checkpoint of the run, or copy it again."
+        )
+    return folder
