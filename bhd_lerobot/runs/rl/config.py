@@ -1,0 +1,319 @@
+"""Configuration of reinforcement learning, and how `bhd-train` recognises it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot.robots.config import RobotConfig
+
+from bhd_lerobot.envs.register import ENVIRONMENTS
+from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.mlp.configuration_mlp import ScanConfig
+from bhd_lerobot.runs import configuration
+from bhd_lerobot.runs.registry import robot_of_task
+from bhd_lerobot.tasks.config_task import TaskConfig
+from bhd_lerobot.tasks.task import Event
+
+ALGORITHMS = ("ppo",)
+SCHEDULES = ("linear", "constant")
+POTENTIALS = ("none", "pose")
+SELECTIONS = ("score", "success", "return")
+EVENTS = tuple(event.cause for event in Event if event != Event.NOTHING)
+CONFIG_NAME = "config.yaml"
+
+
+@dataclass
+class RlEnvConfig:
+    """The environments that are learned in.
+
+    Attributes:
+        n_envs: how many run side by side.
+        threads: threads that step the physics; all processors if nothing.
+    """
+
+    n_envs: int = 64
+    threads: int | None = None
+
+
+@dataclass
+class RlPolicyConfig:
+    """The actor, a `bhd_mlp`; with `start_from` the checkpoint decides, and all of this but `critic_dims` is ignored.
+
+    Attributes:
+        n_obs_steps: observations that it looks at.
+        obs_stride: frames from each of them to the next.
+        hidden_dims: widths of the hidden layers.
+        activation: one of bhd_mlp's.
+        layer_norm: normalise each hidden layer before its activation.
+        feature_clip: normalised inputs beyond ± this count as this; nothing turns it off.
+        scan: how a range finder's beams become inputs.
+        critic_dims: widths of the critic's hidden layers.
+    """
+
+    n_obs_steps: int = 1
+    obs_stride: int = 1
+    hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
+    activation: str = "tanh"
+    layer_norm: bool = False
+    feature_clip: float | None = 10.0
+    scan: ScanConfig = field(default_factory=ScanConfig)
+    critic_dims: list[int] = field(default_factory=lambda: [256, 256])
+
+
+@dataclass
+class PpoConfig:
+    """Proximal policy optimisation; the names are those of stable-baselines3.
+
+    Attributes:
+        n_steps: frames of each environment between two updates.
+        batch_size: samples of a gradient step.
+        n_epochs: passes over the samples of an update.
+        gamma: discount of a frame.
+        gae_lambda: of the generalised advantage estimate.
+        clip_range: by how much an update may change an action's probability, as a share.
+        ent_coef: weight of the entropy.
+        vf_coef: weight of the critic's loss.
+        max_grad_norm: largest norm of the gradient.
+        lr: learning rate of Adam.
+        lr_schedule: ``"linear"``: to 0 over the training; ``"constant"``.
+        target_kl: an update ends when the policy has changed by 1.5 times this; nothing turns it off.
+        log_std_init: logarithm of the exploration noise, in normalised actions; the checkpoint's own, or 0, if nothing.
+    """
+
+    n_steps: int = 64
+    batch_size: int = 1024
+    n_epochs: int = 5
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    ent_coef: float = 0.0
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+    lr: float = 3e-4
+    lr_schedule: str = "linear"
+    target_kl: float | None = None
+    log_std_init: float | None = None
+
+
+@dataclass
+class RewardConfig:
+    """What the learner gets for what the task gives; what is reported is always the task's own reward.
+
+    Attributes:
+        scale: factor on the task's reward.
+        events: added in the frame that ends with an event, by its name: negative for a failure, positive for a success.
+        frame: added in every frame.
+        potential: ``"pose"``: potential-based shaping, which leaves the best policy as it is: gamma times the potential
+            of the new state minus that of the old one; the potential is minus the distance of the tool from the target
+            pose; ``"none"``.
+        per_m: weight of the distance in that potential [1/m].
+        per_rad: weight of the angle in that potential [1/rad].
+    """
+
+    scale: float = 1.0
+    events: dict[str, float] = field(default_factory=dict)
+    frame: float = 0.0
+    potential: str = "none"
+    per_m: float = 2.0
+    per_rad: float = 0.5
+
+
+@dataclass
+class ValidationConfig:
+    """Episodes that judge the policy on the way. They are neither those of the training nor any held-out ones.
+
+    Attributes:
+        freq: environment steps between two validations.
+        n_episodes: how many episodes.
+        n_envs: how many run side by side.
+        seed: run seed of these episodes, of the split `train`; another than the training's.
+        select: what makes a checkpoint the best: ``"score"``, ``"success"`` or ``"return"``.
+        rule: a brain whose level is drawn beside the curve; also what normalisation is estimated from. None if nothing.
+    """
+
+    freq: int = 200_000
+    n_episodes: int = 64
+    n_envs: int = 64
+    seed: int = 777_001
+    select: str = "score"
+    rule: BrainConfig | None = None
+
+
+@dataclass
+class AnchorConfig:
+    """What keeps the actor near the checkpoint that it started from.
+
+    Attributes:
+        coef: weight of the KL divergence from the checkpoint's policy; 0 turns it off.
+        batch_size: samples of a gradient step.
+        decay: whether the weight falls to 0 over the training.
+    """
+
+    coef: float = 0.0
+    batch_size: int = 4096
+    decay: bool = True
+
+
+@dataclass
+class RlConfig:
+    """Learn by trial and error: PPO of stable-baselines3 on many simulations side by side, into a `bhd_mlp`.
+
+    Attributes:
+        robot: the robot, in simulation.
+        task: what it is to achieve.
+        algorithm: ``"ppo"``.
+        env: the environments.
+        policy: the actor.
+        ppo: the algorithm.
+        reward: what the learner gets.
+        validation: how it is judged on the way.
+        anchor: what keeps it near `start_from`.
+        steps: environment steps, all environments together.
+        max_minutes: end after this time [min], validation included; nothing: after `steps` only.
+        start_from: a checkpoint of a `bhd_mlp`, whose weights become the actor.
+        critic_warmup: environment steps in which only the critic learns.
+        output_dir: folder of the run; a new one in `outputs/train` if nothing.
+        resume: go on with the run in `output_dir`.
+        seed: of everything that is random.
+        threads: threads of torch; its own choice if nothing.
+    """
+
+    robot: RobotConfig
+    task: TaskConfig
+    algorithm: str = "ppo"
+    env: RlEnvConfig = field(default_factory=RlEnvConfig)
+    policy: RlPolicyConfig = field(default_factory=RlPolicyConfig)
+    ppo: PpoConfig = field(default_factory=PpoConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
+    anchor: AnchorConfig = field(default_factory=AnchorConfig)
+    steps: int = 1_000_000
+    max_minutes: float | None = None
+    start_from: str | None = None
+    critic_warmup: int = 0
+    output_dir: str | None = None
+    resume: bool = False
+    seed: int = 0
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        self._check_names()
+        self._check_numbers()
+        if self.robot.type != robot_of_task(self.task):
+            raise ConfigError(f"robot.type is {self.robot.type!r}; this task is for {robot_of_task(self.task)!r}.")
+        if self.validation.seed == self.seed:
+            raise ConfigError(
+                f"validation.seed and seed are both {self.seed}; the policy would be judged on the episodes that it "
+                "learned from. Set another --validation.seed."
+            )
+        if self.start_from is None:
+            for name, asked in (("anchor.coef", self.anchor.coef), ("critic_warmup", self.critic_warmup)):
+                if asked:
+                    raise ConfigError(f"{name} is {asked}; it needs --start_from, a checkpoint to stay near.")
+        if self.policy.scan.channels and self.policy.scan.transform == "none":
+            raise ConfigError("policy.scan.channels needs policy.scan.transform: inverse or log.")
+        if self.resume and self.output_dir is None:
+            raise ConfigError("resume needs --output_dir, or --config_path with the config.yaml of the run.")
+
+    @property
+    def environment(self) -> str:
+        """Name of the environment of this robot and task."""
+        task = self.task.get_choice_name(type(self.task))
+        return next(name for name, pair in ENVIRONMENTS.items() if pair == (self.robot.type, task))
+
+    def _check_names(self) -> None:
+        for name, value, valid in (
+            ("algorithm", self.algorithm, ALGORITHMS),
+            ("ppo.lr_schedule", self.ppo.lr_schedule, SCHEDULES),
+            ("reward.potential", self.reward.potential, POTENTIALS),
+            ("validation.select", self.validation.select, SELECTIONS),
+            *(("event in reward.events", event, EVENTS) for event in self.reward.events),
+        ):
+            if value not in valid:
+                raise ConfigError(unknown_name(name, value, valid))
+        if self.reward.potential == "pose" and "ur5" not in self.robot.type:
+            raise ConfigError("reward.potential is 'pose'; only a task with a target pose of the tool has it (reach).")
+
+    def _check_numbers(self) -> None:
+        ppo, validation = self.ppo, self.validation
+        for name, value, least in (
+            ("steps", self.steps, 1),
+            ("env.n_envs", self.env.n_envs, 1),
+            ("env.threads", 1 if self.env.threads is None else self.env.threads, 1),
+            ("threads", 1 if self.threads is None else self.threads, 1),
+            ("ppo.n_steps", ppo.n_steps, 2),
+            ("ppo.batch_size", ppo.batch_size, 2),
+            ("ppo.n_epochs", ppo.n_epochs, 1),
+            ("validation.freq", validation.freq, 1),
+            ("validation.n_episodes", validation.n_episodes, 1),
+            ("validation.n_envs", validation.n_envs, 1),
+            ("validation.seed", validation.seed, 0),
+            ("anchor.batch_size", self.anchor.batch_size, 1),
+            ("critic_warmup", self.critic_warmup, 0),
+            ("seed", self.seed, 0),
+        ):
+            if value < least:
+                raise ConfigError(f"{name} is {value}; it must be at least {least}.")
+        for name, number in (("ppo.gamma", ppo.gamma), ("ppo.gae_lambda", ppo.gae_lambda)):
+            if not 0 <= number <= 1:
+                raise ConfigError(f"{name} is {number}; it must be between 0 and 1.")
+        for name, number in (("ppo.lr", ppo.lr), ("ppo.clip_range", ppo.clip_range), ("reward.scale", self.reward.scale)):
+            if not 0 < number < math.inf:
+                raise ConfigError(f"{name} is {number}; it must be positive and finite.")
+        for event, number in self.reward.events.items():
+            if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
+                raise ConfigError(f"reward.events.{event} is {number!r}; it must be a finite number.")
+        if self.anchor.coef < 0:
+            raise ConfigError(f"anchor.coef is {self.anchor.coef}; it must be 0 or more.")
+        if self.max_minutes is not None and not self.max_minutes > 0:
+            raise ConfigError(f"max_minutes is {self.max_minutes}; it must be positive.")
+
+
+def is_rl(arguments: Sequence[str]) -> bool:
+    """Tell whether a command line of `bhd-train` asks for reinforcement learning: `algorithm` is set in it.
+
+    What is wrong with the command line is left to the parser that reads it next.
+    """
+    try:
+        overrides = configuration._overrides(arguments)
+        if "algorithm" in overrides:
+            return True
+        path = overrides.get(configuration.CONFIG_PATH)
+        file = None if path is None else _config_file(Path(str(path)))
+        return file is not None and file.suffix != ".json" and "algorithm" in configuration._read(file)
+    except ConfigError:
+        return False
+
+
+def parse_rl(arguments: Sequence[str]) -> RlConfig:
+    """Return what a command line asks for.
+
+    Args:
+        arguments: `--config_path=FILE` and overrides; to resume, FILE may be the run's folder.
+
+    Raises:
+        ConfigError: an unknown key, a value of the wrong type or out of range, or a file that cannot be read.
+    """
+    prefix = f"--{configuration.CONFIG_PATH}="
+    found = [
+        f"{prefix}{_config_file(Path(one.removeprefix(prefix)))}" if one.startswith(prefix) else one
+        for one in arguments
+    ]
+    return configuration.parse(RlConfig, found)
+
+
+def encode(config: RlConfig) -> dict[str, Any]:
+    """Return a configuration as plain values."""
+    return configuration.encode(config)
+
+
+def _config_file(path: Path) -> Path:
+    return path / CONFIG_NAME if path.is_dir() else path
