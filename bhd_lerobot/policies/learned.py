@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import file_digest
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -102,9 +103,14 @@ class LearnedBrain:
     def robot_of(config: LearnedBrainConfig) -> str:
         """Return the robot that a configuration's policy was trained on, without loading the policy.
 
+        Where there is no such folder, it says `ANY_ROBOT`: a configuration may be read before its policy is trained,
+        and reading it asks nobody on the network. Making the brain then fails, or fetches the policy.
+
         Raises:
-            ConfigError: there is no such checkpoint.
+            ConfigError: there is a folder, and no checkpoint that can be used.
         """
+        if not Path(config.path).expanduser().is_dir():
+            return ANY_ROBOT
         return PolicyContract.load(config.path).robot_type or ANY_ROBOT
 
     def bind(

@@ -73,7 +73,7 @@ def robot_of_brain(config: BrainConfig) -> str:
     """Return the type of the robot that a brain is for, nothing ("") if it is for every robot.
 
     Raises:
-        ConfigError: the brain is a trained policy, and there is none where the configuration says.
+        ConfigError: the brain is a trained policy, and what lies where the configuration says is none.
     """
     brain: Any = _BRAINS[type(config)]
     robot_type = str(brain.robot_of(config) if hasattr(brain, "robot_of") else brain.robot_type)

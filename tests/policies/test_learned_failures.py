@@ -211,8 +211,16 @@ def test_the_registry_asks_the_checkpoint_which_robot_it_drives(folder: Path, tm
     assert parse(RecordConfig, options(tmp_path, str(folder))).brain == config
     with pytest.raises(ConfigError, match=r"drives a turtlebot3; robot\.type is 'ur5'"):
         parse(RecordConfig, options(tmp_path, str(folder), "ur5", "reach"))
-    with pytest.raises(ConfigError, match="the folder does not exist"):
-        parse(RecordConfig, options(tmp_path, str(tmp_path / "none")))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="There is no policy in"):
+        parse(RecordConfig, options(tmp_path, str(tmp_path / "empty")))
     replace(PolicyContract.load(folder), robot_type=None).save(folder)
     assert robot_of_brain(config) == ""
     assert action_names_of(config) == ()
+
+
+def test_a_configuration_is_read_before_its_policy_is_trained(tmp_path: Path) -> None:
+    later = parse(RecordConfig, options(tmp_path, str(tmp_path / "later")))
+    assert robot_of_brain(later.brain) == ""
+    with pytest.raises(ConfigError, match="the folder does not exist"):
+        make_brain(later.brain)
