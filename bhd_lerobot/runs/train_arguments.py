@@ -159,14 +159,14 @@ def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
         return None
     if fine_tune and path and fine_tune != path:
         raise ConfigError(f"fine_tune is {fine_tune!r} and policy.path is {path!r}; give one of them.")
-    folder = str(find_checkpoint(source))
+    folder = str(find_checkpoint(source).resolve())  # `last` may move on
     own = _policy_values(folder)
     wanted = policy.get("type", own["type"])
     if wanted != own["type"]:
         raise ConfigError(f"policy.type is {wanted!r}, but the checkpoint {source} is of type {own['type']!r}.")
     policy.setdefault("push_to_hub", bool(policy.get("repo_id")))
     values["policy"] = {**own, "repo_id": None, **policy, "pretrained_path": folder}
-    return folder
+    return folder if fine_tune else None
 
 
 def _policy_values(source: str) -> dict[str, Any]:
