@@ -21,7 +21,8 @@ from bhd_lerobot.envs.config_env import BhdEnvConfig
 
 GOAL = 0.70  # of the bare physics and scans
 FPS = 10
-OURS, BARE, SYNC, ASYNC = "BhdVectorEnv", "Batch.step and lidar alone", "SyncVectorEnv", "AsyncVectorEnv"
+OURS, BARE = "BhdVectorEnv", "Batch.step and lidar alone"
+PEERS = {"SyncVectorEnv": "sync", "AsyncVectorEnv": "async"}
 
 
 def actions(n: int, frames: int = 64) -> np.ndarray:
@@ -66,9 +67,9 @@ def main() -> int:
     parser.add_argument("--n", type=int, default=64, help="environments")
     parser.add_argument("--repeats", type=int, default=7, help="turns")
     parser.add_argument("--seconds", type=float, default=3.0, help="length of each part of a turn")
-    parser.add_argument("--only_bare", action="store_true", help="leave Gymnasium's vector environments out")
+    parser.add_argument("--peers", nargs="*", choices=("sync", "async"), default=["sync", "async"], help="Gymnasium's")
     options = parser.parse_args()
-    kinds = {OURS: "bhd"} if options.only_bare else {OURS: "bhd", SYNC: "sync", ASYNC: "async"}
+    kinds = {OURS: "bhd"} | {name: kind for name, kind in PEERS.items() if kind in options.peers}
     envs = {
         name: BhdEnvConfig(task="TurtleBot3Avoid-v0", vector=kind).create_envs(options.n)["bhd"][0]
         for name, kind in kinds.items()

@@ -118,7 +118,7 @@ class BhdEnvConfig(EnvConfig):
                 vector = SyncVectorEnv(makers, autoreset_mode=mode)
             else:
                 # What is imported before the processes part need not be imported in each.
-                multiprocessing.set_forkserver_preload(["__main__", BhdEnv.__module__])
+                multiprocessing.set_forkserver_preload(["__main__", __name__])
                 vector = AsyncVectorEnv(makers, context="forkserver", autoreset_mode=mode)
         return {self.type: {0: vector}}
 
