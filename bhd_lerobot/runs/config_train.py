@@ -127,14 +127,16 @@ class BhdTrainConfig(TrainPipelineConfig):
         except (ValueError, FileExistsError, NotImplementedError) as error:
             raise ConfigError(f"The configuration cannot be used: {error}") from error
         if self.use_policy_training_preset and not self.resume:
-            for name, wanted, used in zip(
-                ("optimizer", "scheduler"), given, (self.optimizer, self.scheduler), strict=True
-            ):
-                if wanted is not None and wanted != used:
-                    raise ConfigError(
-                        f"{name} is given, but use_policy_training_preset is true, which takes the policy's own. Set "
-                        f"it to false and both optimizer and scheduler, or change policy.{name}_… instead."
-                    )
+            self._refuse_unused(*given)
+
+    def _refuse_unused(self, optimizer: Any, scheduler: Any) -> None:
+        """Refuse an optimizer or scheduler that LeRobot would silently replace by the policy's own."""
+        for name, wanted, used in (("optimizer", optimizer, self.optimizer), ("scheduler", scheduler, self.scheduler)):
+            if wanted is not None and wanted != used:
+                raise ConfigError(
+                    f"{name} is given, but use_policy_training_preset is true, which takes the policy's own. Set "
+                    f"it to false and both optimizer and scheduler, or change policy.{name}_… instead."
+                )
 
     def _save_pretrained(self, save_directory: Path) -> None:
         """Write LeRobot's fields into the file that LeRobot reads, and ours beside it."""

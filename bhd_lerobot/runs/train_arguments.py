@@ -127,7 +127,9 @@ def _drop_defaults(config_class: type, values: dict[str, Any]) -> None:
     """Leave out what the chosen classes say themselves: LeRobot's defaults do not all have the type of their field."""
     for key, kind, _ in configuration._fields(config_class):
         value = values.get(key)
-        chosen = configuration._choices(kind).get(value.get("type")) if isinstance(value, dict) else None
+        if not isinstance(value, dict):
+            continue
+        chosen = configuration._choices(kind).get(str(value.get("type")))
         if chosen is not None:
             defaults = {name: default for name, _, default in configuration._fields(chosen)}
             values[key] = {
