@@ -71,8 +71,15 @@ def run(main: Callable[[Any], int | None], config_class: type, arguments: Sequen
         return 2
 
 
-def describe(config_class: type, prefix: str = "") -> str:
-    """Return the options of a configuration class, a line each, with their types and defaults."""
+def describe(config_class: type, prefix: str = "", within: tuple[type, ...] = ()) -> str:
+    """Return the options of a configuration class, a line each, with their types and defaults.
+
+    Args:
+        config_class: a dataclass.
+        prefix: what stands before the options' names.
+        within: the classes that this one is an option of: a choice that holds one of its own kind is not told again.
+    """
+    within = (*within, config_class)
     lines = (
         [] if prefix else [(config_class.__doc__ or "").strip(), "", "Options (also in a file: --config_path=FILE):"]
     )
@@ -82,10 +89,13 @@ def describe(config_class: type, prefix: str = "") -> str:
             lines.append(f"  --{key}.NAME.type  {{{','.join(sorted(_choices(_entries(kind))))}}}, for every NAME")
         elif _choices(kind):
             lines.append(f"  --{key}.type  {{{','.join(sorted(_choices(kind)))}}}")
+            if set(within) & set(_choices(kind).values()):
+                continue
             for choice, subclass in sorted(_choices(kind).items()):
-                lines += [f"    {choice}:", *("  " + line for line in describe(subclass, f"{key}.").splitlines())]
+                told = describe(subclass, f"{key}.", within).splitlines()
+                lines += [f"    {choice}:", *("  " + line for line in told)]
         elif dataclasses.is_dataclass(kind):
-            lines.append(describe(typing.cast(type, kind), f"{key}."))
+            lines.append(describe(typing.cast(type, kind), f"{key}.", within))
         else:
             shown = "required" if default is dataclasses.MISSING else f"default {default!r}"
             lines.append(f"  --{key}  {getattr(kind, '__name__', str(kind))}, {shown}")

@@ -8,6 +8,7 @@ import base64
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -36,7 +37,7 @@ OUTCOMES: dict[str, tuple[str, str]] = {
 }
 SHOWN = 6  # episodes whose trajectories are shown
 _POINTS = 400  # points of a distribution that are drawn: more would be a blot
-_STYLE = {
+_STYLE: Any = {
     "svg.fonttype": "none",  # text stays text: sharp, small, and found by a search
     "svg.hashsalt": "bhd-eval",
     "font.size": 10,

@@ -17,9 +17,9 @@ import yaml
 from bhd_lerobot.runs import eval_plots as plots
 from bhd_lerobot.runs.config_eval import EvalConfig
 from bhd_lerobot.runs.configuration import encode
+from bhd_lerobot.runs.eval_html import cell, chart, share, significant, table
 from bhd_lerobot.runs.eval_metrics import EpisodeMetrics
-from bhd_lerobot.runs.eval_results import BrainSummary, EvalResults
-from bhd_lerobot.runs.eval_statistics import Estimate
+from bhd_lerobot.runs.eval_results import EvalResults
 from bhd_lerobot.runs.eval_text import number, percent, sentences
 from bhd_lerobot.runs.plots import Trajectory
 from bhd_lerobot.runs.timing_tables import ms
@@ -136,13 +136,13 @@ def _summary(given: ReportInput) -> str:
     for label, one in results.brains.items():
         means = one.means
         cells = [
-            _cell(percent(one.success), f"{one.successes} of {one.episodes}"),
-            _cell(number(means["score"], 3)),
-            _cell(number(means["length_s"], 1)),
-            _cell(number(means["path_m"], 2)),
-            _cell(_significant(means["jerk_mean"])),
-            _cell(_significant(means["jerk_max"])),
-            _cell(number(means["reward"], 3)),
+            cell(percent(one.success), f"{one.successes} of {one.episodes}"),
+            cell(number(means["score"], 3)),
+            cell(number(means["length_s"], 1)),
+            cell(number(means["path_m"], 2)),
+            cell(significant(means["jerk_mean"])),
+            cell(significant(means["jerk_max"])),
+            cell(number(means["reward"], 3)),
         ]
         rows.append((label, cells))
     unit, what = results.config["jerk_unit"], results.config["jerk"]
@@ -152,8 +152,8 @@ def _summary(given: ReportInput) -> str:
         f"resamples, fixed seed). Jerk is that of the commanded motion ({what}), from frame to frame; “largest” is the "
         "mean over episodes of each one's largest."
     )
-    chart = _chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and scores with intervals")
-    return chart + _table(head, rows, results.config["baseline"]) + f'<p class="note">{note}</p>'
+    drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and scores with intervals")
+    return drawn + table(head, rows, results.config["baseline"]) + f'<p class="note">{note}</p>'
 
 
 def _paired(given: ReportInput) -> str:
@@ -164,11 +164,11 @@ def _paired(given: ReportInput) -> str:
     rows = []
     for label, one in results.paired.items():
         cells = [
-            _cell(percent(one.success, sign=True)),
+            cell(percent(one.success, sign=True)),
             f"{one.differ.better} better, {one.differ.worse} worse",
             f"{one.differ.p:.2g}",
-            _cell(number(one.score, 3, sign=True)),
-            _cell(number(one.ratio, 3)),
+            cell(number(one.score, 3, sign=True)),
+            cell(number(one.ratio, 3)),
             str(one.episodes),
         ]
         rows.append((label, cells))
@@ -179,18 +179,18 @@ def _paired(given: ReportInput) -> str:
         "interval that leaves out the dashed line says that the difference is more than chance; with several brains, "
         "expect a false one in twenty."
     )
-    chart = _chart(plots.paired_forest(results.paired), f"Differences from {baseline} with intervals")
-    return chart + _table(head, rows) + f'<p class="note">{note}</p>'
+    drawn = chart(plots.paired_forest(results.paired), f"Differences from {baseline} with intervals")
+    return drawn + table(head, rows) + f'<p class="note">{note}</p>'
 
 
 def _outcomes(given: ReportInput) -> str:
-    return _chart(plots.outcome_bars(given.results.brains), "How the episodes of each brain ended")
+    return chart(plots.outcome_bars(given.results.brains), "How the episodes of each brain ended")
 
 
 def _distributions(given: ReportInput) -> str:
     note = "Each mark is an episode: a dot a success, a cross a failure. Box: the middle half, and the median."
-    chart = plots.distributions(_by_brain(given), given.results.config["jerk_unit"])
-    return _chart(chart, "Distributions of score, length, path and jerk") + f'<p class="note">{note}</p>'
+    drawn = plots.distributions(_by_brain(given), given.results.config["jerk_unit"])
+    return chart(drawn, "Distributions of score, length, path and jerk") + f'<p class="note">{note}</p>'
 
 
 def _safety(given: ReportInput) -> str:
@@ -203,15 +203,15 @@ def _safety(given: ReportInput) -> str:
     limits, watchdogs = occurring("limits"), occurring("watchdogs")
     rows = []
     for label, one in brains.items():
-        cells = [_share(one.limits.get(name, 0), one) for name in limits]
-        cells += [_share(one.watchdogs.get(name, 0), one) for name in watchdogs]
+        cells = [share(one.limits.get(name, 0), one) for name in limits]
+        cells += [share(one.watchdogs.get(name, 0), one) for name in watchdogs]
         rows.append((label, [*cells, str(one.estops), str(one.faults), str(one.frames)]))
     head = [f"{name} limited" for name in limits] + [f"watchdog: {name.replace('_', ' ')}" for name in watchdogs]
     note = (
         "Share of the frames in which the safety filter changed the command, by kind of limit, and in which a watchdog "
         "noticed something; kinds that never occurred are left out. Emergency stops and faults count episodes."
     )
-    return _table([*head, "emergency stops", "faults", "frames"], rows) + f'<p class="note">{note}</p>'
+    return table([*head, "emergency stops", "faults", "frames"], rows) + f'<p class="note">{note}</p>'
 
 
 def _trajectories(given: ReportInput) -> str:
@@ -223,7 +223,7 @@ def _trajectories(given: ReportInput) -> str:
         "them are episodes that ended unlike most of a brain's, if there are any; the others are the first. "
         "Solid blue: success; dashed orange with a cross: failure."
     )
-    return f'<p class="note">{note}</p>' + _chart(plots.trajectory_grid(ran), "Trajectories from above")
+    return f'<p class="note">{note}</p>' + chart(plots.trajectory_grid(ran), "Trajectories from above")
 
 
 def _films(given: ReportInput) -> str:
@@ -298,7 +298,7 @@ def _latency(given: ReportInput) -> str:
         "Wall-clock time of one call of the brain, which decides for all simulations that run side by side. For the "
         "time that one robot waits, evaluate with --n_envs=1."
     )
-    return _table(head, rows) + f'<p class="note">{note}</p>' if rows else ""
+    return table(head, rows) + f'<p class="note">{note}</p>' if rows else ""
 
 
 def _cite(given: ReportInput) -> str:
@@ -325,37 +325,6 @@ def _cite(given: ReportInput) -> str:
 
 def _by_brain(given: ReportInput) -> dict[str, list[EpisodeMetrics]]:
     return {label: [one for one in given.results.episodes if one.brain == label] for label in given.results.brains}
-
-
-def _share(count: int, one: BrainSummary) -> str:
-    return f"{count / one.frames:.2%}" if one.frames and count else "0"
-
-
-def _significant(estimate: Estimate) -> str:
-    """Return a number with its interval, with digits that fit its size."""
-    size = abs(estimate.value)
-    return number(estimate, 0 if size >= 100 else 1 if size >= 10 else 2)
-
-
-def _cell(text: str, below: str = "") -> str:
-    value, bracket, interval = text.partition(" (")
-    lines = [value, f'<span class="ci">({interval}</span>' if bracket else "", f'<span class="ci">{below}</span>']
-    return "<br>".join(line for line in lines if line and line != '<span class="ci"></span>')
-
-
-def _table(head: list[str], rows: list[tuple[str, list[str]]], baseline: str | None = None) -> str:
-    top = "".join(f"<th>{escape(one)}</th>" for one in ["brain", *head])
-    body = "".join(
-        f"<tr{' class=baseline' if label == baseline and len(rows) > 1 else ''}><td class='name'>{escape(label)}</td>"
-        + "".join(f"<td>{cell}</td>" for cell in cells)
-        + "</tr>"
-        for label, cells in rows
-    )
-    return f'<div class="scroll"><table><tr>{top}</tr>{body}</table></div>'
-
-
-def _chart(source: str, text: str) -> str:
-    return f'<img class="chart" src="{source}" alt="{escape(text)}">'
 
 
 def _listed(names: list[str]) -> str:

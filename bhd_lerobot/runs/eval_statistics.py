@@ -167,9 +167,9 @@ def _correlation(both: int, only_one: int, only_two: int, neither: int) -> float
     margins = (both + only_one) * (only_two + neither) * (both + only_two) * (only_one + neither)
     if margins == 0:
         return 0.0
-    product, count = both * neither - only_one * only_two, both + only_one + only_two + neither
+    product, count = float(both * neither - only_one * only_two), both + only_one + only_two + neither
     if product > 0:
-        product = max(product - count / 2, 0)
+        product = max(product - count / 2, 0.0)
     return product / math.sqrt(margins)
 
 

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.arenas import make_arena
-from bhd_lerobot.runs import eval_plots
-from bhd_lerobot.runs import evaluate as evaluate_module
+from bhd_lerobot.runs import eval_plots, eval_run
 from bhd_lerobot.runs.eval_metrics import EpisodeMetrics
 from bhd_lerobot.runs.eval_plots import OUTCOMES, telling_episodes
 from bhd_lerobot.runs.eval_results import summarise, write_json
@@ -110,7 +109,7 @@ def test_films_are_h264_in_the_page_or_the_page_says_why_there_are_none(page):
     by_brain = {label: [one for one in films if one.name.startswith(label)] for label in result.results.brains}
     for label, one in result.results.brains.items():
         failed = one.episodes - one.successes
-        assert len(by_brain[label]) == (min(failed, evaluate_module.FILMS) or 1)
+        assert len(by_brain[label]) == (min(failed, eval_run.FILMS) or 1)
     with av.open(str(films[0])) as container:
         assert container.streams.video[0].codec_context.name == "h264"
     assert text.count("<video") == len(films) == text.count('poster="data:image/jpeg')
@@ -132,7 +131,7 @@ def test_a_brain_without_a_rival_has_no_paired_section(tmp_path):
 
 
 def test_labels_and_problems_are_text_not_markup(tmp_path, monkeypatch):
-    monkeypatch.setattr("bhd_lerobot.runs.evaluate.measure", _with_problem(evaluate_module.measure))
+    monkeypatch.setattr("bhd_lerobot.runs.eval_run.measure", _with_problem(eval_run.measure))
     result, _ = run_eval(tmp_path, only="[old]", n_episodes=2, task__min_path_m=100)
     text = result.report.read_text()
     assert "<b>no</b> cup &" not in text
