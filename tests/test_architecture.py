@@ -28,7 +28,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "sim": ("bodies.body", "bodies.tabletop"),
     "control": ("bodies.body",),
     "tasks": ("bodies", "control.commands", "control.kinematics", "control.poses"),
-    "policies": ("bodies", "control.messages", "control.commands", "control.poses"),
+    "policies": ("bodies", "control.messages", "control.commands", "control.kinematics", "control.poses"),
     "data": ("tasks", "bodies", "control.messages"),
     "robots": ("tasks", "bodies", "sim", "control"),
     "envs": ("tasks", "bodies", "sim", "control", "robots"),

@@ -211,21 +211,20 @@ class CorrectedBrain:
     ) -> None:
         """Settle who drives in this frame."""
         n = len(running)
-        found = [(watch, watch.look(observation, wanted, advised)) for watch in self._watches]
         self._driven += self._driving
+        danger = np.zeros(n, np.bool_)
+        if self._collision is not None:
+            danger = self._collision.look(observation, wanted, advised)
         if self._hold is not None:
-            over = self._driving & running & (self._driven >= self._hold)
-            for watch, mask in found:
-                if watch is self._collision:
-                    over &= ~mask  # it would be taken over from again
+            # One who is about to collide would be taken over from again at once.
+            over = self._driving & running & (self._driven >= self._hold) & ~danger
             if over.any():
                 self._driving &= ~over
                 for watch in self._watches:
                     watch.restart(np.flatnonzero(over), n)
-        else:
-            over = np.zeros(n, np.bool_)
-        for watch, mask in found:
-            for sim in np.flatnonzero(mask & running & ~self._driving & ~over).tolist():
+        for watch in self._watches:
+            mask = danger if watch is self._collision else watch.look(observation, wanted, advised)
+            for sim in np.flatnonzero(mask & running & ~self._driving).tolist():
                 self._driving[sim], self._driven[sim], self._causes[sim] = True, 0, watch.cause
                 if self._goals is not None:
                     self._goals.take_over(sim)

@@ -21,15 +21,17 @@ _RAISE = 0.15  # [m] what is held is raised by this
 _UP_SPEED, _UP_CHANGE = 0.25, 1.0  # [m/s], [m/s^2]
 _HOME_SPEED, _HOME_CHANGE = 1.5, 4.0  # [rad/s], [rad/s^2]
 _HELD_LIFT, _HELD_APART = 0.006, 0.05  # [m] an object this far up and this near the tool's tip is in the gripper
-_ODD = np.array([2.0, 1.2, 1.2, 1.5, 1.2, 3.2])  # [rad] joints farther than this from home
+_ODD = np.array([1.5, 0.9, 0.9, 1.2, 0.9, 3.2])  # [rad] joints farther than this from home
+_UPRIGHT = np.array([-np.pi / 2, 0.0])  # [rad] shoulder lift and elbow of an arm that is stretched upwards
 _IDLE_S = 2.5  # [s] after which an expert that has nothing to do any more begins again
 _HOMES = 3  # how often it is brought home, in one intervention, because it finds no way
 
-OPEN, UP, RAISE, HOME = "open", "up", "raise", "home"
+OPEN, UP, RAISE, UPRIGHT, HOME = "open", "up", "raise", "upright", "home"
 _SAID = {
     OPEN: "open the gripper",
     UP: "raise the arm",
     RAISE: "raise what is held",
+    UPRIGHT: "stretch upwards",
     HOME: "go home",
 }
 
@@ -83,7 +85,8 @@ class GoalExpert:
     def __init__(self, brain: GoalBrain) -> None:
         self.brain = brain
         arm = ur5()
-        self._kinematics, self._home = ArmKinematics(arm.chain, arm.limits), arm.home
+        self._kinematics, self._home = ArmKinematics(arm.chain, arm.limits), np.array(arm.home[:-1])
+        self._lower, self._upper = np.array(arm.limits.lower[:-1]), np.array(arm.limits.upper[:-1])
         self._names = arm.limits.names
         self._joints: NDArray[np.intp] = np.zeros(0, np.intp)
         self._objects: NDArray[np.intp] | None = None
@@ -140,7 +143,7 @@ class GoalExpert:
                 turn.is_new, turn.own = False, self._before(sim, seen)
                 self._restart(sim)
             elif turn.is_first and any(not one.success for one in ended) and turn.homes < _HOMES:
-                turn.own, turn.homes = [HOME], turn.homes + 1
+                turn.own, turn.homes = [UPRIGHT, HOME], turn.homes + 1
                 self._restart(sim)
                 ended = []
             if turn.pending is not None:
@@ -149,8 +152,8 @@ class GoalExpert:
                     continue
                 turn.pending = None
                 turn.is_holding = own.success and own.task_id.endswith(RAISE)
-                if not own.success and not own.task_id.endswith(HOME):
-                    turn.own = [HOME]
+                if not own.success and not own.task_id.endswith((UPRIGHT, HOME)):
+                    turn.own = [UPRIGHT, HOME]
             if turn.own:
                 commands[sim] = [self._own_goal(sim, turn.own.pop(0), seen)]
                 asked[sim] = False
@@ -214,8 +217,8 @@ class GoalExpert:
         _, height = self._kinematics.collision.distances(q)
         before = [OPEN, UP] if height < _LOW else []
         # Folded in another way than usual, it would sweep over the table, or find no straight way down.
-        is_odd = bool((np.abs(q - np.array(self._home[:-1])) > _ODD).any())
-        return [*before, HOME] if is_odd or self._turns[sim].homes else before
+        is_odd = bool((np.abs(q - self._home_near(q)) > _ODD).any())
+        return [*before, UPRIGHT, HOME] if is_odd or self._turns[sim].homes else before
 
     def _held(self, sim: int, q: NDArray[np.float64], seen: Observation) -> SeenObject | None:
         """Return the object that is in the gripper and off the table, if any."""
@@ -230,18 +233,28 @@ class GoalExpert:
                 return one
         return None
 
+    def _home_near(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the home posture whose joints need not make a full turn more than necessary [rad], shape (6,)."""
+        turns = np.round((q - self._home) / (2 * np.pi)) * 2 * np.pi
+        near = self._home + turns
+        return np.where((near >= self._lower) & (near <= self._upper), near, self._home)
+
     def _own_goal(self, sim: int, step: str, seen: Observation) -> BrainCommand:
         turn = self._turns[sim]
         turn.count += 1
         turn.pending, turn.doing = f"{turn.number}-{turn.homes}-{turn.count}-{step}", _SAID[step]
         if step == OPEN:
             return BrainCommand(turn.pending, gripper=MAX_OPENING)
-        if step == HOME:
-            home = tuple(self._home[:-1])
-            return BrainCommand(
-                turn.pending, joint_target=home, max_velocity=_HOME_SPEED, max_acceleration=_HOME_CHANGE
-            )
         q = seen.state[sim, self._joints]
+        if step in (UPRIGHT, HOME):
+            target = self._home_near(q)
+            if step == UPRIGHT:  # from nearly everywhere it leads up
+                target[[0, 3, 4, 5]] = q[[0, 3, 4, 5]]
+                target[1:3] += _UPRIGHT - self._home[1:3]
+            joints = tuple(np.clip(target, self._lower, self._upper).tolist())
+            return BrainCommand(
+                turn.pending, joint_target=joints, max_velocity=_HOME_SPEED, max_acceleration=_HOME_CHANGE
+            )
         _, height = self._kinematics.collision.distances(q)
         x, y, z, *quaternion = pose_vectors(self._kinematics.tool(q)).tolist()
         by = _RAISE if step == RAISE else _CLEAR - float(height)

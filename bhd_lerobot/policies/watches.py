@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.collision import CollisionModel
+from bhd_lerobot.control.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, find_columns, find_scan
 from bhd_lerobot.policies.clearance import HULL, LIDAR_X, WHEELS
@@ -213,7 +213,7 @@ class ArmCollisionWatch:
         speeds = [name.replace(".pos", ".vel") for name in joints]
         self._velocity = find_columns(observed, speeds, "corrected", "observation")
         self._actions = find_columns(actions, joints, "corrected", "action") if set(joints) <= set(actions) else None
-        self._model, self._fps = CollisionModel(_ARM.chain), fps
+        self._model, self._fps = ArmKinematics(_ARM.chain, _ARM.limits).collision, fps
         limits = _ARM.limits
         self._speed, self._change = np.array(limits.velocity[:_DOF]), np.array(limits.acceleration[:_DOF])
         self._delay = self._change / np.array(limits.jerk[:_DOF])

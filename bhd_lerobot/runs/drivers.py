@@ -50,6 +50,7 @@ class DriverLog:
         self._now, self._before = np.zeros((2, 2, n), np.bool_)  # taken over, by goals
         self._fresh = np.ones(n, np.bool_)
         self._causes: list[dict[int, str]] = [{} for _ in range(n)]
+        self._why, self._why_before = [""] * n, [""] * n
 
     def start(self, ids: NDArray[np.intp]) -> None:
         """Start episodes in some simulations."""
@@ -57,25 +58,22 @@ class DriverLog:
         for sim in ids.tolist():
             self._causes[sim] = {}
 
-    def decided(self, decision: Any, length: NDArray[np.int64]) -> None:
-        """Take note of what the brain wants.
-
-        Args:
-            decision: what `act` returned.
-            length: frames of each simulation's episode so far, shape (n,).
-        """
+    def decided(self, decision: Any) -> None:
+        """Take note of what the brain wants: what `act` returned."""
+        n = len(self._fresh)
         self.is_mixed = isinstance(decision, Mixed)
         self.gives_goals = self.is_mixed or isinstance(decision, Goals)
         self._before = self._now
-        taken = np.array(self._brain.interventions(), np.bool_) if self.intervenes else np.zeros(len(length), np.bool_)
-        by_goals = decision.by_goals if self.is_mixed else np.full(len(length), self.gives_goals)
+        taken = np.array(self._brain.interventions(), np.bool_) if self.intervenes else np.zeros(n, np.bool_)
+        by_goals = decision.by_goals if self.is_mixed else np.full(n, self.gives_goals)
         self._now = np.stack([taken, by_goals])
         self._before[:, self._fresh] = self._now[:, self._fresh]
-        self._fresh[:] = False
+        self._why_before = self._why
         if np.count_nonzero(taken):
-            causes = self._brain.causes()
-            for sim in np.flatnonzero(taken).tolist():
-                self._causes[sim][int(length[sim])] = causes[sim]
+            self._why = list(self._brain.causes())
+            pairs = zip(self._fresh, self._why, self._why_before, strict=True)
+            self._why_before = [now if is_fresh else before for is_fresh, now, before in pairs]
+        self._fresh[:] = False
 
     def frame(self, running: NDArray[np.intp], length: NDArray[np.int64], *, is_missed: bool) -> tuple[Mask, Mask]:
         """Note who drove in a frame that just ended.
@@ -92,17 +90,19 @@ class DriverLog:
         taken, by_goals = self._before if is_missed else self._now
         rows = length[running]
         self._taken[running, rows], self._by_goals[running, rows] = taken[running], by_goals[running]
+        if np.count_nonzero(taken[running]):
+            causes = self._why_before if is_missed else self._why
+            for sim, row in zip(running.tolist(), rows.tolist(), strict=True):
+                if taken[sim]:
+                    self._causes[sim][row] = causes[sim]
         return taken, by_goals
 
     def interventions(self, sim: int, length: int) -> list[Intervention] | None:
         """Return the interventions of an episode that has ended; None if there is nobody to intervene."""
         if not self.intervenes:
             return None
-        found = []
-        for first, end in spans(self._taken[sim, :length]):
-            noted = [cause for frame, cause in sorted(self._causes[sim].items()) if first - 1 <= frame < end]
-            found.append(Intervention(first, end, noted[-1] if noted else ""))
-        return found
+        causes = self._causes[sim]
+        return [Intervention(first, end, causes[first]) for first, end in spans(self._taken[sim, :length])]
 
     def goal_frames(self, sim: int, length: int) -> list[tuple[int, int]] | None:
         """Return when an episode followed goals, as first frames and those after the last.

@@ -269,7 +269,7 @@ class EpisodeLoop:
 
     def _log(self, decision: Any, report: FrameReport) -> None:
         """Remember goals and how they ended, for the episode's metadata and for the brain."""
-        self._drivers.decided(decision, self._length)
+        self._drivers.decided(decision)
         if isinstance(decision, Goals | Mixed):
             for sim, commands in decision.commands.items():
                 self._commands[sim] += [(int(self._length[sim]), command) for command in commands]
