@@ -23,7 +23,7 @@ def tell_summary(console: Console, config: EvalConfig, result: "EvalResult") -> 
         title_justify="left",
         box=SIMPLE_HEAD,
     )
-    for heading in ("brain", "success, 95 %", "mean score, 95 %", f"success beside\n{baseline}", "failures"):
+    for heading in ("brain", "success, 95 %", "score, 95 %", f"success beside\n{baseline}", "failures"):
         table.add_column(escape(heading), no_wrap=True)
     for label, one in results.brains.items():
         failures = [f"{name} {count}" for name, count in one.outcomes.items() if name != "success"]
