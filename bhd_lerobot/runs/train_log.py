@@ -17,7 +17,7 @@ PLOT_NAME = "loss.png"
 
 Row = dict[str, Any]
 
-TIMING = ("data_s", "update_s", "steps_per_s", "samples_per_s")
+TIMING = ("data_s", "update_s", "steps_per_s", "samples_per_s", "eval_s")
 """Keys of a row that differ between two runs of the same seed."""
 
 
