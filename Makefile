@@ -1,11 +1,12 @@
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format bench bench-realtime lock clean venv
+.PHONY: help demo test lint format bench bench-realtime results lock clean venv
 
 PYTHON_IN_VENV := .venv/bin/python
 # Two test processes by default; `make test WORKERS=0` runs everything in one, for a debugger.
 WORKERS ?= 2
 PYTEST_ARGS ?=
 BENCH ?=
+RESULTS ?=
 LOCK_ARGS ?=
 
 help: ## show this list
@@ -31,6 +32,9 @@ bench: venv ## run the benchmarks; BENCH='name' picks some
 
 bench-realtime: venv ## measure how punctual the control loop is; BENCH='--quick' for a short run
 	$(PYTHON_IN_VENV) -m benchmarks.realtime $(BENCH)
+
+results: venv ## record, train and evaluate everything that is claimed about learning (hours), into docs/results.md
+	$(PYTHON_IN_VENV) -m benchmarks.results $(RESULTS)
 
 lock: ## rewrite constraints.txt; LOCK_ARGS=--upgrade takes the newest versions
 	uv=$$(scripts/bootstrap.sh --print-uv) && printf 'hatchling\neditables\n' | "$$uv" pip compile --quiet \

@@ -1,0 +1,56 @@
+"""`make results`: everything that is claimed about learning, made again, into `docs/results.md`.
+
+It takes hours. What was done is not done again: `outputs/results` keeps it, `--fresh` begins anew.
+"""
+
+import argparse
+import shutil
+import sys
+from pathlib import Path
+
+from benchmarks.results.learning import avoid, pick, reach
+from benchmarks.results.page import write_page
+from benchmarks.results.runner import REPOSITORY, FailedError, Runner
+from benchmarks.results.section import Measure, Section
+
+MEASURES = (
+    Measure("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),
+    Measure("reach", "Reach: a UR5 brings its tool to a pose", reach),
+    Measure("pick", "Pick, from state: a UR5 picks up what it is told to", pick),
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make the results; return 0, 1 if a goal was missed, or 2 if a command failed."""
+    names = [one.name for one in MEASURES]
+    parser = argparse.ArgumentParser(prog="make results", description=__doc__)
+    parser.add_argument("--only", nargs="+", choices=names, default=names, help="sections to make")
+    parser.add_argument("--folder", type=Path, default=Path("outputs/results"), help="where everything goes")
+    parser.add_argument("--page", type=Path, default=Path("docs/results.md"))
+    parser.add_argument("--short", action="store_true", help="a short run, to try the commands")
+    parser.add_argument("--fresh", action="store_true", help="begin anew")
+    options = parser.parse_args(arguments)
+    folder = REPOSITORY / options.folder
+    if options.fresh and folder.exists():
+        shutil.rmtree(folder)
+    sections = []
+    for measure in MEASURES:
+        if measure.name not in options.only:
+            continue
+        section, run = Section(measure.name, measure.title), Runner(folder, is_short=options.short)
+        try:
+            measure.measure(run, section)
+        except FailedError as error:
+            print(f"{measure.name}: {error}", file=sys.stderr)
+            return 2
+        section.commands = run.commands
+        sections.append(section)
+        # After each section: what takes hours may be stopped.
+        write_page(REPOSITORY / options.page, sections, is_short=options.short)
+    missed = [f"{section.name}: {row.what}" for section in sections for row in section.rows if row.met is False]
+    print(f"Written: {options.page}." + (f" Missed: {'; '.join(missed)}." if missed else ""))
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,110 @@
+"""Runs the commands that results come from, each once, and remembers what they were and how long they took."""
+
+import json
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+# Command lines, and the modules behind them: the tests of a checkout must not depend on what is in PATH.
+_MODULES = {
+    "bhd-record": "bhd_lerobot.runs.record",
+    "bhd-train": "bhd_lerobot.runs.train",
+    "bhd-eval": "bhd_lerobot.runs.evaluate",
+}
+
+
+class FailedError(Exception):
+    """A command did not do what it was asked for."""
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A command that ended well, or that found a goal missed.
+
+    Attributes:
+        command: as a person would type it, in the repository.
+        seconds: how long it took [s].
+        status: its exit status.
+    """
+
+    command: str
+    seconds: float
+    status: int
+
+
+class Runner:
+    """Runs commands in the repository and keeps a note of each that succeeded.
+
+    A command that a note in the folder tells of is not run again: a run of hours that was stopped goes on where it was.
+
+    Attributes:
+        folder: where everything goes; one folder for each section.
+        commands: what the present section ran, or had run before.
+
+    Args:
+        folder: where everything goes.
+        is_short: a short run, whose numbers are not to be quoted.
+    """
+
+    def __init__(self, folder: Path, *, is_short: bool) -> None:
+        self.folder, self.is_short = folder, is_short
+        self.commands: list[Ran] = []
+
+    def path(self, *parts: str) -> Path:
+        """Return a path in the folder, relative to the repository if it lies there; its parent exists."""
+        path = self.folder.joinpath(*parts)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path.relative_to(REPOSITORY) if path.is_relative_to(REPOSITORY) else path
+
+    def run(self, name: str, arguments: Sequence[str], allowed: Sequence[int] = (0,)) -> Ran:
+        """Run a command, or find that it was run.
+
+        Args:
+            name: what its note and its log are called.
+            arguments: the command line: `bhd-…`, or `python -m …`.
+            allowed: exit statuses that are no failure.
+
+        Raises:
+            FailedError: it failed; the message names its log.
+        """
+        command = shlex.join(arguments)
+        note = REPOSITORY / self.path("notes", f"{name}.json")
+        if note.exists():
+            kept = Ran(**json.loads(note.read_text(encoding="utf-8")))
+            if kept.command == command:
+                print(f"== {command}\n-- was run before, {kept.seconds:.0f} s", flush=True)
+                self.commands.append(kept)
+                return kept
+        log = note.with_suffix(".log")
+        print(f"== {command}\n   log: {log}", flush=True)
+        started = time.perf_counter()
+        with log.open("w", encoding="utf-8") as file:
+            done = subprocess.run(
+                _executable(arguments), cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT, check=False
+            )
+        ran = Ran(command, time.perf_counter() - started, done.returncode)
+        if done.returncode not in allowed:
+            tail = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-15:])
+            raise FailedError(f"{command}\nended with status {done.returncode}. The end of {log}:\n{tail}")
+        print(f"-- {ran.seconds:.0f} s", flush=True)
+        note.write_text(json.dumps(asdict(ran), indent=1), encoding="utf-8")
+        self.commands.append(ran)
+        return ran
+
+    def read(self, *parts: str) -> Any:
+        """Return what a JSON file in the folder holds."""
+        return json.loads((REPOSITORY / self.path(*parts)).read_text(encoding="utf-8"))
+
+
+def _executable(arguments: Sequence[str]) -> list[str]:
+    first, *rest = arguments
+    if first == "python":
+        return [sys.executable, *rest]
+    return [sys.executable, "-m", _MODULES[first], *rest]
