@@ -11,7 +11,7 @@ import re
 import sys
 import textwrap
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,11 @@ from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.turtlebot3_simulation import observation_names
 from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, OBSERVED
 from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
+from bhd_lerobot.runs.config_eval import EvalConfig
 from bhd_lerobot.runs.config_record import RecordConfig
+from bhd_lerobot.runs.config_train import BhdTrainConfig, own_fields
 from bhd_lerobot.runs.replay import ReplayConfig
+from bhd_lerobot.runs.rl.config import RlConfig
 from bhd_lerobot.tasks import pick, reach
 from bhd_lerobot.tasks.task import Event
 
@@ -61,6 +64,14 @@ def reference() -> str:
         *_options(RecordConfig, ""),
         "## `bhd-replay`\n",
         *_options(ReplayConfig, ""),
+        "## `bhd-eval`\n",
+        *_options(EvalConfig, "", choices=False),
+        "## `bhd-train`\n",
+        "LeRobot's own options of training, `policy.*`, `dataset.*`, `steps`, `batch_size` and the others, keep their "
+        "names and their meaning. Beside them:\n",
+        *_options(BhdTrainConfig, "", only=own_fields()),
+        "## `bhd-train` with `algorithm: ppo`\n",
+        *_options(RlConfig, "", choices=False),
         "## Teleoperator `bhd_brain`\n",
         "For the stock commands: `--teleop.type=bhd_brain`. The brain is chosen by `--teleop.brain.type`; its options "
         "are those of `brain.*` above.\n",
@@ -88,11 +99,15 @@ def reference() -> str:
 # --- options ---------------------------------------------------------------------------------------------------------
 
 
-def _options(config_class: type, prefix: str, choices: bool = True) -> Iterator[str]:
+def _options(
+    config_class: type, prefix: str, *, choices: bool = True, only: Sequence[str] | None = None
+) -> Iterator[str]:
     """Yield the table of a class's plain options, and then those of the classes inside it."""
     described, hints = _descriptions(config_class), typing.get_type_hints(config_class)
     rows, inner = [], []
     for field in dataclasses.fields(config_class):
+        if only is not None and field.name not in only:
+            continue
         key, kind, meaning = f"{prefix}{field.name}", hints[field.name], described.get(field.name)
         if meaning is None:
             raise SystemExit(f"{config_class.__qualname__}: the docstring does not describe {field.name!r}.")
@@ -100,7 +115,8 @@ def _options(config_class: type, prefix: str, choices: bool = True) -> Iterator[
             default = _default(field)
             shown = f"`{_choice_name(kind, type(default))}`" if dataclasses.is_dataclass(default) else "*required*"
             rows.append((f"`{key}.type`", _kinds(kind), shown, meaning))
-            if choices:
+            # A choice that holds others of its own kind is told once.
+            if choices and not issubclass(config_class, kind):
                 inner += [(f"`{key}.type={name}`", one, f"{key}.") for name, one in _choices(kind).items()]
         elif dataclasses.is_dataclass(kind):
             inner.append((f"`{key}`", typing.cast(type, kind), f"{key}."))
@@ -164,6 +180,8 @@ def _plain(value: Any) -> str:
 
 def _type_name(kind: Any) -> str:
     arguments = typing.get_args(kind)
+    if arguments and typing.get_origin(kind) is dict:
+        return f"{_type_name(arguments[1])} for each name"
     if arguments and typing.get_origin(kind) is not list:
         return " or ".join("nothing" if one is type(None) else _type_name(one) for one in arguments)
     if arguments:

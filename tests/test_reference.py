@@ -13,10 +13,14 @@ import pytest
 
 from bhd_lerobot.data.inspect import dataset_info
 from bhd_lerobot.runs import data, monitor
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.runs.config_eval import EvalConfig
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import parse
 from bhd_lerobot.runs.record import record
 from bhd_lerobot.runs.replay import ReplayConfig
+from bhd_lerobot.runs.rl.config import is_rl, parse_rl
+from bhd_lerobot.runs.train_arguments import parse_train
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -114,19 +118,27 @@ def quoted_commands(path: Path) -> Iterator[str]:
     """Yield every command line of ours in a document's code blocks and code spans, or in a file's comments."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".yaml":
-        lines = [line.lstrip("# ") for line in text.splitlines() if line.startswith("#")]
+        comments = "\n".join(line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
+        lines = comments.replace("\\\n", " ").splitlines()
     else:
         blocks = "\n".join(re.findall(r"```(?:bash|sh)\n(.*?)```", text, re.DOTALL))
         lines = blocks.replace("\\\n", " ").splitlines()
         lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", without_code(text)) if " " in span]
-    yield from (line for line in lines if re.match(r"bhd-\w+ ", line))
+    # "…" stands for what was said before.
+    yield from (line for line in lines if re.match(r"bhd-\w+ ", line) and "…" not in line)
 
 
 def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Parse a command line as its program would, and run nothing."""
     monkeypatch.chdir(ROOT)
     program, *arguments = shlex.split(line, comments=True)
-    if program == "bhd-record":
+    if arguments == ["--help"]:
+        return
+    if program == "bhd-train":
+        parse_training(arguments)
+    elif program == "bhd-eval":
+        parse(EvalConfig, arguments)
+    elif program == "bhd-record":
         parse(RecordConfig, arguments)
     elif program == "bhd-replay":
         parse(ReplayConfig, arguments)
@@ -138,11 +150,25 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError(f"Unknown program {program}.")
 
 
+def parse_training(arguments: list[str]) -> None:
+    """Parse what `bhd-train` is told; checkpoints of earlier commands need not be there."""
+    if is_rl(arguments):
+        parse_rl(arguments)
+        return
+    try:
+        parse_train(arguments)
+    except ConfigError as error:
+        if "outputs/train" not in str(error):
+            raise
+
+
 COMMANDS = [(path, line) for path in [*DOCUMENTS, *CONFIGURATIONS] for line in quoted_commands(path)]
 
 
 def test_the_documents_quote_commands() -> None:
-    assert {line.split()[0] for _, line in COMMANDS} == {"bhd-record", "bhd-replay", "bhd-data", "bhd-monitor"}
+    assert {line.split()[0] for _, line in COMMANDS} == {
+        *("bhd-record", "bhd-replay", "bhd-data", "bhd-monitor", "bhd-train", "bhd-eval")
+    }
 
 
 @pytest.mark.parametrize(("path", "line"), COMMANDS, ids=[f"{by_name(path)}: {line}" for path, line in COMMANDS])
@@ -151,7 +177,11 @@ def test_every_quoted_command_parses(path: Path, line: str, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    "line", ["bhd-record --seed=1", "bhd-replay --mode=sideways", "bhd-data inform x", "bhd-fly x"]
+    "line",
+    [
+        *("bhd-record --seed=1", "bhd-replay --mode=sideways", "bhd-data inform x", "bhd-fly x"),
+        *("bhd-train --policy.type=none", "bhd-eval --robot.type=ur5"),
+    ],
 )
 def test_a_wrong_command_does_not_parse(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises((Exception, SystemExit)):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+import lerobot.policies  # noqa: F401  registers LeRobot's own
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
