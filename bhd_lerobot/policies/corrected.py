@@ -8,14 +8,14 @@ C. Sidrane, K. Driggs-Campbell and M. Kochenderfer, ICRA 2019), with a rule in t
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, Mixed, Observation
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.config_brain import BrainConfig, DriverConfig
 from bhd_lerobot.policies.goal_brain import GoalBrain
 from bhd_lerobot.policies.goal_expert import GoalExpert
 from bhd_lerobot.policies.watches import DisagreementWatch, PatienceWatch, StallWatch, Watch, collision_watch
@@ -43,8 +43,10 @@ class CorrectedConfig(BrainConfig):
         hold_s: how long the expert drives before the learner has another turn [s]; to the episode's end if nothing.
     """
 
-    learner: BrainConfig
-    expert: BrainConfig
+    is_composed: ClassVar[bool] = True
+
+    learner: DriverConfig
+    expert: DriverConfig
     collision_s: float | None = 0.5
     stall_s: float | None = 3.0
     disagreement: float | None = None
@@ -212,7 +214,7 @@ class CorrectedBrain:
         """Settle who drives in this frame."""
         n = len(running)
         self._driven += self._driving
-        danger = np.zeros(n, np.bool_)
+        danger: NDArray[np.bool_] = np.zeros(n, np.bool_)
         if self._collision is not None:
             danger = self._collision.look(observation, wanted, advised)
         if self._hold is not None:

@@ -24,10 +24,13 @@ _HELD_LIFT, _HELD_APART = 0.006, 0.05  # [m] an object this far up and this near
 _ODD = np.array([1.5, 0.9, 0.9, 1.2, 0.9, 3.2])  # [rad] joints farther than this from home
 _UPRIGHT = np.array([-np.pi / 2, 0.0])  # [rad] shoulder lift and elbow of an arm that is stretched upwards
 _IDLE_S = 2.5  # [s] after which an expert that has nothing to do any more begins again
+_FAST = 0.3  # [rad/s] an arm that is faster comes to rest first: from there it can be said where it is
+_STOPS = 5  # how often that is tried
 _HOMES = 3  # how often it is brought home, in one intervention, because it finds no way
 
-OPEN, UP, RAISE, UPRIGHT, HOME = "open", "up", "raise", "upright", "home"
+STOP, OPEN, UP, RAISE, UPRIGHT, HOME = "stop", "open", "up", "raise", "upright", "home"
 _SAID = {
+    STOP: "come to rest",
     OPEN: "open the gripper",
     UP: "raise the arm",
     RAISE: "raise what is held",
@@ -48,6 +51,7 @@ class _Turn:
         is_first: whether that is the first since it began.
         is_new: whether the turn has just begun, or begins again.
         is_holding: whether it holds what the task is about, and waits for that to be enough.
+        stops: how often it was told to come to rest.
         homes: how often it was brought home.
         idle: frames in which it had nothing to do.
         count: number of the last goal of ours.
@@ -63,6 +67,7 @@ class _Turn:
     is_first: bool = False
     is_new: bool = False
     is_holding: bool = False
+    stops: int = 0
     homes: int = 0
     idle: int = 0
     count: int = 0
@@ -74,9 +79,9 @@ class _Turn:
 class GoalExpert:
     """Lets a brain that gives goals take over, as often as somebody asks.
 
-    Before it begins, the arm gets out of what it is among: it opens the gripper and goes straight up; what it holds, if
-    that is what the task is about, it raises. From an odd posture, and where the expert's first goal has no way, it
-    goes home first. An expert that has given up begins again from there.
+    Before it begins, an arm with objects around it comes to rest and gets out of what it is among: it opens the gripper
+    and goes straight up; what it holds, if that is what the task is about, it raises. From an odd posture, and where
+    the expert's first goal has no way, it goes home first. An expert that has given up begins again from there.
 
     Args:
         brain: the expert.
@@ -89,6 +94,8 @@ class GoalExpert:
         self._lower, self._upper = np.array(arm.limits.lower[:-1]), np.array(arm.limits.upper[:-1])
         self._names = arm.limits.names
         self._joints: NDArray[np.intp] = np.zeros(0, np.intp)
+        self._speeds: NDArray[np.intp] = np.zeros(0, np.intp)
+        self._opening = 0
         self._objects: NDArray[np.intp] | None = None
         self._turns: list[_Turn] = []
         self._most_idle = 1
@@ -102,7 +109,11 @@ class GoalExpert:
     ) -> None:
         """Find the joints, and the objects if there are any."""
         self.brain.bind(observation_names, action_names, fps, environment_names)  # type: ignore[attr-defined]
-        self._joints = find_columns(observation_names, self._names[:-1], self.brain.name, "observation")
+        *joints, gripper = self._names
+        self._joints = find_columns(observation_names, joints, self.brain.name, "observation")
+        speeds = [name.replace(".pos", ".vel") for name in joints]
+        self._speeds = find_columns(observation_names, speeds, self.brain.name, "observation")
+        self._opening = int(find_columns(observation_names, [gripper], self.brain.name, "observation")[0])
         wanted = [f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS]
         self._objects = None
         if set(wanted) <= set(environment_names):
@@ -139,9 +150,14 @@ class GoalExpert:
         for sim in np.flatnonzero(driving).tolist():
             turn = self._turns[sim]
             own, ended = self._results(turn, seen.results.get(sim, ()))
-            if turn.is_new:
-                turn.is_new, turn.own = False, self._before(sim, seen)
-                self._restart(sim)
+            if turn.is_new and (turn.pending is None or own is not None):
+                turn.pending, own, ended = None, None, []
+                is_fast = self._objects is not None and np.abs(seen.state[sim, self._speeds]).max() > _FAST
+                if is_fast and turn.stops < _STOPS:
+                    turn.own, turn.stops = [STOP], turn.stops + 1
+                else:
+                    turn.is_new, turn.own = False, self._before(sim, seen)
+                    self._restart(sim)
             elif turn.is_first and any(not one.success for one in ended) and turn.homes < _HOMES:
                 turn.own, turn.homes = [UPRIGHT, HOME], turn.homes + 1
                 self._restart(sim)
@@ -243,6 +259,9 @@ class GoalExpert:
         turn = self._turns[sim]
         turn.count += 1
         turn.pending, turn.doing = f"{turn.number}-{turn.homes}-{turn.count}-{step}", _SAID[step]
+        if step == STOP:
+            opening = float(np.clip(seen.state[sim, self._opening], 0.0, MAX_OPENING))
+            return BrainCommand(turn.pending, gripper=opening)
         if step == OPEN:
             return BrainCommand(turn.pending, gripper=MAX_OPENING)
         q = seen.state[sim, self._joints]

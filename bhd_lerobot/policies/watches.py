@@ -21,6 +21,7 @@ Mask = NDArray[np.bool_]
 _STALL_RAD, _STALL_M = 0.05, 0.1  # an arm that turns no joint farther, a base that gets no farther, has stalled
 _TABLE_ROOM, _SELF_ROOM = 0.001, 0.015  # [m] beyond the least distance that goals keep to
 _STOP_POSTURES = 6  # along the way on which an arm comes to rest
+_STOP_SHARE = 1.3  # of the way that a stop takes; while it is planned, the arm speeds up for a moment
 _ARC_POINTS = 6  # along the way of a base
 _BASE_ROOM = 0.005  # [m] beside the outline
 _NO_RETURN = 3.49  # [m] a beam that reads more has hit nothing
@@ -231,7 +232,7 @@ class ArmCollisionWatch:
             change = self._change / self._fps
             after = np.clip(asked, velocity - change, velocity + change)
         frame = (velocity + after) / 2 / self._fps
-        way = after * self._delay + after * np.abs(after) / (2 * self._change)
+        way = _STOP_SHARE * (after * self._delay + after * np.abs(after) / (2 * self._change))
         share = (np.arange(1, _STOP_POSTURES + 1) / _STOP_POSTURES)[:, None, None]
         postures = np.concatenate([position[None], position + frame + share * way])
         itself, table = self._model.distances(postures)

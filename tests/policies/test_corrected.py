@@ -366,3 +366,16 @@ def test_results_of_goals_of_an_earlier_turn_are_not_taken_for_those_of_this_one
     stray = CommandResult("0.0.1-above", True, ResultCode.SUCCEEDED, "")
     assert table.look({0: [stray]}) == {}
     assert table.steps() == ["above"]
+
+
+def test_an_arm_that_is_fast_comes_to_rest_first() -> None:
+    table = Table()
+    table.state[0, 7:13] = 1.0
+    table.look()
+    table.look()
+    assert table.steps() == ["stop"]
+    assert table.given[0][0].target_pose is table.given[0][0].joint_target is None
+    assert table.given[0][0].gripper == pytest.approx(HOME[6])  # nothing is let go of
+    table.state[0, 7:] = 0.0
+    table.end()
+    assert table.steps() == ["stop", "above"]
