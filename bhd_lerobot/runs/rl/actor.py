@@ -134,4 +134,5 @@ class MlpActorCritic(ActorCriticPolicy):
                 if isinstance(one, nn.Linear):
                     nn.init.orthogonal_(one.weight, gain=gain)
                     nn.init.zeros_(one.bias)
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+        kwargs: dict[str, Any] = {**self.optimizer_kwargs, "lr": lr_schedule(1)}
+        self.optimizer = self.optimizer_class(self.parameters(), **kwargs)

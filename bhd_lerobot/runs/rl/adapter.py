@@ -23,8 +23,8 @@ class RlVecEnv(VecEnv):
     """n simulations as stable-baselines3's `VecEnv`: feature vectors in, normalised actions out.
 
     An episode that ended begins anew in the same step. Its last observation is in `infos[i]["terminal_observation"]`,
-    and `infos[i]["TimeLimit.truncated"]` says whether only its time was over, so that the learner adds the value of what
-    would have come. `infos[i]["episode"]` holds the task's own return `r`, not the learner's, and the length `l`.
+    and `infos[i]["TimeLimit.truncated"]` says whether only its time was over, so that the learner adds the value of
+    what would have come. `infos[i]["episode"]` holds the task's own return `r`, not the learner's, and the length `l`.
 
     Attributes:
         env: the environment.

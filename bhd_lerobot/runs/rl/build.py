@@ -26,6 +26,9 @@ _LOGGED = {
 }
 
 
+_NEVER = 2**62  # updates between two outputs of stable-baselines3's own log
+
+
 def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv, done: Callable[[int], float]) -> AnchoredPPO:
     """Return PPO on an actor.
 
@@ -80,26 +83,26 @@ def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv, done: Callable
     return learner
 
 
-def learn(
-    learner: AnchoredPPO, steps: int, updated: Callable[[Any, Row], None], is_over: Callable[[int], bool]
-) -> None:
+def learn(learner: AnchoredPPO, steps: int, updated: Callable[[Any, Row], None], is_over: Callable[[], bool]) -> None:
     """Learn until a number of environment steps is done, or until it is over.
 
     Args:
         learner: what learns.
         steps: environment steps in all.
         updated: is told of the learner and what it measured, after each update.
-        is_over: asked after each frame, with the steps done.
+        is_over: asked after each frame.
     """
     watcher = _Watcher(updated, is_over)
-    learner.learn(max(0, steps - learner.num_timesteps), callback=watcher, log_interval=None, reset_num_timesteps=False)
+    learner.learn(
+        max(0, steps - learner.num_timesteps), callback=watcher, log_interval=_NEVER, reset_num_timesteps=False
+    )
     watcher.report()
 
 
 class _Watcher(BaseCallback):
     """Reports after each update, which is before the next samples are gathered."""
 
-    def __init__(self, updated: Callable[[Any, Row], None], is_over: Callable[[int], bool]) -> None:
+    def __init__(self, updated: Callable[[Any, Row], None], is_over: Callable[[], bool]) -> None:
         super().__init__()
         self._updated, self._is_over = updated, is_over
         self._gathered, self._since, self._gathering_s = 0, time.perf_counter(), 0.0
@@ -112,7 +115,7 @@ class _Watcher(BaseCallback):
         self._gathering_s = time.perf_counter() - self._start
 
     def _on_step(self) -> bool:
-        return not self._is_over(self.num_timesteps)
+        return not self._is_over()
 
     def report(self) -> None:
         """Tell of the last update, if there was one since the last report."""
@@ -121,6 +124,10 @@ class _Watcher(BaseCallback):
         if frames and self._gathering_s:
             took = time.perf_counter() - self._since
             row: Row = {name: float(values[key]) for key, name in _LOGGED.items() if key in values}
-            row |= {"frames_per_s": frames / took, "gathering_s": self._gathering_s, "update_s": took - self._gathering_s}
+            row |= {
+                "frames_per_s": frames / took,
+                "gathering_s": self._gathering_s,
+                "update_s": took - self._gathering_s,
+            }
             self._updated(self.model, row)
         self._gathered, self._since, self._gathering_s = self.model.num_timesteps, time.perf_counter(), 0.0

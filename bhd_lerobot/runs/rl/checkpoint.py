@@ -83,7 +83,8 @@ def load(output_dir: Path, learner: Any) -> tuple[int, dict[str, Any]]:
         learner.num_timesteps, learner._n_updates = state["step"], state["updates"]
         torch.set_rng_state(state["torch"])
         kind, words, position, has_gauss, cached = state["numpy"]
-        np.random.set_state((kind, np.array(words, np.uint32), position, has_gauss, cached))
+        numpy_state = kind, np.array(words, np.uint32), position, has_gauss, cached
+        np.random.set_state(numpy_state)  # noqa: NPY002
         version, internal, following = state["python"]
         random.setstate((version, tuple(internal), following))
     except Exception as error:  # JSON, pickle, PyTorch: each has its own
@@ -104,7 +105,7 @@ def point(checkpoint: Path, name: str) -> None:
 
 def _state(learner: Any) -> dict[str, Any]:
     # Stable-baselines3 draws its minibatches from NumPy's global generator.
-    kind, words, position, has_gauss, cached = np.random.get_state()
+    kind, words, position, has_gauss, cached = np.random.get_state()  # noqa: NPY002
     version, internal, following = random.getstate()
     return {
         "policy": learner.policy.state_dict(),

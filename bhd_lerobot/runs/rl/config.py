@@ -265,7 +265,11 @@ class RlConfig:
         for name, number in (("ppo.gamma", ppo.gamma), ("ppo.gae_lambda", ppo.gae_lambda)):
             if not 0 <= number <= 1:
                 raise ConfigError(f"{name} is {number}; it must be between 0 and 1.")
-        for name, number in (("ppo.lr", ppo.lr), ("ppo.clip_range", ppo.clip_range), ("reward.scale", self.reward.scale)):
+        for name, number in (
+            ("ppo.lr", ppo.lr),
+            ("ppo.clip_range", ppo.clip_range),
+            ("reward.scale", self.reward.scale),
+        ):
             if not 0 < number < math.inf:
                 raise ConfigError(f"{name} is {number}; it must be positive and finite.")
         for event, number in self.reward.events.items():

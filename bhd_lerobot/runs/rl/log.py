@@ -44,7 +44,9 @@ def draw_curve(rows: Sequence[Row], path: Path, heading: str, rule: tuple[str, M
                 axis.plot(*training, color="#8a8478", linewidth=1.0, alpha=0.8, label="training, with exploration")
             judged = _points(rows, time, f"val_{key}")
             if judged:
-                axis.plot(*judged, color="#1f6f8b", marker="o", markersize=4, linewidth=1.6, label="validation episodes")
+                axis.plot(
+                    *judged, color="#1f6f8b", marker="o", markersize=4, linewidth=1.6, label="validation episodes"
+                )
             if rule is not None:
                 axis.axhline(rule[1][f"val_{key}"], color="#c0392b", linestyle="--", linewidth=1.2, label=rule[0])
             axis.grid(alpha=0.3)

@@ -75,7 +75,10 @@ def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] 
         versions=versions(),
     )
     if config.start_from is not None:
-        return _from_checkpoint(config, contract)
+        return _from_checkpoint(config.start_from, contract)
+    if config.resume:
+        # With the normalisation that the run began with.
+        return _from_checkpoint(str(config.output_dir), contract)
     policy = config.policy
     mlp = MlpConfig(
         n_obs_steps=policy.n_obs_steps,
@@ -105,11 +108,10 @@ def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] 
     return RlParts(MlpPolicy(mlp), _front(mlp), before, after, contract, fresh=True)
 
 
-def _from_checkpoint(config: RlConfig, contract: PolicyContract) -> RlParts:
-    assert config.start_from is not None
-    folder = find_checkpoint(config.start_from)
+def _from_checkpoint(path: str, contract: PolicyContract) -> RlParts:
+    folder = find_checkpoint(path)
     loaded = load_policy(folder)
-    who = f"The policy {config.start_from!r}"
+    who = f"The policy {path!r}"
     if loaded.kind != "bhd_mlp":
         raise ConfigError(f"{who} is of the type {loaded.kind!r}; PPO starts from a 'bhd_mlp', or from nothing.")
     trained = PolicyContract.load(folder)
@@ -138,11 +140,18 @@ def _from_checkpoint(config: RlConfig, contract: PolicyContract) -> RlParts:
 def single_action(policy: MlpPolicy) -> MlpPolicy:
     """Return a Gaussian policy that predicts the first action of another's chunk, with the same weights."""
     old = policy.config
-    values = {"chunk_size": 1, "n_action_steps": 1, "gaussian": True, "loss": None, "sample": False, "device": "cpu"}
+    values: dict[str, Any] = {
+        "chunk_size": 1,
+        "n_action_steps": 1,
+        "gaussian": True,
+        "loss": None,
+        "sample": False,
+        "device": "cpu",
+    }
     config = dataclasses.replace(old, **values)
     config.scan = copy.deepcopy(old.scan)
     actor = MlpPolicy(config)
-    size = int(config.action_feature.shape[0])  # type: ignore[union-attr]
+    size = int(config.action_feature.shape[0])
     state = dict(policy.state_dict())
     last = f"net.{len(policy.net) - 1}"
     for name in ("weight", "bias"):

@@ -14,8 +14,8 @@ from bhd_lerobot.runs.rl.actor import MlpActorCritic
 class AnchoredPPO(PPO):
     """Stable-baselines3's PPO; its actor can be frozen at first, and be kept near the one that it started as.
 
-    The anchor is a pass of gradient steps over the samples of an update, after PPO's own: it lowers the KL divergence of
-    the policy from the first one, KL(first ‖ policy), times the weight.
+    The anchor is a pass of gradient steps over the samples of an update, after PPO's own: it lowers the divergence
+    KL(first, policy) times the weight.
 
     Args:
         args: see `stable_baselines3.PPO`.

@@ -110,8 +110,12 @@ class _Run:
     def go(self) -> RlResult:
         config, result = self._config, self._result
         self._started = time.perf_counter()
-        episodes = [] if config.validation.rule is None else self._validation.run(config.validation.rule, self._stop.__bool__)
+        episodes = (
+            [] if config.validation.rule is None else self._validation.run(config.validation.rule, self._stop.__bool__)
+        )
         result.rule = level(episodes)
+        if self._stop:
+            return result
         env = BhdVectorEnv(
             config.env.n_envs,
             config.environment,
@@ -171,7 +175,9 @@ class _Run:
             result.best = best.resolve() if best.exists() else None
             self._saved = result.step
         if result.step >= config.steps:
-            raise ConfigError(f"The run has done {result.step} of {config.steps} steps. To go on, set more with --steps.")
+            raise ConfigError(
+                f"The run has done {result.step} of {config.steps} steps. To go on, set more with --steps."
+            )
         self._file, self._parts, self._env = MetricsFile(metrics, rows), parts, env
         result.rows = self._file.rows
         self._judged = result.step
@@ -185,8 +191,9 @@ class _Run:
             self._judge_or_save(learner)
         self._tell()
 
-    def _is_over(self, step: int) -> bool:
-        return bool(self._stop) or self._done(step) >= 1
+    def _is_over(self) -> bool:
+        minutes = self._config.max_minutes
+        return bool(self._stop) or (minutes is not None and self._minutes() >= minutes)
 
     def _updated(self, learner: Any, row: Row) -> None:
         """Log an update; validate when it is time to."""
@@ -252,7 +259,9 @@ class _Run:
             lines.append(f"best checkpoint: {result.best / PRETRAINED_MODEL_DIR}")
         lines.append(f"curve: {result.output_dir / PLOT_NAME}")
         if self._stop:
-            lines.append(f"Stopped by {self._stop.name}. Go on with: bhd-train --resume=true --config_path={result.output_dir}")
+            lines.append(
+                f"Stopped by {self._stop.name}. Go on with: bhd-train --resume=true --config_path={result.output_dir}"
+            )
         self._console.print(escape("\n".join(lines)), soft_wrap=True, highlight=False)
 
 
