@@ -23,6 +23,7 @@ from bhd_lerobot.policies.contract import PolicyContract
 from bhd_lerobot.runs import train_checkpoint
 from bhd_lerobot.runs.config_train import BhdTrainConfig, plain
 from bhd_lerobot.runs.configuration import describe
+from bhd_lerobot.runs.rl.config import is_rl
 from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
 from bhd_lerobot.runs.train_arguments import Request, parse_train
 from bhd_lerobot.runs.train_checkpoint import TrainingParts, resume_command
@@ -282,6 +283,10 @@ def _push(config: BhdTrainConfig, parts: TrainingParts, result: TrainResult) -> 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bhd-train`; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    if is_rl(arguments):
+        from bhd_lerobot.runs.rl.train import main as learn_by_trial
+
+        return learn_by_trial(arguments)
     if any(one in ("-h", "--help") for one in arguments):
         print(describe(BhdTrainConfig))
         return 0
