@@ -12,8 +12,8 @@ from types import ModuleType
 import pytest
 
 from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.runs import data, monitor
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.runs import data, monitor
 from bhd_lerobot.runs.config_eval import EvalConfig
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import parse

@@ -169,7 +169,7 @@ class Cerebellum:
                 # What was sent before and is due later belongs to an action chunk that a newer one took the place of.
                 self.fifo.drop_older(popped[0], self._popped_mask)
             # Modes may have changed since the command was sent.
-            take = self._popped_mask
+            take: NDArray[np.bool_] = self._popped_mask
             if now_ns - due > self._timeout_ns or not self._all_track:
                 take = self._sift(take, now_ns - due)
                 self._last_due[take] = due
