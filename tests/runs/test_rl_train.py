@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from lerobot.configs import FeatureType, PolicyFeature
 from rich.console import Console
 
 pytest.importorskip("stable_baselines3")
@@ -17,13 +18,15 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.contract import PolicyContract
 from bhd_lerobot.policies.learned import LearnedBrain, LearnedBrainConfig
+from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
+from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
 from bhd_lerobot.runs.rl import checkpoint
 from bhd_lerobot.runs.rl import train as module
 from bhd_lerobot.runs.rl.adapter import RlVecEnv
 from bhd_lerobot.runs.rl.build import make_learner
 from bhd_lerobot.runs.rl.config import RlConfig, is_rl, parse_rl
 from bhd_lerobot.runs.rl.features import ActionUnits, FeatureStack
-from bhd_lerobot.runs.rl.parts import make_parts
+from bhd_lerobot.runs.rl.parts import make_parts, single_action
 from bhd_lerobot.runs.rl.shaping import Shaping
 from bhd_lerobot.runs.rl.train import RlResult, main, train
 
@@ -272,7 +275,6 @@ def test_a_checkpoint_of_another_robot_is_refused(finished: RlResult, tmp_path: 
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(tmp_path: Path) -> None:
-    from lerobot.configs import FeatureType, PolicyFeature
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy
     from lerobot.policies.factory import make_pre_post_processors
@@ -329,3 +331,26 @@ def test_bhd_train_hands_over_what_names_an_algorithm(tmp_path: Path, capsys) ->
     assert "steps is 0" in capsys.readouterr().err
     assert bhd_train(options(tmp_path / "run", steps=32)) == 0
     assert (tmp_path / "run/checkpoints/last/pretrained_model/config.json").is_file()
+
+
+def test_a_later_action_of_the_checkpoints_chunk_may_become_the_actors(tmp_path: Path) -> None:
+    policy = MlpPolicy(mlp(chunk_size=4))
+    first, third = single_action(policy), single_action(policy, 2)
+    batch = {"observation.state": torch.linspace(-1, 1, 10).reshape(2, 5)}
+    chunk = policy.predict_action_chunk(batch)
+    for actor, index in ((first, 0), (third, 2)):
+        torch.testing.assert_close(actor.predict_action_chunk(batch)[:, 0], chunk[:, index], rtol=0, atol=1e-6)
+        assert actor.config.chunk_size == 1
+        assert actor.log_std is not None
+
+
+def test_an_action_beyond_the_chunk_is_refused(finished: RlResult, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"start_action is 3; the policy .* predicts 1: 0 to 0"):
+        run(tmp_path / "run", start_from=finished.checkpoint, start_action=3)
+
+
+def mlp(**values: object) -> MlpConfig:
+    config = MlpConfig(hidden_dims=[8], device="cpu", push_to_hub=False, **values)  # type: ignore[arg-type]
+    config.input_features = {"observation.state": PolicyFeature(FeatureType.STATE, (5,))}
+    config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
+    return config

@@ -174,6 +174,8 @@ class RlConfig:
         steps: environment steps, all environments together.
         max_minutes: end after this time [min], validation included; nothing: after `steps` only.
         start_from: a checkpoint of a `bhd_mlp`, whose weights become the actor.
+        start_action: which action of the checkpoint's chunk becomes the actor's, from 0. A later one asks at once for
+            what the checkpoint would ask for some frames later, and so hurries.
         critic_warmup: environment steps in which only the critic learns.
         output_dir: folder of the run; a new one in `outputs/train` if nothing.
         resume: go on with the run in `output_dir`.
@@ -193,6 +195,7 @@ class RlConfig:
     steps: int = 1_000_000
     max_minutes: float | None = None
     start_from: str | None = None
+    start_action: int = 0
     critic_warmup: int = 0
     output_dir: str | None = None
     resume: bool = False
@@ -258,6 +261,7 @@ class RlConfig:
             ("validation.seed", validation.seed, 0),
             ("anchor.batch_size", self.anchor.batch_size, 1),
             ("critic_warmup", self.critic_warmup, 0),
+            ("start_action", self.start_action, 0),
             ("seed", self.seed, 0),
         ):
             if value < least:
