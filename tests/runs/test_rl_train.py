@@ -316,9 +316,7 @@ def test_a_command_line_with_an_algorithm_asks_for_reinforcement_learning(tmp_pa
 
 @pytest.mark.parametrize("name", ["ppo_turtlebot3", "ppo_ur5_reach"])
 def test_the_shipped_configurations_are_valid(name: str) -> None:
-    config: RlConfig = parse_rl(
-        [f"--config_path=configs/train/{name}.yaml", *(["--start_from=x"] if "ur5" in name else [])]
-    )
+    config: RlConfig = parse_rl([f"--config_path=configs/train/{name}.yaml"])
     assert config.max_minutes is not None
     assert config.max_minutes <= 20
     assert module.REMEDY.endswith("[rl]'")
