@@ -12,7 +12,7 @@ from bhd_lerobot.runs.config_record import DatasetConfig, RecordConfig
 from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import Episode
 from bhd_lerobot.runs.provenance import episode_metadata
-from bhd_lerobot.runs.record import _open_recorder, _save
+from bhd_lerobot.runs.record import open_recorder, save_episode
 
 
 class BrainRecorder:
@@ -48,7 +48,7 @@ class BrainRecorder:
             seed=config.seed,
             split=config.split,
         )
-        with _open_recorder(recording, root, loop.simulation, loop.task, loop.brain) as recorder:
+        with open_recorder(recording, root, loop.simulation, loop.task, loop.brain) as recorder:
             yield cls(recorder, loop, config.split)
             recorder.finalize()
 
@@ -61,4 +61,4 @@ class BrainRecorder:
         """Save an episode."""
         if self._recorder is not None:
             task, brain = self._loop.task.parameters(), self._loop.brain.parameters()
-            _save(self._recorder, episode, episode_metadata(episode, split=self._split, task=task, brain=brain))
+            save_episode(self._recorder, episode, episode_metadata(episode, split=self._split, task=task, brain=brain))

@@ -69,7 +69,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         output_dir = _make_output_dir(config)
         result = RecordResult(root, output_dir, stopped_by=stop)
         show = live_view(config, simulation, console)  # a view that cannot be started fails before a dataset exists
-        with show as loop.observer, _open_recorder(config, root, simulation, task, brain) as recorder:
+        with show as loop.observer, open_recorder(config, root, simulation, task, brain) as recorder:
             if recorder.repair_report:
                 console.print(f"Mended before resuming: {recorder.repair_report}")
             trajectories, first = _run(config, recorder, loop, result, console)
@@ -108,7 +108,7 @@ def _run(
             if config.dataset.language and brain.has_plan:
                 said = language_column(episode.plan, episode.columns[SUBTASK], config.dataset.fps)
                 episode.columns[LANGUAGE] = said
-            _save(recorder, episode, metadata)
+            save_episode(recorder, episode, metadata)
             result.count(episode, config.dataset.fps)
             result.wall_s = time.perf_counter() - started
             trajectories.append(_trajectory(episode, loop.simulation))
@@ -180,9 +180,14 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
         console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} {os.getpid()}")
 
 
-def _open_recorder(
+def open_recorder(
     config: RecordConfig, root: Path, simulation: Simulation, task: Task, brain: Brain
 ) -> DatasetRecorder:
+    """Open the dataset that a configuration asks for, or go on with it.
+
+    Raises:
+        BhdError: it exists and is not to be resumed, or holds something else.
+    """
     images = dict.fromkeys(
         simulation.camera_names, (simulation.config.camera_height, simulation.config.camera_width, 3)
     )
@@ -218,7 +223,8 @@ def _open_recorder(
     )
 
 
-def _save(recorder: DatasetRecorder, episode: Episode, metadata: dict[str, Any]) -> None:
+def save_episode(recorder: DatasetRecorder, episode: Episode, metadata: dict[str, Any]) -> None:
+    """Save an episode; when this returns, it survives a kill."""
     writer = episode.writer or recorder.begin_episode()
     try:
         writer.set_columns(episode.columns)
