@@ -11,7 +11,7 @@ import torch
 
 from benchmarks.results.section import Section
 
-_PACKAGES = ("bhd-lerobot", "lerobot", "mujoco", "torch", "stable-baselines3", "gymnasium")
+_PACKAGES = ("lerobot_robot_bhd", "lerobot", "mujoco", "torch", "stable-baselines3", "gymnasium")
 
 
 def write_page(path: Path, sections: Sequence[Section], *, is_short: bool) -> None:
