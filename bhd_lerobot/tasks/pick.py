@@ -118,18 +118,18 @@ class PickTask:
         objects: list[TableObject] = []
         while len(objects) < count:
             objects = _draw_objects(config.randomisation, chosen, rng)
-        target = int(rng.integers(count))
+        objects = _target_first(objects, int(rng.integers(count)))
         languages = tuple(INSTRUCTIONS) if config.language == "any" else (config.language,)
         language = languages[int(rng.integers(len(languages)))]
         phrase = INSTRUCTIONS[language][int(rng.integers(len(INSTRUCTIONS[language])))]
-        name = objects[target].name
+        name = objects[0].name
         if language == "zh":
-            name = _ZH[objects[target].colour] + _ZH[objects[target].kind]
+            name = _ZH[objects[0].colour] + _ZH[objects[0].kind]
         return TableScene(
             name="pick",
             objects=tuple(objects),
             posture=_HOME,
-            target_object=target,
+            target_object=0,
             instruction=phrase.format(name),
             variation=draw_variation(config.randomisation, rng),
         )
@@ -159,6 +159,7 @@ class PickTask:
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
         """Return what is on the table, 16 numbers for each place of an object, shape (n, 80).
 
+        The first is the one asked for; the others follow, at the start the nearest to it first.
         Of each: whether there is one, whether it is the one asked for, whether it is a box; its pose in the base frame
         (x, y, z [m], quaternion wxyz); length, width and height [m]; red, green and blue. Zeros, and the identity, for
         places without one.
@@ -222,6 +223,17 @@ class PickTask:
 
 
 _HOME = ur5().home
+
+
+def _target_first(objects: Sequence[TableObject], target: int) -> list[TableObject]:
+    """Return the object asked for, then the others, the nearest to it first.
+
+    A network then finds what it has to grasp, and what stands in the way of that, always in the same inputs. The order
+    tells nothing that the environment state does not tell anyway.
+    """
+    at = objects[target]
+    others = [one for number, one in enumerate(objects) if number != target]
+    return [at, *sorted(others, key=lambda one: math.hypot(one.x - at.x, one.y - at.y))]
 
 
 def _draw_objects(
