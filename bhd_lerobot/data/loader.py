@@ -65,6 +65,7 @@ def make_loader(
     selection: EpisodeFilter | None = None,
     intervention_weight: float = 1.0,
     eval_split: float = 0.0,
+    hold_out: str = "episode",
     max_eval_samples: int = 0,
     delta_timestamps: Mapping[str, Sequence[float]] | None = None,
     drop_n_last_frames: int = 0,
@@ -84,7 +85,7 @@ def make_loader(
     world_size: int = 1,
     say: Callable[[str], None] | None = None,
 ) -> Loaders:
-    """Return the batches of a training and of what it holds out, as LeRobot's `make_train_eval_datasets` selects them.
+    """Return the batches of a training and of what it holds out.
 
     Both share one copy of the data in memory. If that does not fit, or the dataset has something that is not kept in
     memory, the same samples come in the same order from LeRobot's own dataset and PyTorch's `DataLoader`, and a message
@@ -100,7 +101,8 @@ def make_loader(
         selection: which episodes; None means all.
         intervention_weight: how often frames in which somebody intervened are drawn, compared with others; 0 drops
             them. Held-out samples are not weighted.
-        eval_split: share of the episodes of each task that is held out, from 0 to below 1.
+        eval_split: share of the episodes that is held out, from 0 to below 1.
+        hold_out: of what the share is meant: `episode` or `instruction`; see `split_episodes`.
         max_eval_samples: at most about so many held-out samples, the first of each task; 0 means all.
         delta_timestamps: key -> times relative to the sample [s], multiples of 1 / fps.
         drop_n_last_frames: frames at the end of each episode that no training sample starts from.
@@ -126,7 +128,7 @@ def make_loader(
     """
     meta = local_metadata(repo_id, root, revision, [] if streaming else episodes)
     chosen = checked_episodes(meta, episodes) if selection is None else selection.select(meta, episodes)
-    train, held_out = split_episodes(meta, chosen, eval_split)
+    train, held_out = split_episodes(meta, chosen, eval_split, hold_out)
     weights = intervention_weights(meta, train, intervention_weight)
     if use_imagenet_stats:
         imagenet_stats(meta)

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 OUTCOMES = tuple(event.cause for event in Event if event not in (Event.NOTHING, Event.INTERVENTION))
 """The events that an episode can end with, by name."""
 
+HOLD_OUTS = ("episode", "instruction")
+"""Of what a share is held out: of all episodes, or of those of each instruction, as LeRobot does it."""
+
 
 @dataclass(frozen=True)
 class EpisodeFilter:
@@ -99,18 +102,29 @@ class EpisodeFilter:
 
 
 def split_episodes(
-    meta: "LeRobotDatasetMetadata", episodes: Sequence[int] | None, eval_split: float
+    meta: "LeRobotDatasetMetadata", episodes: Sequence[int] | None, eval_split: float, hold_out: str = "episode"
 ) -> tuple[list[int], list[int]]:
-    """Return the episodes to train on and those that are held out, as LeRobot's `make_train_eval_datasets` does.
+    """Return the episodes to train on and those that are held out; the same ones whenever it is asked.
 
-    Of each task (instruction), the last ceil(n * eval_split) episodes are held out.
+    Of each instruction the last episodes are held out. How many is counted over all episodes, the instructions one
+    after the other: ceil(n * eval_split) in all. Where most instructions occur once, that is one episode in so many.
+    With a single instruction it is what LeRobot's `make_train_eval_datasets` does.
+
+    Args:
+        meta: the dataset.
+        episodes: to choose from; None means all.
+        eval_split: share that is held out, from 0 to below 1.
+        hold_out: `episode` for this rule. `instruction` for LeRobot's, which counts each instruction by itself and
+            holds out at least one episode of every one.
 
     Raises:
-        ConfigError: a share that is not in [0, 1).
+        ConfigError: a share that is not in [0, 1), or an unknown rule.
         DatasetError: nothing is left to train on.
     """
     if not 0 <= eval_split < 1:
         raise ConfigError(f"eval_split is {eval_split}; it must be from 0 to below 1.")
+    if hold_out not in HOLD_OUTS:
+        raise ConfigError(unknown_name("hold_out", hold_out, HOLD_OUTS))
     candidates = checked_episodes(meta, None) if episodes is None else [int(episode) for episode in episodes]
     if eval_split == 0:
         return candidates, []
@@ -120,16 +134,31 @@ def split_episodes(
         by_task.setdefault(tasks[episode][0] if tasks[episode] else "", []).append(episode)
     train: list[int] = []
     held_out: list[int] = []
+    left = len(candidates)
     for group in by_task.values():
-        keep = len(group) - math.ceil(len(group) * eval_split)
-        train += group[:keep]
-        held_out += group[keep:]
+        if hold_out == "instruction":
+            count = math.ceil(len(group) * eval_split)
+        else:
+            count = math.ceil(left * eval_split) - math.ceil((left - len(group)) * eval_split)
+        left -= len(group)
+        train += group[: len(group) - count]
+        held_out += group[len(group) - count :]
     if not train:
-        raise DatasetError(
-            f"eval_split={eval_split} leaves no episode to train on: {len(candidates)} episodes have {len(by_task)} "
-            "different instructions, and at least one episode of each is held out. Record more, or set it to 0."
-        )
+        raise DatasetError(_nothing_to_train_on(len(candidates), len(by_task), eval_split, hold_out))
     return train, held_out
+
+
+def _nothing_to_train_on(episodes: int, instructions: int, eval_split: float, hold_out: str) -> str:
+    if hold_out == "instruction" and episodes > 1:
+        return (
+            f"eval_split={eval_split} leaves no episode to train on: {episodes} episodes have {instructions} different "
+            "instructions, and with hold_out 'instruction' at least one episode of each is held out. Set hold_out to "
+            "'episode', or eval_split to 0."
+        )
+    return (
+        f"eval_split={eval_split} leaves no episode to train on: there are {episodes}, and at least one is held out. "
+        "Record more, or set eval_split to 0."
+    )
 
 
 def intervention_weights(

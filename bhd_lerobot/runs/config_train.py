@@ -11,7 +11,7 @@ import draccus
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 
-from bhd_lerobot.data.selection import EpisodeFilter
+from bhd_lerobot.data.selection import HOLD_OUTS, EpisodeFilter
 from bhd_lerobot.errors import ConfigError, unknown_name
 
 OWN_CONFIG_NAME = "bhd_train.json"
@@ -30,12 +30,15 @@ class SelectionConfig:
         exclude_late: leave out episodes with more late frames than their recording tolerated.
         intervention_weight: how often frames in which somebody intervened are drawn, compared with others; 0 drops
             them.
+        hold_out: of what `dataset.eval_split` is the share that is held out: `episode`, of all episodes; `instruction`,
+            of each instruction's, and at least one of each, as `lerobot-train` does.
     """
 
     outcome: list[str] = field(default_factory=lambda: ["all"])
     min_score: float | None = None
     exclude_late: bool = False
     intervention_weight: float = 1.0
+    hold_out: str = "episode"
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be honoured.
@@ -46,6 +49,8 @@ class SelectionConfig:
         _ = self.filter
         if not 0 <= self.intervention_weight < float("inf"):
             raise ConfigError(f"selection.intervention_weight is {self.intervention_weight}; it must be 0 or more.")
+        if self.hold_out not in HOLD_OUTS:
+            raise ConfigError(unknown_name("selection.hold_out", self.hold_out, HOLD_OUTS))
 
     @property
     def filter(self) -> EpisodeFilter:

@@ -160,6 +160,7 @@ def _run(
         save_freq=config.save_freq,
         env_eval_freq=config.env_eval_freq,
         seed=config.seed or 0,
+        held_out=data.held_out_episodes,
     )
     result = TrainResult(Path(str(config.output_dir)), step, config.checkpoint_path, contract=parts.contract)
     environment = EnvEvaluation(config, parts, accelerator) if config.env and config.env_eval_freq > 0 else None

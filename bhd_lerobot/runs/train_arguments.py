@@ -102,7 +102,10 @@ def _read_checkpoint(checkpoint: Path) -> dict[str, Any]:
     folder = checkpoint / PRETRAINED_MODEL_DIR
     values = _read(folder / TRAIN_CONFIG_NAME)
     own = folder / OWN_CONFIG_NAME  # a checkpoint of lerobot-train has none
-    return {**values, **(_read(own) if own.is_file() else {})}
+    values |= _read(own) if own.is_file() else {}
+    # Where it is not said, LeRobot's rule was the only one.
+    values["selection"] = {"hold_out": "instruction", **(values.get("selection") or {})}
+    return values
 
 
 def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:

@@ -30,7 +30,7 @@ class TrainingData:
         held_out: batches of the held-out episodes; None if there are none.
         frames: samples in an epoch.
         episodes: number of episodes that are learned from.
-        held_out_episodes: number of those that are not.
+        held_out_episodes: those that are not, by number.
         how: how the batches are served, in words.
     """
 
@@ -38,7 +38,7 @@ class TrainingData:
     held_out: Loader | None
     frames: int
     episodes: int
-    held_out_episodes: int
+    held_out_episodes: list[int]
     how: str
 
 
@@ -112,6 +112,7 @@ def open_data(
         selection=config.selection.filter,
         intervention_weight=config.selection.intervention_weight,
         eval_split=dataset.eval_split,
+        hold_out=config.selection.hold_out,
         max_eval_samples=config.max_eval_samples,
         delta_timestamps=deltas or None,
         drop_n_last_frames=getattr(policy, "drop_n_last_frames", 0),
@@ -141,7 +142,7 @@ def open_data(
         held_out=loaders.held_out,
         frames=len(loaders.train.order.samples),
         episodes=loaders.dataset.num_episodes,
-        held_out_episodes=0 if loaders.held_out is None else loaders.held_out.dataset.num_episodes,
+        held_out_episodes=[] if loaders.held_out is None else sorted(loaders.held_out.dataset.episodes),
         how=f"LeRobot's, {config.num_workers} workers" if size is None else f"in memory, {size / 2**20:.3g} MiB",
     )
 

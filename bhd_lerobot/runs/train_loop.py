@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,6 +33,7 @@ class LoopOptions:
         save_freq: steps from one checkpoint to the next; there is one after the last step, too.
         env_eval_freq: steps from one evaluation in an environment to the next.
         seed: of the noise in the held-out loss.
+        held_out: numbers of the episodes that are not learned from.
     """
 
     steps: int
@@ -43,6 +44,7 @@ class LoopOptions:
     save_freq: int = 0
     env_eval_freq: int = 0
     seed: int = 0
+    held_out: Sequence[int] = ()
 
 
 @dataclass
@@ -128,7 +130,12 @@ class TrainingLoop:
 
     def state_dict(self) -> dict[str, Any]:
         """Return where it is, as JSON values: floats keep all their bits."""
-        return {"frames": self.options.frames, "loader": self.loader.state_dict(), "window": self._window.numbers()}
+        return {
+            "frames": self.options.frames,
+            "held_out": list(self.options.held_out),
+            "loader": self.loader.state_dict(),
+            "window": self._window.numbers(),
+        }
 
     def load_state_dict(self, step: int, state: dict[str, Any]) -> None:
         """Go on after `step` steps.
@@ -141,6 +148,12 @@ class TrainingLoop:
                 f"The run was started on {state['frames']} frames, and now there are {self.options.frames}: the "
                 "dataset or the selection has changed since. To learn from it, start a new run with "
                 "--fine_tune=CHECKPOINT."
+            )
+        before, now = state.get("held_out", list(self.options.held_out)), list(self.options.held_out)
+        if before != now:
+            raise BhdError(
+                f"The run was started with {_listed(before)} held out, and now it would be {_listed(now)}. Leave "
+                "dataset.eval_split and selection.hold_out as they were, or start a new run."
             )
         self.step = self._saved = step
         self._window = Window(before=list(state.get("window", [])))
@@ -253,6 +266,11 @@ class TrainingLoop:
                 torch.empty((), dtype=torch.int64).random_()
             yield from self.loader
             is_new_epoch = True
+
+
+def _listed(episodes: Sequence[int]) -> str:
+    shown = ", ".join(map(str, episodes[:5])) + (", …" if len(episodes) > 5 else "")
+    return f"{len(episodes)} episodes ({shown})" if episodes else "no episode"
 
 
 def _is_due(step: int, frequency: int) -> bool:

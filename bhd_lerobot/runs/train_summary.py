@@ -23,7 +23,7 @@ def tell_start(console: Console, config: BhdTrainConfig, policy: Any, data: Trai
     learnable = sum(one.numel() for one in policy.parameters() if one.requires_grad)
     total = sum(one.numel() for one in policy.parameters())
     frozen = f", {total - learnable:,} more are fixed" if total > learnable else ""
-    held_out = f", {data.held_out_episodes} held out" if data.held_out_episodes else ""
+    held_out = f", {len(data.held_out_episodes)} held out" if data.held_out_episodes else ""
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_row(
         "policy", escape(f"{policy.config.type}, {learnable:,} parameters{frozen}, on {policy.config.device}")

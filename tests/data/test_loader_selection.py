@@ -94,7 +94,7 @@ def test_wrong_filters_are_named(options: dict[str, Any], message: str) -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])
-def test_the_split_is_that_of_lerobot(plain: Path, share: float) -> None:
+def test_the_split_by_instruction_is_that_of_lerobot(plain: Path, share: float) -> None:
     from lerobot.configs.default import DatasetConfig
     from lerobot.datasets.factory import make_train_eval_datasets
 
@@ -102,16 +102,49 @@ def test_the_split_is_that_of_lerobot(plain: Path, share: float) -> None:
     dataset = DatasetConfig("t/t", root=str(plain), eval_split=share, video_backend="pyav")
     config: Any = SimpleNamespace(dataset=dataset, trainable_config=policy, tolerance_s=1e-4)
     theirs = make_train_eval_datasets(config)
-    ours = split_episodes(open_metadata(plain), None, share)
+    ours = split_episodes(open_metadata(plain), None, share, "instruction")
     assert ours == tuple(dataset.episodes for dataset in theirs)
     assert split_episodes(open_metadata(plain), [3, 1], 0.0) == ([3, 1], [])
 
 
+def described(instructions: list[str]) -> Any:
+    """Metadata of a dataset with an episode of each of these instructions."""
+    n, episodes = len(instructions), {"tasks": [[one] for one in instructions]}
+    return SimpleNamespace(root=Path("toy"), total_episodes=n, total_frames=n, episodes=episodes)
+
+
+@pytest.mark.parametrize("kinds", [1, 2, 7, 100])
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.25, 0.9])
+def test_a_share_of_all_episodes_is_held_out(kinds: int, share: float) -> None:
+    meta = described([f"pick object {i % kinds}" for i in range(100)])
+    train, held_out = split_episodes(meta, None, share)
+    assert sorted(train + held_out) == list(range(100))
+    assert len(held_out) == math.ceil(100 * share)
+    for kind in range(kinds):  # in proportion, and of each the last ones
+        ours = [i for i in range(kind, 100, kinds) if i in held_out]
+        assert abs(len(ours) - share * len(range(kind, 100, kinds))) < 1
+        assert ours == list(range(kind, 100, kinds))[100 // kinds + (kind < 100 % kinds) - len(ours) :]
+    assert (train, held_out) == split_episodes(meta, list(range(100)), share)
+    if kinds == 1:
+        assert (train, held_out) == split_episodes(meta, None, share, "instruction")
+    if kinds == 100:  # no stretch of the dataset is without
+        gaps = np.diff([-1, *held_out, 100])
+        assert gaps.max() <= math.ceil(1 / share)
+
+
+def test_few_episodes_with_instructions_of_their_own(plain: Path) -> None:
+    assert split_episodes(open_metadata(plain), [0, 1], 0.1) == ([0], [1])
+
+
 def test_a_split_that_leaves_nothing(plain: Path) -> None:
-    with pytest.raises(DatasetError, match="2 episodes have 2 different instructions"):
-        split_episodes(open_metadata(plain), [0, 1], 0.1)
+    with pytest.raises(DatasetError, match=r"2 episodes have 2 different instructions.* hold_out to 'episode'"):
+        split_episodes(open_metadata(plain), [0, 1], 0.1, "instruction")
+    with pytest.raises(DatasetError, match="there are 1, and at least one is held out"):
+        split_episodes(open_metadata(plain), [3], 0.1)
     with pytest.raises(ConfigError, match="eval_split is 1"):
         split_episodes(open_metadata(plain), None, 1)
+    with pytest.raises(ConfigError, match=r"'episodes'\. Did you mean 'episode'"):
+        split_episodes(open_metadata(plain), None, 0.1, "episodes")
 
 
 def test_interventions_are_weighted_or_dropped(plain: Path, foreign: Path) -> None:

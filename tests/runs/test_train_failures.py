@@ -179,6 +179,24 @@ def test_a_dataset_that_grew_since_is_not_resumed_on(tmp_path: Path) -> None:
         run_train(["--resume=true", f"--config_path={tmp_path / 'run'}", "--steps=9", f"--dataset.root={bigger}"])
 
 
+def test_what_is_held_out_stays_so_when_a_run_is_resumed(tmp_path: Path) -> None:
+    root = make_dataset(tmp_path / "set", episodes=5, instructions=5)
+    run = tmp_path / "run"
+    held_out = {"dataset__episodes": "[0, 1, 2, 3]", "dataset__eval_split": 0.3, "eval_steps": 5}
+    _, said = run_train(options(root, run, MLP, steps=5, **held_out))
+    assert "2 episodes, 2 held out" in said
+    again = ["--resume=true", f"--config_path={run}", "--steps=9"]
+    with pytest.raises(BhdError, match=r"2 episodes \(0, 3\) held out, and now it would be 2 episodes \(0, 4\)"):
+        run_train([*again, "--dataset.episodes=[0, 1, 2, 4]"])
+    own = run / "checkpoints" / "last" / "pretrained_model" / "bhd_train.json"
+    values = json.loads(own.read_text())
+    assert values["selection"].pop("hold_out") == "episode"
+    own.write_text(json.dumps(values))  # as it was written when LeRobot's rule was the only one
+    assert parse_train(again).config.selection.hold_out == "instruction"
+    own.unlink()  # a checkpoint of lerobot-train
+    assert parse_train(again).config.selection.hold_out == "instruction"
+
+
 def test_a_loss_that_is_not_a_number_stops_and_keeps_the_last_checkpoint(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -220,6 +238,7 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
         ({"fine_tune_statistics": "both"}, "both.*checkpoint, dataset"),
         ({"selection.min_score": 2}, "min_score is 2"),
         ({"selection.intervention_weight": -1}, "intervention_weight is -1"),
+        ({"selection.hold_out": "task"}, "Unknown selection.hold_out 'task'. Valid: episode, instruction"),
         ({"dataset.streaming": "true"}, "dataset.streaming is not for bhd-train"),
         ({"peft.r": 4}, "peft"),
         ({"policy.push_to_hub": "true"}, "--policy.repo_id"),

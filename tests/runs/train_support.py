@@ -44,6 +44,7 @@ def make_dataset(
     fps: int = FPS,
     robot: str = "toy",
     shift: float = 0.0,
+    instructions: int = 1,
 ) -> Path:
     """Record episodes in which the action follows from what is observed; return the dataset's folder."""
     described = features(environment, camera)
@@ -68,7 +69,8 @@ def make_dataset(
                 for frame in range(frames):
                     writer.add_image("observation.images.front", np.full((32, 32, 3), 10 * episode + frame, np.uint8))
             outcome = OUTCOMES[episode % len(OUTCOMES)]
-            recorder.save(writer, task="go", metadata={"outcome": outcome, "score": episode / 10})
+            metadata = {"outcome": outcome, "score": episode / 10}
+            recorder.save(writer, task=f"go {episode % instructions}", metadata=metadata)
         recorder.finalize()
     return root
 
