@@ -16,6 +16,7 @@ from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.bodies.tabletop import COLOURS, TableScene
 
 PANELS = 100  # panels on one page
+SHOWN = 200  # episodes of a run that are drawn: a panel takes 0.1 s, and nobody looks at thousands
 
 _FREE, _WALL, _GOOD, _BAD = "#f4f1ea", "#8a8478", "#1b7f4d", "#c0392b"
 
@@ -35,6 +36,39 @@ class Trajectory:
     scene: Arena | TableScene
     xy: NDArray[np.float64]
     success: bool
+
+
+class TrajectoryAlbum:
+    """Collects the episodes of a run that are worth a picture, in memory that does not grow with the run.
+
+    Attributes:
+        added: number of episodes that were added.
+    """
+
+    def __init__(self) -> None:
+        self.added = 0
+        self._kept: dict[bool, list[tuple[int, Trajectory]]] = {True: [], False: []}
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Add the next episode; of failures, and of successes, the first `SHOWN` are kept."""
+        kept = self._kept[trajectory.success]
+        if len(kept) < SHOWN:
+            kept.append((self.added, trajectory))
+        self.added += 1
+
+    @property
+    def shown(self) -> list[Trajectory]:
+        """At most `SHOWN` episodes in the order of the run: failures before all, then the first successes."""
+        failures, successes = self._kept[False], self._kept[True]
+        chosen = [*failures, *successes[: SHOWN - len(failures)]]
+        return [trajectory for _, trajectory in sorted(chosen, key=lambda one: one[0])]
+
+    def draw(self, path: Path, heading: str) -> list[Path]:
+        """Draw what is shown; the heading says so if that is not all."""
+        shown = self.shown
+        if len(shown) < self.added:
+            heading += f"; {len(shown)} of them, failures before others"
+        return draw_trajectories(shown, path, heading)
 
 
 def draw_trajectories(trajectories: Sequence[Trajectory], path: Path, heading: str) -> list[Path]:

@@ -28,7 +28,7 @@ from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.runs.language_rows import language_column
 from bhd_lerobot.runs.live_view import live_view
-from bhd_lerobot.runs.plots import Trajectory, draw_trajectories
+from bhd_lerobot.runs.plots import Trajectory, TrajectoryAlbum
 from bhd_lerobot.runs.preview import Preview
 from bhd_lerobot.runs.provenance import episode_metadata
 from bhd_lerobot.runs.record_report import RecordResult, tell_refusals, tell_summary
@@ -72,12 +72,12 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         with show as loop.observer, open_recorder(config, root, simulation, task, brain) as recorder:
             if recorder.repair_report:
                 console.print(f"Mended before resuming: {recorder.repair_report}")
-            trajectories, first = _run(config, recorder, loop, result, console)
+            album, first = _run(config, recorder, loop, result, console)
         if loop.emergency_stop:
             result.estop = ", ".join(pressed.causes) or "from another process"
-    if trajectories:
+    if album.added:
         heading = f"{task.name}, {brain.name}: {result.successes} of {result.recorded} episodes succeeded"
-        draw_trajectories(trajectories, output_dir / "trajectories.png", heading)
+        album.draw(output_dir / "trajectories.png", heading)
     if first is not None and preview is not None:
         states = first.columns[PHYSICS_STATE]
         preview.write(first.scene, states, config.dataset.fps, output_dir / "episode.mp4")
@@ -91,10 +91,10 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
 
 def _run(
     config: RecordConfig, recorder: DatasetRecorder, loop: EpisodeLoop, result: RecordResult, console: Console
-) -> tuple[list[Trajectory], Episode | None]:
+) -> tuple[TrajectoryAlbum, Episode | None]:
     """Run and save the episodes that the dataset lacks; return their trajectories, and the first of them."""
     task, brain = loop.task, loop.brain
-    trajectories: list[Trajectory] = []
+    album = TrajectoryAlbum()
     first: Episode | None = None
     specs = [
         EpisodeSpec(index, episode_seed(config.seed, index, config.split))  # type: ignore[arg-type]
@@ -111,7 +111,7 @@ def _run(
             save_episode(recorder, episode, metadata)
             result.count(episode, config.dataset.fps)
             result.wall_s = time.perf_counter() - started
-            trajectories.append(_trajectory(episode, loop.simulation))
+            album.add(_trajectory(episode, loop.simulation))
             first = first or episode
             progress.update(
                 bar,
@@ -122,7 +122,7 @@ def _run(
     result.episodes = recorder.num_episodes
     recorder.finalize()
     result.wall_s = time.perf_counter() - started if result.recorded else 0.0
-    return trajectories, first
+    return album, first
 
 
 def _episodes(

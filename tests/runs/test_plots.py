@@ -24,6 +24,22 @@ def test_every_trajectory_has_a_panel(tmp_path, monkeypatch, count, pages):
         assert min(Image.open(file).size) > 200
 
 
+@pytest.mark.parametrize("failed", [set(), {3, 17}, set(range(9)), set(range(20))])
+def test_of_many_episodes_the_failures_are_shown_before_others(tmp_path, monkeypatch, failed):
+    monkeypatch.setattr(plots, "SHOWN", 5)
+    arena = make_arena("turtlebot3_world", 0)
+    album = plots.TrajectoryAlbum()
+    for i in range(20):
+        album.add(plots.Trajectory(str(i), arena, np.array([[-2.0, -0.5], [-1.6, -0.5]]), i not in failed))
+    shown = [int(one.title) for one in album.shown]
+    assert len(shown) == 5 and shown == sorted(shown)
+    assert len(failed & set(shown)) == min(5, len(failed))
+    headings = []
+    monkeypatch.setattr(plots, "draw_trajectories", lambda trajectories, path, heading: headings.append(heading))
+    album.draw(tmp_path / "t.png", "20 episodes")
+    assert headings == ["20 episodes; 5 of them, failures before others"]
+
+
 def test_a_divergence_of_zero_is_drawn_as_such(tmp_path):
     arena = make_arena("empty", 0)
     xy = np.zeros((5, 2))
