@@ -65,6 +65,14 @@ class DatasetLockedError(DatasetError):
     """Another process is writing this dataset."""
 
 
+class MemoryBudgetError(DatasetError):
+    """The frames of a dataset do not fit the memory that they may take, or that is free."""
+
+
+class UnsupportedDatasetError(DatasetError):
+    """LeRobot's own loader is needed: a kind of feature that is not kept in memory."""
+
+
 class FrameError(DatasetError, ValueError):
     """A frame, an image or episode metadata that does not fit the features of the dataset."""
 

@@ -1,6 +1,6 @@
 """Where batches come from: a dataset in memory, or LeRobot's own datasets behind the same interface."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -11,12 +11,37 @@ from bhd_lerobot.data.batches import BatchLoader, Loader, Placing
 from bhd_lerobot.data.gather import Batch
 from bhd_lerobot.data.order import BatchOrder
 from bhd_lerobot.data.table_dataset import TableDataset
+from bhd_lerobot.errors import MemoryBudgetError, UnsupportedDatasetError
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 Transform = Callable[[Tensor], Tensor] | None
-Times = Mapping[str, Sequence[float]] | None
+
+
+@dataclass(frozen=True)
+class Serving:
+    """How samples are made of a dataset, by whatever source; `make_loader` says what each of it means."""
+
+    delta_timestamps: Mapping[str, Sequence[float]] | None = None
+    tolerance_s: float = 1e-4
+    video_backend: str | None = "pyav"
+    return_uint8: bool = True
+    keep: Collection[str] | None = None
+    budget_gib: float = 4.0
+    num_workers: int = 0
+
+    def stock(self, meta: "LeRobotDatasetMetadata", episodes: Sequence[int]) -> dict[str, Any]:
+        """Return the arguments that LeRobot's own datasets take for some episodes."""
+        times = self.delta_timestamps
+        return {
+            "root": meta.root,
+            "episodes": None if len(episodes) == meta.total_episodes else list(episodes),
+            "delta_timestamps": None if times is None else {key: list(values) for key, values in times.items()},
+            "tolerance_s": self.tolerance_s,
+            "revision": meta.revision,
+            "return_uint8": self.return_uint8,
+        }
 
 
 class LeRobotLoader(Loader):
@@ -127,11 +152,7 @@ class LeRobotSource:
     """From LeRobot's own dataset, which decodes each image when it is asked for."""
 
     meta: "LeRobotDatasetMetadata"
-    delta_timestamps: Times
-    tolerance_s: float
-    video_backend: str | None
-    return_uint8: bool
-    num_workers: int
+    serving: Serving
 
     def open(self, episodes: Sequence[int], image_transforms: Transform) -> tuple[Any, dict[str, Tensor]]:
         """Return a dataset of some episodes, and `index` and `task_index` of its samples."""
@@ -139,14 +160,9 @@ class LeRobotSource:
 
         dataset = LeRobotDataset(
             self.meta.repo_id,
-            root=self.meta.root,
-            episodes=None if len(episodes) == self.meta.total_episodes else list(episodes),
-            delta_timestamps=_lists(self.delta_timestamps),
             image_transforms=image_transforms,
-            tolerance_s=self.tolerance_s,
-            revision=self.meta.revision,
-            video_backend=self.video_backend,
-            return_uint8=self.return_uint8,
+            video_backend=self.serving.video_backend,
+            **self.serving.stock(self.meta, episodes),
         )
         dataset.meta.stats = self.meta.stats
         columns = dataset.hf_dataset.data
@@ -157,7 +173,7 @@ class LeRobotSource:
 
     def loader(self, dataset: Any, order: BatchOrder, placing: Placing) -> Loader:
         """Return batches of it."""
-        return LeRobotLoader(dataset, order, placing, self.num_workers)
+        return LeRobotLoader(dataset, order, placing, self.serving.num_workers)
 
 
 @dataclass
@@ -165,10 +181,7 @@ class StreamedSource:
     """From LeRobot's streaming dataset."""
 
     meta: "LeRobotDatasetMetadata"
-    delta_timestamps: Times
-    tolerance_s: float
-    return_uint8: bool
-    num_workers: int
+    serving: Serving
 
     def open(self, episodes: Sequence[int], image_transforms: Transform) -> tuple[Any, dict[str, Tensor]]:
         """Return a dataset of some episodes, and `index` and `task_index` that only count its samples."""
@@ -176,14 +189,9 @@ class StreamedSource:
 
         dataset = StreamingLeRobotDataset(
             self.meta.repo_id,
-            root=self.meta.root,
-            episodes=None if len(episodes) == self.meta.total_episodes else list(episodes),
-            delta_timestamps=_lists(self.delta_timestamps),
             image_transforms=image_transforms,
-            tolerance_s=self.tolerance_s,
-            revision=self.meta.revision,
-            max_num_shards=max(1, self.num_workers),
-            return_uint8=self.return_uint8,
+            max_num_shards=max(1, self.serving.num_workers),
+            **self.serving.stock(self.meta, episodes),
         )
         dataset.meta.stats = self.meta.stats
         begin, end = self.meta.episodes["dataset_from_index"], self.meta.episodes["dataset_to_index"]
@@ -192,8 +200,42 @@ class StreamedSource:
 
     def loader(self, dataset: Any, order: BatchOrder, placing: Placing) -> Loader:
         """Return batches of it."""
-        return StreamingLoader(dataset, order, placing, self.num_workers)
+        return StreamingLoader(dataset, order, placing, self.serving.num_workers)
 
 
-def _lists(times: Times) -> dict[str, list[float]] | None:
-    return None if times is None else {key: list(values) for key, values in times.items()}
+def open_source(
+    meta: "LeRobotDatasetMetadata", episodes: Sequence[int], serving: Serving, *, streaming: bool = False
+) -> tuple[Source, str]:
+    """Return where some episodes are read from: memory where they fit, else LeRobot's own dataset.
+
+    Args:
+        meta: the dataset.
+        episodes: those that are going to be opened.
+        serving: how samples are made.
+        streaming: read from the Hub while training.
+
+    Returns:
+        The source, and why it is not memory; empty if it is.
+
+    Raises:
+        DatasetError: the dataset cannot be read, or lacks what is asked for.
+    """
+    if streaming:
+        message = f"{meta.repo_id} is streamed by LeRobot's own dataset; a resumed training sees its samples in "
+        return StreamedSource(meta, serving), message + "another order."
+    try:
+        whole = TableDataset(
+            meta.repo_id,
+            episodes=None if len(episodes) == meta.total_episodes else episodes,
+            delta_timestamps=serving.delta_timestamps,
+            budget_gib=serving.budget_gib,
+            tolerance_s=serving.tolerance_s,
+            video_backend=serving.video_backend,
+            keep=serving.keep,
+            return_uint8=serving.return_uint8,
+            meta=meta,
+        )
+    except (MemoryBudgetError, UnsupportedDatasetError) as error:
+        message = f"{error}. LeRobot's own loader serves the same samples, decoding them anew every time."
+        return LeRobotSource(meta, serving), message
+    return MemorySource(whole), ""

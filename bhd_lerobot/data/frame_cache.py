@@ -17,7 +17,7 @@ from bhd_lerobot.data import layout
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.data.state import corrupt
 from bhd_lerobot.data.table import FrameTable
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import DatasetError, MemoryBudgetError, UnsupportedDatasetError
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -25,14 +25,6 @@ if TYPE_CHECKING:
 GIB = 2**30
 _MEMORY = Path("/proc/meminfo")
 _CGROUP = Path("/sys/fs/cgroup")
-
-
-class MemoryBudgetError(DatasetError):
-    """The frames of a dataset do not fit the memory that they may take, or that is free."""
-
-
-class UnsupportedDatasetError(DatasetError):
-    """LeRobot's own loader is needed: a kind of feature that is not kept in memory."""
 
 
 def image_shape(meta: "LeRobotDatasetMetadata", key: str) -> tuple[int, int, int]:

@@ -10,15 +10,14 @@ from torch import Tensor
 
 from bhd_lerobot.data.batches import BatchLoader, Loader, Placing, first_frames, ordered_samples, per_task_samples
 from bhd_lerobot.data.check import check
-from bhd_lerobot.data.fallback import LeRobotSource, MemorySource, Source, StreamedSource
-from bhd_lerobot.data.frame_cache import MemoryBudgetError, UnsupportedDatasetError
+from bhd_lerobot.data.fallback import Serving, open_source
 from bhd_lerobot.data.gather import Batch
 from bhd_lerobot.data.order import BatchOrder
 from bhd_lerobot.data.selection import EpisodeFilter, intervention_weights, split_episodes
 from bhd_lerobot.data.source import local_metadata
 from bhd_lerobot.data.table import FrameTable, checked_episodes
 from bhd_lerobot.data.table_dataset import TableDataset
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, MemoryBudgetError, UnsupportedDatasetError
 
 __all__ = [
     "Batch",
@@ -130,57 +129,25 @@ def make_loader(
     chosen = checked_episodes(meta, episodes) if selection is None else selection.select(meta, episodes)
     train, held_out = split_episodes(meta, chosen, eval_split, hold_out)
     weights = intervention_weights(meta, train, intervention_weight)
+    if streaming and (held_out or weights is not None):
+        raise ConfigError("Streaming has no held-out episodes and no weights: set eval_split to 0, the weight to 1.")
     if use_imagenet_stats:
         imagenet_stats(meta)
-    source: Source
-    if streaming:
-        if held_out or weights is not None:
-            raise ConfigError(
-                "Streaming has no held-out episodes and no weights: set eval_split to 0, the weight to 1."
-            )
-        message = (
-            f"{repo_id} is streamed by LeRobot's own dataset; a resumed training sees its samples in another order."
-        )
-        source = StreamedSource(meta, delta_timestamps, tolerance_s, return_uint8, num_workers)
-    else:
-        try:
-            message = ""
-            whole = TableDataset(
-                repo_id,
-                episodes=None if len(chosen) == meta.total_episodes else chosen,
-                delta_timestamps=delta_timestamps,
-                budget_gib=budget_gib,
-                tolerance_s=tolerance_s,
-                video_backend=video_backend,
-                keep=keep,
-                return_uint8=return_uint8,
-                meta=meta,
-            )
-            source = MemorySource(whole)
-        except (MemoryBudgetError, UnsupportedDatasetError) as error:
-            message = f"{error}. LeRobot's own loader serves the same samples, decoding them anew every time."
-            source = LeRobotSource(meta, delta_timestamps, tolerance_s, video_backend, return_uint8, num_workers)
+    serving = Serving(delta_timestamps, tolerance_s, video_backend, return_uint8, keep, budget_gib, num_workers)
+    source, message = open_source(meta, chosen, serving, streaming=streaming)
     if message:
         (say or logging.getLogger(__name__).warning)(message)
     placing = Placing(device, pin)
-    dealing: dict[str, Any] = {"rank": rank, "world_size": world_size}
     dataset, columns = source.open(train, image_transforms)
     samples = ordered_samples(columns["index"], meta, drop_n_last_frames)
-    order = BatchOrder(
-        samples,
-        batch_size,
-        seed,
-        drop_last=drop_last,
-        weights=None if weights is None else weights[samples],
-        **dealing,
-    )
+    drawn = None if weights is None else weights[samples]
+    order = BatchOrder(samples, batch_size, seed, drop_last=drop_last, weights=drawn, rank=rank, world_size=world_size)
     loader = source.loader(dataset, order, placing)
     if not held_out:
         return Loaders(dataset, loader, None, message)
     rest, columns = source.open(held_out, None)
-    order = BatchOrder(
-        per_task_samples(columns["task_index"], max_eval_samples), batch_size, 0, shuffle=False, **dealing
-    )
+    samples = per_task_samples(columns["task_index"], max_eval_samples)
+    order = BatchOrder(samples, batch_size, 0, shuffle=False, rank=rank, world_size=world_size)
     return Loaders(dataset, loader, source.loader(rest, order, placing), message)
 
 

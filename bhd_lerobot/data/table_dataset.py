@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from bhd_lerobot.data.frame_cache import FrameCache, MemoryBudgetError, check_memory
+from bhd_lerobot.data.frame_cache import FrameCache, check_memory
 from bhd_lerobot.data.gather import Batch, Gatherer, delta_indices
 from bhd_lerobot.data.source import local_metadata
 from bhd_lerobot.data.table import FrameTable, checked_episodes
-from bhd_lerobot.errors import DatasetError, unknown_name
+from bhd_lerobot.errors import DatasetError, MemoryBudgetError, unknown_name
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata

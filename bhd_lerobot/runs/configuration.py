@@ -6,8 +6,10 @@ key, the nearest one that exists, and the valid ones on that level. Both read th
 """
 
 import dataclasses
+import json
 import keyword
 import re
+import signal
 import sys
 import types
 import typing
@@ -33,11 +35,24 @@ def parse[T](config_class: type[T], arguments: Sequence[str]) -> T:
     Raises:
         ConfigError: an unknown key, a value of the wrong type, or a file that cannot be read.
     """
-    overrides = _overrides(arguments)
+    overrides = read_overrides(arguments)
     path = overrides.pop(CONFIG_PATH, None)
-    values: dict[str, Any] = _read(Path(str(path))) if path is not None else {}
+    values: dict[str, Any] = read_file(Path(str(path)).expanduser()) if path is not None else {}
     for key, value in overrides.items():
-        _set(values, key.split("."), value, key)
+        set_option(values, key, value)
+    return decode(config_class, values)
+
+
+def decode[T](config_class: type[T], values: dict[str, Any]) -> T:
+    """Return the configuration that plain values stand for.
+
+    Args:
+        config_class: a dataclass.
+        values: by the names of its fields, nested; values with an exponent and entries that are nothing are replaced.
+
+    Raises:
+        ConfigError: an unknown or missing key, or a value that cannot be honoured.
+    """
     _check_keys(config_class, values, "")
     try:
         return draccus.decode(config_class, values)
@@ -45,7 +60,8 @@ def parse[T](config_class: type[T], arguments: Sequence[str]) -> T:
         raise
     except Exception as error:  # draccus raises DecodingError, ValueError, TypeError and what our checks raise in it
         own = _own_error(error)
-        raise ConfigError(str(own) if own else f"The configuration cannot be used: {error}") from error
+        reason = " ".join(str(own or error).split())
+        raise ConfigError(reason if own else f"The configuration cannot be used: {reason}") from error
 
 
 def encode(config: Any) -> dict[str, Any]:
@@ -69,6 +85,9 @@ def run(main: Callable[[Any], int | None], config_class: type, arguments: Sequen
         for note in getattr(error, "__notes__", ()):
             print(f"  {note}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:  # before, or a second time after, the program minds it by itself
+        print("Interrupted.", file=sys.stderr)
+        return 128 + signal.SIGINT
 
 
 def describe(config_class: type, prefix: str = "", within: tuple[type, ...] = ()) -> str:
@@ -83,15 +102,15 @@ def describe(config_class: type, prefix: str = "", within: tuple[type, ...] = ()
     lines = (
         [] if prefix else [(config_class.__doc__ or "").strip(), "", "Options (also in a file: --config_path=FILE):"]
     )
-    for name, kind, default in _fields(config_class):
+    for name, kind, default in options_of(config_class):
         key = f"{prefix}{name}"
         if _entries(kind) is not None:
-            lines.append(f"  --{key}.NAME.type  {{{','.join(sorted(_choices(_entries(kind))))}}}, for every NAME")
-        elif _choices(kind):
-            lines.append(f"  --{key}.type  {{{','.join(sorted(_choices(kind)))}}}")
-            if set(within) & set(_choices(kind).values()):
+            lines.append(f"  --{key}.NAME.type  {{{','.join(sorted(choices_of(_entries(kind))))}}}, for every NAME")
+        elif choices_of(kind):
+            lines.append(f"  --{key}.type  {{{','.join(sorted(choices_of(kind)))}}}")
+            if set(within) & set(choices_of(kind).values()):
                 continue
-            for choice, subclass in sorted(_choices(kind).items()):
+            for choice, subclass in sorted(choices_of(kind).items()):
                 told = describe(subclass, f"{key}.", within).splitlines()
                 lines += [f"    {choice}:", *("  " + line for line in told)]
         elif dataclasses.is_dataclass(kind):
@@ -102,7 +121,12 @@ def describe(config_class: type, prefix: str = "", within: tuple[type, ...] = ()
     return "\n".join(line for line in lines)
 
 
-def _overrides(arguments: Sequence[str]) -> dict[str, Any]:
+def read_overrides(arguments: Sequence[str]) -> dict[str, Any]:
+    """Return the options of a command line, by their full names; their values are YAML, that of `config_path` is not.
+
+    Raises:
+        ConfigError: an argument that is no option, an option without a value or given twice, or what is no YAML.
+    """
     result: dict[str, Any] = {}
     rest = list(arguments)
     while rest:
@@ -123,43 +147,59 @@ def _overrides(arguments: Sequence[str]) -> dict[str, Any]:
     return result
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_file(path: Path) -> dict[str, Any]:
+    """Return what a YAML or JSON file holds.
+
+    Raises:
+        ConfigError: it cannot be read, or holds no keys and values.
+    """
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        values = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)  # JSON's 1e-05 is text in YAML
     except OSError as error:
-        raise ConfigError(f"The configuration {str(path)!r} cannot be read: {error.strerror}.") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not a YAML file: {error}") from error
+        raise ConfigError(
+            f"The configuration {str(path)!r} cannot be read: {error.strerror}. Give --config_path a YAML or JSON file."
+        ) from error
+    except (yaml.YAMLError, ValueError) as error:
+        kind = "JSON" if path.suffix == ".json" else "YAML"
+        raise ConfigError(f"{path} is not a {kind} file: {' '.join(str(error).split())}") from error
     if not isinstance(values, dict):
-        raise ConfigError(f"{path} must hold keys and values at its top level, found {type(values).__name__}.")
+        found = "nothing" if values is None else type(values).__name__
+        raise ConfigError(f"{path} must hold keys and values at its top level, found {found}.")
     return values
 
 
-def _set(values: dict[str, Any], keys: list[str], value: Any, full: str) -> None:
-    for key in keys[:-1]:
+def set_option(values: dict[str, Any], name: str, value: Any) -> None:
+    """Set an option in nested values by its full name, such as ``robot.type``.
+
+    Raises:
+        ConfigError: what it is an option of is a plain value.
+    """
+    *keys, last = name.split(".")
+    for key in keys:
         values = values.setdefault(key, {})
         if not isinstance(values, dict):
-            raise ConfigError(f"Option --{full} sets a key of {key!r}, which is a plain value.")
-    values[keys[-1]] = value
+            raise ConfigError(f"Option --{name} sets a key of {key!r}, which is a plain value.")
+    values[last] = value
 
 
 def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None:
-    fields = {name: kind for name, kind, _ in _fields(config_class)}
+    fields = {name: kind for name, kind, _ in options_of(config_class)}
     for key, value in values.items():
         if key not in fields:
             raise ConfigError(unknown_name("option", f"{prefix}{key}", [f"{prefix}{name}" for name in fields]))
         values[key] = _checked(f"{prefix}{key}", value, fields[key])
-    for name, kind, default in _fields(config_class):
+    for name, kind, default in options_of(config_class):
         if default is dataclasses.MISSING and name not in values:
-            if dataclasses.is_dataclass(kind) and not _choices(kind):
+            if dataclasses.is_dataclass(kind) and not choices_of(kind):
                 _check_keys(typing.cast(type, kind), {}, f"{prefix}{name}.")  # names what is missing in it
-            choice = f".type, one of {', '.join(sorted(_choices(kind)))}" if _choices(kind) else ""
+            choice = f".type, one of {', '.join(sorted(choices_of(kind)))}" if choices_of(kind) else ""
             raise ConfigError(f"The option {prefix}{name} is required; set --{prefix}{name}{choice}.")
 
 
 def _checked(key: str, value: Any, kind: Any) -> Any:
     """Return the value of an option whose keys, if it has any, all exist."""
-    choices, entries = _choices(kind), _entries(kind)
+    choices, entries = choices_of(kind), _entries(kind)
     if entries is not None and isinstance(value, dict):
         # Nothing in the place of an entry takes it out: a command line can drop what a file names.
         kept = {name: one for name, one in value.items() if one is not None}
@@ -181,7 +221,8 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
         return None
     if entries is not None or dataclasses.is_dataclass(kind) or choices:
         name = ".NAME" if entries is not None else ""
-        raise ConfigError(f"{key} is {value!r}; it has keys of its own, such as {key}{name}.type.")
+        first = "type" if entries is not None or choices else options_of(typing.cast(type, kind))[0][0]
+        raise ConfigError(f"{key} is {value!r}; it has keys of its own, such as {key}{name}.{first}.")
     return _checked_value(key, value, kind)
 
 
@@ -191,12 +232,21 @@ def _checked_value(key: str, value: Any, kind: Any) -> Any:
     if float in allowed and isinstance(value, str) and _EXPONENT.fullmatch(value):
         return float(value)  # YAML takes 1e-6 for text: it wants a point in it
     for one in allowed:
+        if typing.get_origin(one) is list and not isinstance(value, list):
+            continue
+        if typing.get_origin(one) is list and typing.get_args(one)[0] in (int, float, bool):
+            return [_checked_value(f"{key}[{i}]", item, typing.get_args(one)[0]) for i, item in enumerate(value)]
         if one not in _PLAIN:
-            return value  # enumerations and lists: the decoder checks them
+            return value  # enumerations and other lists: the decoder checks them
         if isinstance(value, _PLAIN[one]) and (one is bool or not isinstance(value, bool)):
             return value
-    names = " or ".join("nothing" if one is type(None) else one.__name__ for one in allowed)
-    raise ConfigError(f"{key} is {value!r}; it must be {names}.")
+    raise ConfigError(f"{key} is {value!r}; it must be {' or '.join(map(_named, allowed))}.")
+
+
+def _named(kind: Any) -> str:
+    if typing.get_origin(kind) is list:
+        return f"a list of {_named(typing.get_args(kind)[0])} in brackets, such as [a, b]"
+    return "nothing" if kind is type(None) else str(getattr(kind, "__name__", kind))
 
 
 _EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
@@ -210,7 +260,7 @@ _PLAIN: dict[Any, tuple[type, ...]] = {
 }
 
 
-def _fields(config_class: type) -> list[tuple[str, Any, Any]]:
+def options_of(config_class: type) -> list[tuple[str, Any, Any]]:
     """Return name, type and default of each field; the default is MISSING where there is none."""
     hints = typing.get_type_hints(config_class)
     result = []
@@ -225,7 +275,7 @@ def _fields(config_class: type) -> list[tuple[str, Any, Any]]:
 def _entries(kind: Any) -> Any:
     """Return the choice type of the entries of a mapping from names to choices, or None if it is none."""
     arguments = typing.get_args(kind) if typing.get_origin(kind) is dict else ()
-    return arguments[1] if len(arguments) == 2 and _choices(arguments[1]) else None
+    return arguments[1] if len(arguments) == 2 and choices_of(arguments[1]) else None
 
 
 def _keyed(names: Iterable[Any], kind: Any) -> type:
@@ -240,7 +290,7 @@ def _allows_none(kind: Any) -> bool:
     return type(None) in typing.get_args(kind)
 
 
-def _choices(kind: Any) -> dict[str, type]:
+def choices_of(kind: Any) -> dict[str, type]:
     """Return the registered classes of a choice type, or of one that may be nothing; empty if it is none."""
     if _allows_none(kind) and len(typing.get_args(kind)) == 2:
         kind = typing.get_args(kind)[0]

@@ -27,7 +27,7 @@ from bhd_lerobot.runs.rl.config import is_rl
 from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
 from bhd_lerobot.runs.train_arguments import Request, parse_train
 from bhd_lerobot.runs.train_checkpoint import TrainingParts, resume_command
-from bhd_lerobot.runs.train_data import TrainingData, open_data, open_metadata
+from bhd_lerobot.runs.train_data import TrainingData, open_data, open_metadata, select_episodes
 from bhd_lerobot.runs.train_env import EnvEvaluation
 from bhd_lerobot.runs.train_log import (
     METRICS_NAME,
@@ -99,8 +99,7 @@ def train(request: Request, console: Console | None = None) -> TrainResult:
         meta = open_metadata(config)
     if request.contract is not None:
         check_contract(request.contract, meta)
-    if not config.selection.is_everything:  # resolved, so that lerobot-train can go on with the same episodes
-        config.dataset.episodes = config.selection.filter.select(meta, config.dataset.episodes)
+    select_episodes(config, meta)
     policy = build_policy(config, meta, accelerator)
     keep = config.resume or (request.contract is not None and config.fine_tune_statistics == "checkpoint")
     preprocessor, postprocessor = build_processors(config, policy, meta, accelerator.device, keep_statistics=keep)

@@ -4,14 +4,12 @@ Adds to `configuration.parse` what LeRobot's training knows beyond plain fields:
 configuration that lies in a checkpoint.
 """
 
-import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import draccus
 import lerobot.policies  # noqa: F401  registers LeRobot's own
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME
@@ -49,7 +47,7 @@ def parse_train(arguments: Sequence[str]) -> Request:
     """
     # LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
-    overrides = configuration._overrides(arguments)
+    overrides = configuration.read_overrides(arguments)
     path = overrides.pop(configuration.CONFIG_PATH, None)
     resume = overrides.get("resume") is True
     checkpoint: Path | None = None
@@ -60,11 +58,11 @@ def parse_train(arguments: Sequence[str]) -> Request:
         values = _read_checkpoint(checkpoint)
         values["output_dir"] = str(checkpoint.parent.parent)  # the run may have been moved
     else:
-        values = _read(Path(str(path)).expanduser()) if path is not None else {}
+        values = configuration.read_file(Path(str(path)).expanduser()) if path is not None else {}
     for key, value in overrides.items():
         if key.startswith("policy.") and not isinstance(values.get("policy"), dict):
             values["policy"] = {}
-        configuration._set(values, key.split("."), value, key)
+        configuration.set_option(values, key, value)
     return _decoded(values, checkpoint)
 
 
@@ -84,25 +82,11 @@ def resumed_checkpoint(path: Path) -> Path:
     )
 
 
-def _read(path: Path) -> dict[str, Any]:
-    if path.suffix != ".json":
-        return configuration._read(path)
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))  # YAML would take JSON's 1e-05 for text
-    except OSError as error:
-        raise ConfigError(f"The configuration {str(path)!r} cannot be read: {error.strerror}.") from error
-    except ValueError as error:
-        raise ConfigError(f"{path} is not a JSON file: {error}") from error
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path} must hold keys and values at its top level, found {type(values).__name__}.")
-    return values
-
-
 def _read_checkpoint(checkpoint: Path) -> dict[str, Any]:
     folder = checkpoint / PRETRAINED_MODEL_DIR
-    values = _read(folder / TRAIN_CONFIG_NAME)
+    values = configuration.read_file(folder / TRAIN_CONFIG_NAME)
     own = folder / OWN_CONFIG_NAME  # a checkpoint of lerobot-train has none
-    values |= _read(own) if own.is_file() else {}
+    values |= configuration.read_file(own) if own.is_file() else {}
     # Where it is not said, LeRobot's rule was the only one.
     values["selection"] = {"hold_out": "instruction", **(values.get("selection") or {})}
     return values
@@ -115,12 +99,7 @@ def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
     if isinstance(selection, dict) and isinstance(selection.get("outcome"), str):
         selection["outcome"] = [selection["outcome"]]
     _drop_defaults(BhdTrainConfig, values)
-    configuration._check_keys(BhdTrainConfig, values, "")
-    try:
-        config = draccus.decode(BhdTrainConfig, values)
-    except Exception as error:  # draccus raises DecodingError, ValueError, TypeError and what our checks raise in it
-        own = configuration._own_error(error)
-        raise ConfigError(str(own) if own else f"The configuration cannot be used: {error}") from error
+    config = configuration.decode(BhdTrainConfig, values)
     if checkpoint is not None:
         config.checkpoint_path = checkpoint
         config.policy.pretrained_path = checkpoint / PRETRAINED_MODEL_DIR
@@ -129,13 +108,13 @@ def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
 
 def _drop_defaults(config_class: type, values: dict[str, Any]) -> None:
     """Leave out what the chosen classes say themselves: LeRobot's defaults do not all have the type of their field."""
-    for key, kind, _ in configuration._fields(config_class):
+    for key, kind, _ in configuration.options_of(config_class):
         value = values.get(key)
         if not isinstance(value, dict):
             continue
-        chosen = configuration._choices(kind).get(str(value.get("type")))
+        chosen = configuration.choices_of(kind).get(str(value.get("type")))
         if chosen is not None:
-            defaults = {name: default for name, _, default in configuration._fields(chosen)}
+            defaults = {name: default for name, _, default in configuration.options_of(chosen)}
             values[key] = {
                 name: one
                 for name, one in value.items()

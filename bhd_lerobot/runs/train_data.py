@@ -1,4 +1,4 @@
-"""What a training run learns from: episodes chosen and split, checked, and served as batches."""
+"""What a training run learns from, by its configuration; `data/` chooses, splits, checks and serves it."""
 
 import json
 from collections.abc import Callable
@@ -11,10 +11,9 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.transforms import ImageTransforms
-from lerobot.utils.constants import IMAGENET_STATS
 
 from bhd_lerobot.data.identity import default_root
-from bhd_lerobot.data.loader import Loader, check, make_loader
+from bhd_lerobot.data.loader import Loader, check, imagenet_stats, make_loader
 from bhd_lerobot.data.source import local_metadata
 from bhd_lerobot.data.table import checked_episodes
 from bhd_lerobot.errors import DatasetError
@@ -59,10 +58,18 @@ def open_metadata(config: BhdTrainConfig) -> LeRobotDatasetMetadata:
             f"Run bhd-data repair {meta.root}."
         )
     if dataset.use_imagenet_stats:
-        for key in meta.camera_keys:
-            for kind, values in IMAGENET_STATS.items():
-                meta.stats[key][kind] = torch.tensor(values, dtype=torch.float32)
+        imagenet_stats(meta)
     return meta
+
+
+def select_episodes(config: BhdTrainConfig, meta: LeRobotDatasetMetadata) -> None:
+    """Put the episodes that `selection` leaves into `dataset.episodes`, so that lerobot-train can go on with the same.
+
+    Raises:
+        DatasetError: none is left; the message says what there is.
+    """
+    if not config.selection.is_everything:
+        config.dataset.episodes = config.selection.filter.select(meta, config.dataset.episodes)
 
 
 def _refuse_empty(root: Path) -> None:
@@ -88,7 +95,7 @@ def open_data(
     """Load the dataset.
 
     Args:
-        config: what is asked for.
+        config: what is asked for, with `dataset.episodes` as `select_episodes` left it.
         policy: the policy's configuration, with its features.
         meta: of the dataset.
         device: where batches are needed.
@@ -109,7 +116,6 @@ def open_data(
         root=meta.root,
         revision=dataset.revision,
         episodes=dataset.episodes,
-        selection=config.selection.filter,
         intervention_weight=config.selection.intervention_weight,
         eval_split=dataset.eval_split,
         hold_out=config.selection.hold_out,

@@ -47,7 +47,8 @@ def test_numbers_may_have_an_exponent(text):
         (["--seed=1.5"], "must be int"),
         (["--seed=true"], "must be int"),
         (["--resume=1"], "must be bool"),
-        (["--dataset.tags=x"], "tags"),
+        (["--dataset.tags=x"], r"dataset.tags is 'x'; it must be a list of str in brackets, such as \[a, b\]"),
+        (["--dataset=x"], r"has keys of its own, such as dataset\.repo_id"),
         (["--dataset.fps.x=1"], "fps"),
         (["--seed=[1"], "cannot be read"),
         (["--config_path=missing.yaml"], "'missing.yaml' cannot be read: No such file"),
@@ -63,14 +64,6 @@ def test_required_options_are_asked_for(left_out):
     options = [option for index, option in enumerate(REQUIRED) if index != left_out]
     with pytest.raises(ConfigError, match=REQUIRED[left_out][2:].split("=")[0].removesuffix(".type")):
         parse(RecordConfig, options)
-
-
-@pytest.mark.parametrize("text", ["- a\n- b\n", "a: [", "\x00"])
-def test_files_that_are_no_configuration(tmp_path, text):
-    path = tmp_path / "c.yaml"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=r"c\.yaml"):
-        parse(RecordConfig, [f"--config_path={path}"])
 
 
 def test_errors_of_ours_are_sentences_and_others_keep_their_traceback(capsys):
@@ -90,3 +83,31 @@ def test_help_lists_every_option():
     text = describe(RecordConfig)
     for option in ("--robot.beams", "--dataset.episode_time_s", "--brain.safe_distance_m", "--task.arena", "--resume"):
         assert option in text
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.yaml", b"", "found nothing"),
+        ("a.yaml", b"- x\n", "found list"),
+        ("a.yaml", b"a: [1\nb: {", "is not a YAML file"),
+        ("a.yaml", b"\xff\xfe\x00", "is not a YAML file"),
+        ("a.yaml", b"\x00", "is not a YAML file"),
+        ("a.json", b"{", "is not a JSON file"),
+    ],
+)
+def test_files_that_are_no_configuration(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ConfigError, match=message) as caught:
+        parse(RecordConfig, [f"--config_path={tmp_path / name}"])
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ConfigError, match=r"Is a directory.*--config_path a YAML"):
+        parse(RecordConfig, [f"--config_path={tmp_path}"])
+
+
+def test_ctrl_c_before_anything_began_is_no_traceback(capsys):
+    def stopped(config):
+        raise KeyboardInterrupt
+
+    assert run(stopped, RecordConfig, REQUIRED) == 130
+    assert capsys.readouterr().err == "Interrupted.\n"

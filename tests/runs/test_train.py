@@ -14,8 +14,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_train
 
-from bhd_lerobot.data.frame_cache import MemoryBudgetError
-from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.errors import BhdError, ConfigError, MemoryBudgetError
 from bhd_lerobot.runs import train as train_module
 from bhd_lerobot.runs import train_checkpoint
 from bhd_lerobot.runs.train import main

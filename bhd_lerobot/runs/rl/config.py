@@ -291,12 +291,12 @@ def is_rl(arguments: Sequence[str]) -> bool:
     What is wrong with the command line is left to the parser that reads it next.
     """
     try:
-        overrides = configuration._overrides(arguments)
+        overrides = configuration.read_overrides(arguments)
         if "algorithm" in overrides:
             return True
         path = overrides.get(configuration.CONFIG_PATH)
         file = None if path is None else _config_file(Path(str(path)))
-        return file is not None and file.suffix != ".json" and "algorithm" in configuration._read(file)
+        return file is not None and file.suffix != ".json" and "algorithm" in configuration.read_file(file)
     except ConfigError:
         return False
 
