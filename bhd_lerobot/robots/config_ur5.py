@@ -30,6 +30,7 @@ class UR5Config(RobotConfig):
         control: ``"servo"``: position servos, stiff and precise, with goals; ``"impedance"``: joint torques that make
             the tool a damped spring, for contact; needs `action_space = "tool"` and takes no goals.
         action_space: ``"joint"``: joint positions; ``"tool"``: a tool pose, from which the bridge computes them.
+        tool_pose: observe the tool's pose as well, computed from the joint positions.
         scene: what is on the table when the robot is used by itself: ``"empty"``, ``"reach"`` (a target pose) or
             ``"pick"`` (objects). In a task the task decides.
         seed: seed of the scene and of the sensor noise when the robot is used by itself.
@@ -47,6 +48,7 @@ class UR5Config(RobotConfig):
     physics_hz: int = 500
     control: str = "servo"
     action_space: str = "joint"
+    tool_pose: bool = False
     scene: str = "empty"
     seed: int = 0
     camera: bool = False

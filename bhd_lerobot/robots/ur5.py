@@ -9,7 +9,7 @@ from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot
 from bhd_lerobot.robots.tool_space import TOOL_NAMES
-from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, OBSERVED, UR5Simulation
+from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, UR5Simulation, observation_names
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 
@@ -20,7 +20,7 @@ class UR5(SimulatedRobot):
     Action: `shoulder_pan.pos`, `shoulder_lift.pos`, `elbow.pos`, `wrist_1.pos`, `wrist_2.pos`, `wrist_3.pos` [rad] and
     `gripper.pos` [m of opening]; or, with `action_space = "tool"`, `tool_x.pos`, `tool_y.pos`, `tool_z.pos` [m], the
     quaternion `tool_qw.pos` … `tool_qz.pos`, and `gripper.pos`. Observation: `.pos` and `.vel` of the joints and of the
-    gripper; by option the images `scene` and `wrist`.
+    gripper; by option the pose of the tool, under the names that it has in actions, and the images `scene` and `wrist`.
 
     Args:
         config: the configuration.
@@ -67,7 +67,7 @@ class UR5(SimulatedRobot):
     @property
     def observation_names(self) -> tuple[str, ...]:
         """Names of the observation's floats, in order."""
-        return OBSERVED
+        return observation_names(self.config)
 
     @property
     def action_names(self) -> tuple[str, ...]:

@@ -53,7 +53,6 @@ class UR5Simulation(Simulation):
     """
 
     action_names = JOINT_ACTIONS
-    observation_names = OBSERVED
 
     def __init__(
         self, config: "UR5Config", n: int = 1, threads: int | None = None, planning: Planning | None = None
@@ -72,6 +71,7 @@ class UR5Simulation(Simulation):
         self.cerebellum = Cerebellum(body, self.plant, config.control_hz, controller=self.controller)
         self.bridge = LockstepBridge(self.cerebellum, self.rates, self.advance)
         self.kinematics = ArmKinematics(body.chain, body.limits)
+        self.observation_names = observation_names(config)
         if config.action_space == "tool":
             self.action_names = TOOL_NAMES
         self.camera_names = ("scene", "wrist") if config.camera else ()
@@ -123,6 +123,8 @@ class UR5Simulation(Simulation):
                 noise = self._rngs[sim].normal(0.0, self._noise[sim], (2, joints))
                 state[sim, :joints] += noise[0]
                 state[sim, joints + 1 : -1] += noise[1] * _SPEED_NOISE
+        if self.config.tool_pose:
+            state = np.concatenate([state, pose_vectors(self.kinematics.tool(state[:, : len(JOINTS)]))], axis=1)
         return state, self._now * self.tick
 
     @property
@@ -171,3 +173,8 @@ class UR5Simulation(Simulation):
                 continue
             setpoints[sim, :-1], setpoints[sim, -1] = result.postures[0], action[sim, -1]
         return setpoints, refused
+
+
+def observation_names(config: "UR5Config") -> tuple[str, ...]:
+    """Return the names of the observation's floats, in order."""
+    return OBSERVED + TOOL_NAMES[:-1] * config.tool_pose

@@ -1,14 +1,18 @@
 """Tool poses as actions: the numbers, and a UR5 that follows them or says why not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.bodies.tabletop import TableScene, Variation
+from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.messages import Limit, Mode, Reason
 from bhd_lerobot.control.poses import pose_vectors
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.tool_space import TOOL_NAMES, pose_matrices
+from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 
 DOWN = [0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0]
@@ -47,6 +51,23 @@ def test_what_is_no_orientation_is_not_guessed_at(length: float) -> None:
     assert problem is not None
     assert "length" in problem
     assert "must be near 1" in problem
+
+
+def test_the_observed_tool_pose_is_that_of_the_observed_joints_with_their_noise() -> None:
+    arm = UR5Simulation(UR5Config(tool_pose=True), 2, threads=1)
+    noisy = replace(Variation(), sensor_noise=0.01)
+    scenes = [TableScene("empty", (), arm.body.home, variation=one) for one in (Variation(), noisy)]
+    arm.reset(np.arange(2), scenes, [0, 1])
+    arm.act(np.repeat(arm.cerebellum.command[:1], 2, axis=0))
+    state, _ = arm.sense()
+    names = list(arm.observation_names)
+    assert names[-7:] == list(TOOL_NAMES[:-1])
+    assert state.shape == (2, len(names))
+    joints = state[:, [names.index(f"{joint}.pos") for joint in JOINTS]]
+    assert np.allclose(state[:, -7:], pose_vectors(arm.kinematics.tool(joints)), atol=1e-12)
+    assert np.allclose(state[0, -7:-4], arm.truth().tool_pose[0, :3], atol=1e-3)
+    assert np.abs(state[1, -7:-4] - arm.truth().tool_pose[1, :3]).max() > 1e-3
+    assert list(UR5(UR5Config(tool_pose=True)).observation_features) == names
 
 
 @pytest.fixture(scope="module")
