@@ -24,6 +24,12 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {
 }
 _LOG_STD = (-5.0, 2.0)  # a standard deviation that goes to 0 makes the loss go to minus infinity
 _PADDING = "action_is_pad"
+_HINTS = {
+    OBS_SCAN: " Run the policy's own preprocessor first.",
+    OBS_ENV_STATE: " A task tells it; a robot's own sensors, and so lerobot-rollout, do not. Run this policy in "
+    "bhd-eval or lerobot-eval, or train one on the sensors alone: "
+    "--policy.input_features='{observation.state: {type: STATE, shape: [WIDTH]}}'.",
+}
 
 type Layer = tuple[Tensor, Tensor]
 """Weight, shape (outputs, inputs), and bias, shape (outputs,), of a linear layer."""
@@ -220,8 +226,7 @@ class MlpPolicy(PreTrainedPolicy):
         """Return an input, shape (batch, n_obs_steps, width)."""
         values = batch.get(key)
         if values is None:
-            hint = " Run the policy's own preprocessor first." if key == OBS_SCAN else ""
-            raise ConfigError(f"bhd_mlp was trained with {key!r}, which is not in the batch.{hint}")
+            raise ConfigError(f"bhd_mlp was trained with {key!r}, which is not in the batch.{_HINTS.get(key, '')}")
         values = values.unsqueeze(1) if values.ndim == 2 else values
         if values.shape[1] != self.config.n_obs_steps:
             raise ConfigError(
