@@ -149,7 +149,7 @@ class Demo:
         _check(result.exit_status)
         self._console.print(_table(result.results, one))
         self._say(f"learned, beside the rule: {verdict(result.results.paired['learned'])}.")
-        self._say(f"score: {one.score}. Longer training: {one.recipe}")
+        self._say(f"score: {one.score}. Training in full: {one.recipe}, docs/training.md")
         return result.report
 
     def _head(self, text: str) -> None:
