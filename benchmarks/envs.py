@@ -6,23 +6,42 @@ the table shows medians, and medians of the ratios within a turn, because a nois
 """
 
 import argparse
+import multiprocessing
+import signal
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing import forkserver
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from rich.console import Console
-from rich.table import Table
 
-from benchmarks.record import bare_step
+from benchmarks.spread import ratios, spread, write
 from bhd_lerobot.envs.config_env import BhdEnvConfig
+
+# Not imported here: the recorder and the rest that only the measuring process needs. Every process of `AsyncVectorEnv`
+# imports this module anew, and 64 of them would be busy with that for minutes.
 
 GOAL = 0.70  # of the bare physics and scans
 FPS = 10
 OURS, BARE = "BhdVectorEnv", "Batch.step and lidar alone"
 PEERS = {"SyncVectorEnv": "sync", "AsyncVectorEnv": "async"}
+TASK = "TurtleBot3Avoid-v0"
+# What a process of `AsyncVectorEnv` needs, imported once, before the processes part.
+PRELOADED = (
+    "bhd_lerobot.envs.config_env",
+    "bhd_lerobot.envs.stage",
+    "bhd_lerobot.robots.turtlebot3",
+    "benchmarks.envs",
+)
+
+
+class TooLateError(Exception):
+    """Something did not come up in time."""
 
 
 def actions(n: int, frames: int = 64) -> np.ndarray:
@@ -50,6 +69,7 @@ def stepper(env: VectorEnv) -> Callable[[float], float]:
 
 def bare(n: int) -> Callable[[float], float]:
     """Return the same for the physics steps and the scans alone; each scan is worth two frames."""
+    from benchmarks.record import bare_step
 
     def run(seconds: float) -> float:
         steps, used = 0, 0.0
@@ -61,6 +81,94 @@ def bare(n: int) -> Callable[[float], float]:
     return run
 
 
+@contextmanager
+def time_limit(seconds: float, what: str) -> Iterator[None]:
+    """Raise `TooLateError` in the block when so many seconds are over; processes that it started are ended then."""
+
+    def late(*_: Any) -> None:
+        raise TooLateError(f"{what} did not come up within {seconds:.0f} s")
+
+    before = multiprocessing.active_children()
+    handler = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    except TooLateError:
+        for process in multiprocessing.active_children():
+            if process not in before:
+                process.kill()
+        raise
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, handler)
+
+
+def make(kind: str, n: int) -> VectorEnv:
+    """Return n environments side by side, as `kind` does that."""
+    env = BhdEnvConfig(task=TASK, vector=kind).create_envs(n)["bhd"][0]
+    if env.metadata["autoreset_mode"] != AutoresetMode.SAME_STEP:
+        raise AssertionError("All of them are measured in the same autoreset mode.")
+    return env
+
+
+def start(names: list[str], n: int, limit_s: float) -> tuple[dict[str, VectorEnv], dict[str, str]]:
+    """Make ours and Gymnasium's; return them by name, and what did not come up in time, with the reason."""
+    multiprocessing.set_forkserver_preload(list(PRELOADED))
+    forkserver.ensure_running()
+    envs: dict[str, VectorEnv] = {}
+    problems: dict[str, str] = {}
+    for name in names:
+        try:
+            with time_limit(limit_s, f"{n} environments of {name}"):
+                env = make(PEERS.get(name, "bhd"), n)
+                env.reset(seed=0)
+                envs[name] = env
+        except (TooLateError, OSError, EOFError) as error:
+            if name == OURS:
+                raise
+            problems[name] = str(error) or type(error).__name__
+            print(f"{name} is not measured: {problems[name]}", flush=True)
+    return envs, problems
+
+
+def measure(parts: dict[str, Callable[[float], float]], repeats: int, seconds: float) -> dict[str, list[float]]:
+    """Return environment steps a second of each, turn by turn."""
+    speeds: dict[str, list[float]] = {name: [] for name in parts}
+    for _ in range(repeats):
+        for name, run in parts.items():
+            speeds[name].append(run(seconds))
+    return speeds
+
+
+def summary(speeds: dict[str, list[float]], problems: dict[str, str], n: int) -> dict[str, Any]:
+    """Return what was measured, as plain values."""
+    over = {name: spread(ratios(speeds[OURS], values)) for name, values in speeds.items() if name != OURS}
+    return {
+        "task": TASK,
+        "n": n,
+        "steps_per_s": {name: spread(values) for name, values in speeds.items()},
+        "ours_is": over,
+        "not_measured": problems,
+        "goal": GOAL,
+        "met": over[BARE]["median"] >= GOAL,
+    }
+
+
+def show(speeds: dict[str, list[float]], results: dict[str, Any]) -> None:
+    """Print the table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{TASK}, {results['n']} environments", title_justify="left")
+    for heading in ("measured", "steps per s", "ours is", "goal"):
+        table.add_column(heading, justify="left" if heading == "measured" else "right")
+    for name, values in speeds.items():
+        ratio = 1.0 if name == OURS else results["ours_is"][name]["median"]
+        goal = f">= {GOAL:.2f} x" if name == BARE else ""
+        table.add_row(name, f"{statistics.median(values):.0f}", f"{ratio:.2f} x", goal)
+    Console(width=100).print(table)
+
+
 def main() -> int:
     """Print the table; return 1 if the goal was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -68,35 +176,24 @@ def main() -> int:
     parser.add_argument("--repeats", type=int, default=7, help="turns")
     parser.add_argument("--seconds", type=float, default=3.0, help="length of each part of a turn")
     parser.add_argument("--peers", nargs="*", choices=("sync", "async"), default=["sync", "async"], help="Gymnasium's")
+    parser.add_argument("--limit", type=float, default=300.0, help="longest time for one of them to come up [s]")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
     options = parser.parse_args()
-    kinds = {OURS: "bhd"} | {name: kind for name, kind in PEERS.items() if kind in options.peers}
-    envs = {
-        name: BhdEnvConfig(task="TurtleBot3Avoid-v0", vector=kind).create_envs(options.n)["bhd"][0]
-        for name, kind in kinds.items()
-    }
-    for env in envs.values():
-        if env.metadata["autoreset_mode"] != AutoresetMode.SAME_STEP:
-            raise AssertionError("All of them are measured in the same autoreset mode.")
-    parts = {name: stepper(env) for name, env in envs.items()} | {BARE: bare(options.n)}
-    speeds: dict[str, list[float]] = {name: [] for name in parts}
-    for _ in range(options.repeats):
-        for name, run in parts.items():
-            speeds[name].append(run(options.seconds))
-    for env in envs.values():
-        env.close()
-    table = Table(title=f"TurtleBot3Avoid-v0, {options.n} environments", title_justify="left")
-    for heading in ("measured", "steps per s", "ours is", "goal"):
-        table.add_column(heading, justify="left" if heading == "measured" else "right")
-    ratios = {}
-    for name, values in speeds.items():
-        ratios[name] = statistics.median(mine / other for mine, other in zip(speeds[OURS], values, strict=True))
-        goal = f">= {GOAL:.2f} x" if name == BARE else ""
-        table.add_row(name, f"{statistics.median(values):.0f}", f"{ratios[name]:.2f} x", goal)
-    Console(width=100).print(table)
-    missed = ratios[BARE] < GOAL
-    if missed:
-        print(f"Missed: {ratios[BARE]:.2f} of the bare physics with the same lidar.")
-    return int(missed)
+    # The processes come first: they part from one that has no threads yet.
+    names = [name for name, kind in reversed(PEERS.items()) if kind in options.peers]
+    envs, problems = start([*names, OURS], options.n, options.limit)
+    try:
+        parts = {name: stepper(env) for name, env in reversed(envs.items())} | {BARE: bare(options.n)}
+        speeds = measure(parts, options.repeats, options.seconds)
+    finally:
+        for env in envs.values():
+            env.close()
+    results = summary(speeds, problems, options.n)
+    show(speeds, results)
+    write(options.json, results)
+    if not results["met"]:
+        print(f"Missed: {results['ours_is'][BARE]['median']:.2f} of the bare physics with the same lidar.")
+    return int(not results["met"])
 
 
 if __name__ == "__main__":

@@ -27,9 +27,11 @@ os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.spread import spread, write
 from bhd_lerobot.data.loader import BatchLoader, TableDataset
 
 BATCH, CHUNK, WORKERS = 64, 50, (0, 2)
+NAMES = ("ours", *(f"LeRobot, {n} workers" for n in WORKERS))
 CASES = {
     "state": ("configs/record/ur5_reach.yaml", 50, 200.0, ()),
     "cameras": (
@@ -133,7 +135,7 @@ def main() -> int:
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
     table = Table(title="Loader: batches of 64, action chunks of 50 steps", title_justify="left")
-    for heading in ("measured", "ours", *(f"LeRobot, {n} workers" for n in WORKERS), "ratio", "goal"):
+    for heading in ("measured", *NAMES, "ratio", "goal"):
         table.add_column(heading, justify="left" if heading == "measured" else "right")
     results: dict[str, Any] = {}
     missed = []
@@ -155,9 +157,10 @@ def main() -> int:
                 f">= {goal:.0f}",
             )
             results[name] = {
-                "samples_per_s": medians,
-                "ratio": ratio,
+                "samples_per_s": dict(zip(NAMES, map(spread, zip(*values, strict=True)), strict=True)),
+                "ratio": spread([mine / max(theirs) for mine, *theirs in values]),
                 "goal": goal,
+                "met": ratio >= goal,
                 "samples": samples,
                 "mib": mebibytes,
             }
@@ -176,13 +179,15 @@ def main() -> int:
                     f"{ratio:.3g}",
                     "",
                 )
-                results[name][what.replace(" ", "_")] = {"seconds": medians, "ratio": ratio}
+                results[name][what.replace(" ", "_")] = {
+                    "seconds": dict(zip(NAMES, map(spread, zip(*rows, strict=True)), strict=True)),
+                    "ratio": spread([min(theirs) / mine for mine, *theirs in rows]),
+                }
     finally:
         with contextlib.suppress(OSError):
             shutil.rmtree(folder)
     Console(width=150).print(table)
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=1), encoding="utf-8")
+    write(options.json, results)
     if missed:
         print(f"Missed: {', '.join(missed)}")
     return 1 if missed else 0

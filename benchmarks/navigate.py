@@ -8,16 +8,19 @@ import argparse
 import sys
 import time
 from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 
+from benchmarks.spread import write
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.navigator import NavigatorBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
 from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import EpisodeSpec
-from bhd_lerobot.runs.eval_statistics import wilson
+from bhd_lerobot.runs.eval_statistics import mean, wilson
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, Outcome, episode_seed
 
@@ -48,6 +51,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--split", choices=("held_out", "train"), default="held_out")
     parser.add_argument("--arena", default="random")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
     args = parser.parse_args()
     task = NavigateConfig(arena=args.arena, random_start=args.arena != "random")
     seeds = [episode_seed(args.seed, episode, args.split) for episode in range(args.episodes)]
@@ -62,13 +66,31 @@ def main() -> int:
     print(f"success     {rate.value:.1%} ({rate.low:.1%} to {rate.high:.1%}), goal {GOAL_SUCCESS:.0%}")
     print(f"ends        {', '.join(f'{cause} {count}' for cause, count in causes.most_common())}")
     print(f"SPL         mean {spl.mean():.3f}, 5 % below {np.percentile(spl, 5):.3f}, goal {GOAL_SPL}")
-    print(f"time        median {np.median(duration):.1f} s, longest {duration.max():.1f} s")
+    if len(duration):
+        print(f"time        median {np.median(duration):.1f} s, longest {duration.max():.1f} s")
     for n, one in ((1, alone), (min(SIDE_BY_SIDE, len(seeds)), times)):
         print(f"act, n={n:<4} mean {one.mean() * 1e3:.2f} ms, median {np.median(one) * 1e3:.2f} ms")
     failed = [index for index, outcome in enumerate(outcomes) if not outcome.success]
     if failed:
         print("failed      " + ", ".join(f"{index} ({outcomes[index].event.cause})" for index in failed))
-    met = len(good) >= GOAL_SUCCESS * len(outcomes) and not causes[Event.COLLISION.cause] and spl.mean() > GOAL_SPL
+    collisions = causes[Event.COLLISION.cause]
+    met = rate.value >= GOAL_SUCCESS and not collisions and spl.mean() > GOAL_SPL
+    write(
+        args.json,
+        {
+            "episodes": len(outcomes),
+            "split": args.split,
+            "arena": args.arena,
+            "seed": args.seed,
+            "success": {**asdict(rate), "goal": GOAL_SUCCESS, "met": rate.value >= GOAL_SUCCESS},
+            "ends": dict(causes),
+            "collisions": {"value": collisions, "goal": 0, "met": not collisions},
+            "spl": {**asdict(mean(spl)), "goal": GOAL_SPL, "met": bool(spl.mean() > GOAL_SPL)},
+            "median_time_s": float(np.median(duration)) if len(duration) else None,
+            "act_s": {"1": float(np.median(alone)), str(min(SIDE_BY_SIDE, len(seeds))): float(np.median(times))},
+            "met": bool(met),
+        },
+    )
     print("goal met" if met else "GOAL MISSED")
     return 0 if met else 1
 

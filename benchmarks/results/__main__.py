@@ -8,15 +8,20 @@ import shutil
 import sys
 from pathlib import Path
 
+from benchmarks.results.adaptation import fine_tune
 from benchmarks.results.learning import avoid, pick, reach
 from benchmarks.results.page import write_page
 from benchmarks.results.runner import REPOSITORY, FailedError, Runner
 from benchmarks.results.section import Measure, Section
+from benchmarks.results.speed import navigate, speed
 
 MEASURES = (
     Measure("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),
     Measure("reach", "Reach: a UR5 brings its tool to a pose", reach),
     Measure("pick", "Pick, from state: a UR5 picks up what it is told to", pick),
+    Measure("fine_tune", "Fine-tune: 10 episodes of a shifted world", fine_tune),
+    Measure("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),
+    Measure("speed", "Speed", speed),
 )
 
 

@@ -1,25 +1,136 @@
-"""The sections about speed: the benchmarks of this folder, each beside its peers in one run."""
+"""The sections about speed, and about the rule of the navigate task: benchmarks of this folder, run as they are."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section
 
 _MISSED = 1  # the exit status of a benchmark that found a goal missed
+_BARE = "Batch.step and lidar alone"
+_PEERS = ("SyncVectorEnv", "AsyncVectorEnv")
 
 
-def benchmark(module: str, rows: Callable[[Any], list[Row]]) -> Callable[[Runner, Section], None]:
+def benchmark(
+    module: str, rows: Callable[[Any], list[Row]], *options: str, short: Sequence[str] = ()
+) -> Callable[[Runner, Section], None]:
     """Return what runs a benchmark that writes JSON.
 
     Args:
         module: name of the benchmark.
         rows: makes rows of what it wrote.
+        options: of its command line.
+        short: options for a short run, after those.
     """
 
     def measure(run: Runner, section: Section) -> None:
         output = run.path("speed", f"{module}.json")
-        run.run(f"speed_{module}", ["python", "-m", f"benchmarks.{module}", f"--json={output}"], allowed=(0, _MISSED))
+        command = ["python", "-m", f"benchmarks.{module}", *options, *(short if run.is_short else ())]
+        run.run(f"speed_{module}", [*command, f"--json={output}"], allowed=(0, _MISSED))
         section.rows += rows(run.read("speed", f"{module}.json"))
 
     return measure
+
+
+def speed(run: Runner, section: Section) -> None:
+    """Loader, environments and evaluation, each beside its peers in one run."""
+    for measure in (
+        benchmark("loader", loader_rows, short=("--repeats=1", "--seconds=0.5", "--no-epoch")),
+        benchmark("envs", envs_rows, short=("--n=4", "--repeats=1", "--seconds=0.5", "--limit=120")),
+        benchmark("evaluate", evaluate_rows, short=("--episodes=4", "--n_envs=4", "--turns=1")),
+    ):
+        measure(run, section)
+    section.remarks.append(
+        "Medians over turns, in which all of a row are measured one after the other, with the least and the largest in "
+        "brackets; a ratio is taken within a turn."
+    )
+
+
+def navigate(run: Runner, section: Section) -> None:
+    """The rule of the navigate task, on scenes that it was not tuned on."""
+    options = ("--seed=2", "--episodes=500")
+    benchmark("navigate", navigate_rows, *options, short=("--episodes=10",))(run, section)
+
+
+def loader_rows(results: Mapping[str, Any]) -> list[Row]:
+    """Return the rows of `benchmarks.loader`."""
+    names = {"state": "loader, state data, chunks of 50 steps", "cameras": "loader, two cameras of 96 x 96 pixels"}
+    rows = []
+    for case, what in names.items():
+        if case not in results:
+            rows.append(Row(what, "not measured: its dataset could not be recorded", "", met=False))
+            continue
+        one = results[case]
+        speeds = ", ".join(f"{name} {speed['median']:,.0f}" for name, speed in one["samples_per_s"].items())
+        rows += [
+            Row(f"{what}: samples/s", speeds),
+            Row(f"{what}: ours / LeRobot's better", times(one["ratio"]), f"at least {one['goal']:.0f} x", one["met"]),
+        ]
+    return rows
+
+
+def envs_rows(results: Mapping[str, Any]) -> list[Row]:
+    """Return the rows of `benchmarks.envs`."""
+    what, over = f"{results['n']} avoid environments", results["ours_is"]
+    speeds = ", ".join(f"{name} {speed['median']:,.0f}" for name, speed in results["steps_per_s"].items())
+    rows = [
+        Row(f"{what}: steps/s", speeds),
+        Row(
+            f"{what}: VectorEnv / bare physics with the same lidar",
+            times(over[_BARE], 2),
+            f"at least {results['goal']:.2f} x",
+            results["met"],
+        ),
+    ]
+    for peer in _PEERS:
+        reason = results["not_measured"].get(peer, "it was left out")
+        value = times(over[peer]) if peer in over else f"not measured: {reason}"
+        rows.append(Row(f"{what}: VectorEnv / Gymnasium's {peer}", value))
+    return rows
+
+
+def evaluate_rows(results: Mapping[str, Any]) -> list[Row]:
+    """Return the rows of `benchmarks.evaluate`."""
+    what = f"{results['episodes']} {results['task']} episodes of {results['policy']}, {results['n_envs']} side by side"
+    speeds = ", ".join(f"{name} {speed['median']:.2f}" for name, speed in results["episodes_per_s"].items())
+    return [
+        Row(f"{what}: episodes/s", speeds),
+        Row(
+            f"{what}: bhd-eval / lerobot-eval on SyncVectorEnv",
+            times(results["ratio"]),
+            f"at least {results['goal']:.0f} x",
+            results["met"],
+        ),
+        Row(
+            f"{what}: ended the same with both",
+            f"{results['same_success']} of {results['compared']}; returns differ by at most "
+            f"{results['largest_return_difference']:.2g}",
+        ),
+    ]
+
+
+def navigate_rows(results: Mapping[str, Any]) -> list[Row]:
+    """Return the rows of `benchmarks.navigate`."""
+    success, spl, collisions = results["success"], results["spl"], results["collisions"]
+    ends = ", ".join(f"{count} {cause}" for cause, count in results["ends"].items() if cause != "success")
+    rate = f"{success['value']:.1%} ({success['low']:.1%} to {success['high']:.1%})"
+    return [
+        Row(
+            f"navigator: success in {results['episodes']}",
+            f"{rate}{f'; {ends}' if ends else ''}",
+            f"at least {success['goal']:.0%}",
+            success["met"],
+        ),
+        Row("navigator: collisions", str(collisions["value"]), f"at most {collisions['goal']}", collisions["met"]),
+        Row(
+            "navigator: success weighted by path length, mean",
+            f"{spl['value']:.3f} ({spl['low']:.3f} to {spl['high']:.3f})",
+            f"above {spl['goal']:.2f}",
+            spl["met"],
+        ),
+    ]
+
+
+def times(ratio: Mapping[str, float], digits: int = 1) -> str:
+    """Return a ratio with its spread."""
+    return f"{ratio['median']:.{digits}f} x ({ratio['low']:.{digits}f} to {ratio['high']:.{digits}f})"

@@ -29,6 +29,7 @@ class RandomisationConfig:
         sensor_noise_rad: noise on observed joint positions has a standard deviation of up to this [rad], on speeds ten
             times that [rad/s].
         latency_s: the servos get their commands up to this late, at most 0.05 [s].
+        latency_min_s: and at least this late; with `latency_s` as large, always [s].
     """
 
     enabled: bool = False
@@ -42,6 +43,7 @@ class RandomisationConfig:
     camera_rad: float = 0.02
     sensor_noise_rad: float = 0.0005
     latency_s: float = 0.01
+    latency_min_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -49,6 +51,11 @@ class RandomisationConfig:
                 raise ConfigError(f"randomisation.{name} is {value}; it must be 0 (off) or positive, and finite.")
         if self.latency_s > MAX_LATENCY_S:
             raise ConfigError(f"randomisation.latency_s is {self.latency_s}; it must be at most {MAX_LATENCY_S}.")
+        if self.latency_min_s > self.latency_s:
+            raise ConfigError(
+                f"randomisation.latency_min_s is {self.latency_min_s}; it must be at most randomisation.latency_s, "
+                f"which is {self.latency_s}."
+            )
         for name in ("size", "light"):
             if getattr(self, name) >= 1:
                 raise ConfigError(f"randomisation.{name} is {getattr(self, name)}; it must be below 1.")
@@ -71,7 +78,7 @@ def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Var
         camera_turn=_floats(uniform(-1, 1, 3) * config.camera_rad),
         wrist_turn=_floats(uniform(-1, 1, 3) * config.camera_rad),
         sensor_noise=float(uniform(0, config.sensor_noise_rad)),
-        latency_s=float(uniform(0, config.latency_s)),
+        latency_s=float(uniform(config.latency_min_s, config.latency_s)),
         finger_friction=_factor(config.friction, rng),
     )
 

@@ -105,3 +105,22 @@ def test_a_latency_that_no_plant_can_delay_by_is_refused_before_anything_runs() 
     with pytest.raises(ConfigError, match=r"randomisation.latency_s is 0.051; it must be at most 0.05"):
         RandomisationConfig(latency_s=0.051)
     assert MAX_LATENCY_S * UR5Config().control_hz <= MAX_LATENCY
+
+
+def test_a_delay_may_be_the_same_in_every_episode() -> None:
+    fixed = RandomisationConfig(enabled=True, latency_s=0.04, latency_min_s=0.04)
+    rng = np.random.default_rng(0)
+    assert {draw_variation(fixed, rng).latency_s for _ in range(20)} == {0.04}
+    between = RandomisationConfig(enabled=True, latency_s=0.05, latency_min_s=0.03)
+    drawn = [draw_variation(between, rng).latency_s for _ in range(200)]
+    assert min(drawn) >= 0.03
+    assert max(drawn) <= 0.05
+    # The least delay changes nothing else that is drawn.
+    one = draw_variation(ON, np.random.default_rng(1))
+    other = draw_variation(dataclasses.replace(ON, latency_min_s=0.01), np.random.default_rng(1))
+    assert dataclasses.replace(one, latency_s=0.0) == dataclasses.replace(other, latency_s=0.0)
+
+
+def test_a_least_delay_above_the_largest_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"latency_min_s is 0\.02; it must be at most .*latency_s, which is 0\.01"):
+        RandomisationConfig(latency_min_s=0.02, latency_s=0.01)

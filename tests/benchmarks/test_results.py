@@ -1,0 +1,164 @@
+"""`make results`: rows of what benchmarks wrote, the page, commands that are run once, and the recovered share."""
+
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.envs import BARE, OURS, TooLateError, summary, time_limit
+from benchmarks.results.__main__ import MEASURES
+from benchmarks.results.adaptation import recovered, successes
+from benchmarks.results.page import write_page
+from benchmarks.results.runner import FailedError, Runner
+from benchmarks.results.section import Row, Section
+from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
+from benchmarks.spread import ratios, spread, write
+
+RATIO = {"median": 12.3, "low": 11.0, "high": 14.0, "turns": 3}
+
+
+def test_a_spread_is_the_median_between_the_ends(tmp_path: Path) -> None:
+    found = spread([3.0, 1.0, 10.0])
+    assert found == {"median": 3.0, "low": 1.0, "high": 10.0, "turns": 3}
+    assert ratios([2.0, 9.0], [1.0, 3.0]) == [2.0, 3.0]
+    with pytest.raises(ValueError, match="zip"):
+        ratios([1.0], [1.0, 2.0])
+    write(tmp_path / "new" / "spread.json", found)
+    assert json.loads((tmp_path / "new" / "spread.json").read_text(encoding="utf-8")) == found
+    write(None, found)
+
+
+def test_all_sections_have_names_of_their_own() -> None:
+    names = [one.name for one in MEASURES]
+    assert len(set(names)) == len(names)
+    assert {"avoid", "reach", "pick", "fine_tune", "navigate", "speed"} <= set(names)
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_met", [True, False])
+def test_loader_rows_say_whether_the_goals_are_met(is_met: bool) -> None:
+    one = {"samples_per_s": {"ours": RATIO}, "ratio": RATIO, "goal": 200.0, "met": is_met}
+    rows = loader_rows({"state": one})
+    assert [row.met for row in rows] == [None, is_met, False]  # the cameras' dataset was not recorded
+    assert "12.3 x (11.0 to 14.0)" in rows[1].value
+    assert rows[1].goal == "at least 200 x"
+    assert "not measured" in rows[2].value
+
+
+def test_what_did_not_come_up_is_said_with_its_reason() -> None:
+    speeds = {OURS: [70.0, 90.0], "SyncVectorEnv": [10.0, 10.0], BARE: [100.0, 100.0]}
+    results = summary(speeds, {"AsyncVectorEnv": "64 environments did not come up within 300 s"}, 64)
+    assert results["met"]
+    assert results["ours_is"][BARE]["median"] == pytest.approx(0.8)
+    rows = envs_rows(json.loads(json.dumps(results)))
+    assert [row.met for row in rows] == [None, True, None, None]
+    assert rows[1].value == "0.80 x (0.70 to 0.90)"
+    assert rows[2].value.startswith("8.0 x")
+    assert rows[3].value == "not measured: 64 environments did not come up within 300 s"
+    assert not summary({**speeds, BARE: [200.0, 200.0]}, {}, 64)["met"]
+
+
+def test_a_time_limit_ends_what_takes_too_long_and_nothing_else() -> None:
+    with (
+        pytest.raises(TooLateError, match=r"a long sleep did not come up within 0 s"),
+        time_limit(0.05, "a long sleep"),
+    ):
+        time.sleep(60)
+    with time_limit(60, "nothing"):
+        pass
+
+
+def test_evaluate_and_navigate_rows_carry_goals_and_numbers() -> None:
+    speeds = {"lerobot-eval": RATIO, "bhd-eval": RATIO}
+    evaluated: dict[str, Any] = {"task": "avoid", "policy": "bhd_mlp", "n_envs": 50, "episodes": 200, "compared": 600}
+    evaluated |= {"episodes_per_s": speeds, "ratio": RATIO, "goal": 10.0, "met": True}
+    rows = evaluate_rows({**evaluated, "same_success": 598, "largest_return_difference": 1e-7})
+    assert "200 avoid episodes of bhd_mlp, 50 side by side" in rows[1].what
+    assert (rows[1].goal, rows[1].met) == ("at least 10 x", True)
+    assert rows[2].value.startswith("598 of 600")
+    interval = {"value": 0.99, "low": 0.98, "high": 0.995}
+    navigated = {
+        "episodes": 500,
+        "success": {**interval, "goal": 0.99, "met": True},
+        "ends": {"success": 495, "collision": 5},
+        "collisions": {"value": 5, "goal": 0, "met": False},
+        "spl": {**interval, "goal": 0.85, "met": True},
+    }
+    rows = navigate_rows(navigated)
+    assert [row.met for row in rows] == [True, False, True]
+    assert rows[0].value == "99.0% (98.0% to 99.5%); 5 collision"
+
+
+# --- fine-tuning ------------------------------------------------------------------------------------------------------
+
+
+def test_the_recovered_share_is_of_what_was_lost() -> None:
+    before, lost = [True] * 100, [True] * 20 + [False] * 80
+    assert recovered(before, lost, lost) == (0.0, 0.0, 0.0)
+    assert recovered(before, lost, before) == (1.0, 1.0, 1.0)
+    share, low, high = recovered(before, lost, [True] * 60 + [False] * 40)
+    assert share == pytest.approx(0.5)
+    assert 0.3 < low < 0.5 < high < 0.7
+    # Half of it again, and worse than before: below 0.
+    share, _, high = recovered(before, lost, [False] * 100)
+    assert share == pytest.approx(-0.25)
+    assert high < 0
+
+
+def test_a_share_of_nothing_is_not_defined() -> None:
+    assert all(math.isnan(one) for one in recovered([True, False], [True, True], [True, True]))
+    assert all(math.isnan(one) for one in recovered([], [], []))
+
+
+def test_the_interval_gets_narrower_with_more_seeds() -> None:
+    rng = np.random.default_rng(0)
+    widths = []
+    for count in (50, 500):
+        before, lost, found = (list(rng.random(count) < p) for p in (0.9, 0.3, 0.7))
+        _, low, high = recovered(before, lost, found)
+        widths.append(high - low)
+    assert widths[1] < widths[0]
+
+
+def test_outcomes_are_in_the_order_of_the_episodes() -> None:
+    told = [("a", 1, True), ("b", 0, True), ("a", 0, False)]
+    results = {"episodes": [{"brain": name, "episode": number, "success": good} for name, number, good in told]}
+    assert successes(results, "a") == [False, True]
+
+
+# --- page and runner --------------------------------------------------------------------------------------------------
+
+
+def test_a_command_is_run_once_and_again_when_it_changed(tmp_path: Path) -> None:
+    run = Runner(tmp_path, is_short=True)
+    first = run.run("note", ["python", "-c", "print('hello')"])
+    again = run.run("note", ["python", "-c", "print('hello')"])
+    assert again == first
+    assert "hello" in (tmp_path / "notes" / "note.log").read_text(encoding="utf-8")
+    assert run.commands == [first, first]
+    missed = run.run("note", ["python", "-c", "raise SystemExit(1)"], allowed=(0, 1))
+    assert missed.status == 1
+    with pytest.raises(FailedError, match=r"ended with status 3[\s\S]*out of order"):
+        run.run("note", ["python", "-c", "print('out of order'); raise SystemExit(3)"])
+
+
+def test_the_page_shows_numbers_goals_verdicts_and_commands(tmp_path: Path) -> None:
+    section = Section("speed", "Speed", [Row("a", "1 x"), Row("b", "2 x", "at least 3 x", met=False)], ["A remark."])
+    section.commands = [Runner(tmp_path, is_short=True).run("note", ["python", "-c", "pass"])]
+    page = tmp_path / "results.md"
+    write_page(page, [section], is_short=True)
+    text = page.read_text(encoding="utf-8")
+    assert "## Speed" in text
+    assert "| a | 1 x |  |  |" in text
+    assert "| b | 2 x | at least 3 x | **missed** |" in text
+    assert "A remark." in text
+    assert "python -c pass   # " in text
+    assert "not to be quoted" in text
+    write_page(page, [section], is_short=False)
+    assert "not to be quoted" not in page.read_text(encoding="utf-8")
