@@ -20,24 +20,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation, find_columns, find_scan
-from bhd_lerobot.policies.clearance import HALF_TRACK, LONGEST, QUANTUM, SPACING, ClearanceTable, Level, make_paths
+from bhd_lerobot.policies.brain import Observation, find_columns
+from bhd_lerobot.policies.clearance import HALF_TRACK, QUANTUM, SPACING, make_paths
 from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.scan import ScanReader
+from bhd_lerobot.policies.steering import Steering, check_driving, keep_heading, wrap
 
-MIN_BEAMS = 36  # with fewer, a post of 0.1 m can stand unseen within a turning circle
-_SECTORS = 120  # more beams than this are merged
 _CELL = 0.125  # [m] edge length of the memory's cells
 _SIDE = 128  # cells along an edge of the memory, a power of two; it wraps around after 16 m
 _MARK = 0.2  # [m] around the robot that counts as visited
 _STEP = 0.2  # [m] between two places of a path where the memory is asked
-_SPOT = 0.3  # [rad/s] a turn on the spot that is slower than this is a correction, and is driven while moving
-_CAREFUL = 0.6  # share of the speed where there is less room than usual
-_WEDGED = 4  # less free than this, in quanta, is no room to turn
-_BACK_ROOM = 0.08  # [m] behind the robot, needed for backing off
 _AROUND = np.arange(8) * math.pi / 4
 _MARK_X = np.append(np.cos(_AROUND), 0.0) * (_MARK / _CELL)
 _MARK_Y = np.append(np.sin(_AROUND), 0.0) * (_MARK / _CELL)
 _NEVER = -(2**30)
+_KEEP = 1.01  # spacings of headings; a heading chosen before is kept where the best one is that near
 
 Array = NDArray[np.float64]
 
@@ -80,26 +77,11 @@ class GapFollowerConfig(BrainConfig):
     range_max_m: float = 3.5
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not 0 <= value < math.inf:
-                raise ConfigError(f"brain.{name} is {value}; it must be 0 or positive, and finite.")
-        for name in ("forward_speed", "rim_speed", "turn_speed", "settle_s", "memory_s", "range_max_m"):
-            if getattr(self, name) == 0:
-                raise ConfigError(f"brain.{name} is 0; it must be positive.")
-        if self.forward_speed > self.rim_speed:
-            raise ConfigError(
-                f"brain.forward_speed is {self.forward_speed}; the wheels reach brain.rim_speed, {self.rim_speed}."
-            )
-        if not _STEP <= self.horizon_m <= LONGEST:
-            raise ConfigError(f"brain.horizon_m is {self.horizon_m}; it must be in [{_STEP}, {LONGEST}].")
+        check_driving(self, _STEP)
+        if self.memory_s == 0:
+            raise ConfigError("brain.memory_s is 0; it must be positive.")
         if not 0 < self.discount <= 1:
             raise ConfigError(f"brain.discount is {self.discount}; it must be in (0, 1].")
-        if self.stop_m > 1:
-            raise ConfigError(f"brain.stop_m is {self.stop_m}; it must be at most 1.")
-        if self.range_min_m >= self.range_max_m:
-            raise ConfigError(
-                f"brain.range_min_m is {self.range_min_m}; it must be below brain.range_max_m, {self.range_max_m}."
-            )
 
 
 class GapFollowerBrain:
@@ -120,16 +102,6 @@ class GapFollowerBrain:
     def __init__(self, config: GapFollowerConfig | None = None) -> None:
         self.config = config = config or GapFollowerConfig()
         self._paths = paths = make_paths(config.forward_speed, config.rim_speed)
-        # Room asked for, and how far beyond its turn a path must be free [m]: what is usual; then enough to turn away
-        # from what is close already; then what remains.
-        self._levels = (
-            Level(config.margin_m, 0.005),
-            Level(config.margin_m, 0.03),
-            Level(0.02, 0.02),
-            Level(0.0, 0.01),
-        )
-        beyond = np.array([config.stop_m, 0.1, 0.1, 0.1])
-        self._enough = np.ceil((paths.turn + beyond[:, None]) / QUANTUM).astype(np.int64)
         # What a path's turn takes away from its length, as a share of half a turn on the spot.
         lost = paths.turn - np.abs(paths.heading) * paths.radius
         self._price = config.turn_weight * lost / (HALF_TRACK * math.pi)
@@ -152,17 +124,20 @@ class GapFollowerBrain:
     ) -> None:
         """Find the scan and the twist, and prepare the look-up table for this number of beams."""
         config = self.config
-        self._scan, angles = find_scan(observation_names, self.name)
+        self._reader = reader = ScanReader(observation_names, self.name, (config.range_min_m, config.range_max_m))
         self._measured = find_columns(observation_names, ("x.vel", "theta.vel"), self.name, "observation")
         self._forward, self._turn = find_columns(action_names, ("x.vel", "theta.vel"), self.name, "action")
         self._width, self._dt = len(action_names), 1.0 / fps
-        beams = len(angles)
-        if beams < MIN_BEAMS:
-            raise ConfigError(f"The brain {self.name!r} needs at least {MIN_BEAMS} beams; this robot has {beams}.")
-        # An odd number of beams in a sector, so that the first is centred straight ahead.
-        self._group = next((g for g in range(beams // _SECTORS, 1, -1) if g % 2 and beams % g == 0), 1)
-        spread = math.pi * max(self._group - 1, 0.5) / beams
-        self._table = ClearanceTable(self._paths, beams // self._group, spread, self._levels, config.range_max_m)
+        self._steering = Steering(
+            self._paths,
+            reader,
+            margin=config.margin_m,
+            stop=config.stop_m,
+            limits=(config.forward_speed, config.rim_speed, config.turn_speed),
+            settle=config.settle_s,
+            range_max=config.range_max_m,
+            has_narrow=False,
+        )
         self._memory_frames = max(1, round(min(config.memory_s * fps, 2**29)))
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
@@ -185,35 +160,21 @@ class GapFollowerBrain:
         if n != self._n:
             raise ConfigError(f"The brain {self.name!r} was reset for {self._n} robots and sees {n}.")
         self._remember(observation.state[:, self._measured])
-        ranges, blind = self._ranges(observation.state[:, self._scan])
-        clear, free, level = self._room(ranges)
-        toward = _wrap(self._goal - self._yaw)  # the heading chosen before, seen from the robot
+        ranges, blind = self._reader.nearest(observation.state[:, self._reader.columns])
+        freedom = self._steering.look(ranges)
+        toward = wrap(self._goal - self._yaw)  # the heading chosen before, seen from the robot
         turn_off = np.abs(paths.heading - toward[:, None])
         turn_off = np.minimum(turn_off, 2 * math.pi - turn_off)
-        score = self._new_ground(clear) - self._price
-        score += config.clear_weight * np.minimum(clear * (QUANTUM / config.horizon_m), 1.0)
+        score = self._new_ground(freedom.clear) - self._price
+        score += config.clear_weight * np.minimum(freedom.clear * (QUANTUM / config.horizon_m), 1.0)
         score -= config.commit_weight * np.minimum(turn_off * 2.0, 1.0)
-        # Where no path is free: on the spot, as far as there is room, and not back and forth.
-        spot = 0.01 * clear - 3 * turn_off - 100.0 * (paths.radius > 0)
-        best = np.where(free, score, spot - 1000.0).argmax(axis=1)
-        sims = np.arange(n)
-        moving, heading, radius = free[sims, best], paths.heading[best], paths.radius[best]
-        # The heading chosen before lies between the headings that there are: keep it while its neighbour is best.
-        heading = np.where(np.abs(_wrap(toward - heading)) <= 1.01 * SPACING, toward, heading)
-        largest = np.where(radius > 0, config.rim_speed / (radius + HALF_TRACK), config.turn_speed)
-        turn = np.minimum(np.abs(heading) / config.settle_s, np.minimum(largest, config.turn_speed))
-        forward = np.clip(config.rim_speed - HALF_TRACK * turn, 0.0, config.forward_speed)
-        forward *= np.where(level > 0, _CAREFUL, 1.0)
-        forward = np.where(moving & ((radius > 0) | (turn < _SPOT)), forward, 0.0)
-        # Wedged, not even room to turn: back off, and then turn away from where it came to.
-        wedged = ~moving & (clear[sims, best] <= _WEDGED) & (self._table.behind(ranges) > _BACK_ROOM)
-        heading = np.where(wedged, math.pi, heading)
-        forward = np.where(wedged, -_CAREFUL * config.forward_speed, forward)
-        turn = np.where(wedged, 0.0, turn)
+        best = self._steering.choose(freedom, -score, turn_off)
+        heading = keep_heading(toward, paths.heading[best], _KEEP * SPACING)
+        forward, turn, heading = self._steering.drive(freedom, best, heading, ranges)
         self._goal = np.where(blind, self._goal, self._yaw + heading)
         action = np.zeros((n, self._width))
         action[:, self._forward] = np.where(blind, 0.0, forward)
-        action[:, self._turn] = np.where(blind, 0.0, np.copysign(turn, heading))
+        action[:, self._turn] = np.where(blind, 0.0, turn)
         return action
 
     def subtasks(self) -> Sequence[str]:
@@ -227,43 +188,6 @@ class GapFollowerBrain:
     def parameters(self) -> dict[str, Any]:
         """Return the parameters."""
         return {"type": self.name, **asdict(self.config)}
-
-    def _room(self, ranges: Array) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.intp]]:
-        """Return how far each path is free, whether that is enough, and which level of room that is for.
-
-        Returns:
-            Free lengths in `QUANTUM`, shape (n, K), whether they are enough, shape (n, K), and levels, shape (n,).
-        """
-        rows = self._table.rows(ranges)
-        clear = self._table.clear(rows, 0)
-        free = clear >= self._enough[0]
-        level = np.zeros(len(ranges), np.intp)
-        for tighter in range(1, len(self._levels)):
-            lost = np.flatnonzero(~free.any(axis=1))
-            if len(lost):
-                level[lost] = tighter
-                clear[lost] = self._table.clear(rows[lost], tighter)
-                free[lost] = clear[lost] >= self._enough[tighter]
-        return clear, free, level
-
-    def _ranges(self, scan: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the nearest valid range of each sector, shape (n, sectors), and who is blind, shape (n,).
-
-        A sector without a valid reading takes over its nearer neighbour's; if neither has one, the robot is blind.
-        """
-        # False for NaN; the limits' own values may have come through single precision.
-        valid = (scan >= self.config.range_min_m - 1e-6) & (scan <= self.config.range_max_m + 1e-6)
-        seen = np.where(valid, scan, np.inf)
-        if self._group > 1:
-            seen = np.roll(seen, self._group // 2, axis=1).reshape(len(scan), -1, self._group).min(axis=2)
-        missing: NDArray[np.bool_] = np.isinf(seen)
-        blind: NDArray[np.bool_] = np.zeros(len(scan), np.bool_)
-        if not missing.any():
-            return seen, blind
-        seen = np.where(missing, np.minimum(np.roll(seen, 1, axis=1), np.roll(seen, -1, axis=1)), seen)
-        missing = np.isinf(seen)
-        missing.any(axis=1, out=blind)
-        return np.where(missing, self.config.range_min_m, seen), blind
 
     def _remember(self, twist: Array) -> None:
         """Move on by what the wheels did since the last frame, and mark the place as visited."""
@@ -300,8 +224,3 @@ def _cell(x: NDArray[Any], y: NDArray[Any], dx: NDArray[Any], dy: NDArray[Any]) 
     column &= _SIDE - 1
     row += column
     return row
-
-
-def _wrap(angle: Array) -> Array:
-    """Return angles in [-pi, pi) [rad]."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -23,7 +23,7 @@ from bhd_lerobot.policies.clearance import HALF_TRACK, HEADINGS, LIDAR_X, LONGES
 from bhd_lerobot.policies.config_brain import BrainConfig
 from bhd_lerobot.policies.goal_map import GoalMap
 from bhd_lerobot.policies.scan import ScanReader
-from bhd_lerobot.policies.steering import NARROW, Freedom, Steering
+from bhd_lerobot.policies.steering import NARROW, Freedom, Steering, check_driving, keep_heading, wrap
 
 GOAL = ("goal_x", "goal_y", "goal_cos", "goal_sin")
 
@@ -84,25 +84,10 @@ class NavigatorConfig(BrainConfig):
     range_max_m: float = 3.5
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not 0 <= value < math.inf:
-                raise ConfigError(f"brain.{name} is {value}; it must be 0 or positive, and finite.")
-        positive = ("forward_speed", "rim_speed", "turn_speed", "settle_s", "arrive_m", "arrive_rad", "range_max_m")
-        for name in positive:
+        check_driving(self, _STEP)
+        for name in ("arrive_m", "arrive_rad"):
             if getattr(self, name) == 0:
                 raise ConfigError(f"brain.{name} is 0; it must be positive.")
-        if self.forward_speed > self.rim_speed:
-            raise ConfigError(
-                f"brain.forward_speed is {self.forward_speed}; the wheels reach brain.rim_speed, {self.rim_speed}."
-            )
-        if not _STEP <= self.horizon_m <= LONGEST:
-            raise ConfigError(f"brain.horizon_m is {self.horizon_m}; it must be in [{_STEP}, {LONGEST}].")
-        if self.stop_m > 1:
-            raise ConfigError(f"brain.stop_m is {self.stop_m}; it must be at most 1.")
-        if self.range_min_m >= self.range_max_m:
-            raise ConfigError(
-                f"brain.range_min_m is {self.range_min_m}; it must be below brain.range_max_m, {self.range_max_m}."
-            )
 
 
 class NavigatorBrain:
@@ -249,7 +234,7 @@ class NavigatorBrain:
     def _drive(self, ranges: Array, pose: Array) -> tuple[Array, Array, Array]:
         """Return forward speed [m/s], yaw rate [rad/s] and the heading chosen [rad], each of shape (n,)."""
         config, paths = self.config, self._paths
-        toward = _wrap(self._heading - pose[2])  # the heading chosen before, seen from the robot; NaN if none
+        toward = wrap(self._heading - pose[2])  # the heading chosen before, seen from the robot; NaN if none
         turn_off = np.abs(paths.heading - toward[:, None])
         turn_off = np.where(np.isfinite(turn_off), np.minimum(turn_off, 2 * math.pi - turn_off), 0.0)
         at = pose.astype(np.float32)[:, :, None, None]
@@ -269,9 +254,7 @@ class NavigatorBrain:
             freedom.clear[into], freedom.free[into] = other.clear[better], other.free[better]
             freedom.level[into] = NARROW
         best = self._steering.choose(freedom, cost, turn_off)
-        heading = paths.heading[best]
-        # The heading chosen before lies between the headings that there are: keep it while its neighbour is best.
-        heading = np.where(np.abs(_wrap(toward - heading)) <= _KEEP * SPACING, toward, heading)
+        heading = keep_heading(toward, paths.heading[best], _KEEP * SPACING)
         return self._steering.drive(freedom, best, heading, ranges)
 
     def _cost(self, left: NDArray[np.float32], freedom: Freedom) -> Array:
@@ -318,8 +301,3 @@ def _to_goal(x: NDArray, y: NDArray, pose: NDArray) -> tuple[NDArray, NDArray]:
     """
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     return pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y
-
-
-def _wrap(angle: Array) -> Array:
-    """Return angles in [-pi, pi) [rad]."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
