@@ -8,9 +8,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.robots.catalog import make_simulation
+from bhd_lerobot.robots.faults import add_faults
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.tasks.catalog import make_task
 from bhd_lerobot.tasks.task import Event, Outcome
@@ -147,12 +147,7 @@ class Stage:
         report = simulation.act(actions)
         self._truth = simulation.truth(report)
         reward, event = self.task.judge(self._truth, simulation.running)
-        stopped = report.mode >= Mode.ESTOP
-        if np.count_nonzero(stopped):
-            # As in `runs/episode.py`: a robot that has latched a fault takes no action any more.
-            event = np.where((report.mode == Mode.FAULT) & (event == Event.NOTHING), Event.FAULT, event)
-            event = np.where(report.mode == Mode.ESTOP, Event.ESTOP, event)
-            event = np.where(simulation.running, event, Event.NOTHING)
+        event = add_faults(event, report.mode, simulation.running)
         truncated = event == Event.TIMEOUT
         if self._lasts:
             truncated |= event == Event.SUCCESS

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
-from bhd_lerobot.control.messages import NANOSECONDS, Mode, SendResult
+from bhd_lerobot.control.messages import NANOSECONDS, SendResult
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Mixed, Observation
+from bhd_lerobot.robots.faults import add_faults
 from bhd_lerobot.robots.simulation import FrameReport, Simulation
 from bhd_lerobot.runs.drivers import DriverLog, flagged
 from bhd_lerobot.runs.episode_images import EpisodeImages, Observer
@@ -214,12 +215,7 @@ class EpisodeLoop:
         running = np.flatnonzero(simulation.running)
         self._truth = simulation.truth(report)
         reward, event = self.task.judge(self._truth, simulation.running)
-        stopped = report.mode >= Mode.ESTOP
-        if np.count_nonzero(stopped):
-            # A robot that has latched a fault takes no action any more. What the task says of the frame says more, but
-            # an emergency stop comes before all else.
-            event = np.where((report.mode == Mode.FAULT) & (event == Event.NOTHING), Event.FAULT, event)
-            event = np.where(report.mode == Mode.ESTOP, Event.ESTOP, event)
+        event = add_faults(event, report.mode, simulation.running)
         taken, by_goals = self._drivers.frame(running, self._length, is_missed=is_missed)
         values |= {
             # While a goal is followed, what a policy learns from is where the reference was.
