@@ -79,6 +79,39 @@ def test_beams_are_transformed_and_the_rest_is_not() -> None:
         assert policy.feature_size == seen.shape[1] == 26
 
 
+@pytest.mark.parametrize("steps", [1, 3])
+@pytest.mark.parametrize("scan", [ScanConfig(), ScanConfig(transform="inverse"), ScanConfig(channels=[4])])
+def test_what_is_ignored_changes_nothing_and_everything_else_does(steps: int, scan: ScanConfig) -> None:
+    made = config(ignore=["*.vel"], n_obs_steps=steps, scan=scan)
+    policy = MlpPolicy(made).eval()
+    given = batch(made)
+    chunk = policy.predict_action_chunk(given)
+    ignored = [NAMES.index("x.vel"), NAMES.index("theta.vel")]
+    for column in range(len(NAMES)):
+        changed = {key: value.clone() for key, value in given.items()}
+        changed[OBS_STATE][..., column] += 0.5
+        if scan.transform != "none" and column not in ignored:
+            changed[OBS_SCAN][..., column - 1] += 0.5
+        assert torch.equal(chunk, policy.predict_action_chunk(changed)) == (column in ignored)
+
+
+def test_what_is_to_be_ignored_must_be_there() -> None:
+    with pytest.raises(ConfigError, match=r"'\*\.vle' matches no number of observation.state: x.vel, scan_000"):
+        config(ignore=["*.vle"])
+    unnamed = MlpConfig(
+        device="cpu",
+        input_features={OBS_STATE: PolicyFeature(FeatureType.STATE, (10,))},
+        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (2,))},
+        ignore=["*.vel"],
+    )
+    with pytest.raises(ConfigError, match=r"give policy\.ignored_columns"):
+        MlpPolicy(unnamed)
+    with pytest.raises(ConfigError, match="has the columns 0 to 9"):
+        MlpPolicy(config(ignored_columns=[3, 10]))
+    with pytest.raises(ConfigError, match="leaves nothing"):
+        MlpPolicy(config(environment=0, ignore=["*"]))
+
+
 def test_a_range_of_nothing_stays_finite() -> None:
     made = config(scan=ScanConfig(transform="inverse", minimum=0.1))
     given = batch(made)

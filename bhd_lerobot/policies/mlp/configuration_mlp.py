@@ -1,7 +1,8 @@
 """Configuration of `bhd_mlp`: numbers in, a chunk of actions out."""
 
+import fnmatch
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,6 +74,18 @@ class ScanConfig:
             )
 
 
+def _matching(patterns: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Return the columns whose names match a pattern.
+
+    Raises:
+        ConfigError: a pattern matches none.
+    """
+    for pattern in patterns:
+        if not any(fnmatch.fnmatchcase(name, pattern) for name in names):
+            raise ConfigError(f"policy.ignore: {pattern!r} matches no number of {OBS_STATE}: {', '.join(names)}.")
+    return [i for i, name in enumerate(names) if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
+
+
 @PreTrainedConfig.register_subclass("bhd_mlp")
 @dataclass
 class MlpConfig(PreTrainedConfig):
@@ -100,6 +113,10 @@ class MlpConfig(PreTrainedConfig):
         initial_log_std: its logarithm before training, in normalised actions.
         sample: with `gaussian`, act on a sample instead of the mean.
         scan: how a range finder's beams become inputs.
+        ignore: numbers of `observation.state` that it does not look at, by name or pattern: ``["*.vel"]``. What the
+            robot measures of its own motion is nearly the last action, and a network that imitates learns to repeat it
+            instead of looking where it goes (P. de Haan et al., "Causal confusion in imitation learning", 2019).
+        ignored_columns: their columns; found by their names.
         optimizer_lr: learning rate of AdamW.
         optimizer_betas: of AdamW.
         optimizer_eps: of AdamW.
@@ -124,6 +141,8 @@ class MlpConfig(PreTrainedConfig):
     initial_log_std: float = 0.0
     sample: bool = False
     scan: ScanConfig = field(default_factory=ScanConfig)
+    ignore: list[str] = field(default_factory=list)
+    ignored_columns: list[int] = field(default_factory=list)
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -223,15 +242,17 @@ class MlpConfig(PreTrainedConfig):
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Find the beams by their names, where they are asked for and not given; LeRobot's `make_policy` calls it.
+        """Find beams, and what is to be ignored, by their names; LeRobot's `make_policy` calls it.
 
         Raises:
             ConfigError: there are none.
         """
+        known = (features.get(OBS_STATE) or {}).get("names")
+        names = list(known) if isinstance(known, list | tuple) else []
+        if self.ignore and not self.ignored_columns:
+            self.ignored_columns = _matching(self.ignore, names)
         if not self.scan.is_used or self.scan.beams:
             return
-        names = (features.get(OBS_STATE) or {}).get("names")
-        names = list(names) if isinstance(names, list | tuple) else []
         columns = [i for i, name in enumerate(names) if name.startswith("scan_") and name.endswith(".pos")]
         if not columns or columns != list(range(columns[0], columns[0] + len(columns))):
             raise ConfigError(
@@ -257,11 +278,22 @@ class MlpConfig(PreTrainedConfig):
         for key, feature in {**kept, **(self.output_features or {})}.items():
             if feature.type != FeatureType.VISUAL and len(feature.shape) != 1:
                 raise ConfigError(f"bhd_mlp reads and writes vectors; {key} has the shape {tuple(feature.shape)}.")
-        if self.scan.is_used:
-            state = self.robot_state_feature
-            width = state.shape[0] if state else 0
-            if not self.scan.beams or self.scan.start is None or self.scan.start + self.scan.beams > width:
-                raise ConfigError(
-                    f"policy.scan has start {self.scan.start} and beams {self.scan.beams}; they must lie among the "
-                    f"{width} columns of {OBS_STATE}."
-                )
+        state = self.robot_state_feature
+        width = state.shape[0] if state else 0
+        if self.ignore and not self.ignored_columns:
+            raise ConfigError(
+                f"policy.ignore is {self.ignore}, but nothing says which columns of {OBS_STATE} those are: make the "
+                "policy with the metadata of its dataset, or give policy.ignored_columns."
+            )
+        if not all(0 <= column < width for column in self.ignored_columns):
+            raise ConfigError(
+                f"policy.ignored_columns is {self.ignored_columns}; {OBS_STATE} has the columns 0 to {width - 1}."
+            )
+        if len(set(self.ignored_columns)) == width and OBS_ENV_STATE not in kept:
+            raise ConfigError(f"policy.ignore is {self.ignore}, which leaves nothing to look at.")
+        scan = self.scan
+        if scan.is_used and (not scan.beams or scan.start is None or scan.start + scan.beams > width):
+            raise ConfigError(
+                f"policy.scan has start {scan.start} and beams {scan.beams}; they must lie among the {width} columns of "
+                f"{OBS_STATE}."
+            )

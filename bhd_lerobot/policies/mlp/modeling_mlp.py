@@ -63,7 +63,7 @@ class MlpPolicy(PreTrainedPolicy):
         environment_size = int(environment.shape[0]) if environment else 0
         self._keys = [key for key, width in ((OBS_STATE, state_size), (OBS_ENV_STATE, environment_size)) if width]
         scan, steps = config.scan, config.n_obs_steps
-        columns = other_columns(state_size, scan.start or 0, scan.beams if scan.is_used else 0)
+        columns = other_columns(state_size, scan.start or 0, scan.beams if scan.is_used else 0, config.ignored_columns)
         # Not part of the checkpoint: the configuration says it.
         self.register_buffer("_columns", torch.tensor(columns, dtype=torch.long), persistent=False)
         activation = _ACTIVATIONS[config.activation]
@@ -145,8 +145,7 @@ class MlpPolicy(PreTrainedPolicy):
             if config.scan.is_used:
                 first = config.scan.start or 0
                 scan = self._clipped(state[..., first : first + config.scan.beams])
-                state = state[..., self._columns]
-            parts.append(state)
+            parts.append(state[..., self._columns])
         if OBS_ENV_STATE in rows:
             parts.append(rows[OBS_ENV_STATE])
         numbers = self._clipped(torch.cat(parts, dim=-1)).flatten(1)

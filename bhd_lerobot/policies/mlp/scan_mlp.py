@@ -81,6 +81,7 @@ class ScanEncoder(nn.Module):
         return self.layers(scans)
 
 
-def other_columns(width: int, start: int, beams: int) -> Sequence[int]:
-    """Return the columns of a state that are not beams."""
-    return [column for column in range(width) if not start <= column < start + beams]
+def other_columns(width: int, start: int, beams: int, ignored: Sequence[int] = ()) -> Sequence[int]:
+    """Return the columns of a state that are neither beams nor ignored."""
+    skipped = {*range(start, start + beams), *ignored}
+    return [column for column in range(width) if column not in skipped]
