@@ -14,7 +14,7 @@ from rich.console import Console
 pytest.importorskip("stable_baselines3")
 
 from bhd_lerobot.envs.vector import BhdVectorEnv
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.contract import PolicyContract
 from bhd_lerobot.policies.learned import LearnedBrain, LearnedBrainConfig
@@ -259,6 +259,18 @@ def test_without_stable_baselines3_the_message_says_how_to_install_it(
         ({"ppo__gamma": 1.5}, "between 0 and 1"),
         ({"ppo__learning_rate": 1.0}, "Unknown option 'ppo.learning_rate'"),
         ({"resume": "true"}, "resume needs --output_dir"),
+        ({"ppo.ent_coef": ".nan"}, "ppo.ent_coef is nan"),
+        ({"ppo.vf_coef": -1}, "ppo.vf_coef is -1"),
+        ({"ppo.max_grad_norm": ".nan"}, "ppo.max_grad_norm is nan"),
+        ({"ppo.target_kl": -1}, "ppo.target_kl is -1"),
+        ({"ppo.log_std_init": ".nan"}, "ppo.log_std_init is nan"),
+        ({"reward.frame": ".nan"}, "reward.frame is nan"),
+        ({"reward.events": "{collision: .inf}"}, "reward.events.collision is inf"),
+        ({"reward.per_m": ".nan"}, "reward.per_m is nan"),
+        ({"anchor.coef": ".nan"}, "anchor.coef is nan"),
+        ({"policy.critic_dims": [0]}, "policy.critic_dims is 0"),
+        ({"policy.activation": "gelul"}, "Did you mean 'gelu'"),
+        ({"policy.n_obs_steps": 0}, "policy.n_obs_steps is 0"),
     ],
 )
 def test_wrong_values_are_named(overrides: dict, message: str) -> None:
@@ -352,3 +364,43 @@ def mlp(**values: object) -> MlpConfig:
     config.input_features = {"observation.state": PolicyFeature(FeatureType.STATE, (5,))}
     config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
     return config
+
+
+def test_a_run_that_fails_before_it_began_leaves_nothing(tmp_path: Path, capsys) -> None:
+    assert main(options(tmp_path / "run", start_from=tmp_path / "none")) == 2
+    assert "There is no policy at" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file" / "run", tmp_path / ("x" * 300)):
+        with pytest.raises(ConfigError, match="--output_dir"):
+            run(folder)
+
+
+def test_weights_that_are_no_numbers_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoil(learner, steps, updated, is_over) -> None:
+        for one in learner.policy.parameters():
+            one.data.fill_(float("nan"))
+        raise ValueError("the distribution's mean is nan")
+
+    monkeypatch.setattr("bhd_lerobot.runs.rl.build.learn", spoil)
+    with pytest.raises(BhdError, match=r"weights are not finite .*000000000 is intact.*--ppo\.lr"):
+        run(tmp_path / "run")
+
+
+def test_a_full_disk_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module.MetricsFile, "append", full)
+    with pytest.raises(BhdError, match=r"No space left on device.*intact.*--resume=true"):
+        run(tmp_path / "run")
+    assert (tmp_path / "run" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
+
+
+def test_ctrl_c_before_the_run_began_is_no_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def stopped(config: RlConfig) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "train", stopped)
+    assert main(options(tmp_path / "run")) == 130
+    assert "Interrupted" in capsys.readouterr().err

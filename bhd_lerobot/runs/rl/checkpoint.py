@@ -42,7 +42,7 @@ def save(output_dir: Path, step: int, parts: RlParts, learner: Any, run: dict[st
         shutil.rmtree(final, ignore_errors=True)
         os.replace(part, final)
         point(final, LAST_CHECKPOINT_LINK)
-    except OSError as error:
+    except Exception as error:  # for a full disk, PyTorch and safetensors raise errors of their own
         shutil.rmtree(part, ignore_errors=True)
         raise BhdError(
             f"The checkpoint of step {step} cannot be written to {final.parent}: {error}. Those before it are intact."

@@ -79,21 +79,7 @@ def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] 
     if config.resume:
         # With the normalisation that the run began with.
         return _from_checkpoint(str(config.output_dir), contract)
-    policy = config.policy
-    mlp = MlpConfig(
-        n_obs_steps=policy.n_obs_steps,
-        obs_stride=policy.obs_stride,
-        chunk_size=1,
-        n_action_steps=1,
-        hidden_dims=list(policy.hidden_dims),
-        activation=policy.activation,
-        layer_norm=policy.layer_norm,
-        feature_clip=policy.feature_clip,
-        gaussian=True,
-        scan=copy.deepcopy(policy.scan),
-        device="cpu",
-        push_to_hub=False,
-    )
+    mlp = config.policy.actor()
     mlp.input_features = {OBS_STATE: PolicyFeature(FeatureType.STATE, (len(contract.observation_names or ()),))}
     if task.environment_names:
         mlp.input_features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (len(task.environment_names),))

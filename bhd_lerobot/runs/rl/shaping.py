@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.runs.rl.config import RewardConfig
+from bhd_lerobot.runs.rl.sections import RewardConfig
 from bhd_lerobot.tasks.task import Event
 
 Array = NDArray[np.float64]

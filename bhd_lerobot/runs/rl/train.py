@@ -1,10 +1,11 @@
 """`bhd-train` with `algorithm: ppo`: a policy learns by trial and error."""
 
 import json
+import signal
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from importlib.util import find_spec
@@ -90,8 +91,15 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
     try:
         with closing(Validation(config)) as validation, stop_on_signals() as stop:
             return _Run(config, folder, console or Console(stderr=True), validation, stop).go()
+    except OSError as error:
+        raise BhdError(
+            f"The run in {folder} cannot be written: {error.strerror or error}. Checkpoints saved before are intact. "
+            f"Make room, and go on with --resume=true --config_path={folder}."
+        ) from error
     finally:
         torch.set_num_threads(threads)
+        if not config.resume:
+            _remove_empty(folder)
 
 
 class _Run:
@@ -178,6 +186,7 @@ class _Run:
             raise ConfigError(
                 f"The run has done {result.step} of {config.steps} steps. To go on, set more with --steps."
             )
+        _write_config(config, result.output_dir)
         self._file, self._parts, self._env = MetricsFile(metrics, rows), parts, env
         result.rows = self._file.rows
         self._judged = result.step
@@ -186,10 +195,23 @@ class _Run:
 
             if not config.resume:
                 self._judge(learner, {"step": 0, "minutes": self._minutes()})
-            learn(learner, config.steps, self._updated, self._is_over)
+            try:
+                learn(learner, config.steps, self._updated, self._is_over)
+            except ValueError as error:
+                raise self._diverged(learner) or error from None
             result.step = int(learner.num_timesteps)
             self._judge_or_save(learner)
         self._tell()
+
+    def _diverged(self, learner: Any) -> BhdError | None:
+        """Return what to say if the weights are no numbers any more; the learner only says so of their product."""
+        if all(bool(torch.isfinite(one).all()) for one in learner.policy.parameters()):
+            return None
+        kept = "there is none yet" if self._result.checkpoint is None else f"{self._result.checkpoint} is intact"
+        return BhdError(
+            f"The policy's weights are not finite any more after {self._result.step} steps. Training stops; of the "
+            f"checkpoints, {kept}. Lower the learning rate (--ppo.lr) or the rewards (--reward.…)."
+        )
 
     def _is_over(self) -> bool:
         minutes = self._config.max_minutes
@@ -273,7 +295,11 @@ def _run_folder(config: RlConfig) -> Path:
     if config.output_dir is None:
         config.output_dir = f"outputs/train/{datetime.now():%Y-%m-%d/%H-%M-%S}_ppo_{config.robot.type}"
     folder = Path(config.output_dir).expanduser()
-    if folder.exists() and not config.resume:
+    try:
+        is_there = folder.exists()
+    except OSError as error:  # a name that is too long
+        raise ConfigError(f"The run folder {folder} cannot be used: {error.strerror}. Set --output_dir.") from error
+    if is_there and not config.resume:
         raise ConfigError(
             f"The output folder {folder} exists. Set another --output_dir, or continue its run with "
             f"--resume=true --config_path={folder}."
@@ -282,12 +308,24 @@ def _run_folder(config: RlConfig) -> Path:
         raise ConfigError(f"There is no run to resume in {folder}.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        values = {**encode(config), "resume": False}
-        text = yaml.safe_dump(json.loads(json.dumps(values)), sort_keys=False, default_flow_style=None, width=110)
-        (folder / CONFIG_NAME).write_text(text, encoding="utf-8")
+        (folder / f".{CONFIG_NAME}.part").touch()
+        (folder / f".{CONFIG_NAME}.part").unlink()
     except OSError as error:
         raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
     return folder
+
+
+def _write_config(config: RlConfig, folder: Path) -> None:
+    """Write the resolved configuration; that of a run which cannot be resumed with another one stays as it was."""
+    values = {**encode(config), "resume": False}
+    text = yaml.safe_dump(json.loads(json.dumps(values)), sort_keys=False, default_flow_style=None, width=110)
+    (folder / CONFIG_NAME).write_text(text, encoding="utf-8")
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove the folder of a run that failed before it wrote anything, so that it can be started again."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -300,3 +338,6 @@ def main(arguments: Sequence[str]) -> int:
     except BhdError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:  # before the run began, or a second time while it was ending
+        print("Interrupted; checkpoints that were written before are complete.", file=sys.stderr)
+        return 128 + signal.SIGINT
