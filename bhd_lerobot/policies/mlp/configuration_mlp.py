@@ -294,6 +294,6 @@ class MlpConfig(PreTrainedConfig):
         scan = self.scan
         if scan.is_used and (not scan.beams or scan.start is None or scan.start + scan.beams > width):
             raise ConfigError(
-                f"policy.scan has start {scan.start} and beams {scan.beams}; they must lie among the {width} columns of "
-                f"{OBS_STATE}."
+                f"policy.scan has start {scan.start} and beams {scan.beams}; they must lie among the {width} columns "
+                f"of {OBS_STATE}."
             )
