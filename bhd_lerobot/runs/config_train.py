@@ -48,7 +48,9 @@ class SelectionConfig:
         """
         _ = self.filter
         if not 0 <= self.intervention_weight < float("inf"):
-            raise ConfigError(f"selection.intervention_weight is {self.intervention_weight}; it must be 0 or more.")
+            raise ConfigError(
+                f"selection.intervention_weight is {self.intervention_weight}; it must be 0 or more, and finite."
+            )
         if self.hold_out not in HOLD_OUTS:
             raise ConfigError(unknown_name("selection.hold_out", self.hold_out, HOLD_OUTS))
 
@@ -103,9 +105,17 @@ class BhdTrainConfig(TrainPipelineConfig):
             ("num_workers", self.num_workers, 0),
             ("seed", 0 if self.seed is None else self.seed, 0),
             ("max_eval_samples", self.max_eval_samples, 0),
+            ("log_freq", self.log_freq, 0),
+            ("save_freq", self.save_freq, 0),
+            ("eval_steps", self.eval_steps, 0),
+            ("env_eval_freq", self.env_eval_freq, 0),
+            ("eval.n_episodes", self.eval.n_episodes if self._is_evaluated else 1, 1),
+            ("eval.batch_size", self.eval.batch_size if self._is_evaluated else 1, 1),
         ):
             if value < least:
                 raise ConfigError(f"{name} is {value}; it must be at least {least}.")
+        if not 0 < self.tolerance_s < float("inf"):
+            raise ConfigError(f"tolerance_s is {self.tolerance_s}; it must be more than 0, and finite [s].")
         if not self.budget_gib > 0:
             raise ConfigError(f"budget_gib is {self.budget_gib}; it must be more than 0.")
         if self.fine_tune_statistics not in STATISTICS:
@@ -119,7 +129,7 @@ class BhdTrainConfig(TrainPipelineConfig):
         if self.dataset.streaming or self.job.is_remote:
             option = "dataset.streaming" if self.dataset.streaming else "job.target"
             raise ConfigError(f"{option} is not for bhd-train; use lerobot-train, which reads the same configuration.")
-        if self.output_dir is not None and not self.resume and Path(self.output_dir).exists():
+        if self.output_dir is not None and not self.resume and _is_there(Path(self.output_dir)):
             raise ConfigError(
                 f"The output folder {self.output_dir} exists. Set another --output_dir, or continue its run with "
                 f"--resume=true --config_path={Path(self.output_dir) / 'checkpoints/last/pretrained_model'}."
@@ -129,10 +139,14 @@ class BhdTrainConfig(TrainPipelineConfig):
         given = self.optimizer, self.scheduler
         try:
             super().validate()
-        except (ValueError, FileExistsError, NotImplementedError) as error:
+        except (ValueError, OSError, NotImplementedError) as error:
             raise ConfigError(f"The configuration cannot be used: {error}") from error
         if self.use_policy_training_preset and not self.resume:
             self._refuse_unused(*given)
+
+    @property
+    def _is_evaluated(self) -> bool:
+        return self.env is not None and self.env_eval_freq > 0
 
     def _refuse_unused(self, optimizer: Any, scheduler: Any) -> None:
         """Refuse an optimizer or scheduler that LeRobot would silently replace by the policy's own."""
@@ -149,6 +163,13 @@ class BhdTrainConfig(TrainPipelineConfig):
         own = {name: values.pop(name) for name in own_fields()}
         (save_directory / TRAIN_CONFIG_NAME).write_text(json.dumps(values, indent=4), encoding="utf-8")
         (save_directory / OWN_CONFIG_NAME).write_text(json.dumps(own, indent=4), encoding="utf-8")
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError as error:  # a name that is too long, a folder that may not be looked into
+        raise ConfigError(f"The output folder {path} cannot be used: {error.strerror}. Set --output_dir.") from error
 
 
 def own_fields() -> list[str]:

@@ -60,7 +60,7 @@ def decode[T](config_class: type[T], values: dict[str, Any]) -> T:
         raise
     except Exception as error:  # draccus raises DecodingError, ValueError, TypeError and what our checks raise in it
         own = _own_error(error)
-        reason = " ".join(str(own or error).split())
+        reason = " ".join(str(own or _cause(error)).split())
         raise ConfigError(reason if own else f"The configuration cannot be used: {reason}") from error
 
 
@@ -297,6 +297,13 @@ def choices_of(kind: Any) -> dict[str, type]:
     if isinstance(kind, type) and issubclass(kind, draccus.ChoiceRegistry):
         return kind.get_known_choices()
     return {}
+
+
+def _cause(error: BaseException) -> BaseException:
+    """Return what says why a class could not be made; draccus only says that it could not."""
+    while error.__cause__ is not None and "Couldn't instantiate" in str(error):
+        error = error.__cause__
+    return error
 
 
 def _own_error(error: BaseException | None) -> BhdError | None:

@@ -9,10 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
-from lerobot.common.train_utils import push_checkpoint_to_hub
-from lerobot.optim.factory import make_optimizer_and_scheduler
-from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.import_utils import register_third_party_plugins
 from rich.console import Console
 from rich.markup import escape
@@ -21,7 +17,7 @@ import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.policies.contract import PolicyContract
 from bhd_lerobot.runs import train_checkpoint
-from bhd_lerobot.runs.config_train import BhdTrainConfig, plain
+from bhd_lerobot.runs.config_train import BhdTrainConfig
 from bhd_lerobot.runs.configuration import describe
 from bhd_lerobot.runs.rl.config import is_rl
 from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
@@ -29,17 +25,11 @@ from bhd_lerobot.runs.train_arguments import Request, parse_train
 from bhd_lerobot.runs.train_checkpoint import TrainingParts, resume_command
 from bhd_lerobot.runs.train_data import TrainingData, open_data, open_metadata, select_episodes
 from bhd_lerobot.runs.train_env import EnvEvaluation
-from bhd_lerobot.runs.train_log import (
-    METRICS_NAME,
-    PLOT_NAME,
-    MetricsFile,
-    Row,
-    TrainingProgress,
-    draw_loss,
-    read_metrics,
-)
+from bhd_lerobot.runs.train_log import Row, TrainingProgress
 from bhd_lerobot.runs.train_loop import Hooks, LoopOptions, TrainingLoop
+from bhd_lerobot.runs.train_output import RunOutput
 from bhd_lerobot.runs.train_setup import (
+    build_optimizer,
     build_policy,
     build_processors,
     check_contract,
@@ -103,7 +93,7 @@ def train(request: Request, console: Console | None = None) -> TrainResult:
     policy = build_policy(config, meta, accelerator)
     keep = config.resume or (request.contract is not None and config.fine_tune_statistics == "checkpoint")
     preprocessor, postprocessor = build_processors(config, policy, meta, accelerator.device, keep_statistics=keep)
-    optimizer, scheduler = make_optimizer_and_scheduler(config, policy)
+    optimizer, scheduler = build_optimizer(config, policy)
     data = open_data(
         config,
         policy.config,
@@ -150,9 +140,35 @@ def _run(
         camera_keys=camera_keys,
     )
     parts.optimizer, parts.scheduler = learner.optimizer, learner.scheduler
-    options = LoopOptions(
+    environment = EnvEvaluation(config, parts, accelerator) if config.env and config.env_eval_freq > 0 else None
+    hooks = Hooks(
+        held_out=None if data.held_out is None else data.held_out.__iter__,
+        evaluate=None if environment is None else environment.run,
+    )
+    if accelerator.num_processes > 1:
+        hooks.mean = lambda values: accelerator.reduce(values.float().to(accelerator.device), reduction="mean").cpu()
+    loop = TrainingLoop(learner, data.train, _loop_options(config, data, accelerator.num_processes), hooks)
+    if config.checkpoint_path:
+        loop.load_state_dict(step, state)
+    if step >= config.steps:
+        raise ConfigError(f"The run has done {step} of {config.steps} steps. To go on, set more with --steps.")
+    is_main = accelerator.is_main_process
+    output = RunOutput(config, parts, step, is_main=is_main, processes=accelerator.num_processes)
+    tell_start(console, config, parts.policy, data, step)
+    result = TrainResult(output.folder, step, contract=parts.contract)
+    _follow(loop, output, result, config, accelerator=accelerator, console=console)
+    tell_summary(console, config, result)
+    if not loop.interrupted:
+        output.push()
+    accelerator.wait_for_everyone()
+    accelerator.end_training()
+    return result
+
+
+def _loop_options(config: BhdTrainConfig, data: TrainingData, processes: int) -> LoopOptions:
+    return LoopOptions(
         steps=config.steps,
-        batch_size=config.batch_size * accelerator.num_processes,
+        batch_size=config.batch_size * processes,
         frames=data.frames,
         log_freq=config.log_freq,
         eval_freq=config.eval_steps,
@@ -161,58 +177,39 @@ def _run(
         seed=config.seed or 0,
         held_out=data.held_out_episodes,
     )
-    result = TrainResult(Path(str(config.output_dir)), step, config.checkpoint_path, contract=parts.contract)
-    environment = EnvEvaluation(config, parts, accelerator) if config.env and config.env_eval_freq > 0 else None
-    hooks = Hooks(
-        held_out=None if data.held_out is None else data.held_out.__iter__,
-        evaluate=None if environment is None else environment.run,
-    )
-    loop = TrainingLoop(learner, data.train, options, hooks)
-    if config.checkpoint_path:
-        loop.load_state_dict(step, state)
-    if step >= config.steps:
-        raise ConfigError(f"The run has done {step} of {config.steps} steps. To go on, set more with --steps.")
-    metrics = _open_run_folder(config, step) if accelerator.is_main_process else None
-    wandb = _wandb(config) if accelerator.is_main_process else None
-    tell_start(console, config, parts.policy, data, step)
 
-    def log(row: Row) -> None:
-        if metrics is None:
-            return
-        metrics.append(row)
-        progress.log(row)
-        if wandb is not None:
-            wandb.log_dict({key: one for key, one in row.items() if key != "step"}, row["step"])
 
-    def save(at: int, loop_state: dict[str, Any]) -> None:
-        if metrics is not None:
-            result.checkpoint = train_checkpoint.save(config, at, parts, loop_state, accelerator.num_processes)
-            draw_loss(metrics.rows, result.output_dir / PLOT_NAME, _heading(config, at))
-            _share(config, result.checkpoint, wandb)
-        accelerator.wait_for_everyone()
-
-    hooks.log, hooks.save = log, save if config.save_checkpoint else None
-    if accelerator.num_processes > 1:
-        hooks.mean = lambda values: accelerator.reduce(values.float().to(accelerator.device), reduction="mean").cpu()
+def _follow(
+    loop: TrainingLoop,
+    output: RunOutput,
+    result: TrainResult,
+    config: BhdTrainConfig,
+    *,
+    accelerator: Any,
+    console: Console,
+) -> None:
+    """Run the loop, show and write what comes of it, and keep the result up to date, also when it fails."""
     started = time.perf_counter()
-    with TrainingProgress(console, config.steps, step) as progress, stop_on_signals() as stop:
-        hooks.progress = progress.advance
-        hooks.should_stop = _agreement(stop, accelerator)
+    with TrainingProgress(console, config.steps, loop.step) as progress, stop_on_signals() as stop:
+
+        def log(row: Row) -> None:
+            output.log(row)
+            progress.log(row)
+
+        def save(at: int, loop_state: dict[str, Any]) -> None:
+            output.save(at, loop_state)
+            accelerator.wait_for_everyone()
+
+        hooks = loop.hooks
+        hooks.log, hooks.save = log, save if config.save_checkpoint else None
+        hooks.progress, hooks.should_stop = progress.advance, _agreement(stop, accelerator)
         result.stopped_by = stop
         try:
             loop.run()
         finally:
             result.step, result.wall_s = loop.step, time.perf_counter() - started
-            if metrics is not None:
-                result.rows = metrics.rows
-                draw_loss(metrics.rows, result.output_dir / PLOT_NAME, _heading(config, loop.step))
-    tell_summary(console, config, result)
-    push = config.policy is not None and config.policy.push_to_hub
-    if not loop.interrupted and accelerator.is_main_process and push:
-        _push(config, parts, result)
-    accelerator.wait_for_everyone()
-    accelerator.end_training()
-    return result
+            result.checkpoint, result.rows = output.checkpoint, output.rows
+            output.draw(loop.step)
 
 
 def _agreement(stop: StopRequest, accelerator: Any) -> Any:
@@ -227,57 +224,6 @@ def _agreement(stop: StopRequest, accelerator: Any) -> Any:
         return bool(accelerator.reduce(flag, reduction="sum") > 0)
 
     return agreed
-
-
-def _open_run_folder(config: BhdTrainConfig, step: int) -> MetricsFile:
-    folder = Path(str(config.output_dir))
-    source = config.checkpoint_path.parent.parent if config.checkpoint_path else folder
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        train_checkpoint.clean(folder)
-        text = yaml.safe_dump(plain(config), sort_keys=False, default_flow_style=None, width=110)
-        (folder / "config.yaml").write_text(text, encoding="utf-8")
-        config._save_pretrained(folder)
-        return MetricsFile(folder / METRICS_NAME, read_metrics(source / METRICS_NAME, step))
-    except OSError as error:
-        raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
-
-
-def _heading(config: BhdTrainConfig, step: int) -> str:
-    return f"{config.job_name} on {config.dataset.repo_id}, step {step} of {config.steps}"
-
-
-def _wandb(config: BhdTrainConfig) -> Any:
-    if not (config.wandb.enable and config.wandb.project):
-        return None
-    from lerobot.common.wandb_utils import WandBLogger
-
-    return WandBLogger(config)
-
-
-def _share(config: BhdTrainConfig, checkpoint: Path, wandb: Any) -> None:
-    if config.save_checkpoint_to_hub and config.policy is not None:
-        try:
-            push_checkpoint_to_hub(checkpoint, config.policy.repo_id, private=config.policy.private)
-        except Exception as error:  # of the Hub's client or the network
-            raise BhdError(f"The checkpoint is complete at {checkpoint}, but it was not uploaded: {error}") from error
-    if wandb is not None:
-        wandb.log_policy(checkpoint)
-
-
-def _push(config: BhdTrainConfig, parts: TrainingParts, result: TrainResult) -> None:
-    policy: Any = config.policy
-    try:
-        parts.policy.push_model_to_hub(config)
-        parts.preprocessor.push_to_hub(policy.repo_id)
-        parts.postprocessor.push_to_hub(policy.repo_id)
-        if result.checkpoint is not None:
-            from huggingface_hub import HfApi
-
-            file = result.checkpoint / PRETRAINED_MODEL_DIR / "bhd.json"
-            HfApi().upload_file(path_or_fileobj=file, path_in_repo=file.name, repo_id=policy.repo_id)
-    except Exception as error:  # of the Hub's client or the network
-        raise BhdError(f"The policy is complete at {result.checkpoint}, but it was not uploaded: {error}") from error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -296,8 +242,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BhdError as error:
         Console(stderr=True).print(f"error: {escape(str(error))}", soft_wrap=True, highlight=False)
         return 2
-    except KeyboardInterrupt:
-        print("Interrupted before the first step; nothing was written.", file=sys.stderr)
+    except KeyboardInterrupt:  # before the first step, or a second time while a step or a checkpoint was under way
+        print("Interrupted; checkpoints that were written before are complete.", file=sys.stderr)
         return 128 + signal.SIGINT
 
 

@@ -9,6 +9,8 @@ from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from lerobot.utils.random_utils import seeded_context
 
+from bhd_lerobot.envs.register import ENVIRONMENTS
+from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.runs.config_train import BhdTrainConfig
 from bhd_lerobot.runs.train_checkpoint import TrainingParts
 from bhd_lerobot.runs.train_log import Row
@@ -24,7 +26,11 @@ class EnvEvaluation:
             config: with `env` and `eval`.
             parts: the policy and its processors.
             accelerator: accelerate's; only its main process evaluates.
+
+        Raises:
+            ConfigError: the environment is of another robot than the dataset.
         """
+        _check_robot(config, parts.contract.robot_type)
         self._config, self._parts, self._accelerator = config, parts, accelerator
         self._before, self._after = make_env_pre_post_processors(env_cfg=config.env, policy_cfg=config.policy)
 
@@ -56,6 +62,14 @@ class EnvEvaluation:
                         start_seed=seed,
                         max_parallel_tasks=config.env.max_parallel_tasks,
                     )
+            except BhdError:
+                raise
+            except Exception as error:  # of a policy, an environment, or a processor between them
+                raise BhdError(
+                    f"The policy cannot be evaluated in env.task={getattr(config.env, 'task', None)!r}: "
+                    f"{' '.join(str(error).split())}. "
+                    "Set --env_eval_freq=0, or the env of the dataset's robot and task."
+                ) from error
             finally:
                 close_envs(envs)
                 self._parts.policy.train()
@@ -67,3 +81,12 @@ class EnvEvaluation:
             }
         self._accelerator.wait_for_everyone()
         return row
+
+
+def _check_robot(config: BhdTrainConfig, robot: str | None) -> None:
+    pair = ENVIRONMENTS.get(str(getattr(config.env, "task", None)))
+    if robot is not None and pair is not None and pair[0] != robot:
+        fitting = ", ".join(sorted(name for name, (kind, _) in ENVIRONMENTS.items() if kind == robot)) or "none"
+        raise ConfigError(
+            f"env.task is {config.env.task!r}, which is for a {pair[0]}; the dataset is of a {robot}. Valid: {fitting}."
+        )

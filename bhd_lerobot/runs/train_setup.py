@@ -10,6 +10,7 @@ from accelerate.utils import DistributedDataParallelKwargs, DistributedType  # t
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION
 from lerobot.utils.feature_utils import dataset_to_policy_features
@@ -138,12 +139,25 @@ def build_policy(config: BhdTrainConfig, meta: LeRobotDatasetMetadata, accelerat
         return make_policy(policy, ds_meta=meta, rename_map=config.rename_map)
     except BhdError:
         raise
-    except (ValueError, RuntimeError, OSError, ImportError) as error:
+    except Exception as error:  # each policy, safetensors and the Hub's client have their own
         whence = f" from {policy.pretrained_path}" if policy.pretrained_path else ""
         raise ConfigError(
             f"The policy {policy.type!r} cannot be made{whence} for {meta.root}, which has "
             f"{', '.join(dataset_to_policy_features(meta.features))}: {error}"
         ) from error
+
+
+def build_optimizer(config: BhdTrainConfig, policy: Any) -> tuple[Any, Any]:
+    """Return the optimizer and the scheduler of the learning rate, or None for that.
+
+    Raises:
+        ConfigError: a value that PyTorch refuses.
+    """
+    try:
+        return make_optimizer_and_scheduler(config, policy)
+    except (ValueError, TypeError, ImportError) as error:
+        options = "policy.optimizer_… and policy.scheduler_…" if config.use_policy_training_preset else "optimizer.…"
+        raise ConfigError(f"The optimizer cannot be made: {error}. Change the options {options}.") from error
 
 
 def build_processors(

@@ -1,5 +1,8 @@
+import errno
 import json
 import math
+import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +11,10 @@ import torch
 from lerobot.policies.act.modeling_act import ACTPolicy
 
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
+from bhd_lerobot.runs import train_output
 from bhd_lerobot.runs.train import main
 from bhd_lerobot.runs.train_arguments import parse_train
+from bhd_lerobot.runs.train_log import MetricsFile
 from tests.runs.train_support import ACT, MLP, curve, make_dataset, options, poison, run_train
 
 
@@ -171,6 +176,46 @@ def test_a_damaged_checkpoint_is_not_resumed(data: Path, tmp_path: Path) -> None
         run_train(["--resume=true", f"--config_path={tmp_path / 'run'}", "--steps=9"])
 
 
+def test_weights_that_are_damaged_are_named(data: Path, trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "damaged", symlinks=True)
+    file = tmp_path / "damaged" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors"
+    file.write_bytes(file.read_bytes()[:200])
+    for key in ("fine_tune", "policy.path"):
+        arguments = options(data, tmp_path / "run", {key: tmp_path / "damaged"})
+        refused(arguments, ConfigError, r"'bhd_mlp' cannot be made from .*damaged.*header")
+    with pytest.raises(ConfigError, match=r"'bhd_mlp' cannot be made from .*damaged"):
+        run_train(["--resume=true", f"--config_path={tmp_path / 'damaged'}", "--steps=12"])
+
+
+def test_an_environment_of_another_robot(tmp_path: Path) -> None:
+    root = make_dataset(tmp_path / "set", episodes=2, robot="ur5")
+    env = {"env__type": "bhd", "env__task": "TurtleBot3Avoid-v0", "env_eval_freq": 2}
+    message = r"env.task is 'TurtleBot3Avoid-v0', which is for a turtlebot3; .* Valid: UR5Pick-v0, UR5Reach-v0"
+    refused(options(root, tmp_path / "run", MLP, **env), ConfigError, message)
+
+
+def test_metrics_that_cannot_be_written_leave_the_checkpoint(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = MetricsFile.append
+
+    def full(self: MetricsFile, row: dict[str, Any]) -> None:
+        if row["step"] > 10:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(self, row)
+
+    def no_picture(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(MetricsFile, "append", full)
+    monkeypatch.setattr(train_output, "draw_loss", no_picture)
+    with pytest.raises(BhdError, match=r"metrics of step 15 .*No space left.*000010 is intact.*resume"):
+        run_train(options(data, tmp_path / "run", MLP))
+    monkeypatch.undo()
+    result, _ = run_train(["--resume=true", f"--config_path={tmp_path / 'run'}"])
+    assert (result.step, [row["step"] for row in curve(tmp_path / "run")]) == (20, [5, 10, 15, 20])
+
+
 def test_a_dataset_that_grew_since_is_not_resumed_on(tmp_path: Path) -> None:
     root = make_dataset(tmp_path / "set", episodes=2)
     run_train(options(root, tmp_path / "run", MLP, steps=5))
@@ -222,6 +267,8 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
     (tmp_path / "run" / "precious").touch()
     refused(options(data, tmp_path / "run"), ConfigError, r"output folder .*run exists.*--output_dir")
     assert [one.name for one in (tmp_path / "run").iterdir()] == ["precious"]
+    with pytest.raises(ConfigError, match=r"File name too long.*--output_dir"):
+        run_train(options(data, tmp_path / ("x" * 300)))
 
 
 @pytest.mark.parametrize(
@@ -246,6 +293,14 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
         ({"eval_steps": 5}, "eval_steps > 0 requires dataset.eval_split"),
         ({"policy.type": None}, "policy.type is missing. Valid: .*act"),
         ({"policy.n_heads": "[1]"}, r"policy.n_heads is \[1\]"),
+        ({"policy.device": "tpu"}, r"(?i)cannot be used: .*tpu"),
+        ({"dataset.eval_split": ".nan"}, r"cannot be used: .*eval_split.*nan"),
+        ({"dataset.episodes": 3}, "dataset.episodes is 3; it must be a list of int"),
+        ({"log_freq": -1}, "log_freq is -1; it must be at least 0"),
+        ({"tolerance_s": ".nan"}, "tolerance_s is nan"),
+        ({"selection.intervention_weight": ".inf"}, "is inf; it must be 0 or more, and finite"),
+        ({"env.type": "bhd", "env_eval_freq": 2, "eval.n_episodes": 0}, "eval.n_episodes is 0"),
+        ({"policy.optimizer_lr": ".nan"}, r"optimizer cannot be made: .*nan.*policy\.optimizer_"),
     ],
 )
 def test_a_configuration_that_cannot_be_honoured(
