@@ -1,5 +1,6 @@
 """`bhd-eval`: brains beside each other on the same held-out episodes, with intervals, a report and films."""
 
+import os
 import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
-from bhd_lerobot.errors import ConfigError, RenderingError
+from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
 from bhd_lerobot.robots.simulation import Simulation, describe
 from bhd_lerobot.runs.config_eval import YARDSTICKS, EvalConfig
 from bhd_lerobot.runs.configuration import encode, run
@@ -32,6 +33,7 @@ from bhd_lerobot.runs.record_report import ESTOP_STATUS, tell_refusals
 from bhd_lerobot.runs.registry import make_robot, make_simulation
 from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
 
+RESULTS_NAME = "results.json"
 FAILED_STATUS = 1  # exit status of an evaluation in which a brain missed `fail_below`
 
 
@@ -78,6 +80,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         BhdError: the configuration cannot be honoured; the message names the brain that does not fit.
     """
     console = console or Console(stderr=True)
+    _refuse_results(config)
     is_live = config.robot.clock == "realtime"
     n = 1 if is_live else min(config.n_envs, len(config.indices))
     simulation = make_robot(config.robot, n, config.threads)
@@ -115,7 +118,14 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     }
     result = EvalResult(output_dir, results, timing, output_dir / "report.html", stopped_by=stop, estop=estop)
     result.missed = _missed(config, results)
-    _write(config, result, runs, preview, no_films)
+    try:
+        _write(config, result, runs, preview, no_films)
+    except OSError as error:
+        tell_summary(console, config, result)  # so that the numbers, at least, are not lost
+        raise BhdError(
+            f"The results cannot be written to {output_dir}: {error.strerror or error}. What is printed above is "
+            "complete. Make room, or set another --output_dir, and run it again: the numbers will be the same."
+        ) from error
     tell_summary(console, config, result)
     return result
 
@@ -160,7 +170,7 @@ def _write(
     config: EvalConfig, result: EvalResult, runs: Sequence[BrainRun], preview: Preview | None, no_films: str
 ) -> None:
     folder = result.output_dir
-    write_json(folder / "results.json", result.results.plain())
+    write_json(folder / RESULTS_NAME, result.results.plain())
     write_json(folder / "timing.json", result.timing)
     write_table(folder / "episodes.parquet", result.results.episodes)
     states: dict[str, Any] = {f"state_{one.label}": np.array(one.initial_states) for one in runs}
@@ -205,6 +215,19 @@ def _make_preview(config: EvalConfig, console: Console) -> tuple[Preview | None,
             raise
         console.print(f"No films: {escape(str(error))}")
         return None, str(error)
+
+
+def _refuse_results(config: EvalConfig) -> None:
+    """Refuse a folder that holds the results of another evaluation.
+
+    Raises:
+        ConfigError: names the folder.
+    """
+    if config.output_dir and os.path.isfile(os.path.join(os.path.expanduser(config.output_dir), RESULTS_NAME)):
+        raise ConfigError(
+            f"The folder {config.output_dir} holds the results of an evaluation ({RESULTS_NAME}). Set another "
+            "--output_dir, or remove it."
+        )
 
 
 def _make_output_dir(config: EvalConfig) -> Path:

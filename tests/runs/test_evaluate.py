@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.policies.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.gap_follower import GapFollowerBrain
 from bhd_lerobot.runs import evaluate as evaluate_module
@@ -241,3 +241,22 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot be written"):
         run_eval(tmp_path / "file" / "run")
+
+
+def test_results_that_are_there_are_not_overwritten(whole):
+    folder = whole[0]
+    before = (folder / "results.json").read_bytes()
+    with pytest.raises(ConfigError, match=r"holds the results of an evaluation.*--output_dir"):
+        run_eval(folder, n_episodes=1)
+    assert (folder / "results.json").read_bytes() == before
+
+
+def test_a_full_disk_still_shows_the_numbers(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(evaluate_module, "write_json", full)
+    console = Console(file=io.StringIO(), width=160)
+    with pytest.raises(BhdError, match=r"No space left on device.*run it again"):
+        evaluate(parse(EvalConfig, options(tmp_path, only="[old]", n_episodes=1)), console)
+    assert "old" in console.file.getvalue()
