@@ -46,17 +46,21 @@ class Arena:
         Args:
             points: x and y in the world frame [m], shape (..., 2).
         """
-        return _clearance(self.shapes, points)
+        return _clearance(self.shapes, points[..., 0], points[..., 1])
 
     @cached_property
     def reachable(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Grid points (rows, columns, 2) [m], and whether the robot's centre can get to each from the start."""
-        points = _grid(self.extent)
-        free = self.clearance(points) > ROBOT_RADIUS + CLEARANCE
-        labels, _ = ndimage.label(free)
+        x, y = _axes(self.extent)
+        return _points(x, y), self._reached(_clearance(self.shapes, x, y))
+
+    def _reached(self, clearance: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return where the robot's centre can get to from the start, on the grid that the clearance is of."""
+        labels, _ = ndimage.label(clearance > ROBOT_RADIUS + CLEARANCE)
         row, column = _nearest(self.extent, self.start[:2])
         label = labels[row, column]
-        return points, (labels == label) & (label > 0)
+        reached: NDArray[np.bool_] = (labels == label) & (label > 0)
+        return reached
 
     def cell_of(self, points: NDArray[np.float64], size: float) -> NDArray[np.int64]:
         """Return the number of the square cell that each point lies in, shape (...,).
@@ -135,19 +139,23 @@ def random_arena(seed: int) -> Arena:
     for _ in range(1000):
         half_x, half_y = rng.uniform(1.8, 3.0, size=2)
         obstacles: list[Shape] = []
-        points = _grid((-half_x, half_x, -half_y, half_y))
-        clearance = _clearance(_outer_walls(half_x, half_y), points)
+        x, y = _axes((-half_x, half_x, -half_y, half_y))
+        clearance = _clearance(_outer_walls(half_x, half_y), x, y)
         builders = (_cylinders, _boxes, _walls, _corridor, _dead_end)
         # Each arena has its own mixture: some are forests of posts, some mazes.
         for builder, count in zip(builders, rng.integers((2, 1, 0, 0, 0), (9, 6, 4, 2, 3)), strict=True):
             for _ in range(count):
                 group = builder(rng, half_x, half_y)
-                trial = np.minimum(clearance, _clearance(group, points))
+                trial = np.minimum(clearance, _clearance(group, x, y))
                 if _is_connected(trial):
                     obstacles += group
                     clearance = trial
         if (clearance > START_CLEARANCE).any():
-            return _closed("random", half_x, half_y, obstacles, _random_pose(points, clearance, rng))
+            points = _points(x, y)
+            arena = _closed("random", half_x, half_y, obstacles, _random_pose(points, clearance, rng))
+            # The cached property's value, which whoever draws an arena asks for: its clearance is known already.
+            vars(arena)["reachable"] = points, arena._reached(clearance)
+            return arena
     raise ConfigError(f"No arena could be generated from seed {seed}.")  # 1000 failures in a row
 
 
@@ -226,11 +234,17 @@ def _is_connected(clearance: NDArray[np.float64]) -> bool:
     return count == 1 and float(free.mean()) > 1 / 3
 
 
-def _grid(extent: tuple[float, float, float, float]) -> NDArray[np.float64]:
+def _axes(extent: tuple[float, float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the grid's x as a row, shape (1, columns), and its y as a column, shape (rows, 1)."""
     x_min, x_max, y_min, y_max = extent
-    x = np.arange(x_min + RESOLUTION / 2, x_max, RESOLUTION)
-    y = np.arange(y_min + RESOLUTION / 2, y_max, RESOLUTION)
-    return np.stack(np.meshgrid(x, y), axis=-1)
+    x = np.arange(x_min + RESOLUTION / 2, x_max, RESOLUTION, dtype=np.float64)
+    y = np.arange(y_min + RESOLUTION / 2, y_max, RESOLUTION, dtype=np.float64)
+    return x[None, :], y[:, None]
+
+
+def _points(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the grid's points, shape (rows, columns, 2)."""
+    return np.stack(np.broadcast_arrays(x, y), axis=-1)
 
 
 def _nearest(extent: tuple[float, float, float, float], point: tuple[float, float]) -> tuple[int, int]:
@@ -238,18 +252,23 @@ def _nearest(extent: tuple[float, float, float, float], point: tuple[float, floa
     return int((point[1] - y_min) / RESOLUTION), int((point[0] - x_min) / RESOLUTION)
 
 
-def _clearance(shapes: Iterable[Shape], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    distance = np.full(points.shape[:-1], np.inf)
+def _clearance(shapes: Iterable[Shape], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the distance to the nearest shape, in the shape that x and y have together."""
+    distance = np.full(np.broadcast_shapes(x.shape, y.shape), np.inf)
     for shape in shapes:
-        np.minimum(distance, _distance(shape, points), out=distance)
+        np.minimum(distance, _distance(shape, x, y), out=distance)
     return distance
 
 
-def _distance(shape: Shape, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    dx, dy = points[..., 0] - shape.x, points[..., 1] - shape.y
+def _distance(shape: Shape, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Runs for every shape of every new episode. Of a grid, x is a row and y a column: what depends on one of them is
+    # computed for that alone.
+    dx, dy = x - shape.x, y - shape.y
     if shape.kind == "cylinder":
         return np.hypot(dx, dy) - shape.size_x
     c, s = math.cos(shape.yaw), math.sin(shape.yaw)
     ax = np.abs(c * dx + s * dy) - shape.size_x
     ay = np.abs(c * dy - s * dx) - shape.size_y
-    return np.hypot(np.maximum(ax, 0), np.maximum(ay, 0)) + np.minimum(np.maximum(ax, ay), 0)
+    outside = np.asarray(np.maximum(ax, ay))
+    # At a corner; elsewhere one of the two is 0, and what is left is the other.
+    return np.hypot(ax, ay, out=outside, where=(ax > 0) & (ay > 0))
