@@ -43,6 +43,7 @@ class PolicyContract:
         cameras: image shapes (height, width, channels) [px] by camera name.
         units: what the numbers are in.
         task: parameters of the task in the dataset.
+        robot: options of the robot in the dataset.
         dataset: which dataset it was: `repo_id`, `root` (the folder's name), `episodes`, `frames`.
         trainer: the program that trained it.
         versions: of the packages that trained it.
@@ -56,6 +57,7 @@ class PolicyContract:
     cameras: Mapping[str, tuple[int, int, int]] | None = None
     units: str | None = None
     task: Mapping[str, Any] | None = None
+    robot: Mapping[str, Any] | None = None
     dataset: Mapping[str, Any] | None = None
     trainer: str | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -205,9 +207,10 @@ class PolicyContract:
             return info[name] if isinstance(info, dict) else getattr(info, name)
 
         features = read("features")
-        task, units = None, None
+        recording: Mapping[str, Any] = {}
+        units = None
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            task = json.loads((root / "meta" / CONTRACT_FILE).read_text(encoding="utf-8"))["recording"].get("task")
+            recording = dict(json.loads((root / "meta" / CONTRACT_FILE).read_text(encoding="utf-8"))["recording"])
             units = "SI"  # it is our recorder that writes that file
         return cls(
             robot_type=read("robot_type"),
@@ -221,7 +224,8 @@ class PolicyContract:
                 if feature["dtype"] in ("video", "image")
             },
             units=units,
-            task=task,
+            task=recording.get("task"),
+            robot=recording.get("robot"),
             dataset={"root": root.name, "episodes": read("total_episodes"), "frames": read("total_frames")},
         )
 
@@ -277,7 +281,7 @@ def _frozen(key: str, value: Any) -> Any:
         return {name: (int(height), int(width), int(channels)) for name, (height, width, channels) in value.items()}
     if key == "fps" and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
         raise ValueError(f"fps is {value!r}; it must be a whole number of Hz")
-    if key in ("task", "dataset", "versions") and not isinstance(value, dict):
+    if key in ("task", "robot", "dataset", "versions") and not isinstance(value, dict):
         raise ValueError(f"{key} is {value!r}; it must be an object")
     return value
 

@@ -1,5 +1,6 @@
 """What `bhd-train` says before and after."""
 
+import json
 from typing import TYPE_CHECKING, Any
 
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
@@ -8,6 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bhd_lerobot.policies.contract import PolicyContract
+from bhd_lerobot.robots.simulation import describe
 from bhd_lerobot.runs.config_train import BhdTrainConfig
 from bhd_lerobot.runs.registry import SIMULATED_ROBOTS
 from bhd_lerobot.runs.train_checkpoint import resume_command
@@ -67,10 +69,19 @@ def tell_summary(console: Console, config: BhdTrainConfig, result: "TrainResult"
 
 
 def evaluate_command(contract: PolicyContract, checkpoint: str) -> str:
-    """Return the command that evaluates a checkpoint on held-out episodes of what it was trained on."""
+    """Return the command that evaluates a checkpoint on held-out episodes of what it was trained on.
+
+    It names the robot's options that are not at their defaults: with others the observations or actions do not fit.
+    """
     path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
-    robots = {kind.get_choice_name(kind) for kind in SIMULATED_ROBOTS}
+    kinds = {str(kind.get_choice_name(kind)): kind for kind in SIMULATED_ROBOTS}
     task = (contract.task or {}).get("type")
-    if contract.robot_type not in robots or task is None:
+    if contract.robot_type not in kinds or task is None:
         return f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={path}"
-    return f"bhd-eval --robot.type={contract.robot_type} --task.type={task} --brain.path={path}"
+    usual = describe(kinds[contract.robot_type]())
+    options = "".join(
+        f" --robot.{name}={json.dumps(value) if isinstance(value, bool | int | float) else value}"
+        for name, value in (contract.robot or {}).items()
+        if name in usual and isinstance(value, str | bool | int | float) and value != usual[name]
+    )
+    return f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task} --brain.path={path}"

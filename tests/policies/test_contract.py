@@ -20,6 +20,7 @@ CONTRACT = PolicyContract(
     cameras={"front": (240, 320, 3)},
     units="SI",
     task={"type": "avoid"},
+    robot={"type": "turtlebot3", "fps": 10},
     dataset={"repo_id": "a/b", "root": "b", "episodes": 3, "frames": 90},
     trainer="bhd-train",
     versions={"torch": "1"},
