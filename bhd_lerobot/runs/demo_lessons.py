@@ -126,15 +126,14 @@ AVOID = Lesson(
     what="a TurtleBot3 roams random arenas",
     # Half of the task's usual time: more arenas in the same number of frames.
     world=("--robot.type=turtlebot3", "--task.type=avoid", "--task.duration_s=30"),
-    brain="gap_follower",
+    brain="avoidance",
     episodes=64,
     seed=1,
     policy=(
-        "--policy.n_obs_steps=2",
-        "--policy.obs_stride=2",
-        "--policy.chunk_size=4",
+        "--policy.chunk_size=1",
         "--policy.hidden_dims=[256,256]",
         "--policy.scan.transform=inverse",
+        "--policy.ignore=['*.vel']",  # docs/policies.md says what happens otherwise
     ),
     steps=2000,
     yardstick="random",
@@ -143,8 +142,12 @@ AVOID = Lesson(
 )
 REACH = Lesson(
     name="ur5_reach",
-    what="a UR5 brings its tool to random poses, within 5 mm and 2°",
-    world=("--robot.type=ur5", "--robot.action_space=tool", "--task.type=reach", "--task.duration_s=6"),
+    what="a UR5 brings its tool to random poses, within 30 mm and 10°",
+    # Coarser than the task's own 5 mm and 2°, for which the network would have to learn longer.
+    world=(
+        *("--robot.type=ur5", "--robot.action_space=tool", "--robot.tool_pose=true"),
+        *("--task.type=reach", "--task.tolerance_m=0.03", "--task.tolerance_deg=10", "--task.duration_s=6"),
+    ),
     brain="reach",
     episodes=320,
     seed=1,
