@@ -1,6 +1,7 @@
 """What can lie on the table before an arm, and how one episode's world differs from the next."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -89,6 +90,9 @@ class Variation:
             [rad/s].
         latency_s: time by which what the cerebellum commands reaches the servos late, in whole control ticks [s].
         finger_friction: factor on the fingers' friction.
+        camera_error: what is added to every position that the task tells, x, y, z in the base frame [m]: in front of a
+            real arm these come from a camera, whose place may be known wrongly. Nothing else is where it is not, and
+            images stay as they are.
     """
 
     light: float = 1.0
@@ -99,6 +103,27 @@ class Variation:
     sensor_noise: float = 0.0
     latency_s: float = 0.0
     finger_friction: float = 1.0
+    camera_error: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+MAX_CAMERA_ERROR = 0.2  # [m] along an axis; a camera that is off by more was set up wrongly, not calibrated badly
+
+
+def check_camera_error(name: str, error: Sequence[float]) -> None:
+    """Refuse what is no error that a camera's calibration can have.
+
+    Args:
+        name: of the option.
+        error: x, y, z in the base frame [m].
+
+    Raises:
+        ConfigError: it is not three finite numbers, or one of them is too large.
+    """
+    if len(error) != 3 or not all(abs(value) <= MAX_CAMERA_ERROR for value in error):
+        raise ConfigError(
+            f"{name} is {list(error)}; it must be three numbers, x, y and z in the base frame [m], each between "
+            f"-{MAX_CAMERA_ERROR} and {MAX_CAMERA_ERROR}."
+        )
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, check_camera_error
 from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED, MAX_OPENING
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import ConfigError, InstructionError
@@ -23,6 +23,7 @@ _SQUEEZE = 0.03  # [m] how far inside the object the fingers are sent: the gripp
 _MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers
 _TRAVEL = 0.22  # [m] height of the tool above the table on free motions: the finger tips stay above every object
 _LIFTED = 0.05  # [m] an object that was lifted by less slipped out
+_POSITION = [OBJECT_FIELDS.index(axis) for axis in "xyz"]
 
 
 @BrainConfig.register_subclass("pick")
@@ -37,6 +38,8 @@ class PickBrainConfig(BrainConfig):
         line_acceleration: acceleration of the tool on the way down and up [m/s^2].
         lift_m: height that it lifts to [m].
         attempts: how often it tries to grasp.
+        camera_error_m: what positions that it is told are known to be off by, x, y, z in the base frame [m]; it is
+            subtracted.
     """
 
     max_velocity: float = 2.0
@@ -45,6 +48,7 @@ class PickBrainConfig(BrainConfig):
     line_acceleration: float = 1.0
     lift_m: float = 0.15
     attempts: int = 2
+    camera_error_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name in ("max_velocity", "max_acceleration", "line_velocity", "line_acceleration", "lift_m"):
@@ -56,6 +60,7 @@ class PickBrainConfig(BrainConfig):
             )
         if self.attempts < 1:
             raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")
+        check_camera_error("brain.camera_error_m", self.camera_error_m)
 
 
 @dataclass
@@ -269,7 +274,9 @@ class PickBrain(GoalBrain):
     def _objects(self, sim: int, seen: Observation) -> list[SeenObject]:
         if seen.environment_state is None:
             raise AssertionError("The brain was bound to the objects.")
-        return read_objects(seen.environment_state[sim, self._columns].reshape(MAX_OBJECTS, len(OBJECT_FIELDS)))
+        table = seen.environment_state[sim, self._columns].reshape(MAX_OBJECTS, len(OBJECT_FIELDS))
+        table[:, _POSITION] -= self.config.camera_error_m
+        return read_objects(table)
 
 
 # The stage that completes each skill.

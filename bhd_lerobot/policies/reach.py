@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.tabletop import check_camera_error
 from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
 from bhd_lerobot.errors import ConfigError
@@ -27,11 +28,14 @@ class ReachBrainConfig(BrainConfig):
         max_velocity: speed of the fastest joint [rad/s].
         max_acceleration: acceleration of the fastest joint [rad/s^2].
         attempts: how often it tries in all; between two tries the arm goes home, as another start opens other ways.
+        camera_error_m: what positions that it is told are known to be off by, x, y, z in the base frame [m]; it is
+            subtracted.
     """
 
     max_velocity: float = 2.0
     max_acceleration: float = 8.0
     attempts: int = 3
+    camera_error_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name in ("max_velocity", "max_acceleration"):
@@ -43,6 +47,7 @@ class ReachBrainConfig(BrainConfig):
             )
         if self.attempts < 1:
             raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")
+        check_camera_error("brain.camera_error_m", self.camera_error_m)
 
 
 class ReachBrain(GoalBrain):
@@ -99,8 +104,9 @@ class ReachBrain(GoalBrain):
             return None
         self._tries[sim] += 1
         self._doing[sim] = "move the tool to the target"
+        dx, dy, dz = self.config.camera_error_m
         w, i, j, k = (value / length for value in quaternion)
-        return self._goal(sim, "reach", target_pose=Pose((x, y, z), (w, i, j, k)))
+        return self._goal(sim, "reach", target_pose=Pose((x - dx, y - dy, z - dz), (w, i, j, k)))
 
     def _goal(self, sim: int, step: str, **target: Any) -> BrainCommand:
         speed, acceleration = self.config.max_velocity, self.config.max_acceleration

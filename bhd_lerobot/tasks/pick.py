@@ -102,6 +102,7 @@ class PickTask:
         self._present = np.zeros((n, MAX_OBJECTS), np.bool_)
         self._start = np.zeros((n, MAX_OBJECTS))  # height of the objects' centres at the start [m]
         self._fixed = np.zeros((n, MAX_OBJECTS, len(OBJECT_FIELDS)))
+        self._camera_error = np.zeros((n, 1, 3))
         self._best, self._height = np.zeros(n), np.zeros(n)
         self._held, self._frame = np.zeros(n, np.int64), np.zeros(n, np.int64)
 
@@ -144,6 +145,7 @@ class PickTask:
             if scene.target_object is None:
                 raise ConfigError(f"The scene {scene.name!r} names no object to pick up.")
             self._target[sim] = scene.target_object
+            self._camera_error[sim] = scene.variation.camera_error
             self._present[sim] = np.arange(MAX_OBJECTS) < len(scene.objects)
             self._fixed[sim], self._start[sim] = 0.0, 0.0
             self._fixed[sim, :, 6] = 1.0
@@ -157,7 +159,7 @@ class PickTask:
         self._held[ids] = self._frame[ids] = 0
 
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
-        """Return what is on the table, 16 numbers for each place of an object, shape (n, 80).
+        """Return what is on the table, as a camera sees it: 16 numbers for each place of an object, shape (n, 80).
 
         The first is the one asked for; the others follow, at the start the nearest to it first.
         Of each: whether there is one, whether it is the one asked for, whether it is a box; its pose in the base frame
@@ -166,6 +168,7 @@ class PickTask:
         """
         state = self._fixed.copy()
         state[self._present, 3:10] = truth.object_poses[self._present]
+        state[:, :, 3:6] += self._camera_error * self._present[:, :, None]
         return state.reshape(len(state), -1)
 
     # --- judging -----------------------------------------------------------------------------------------------------

@@ -81,6 +81,7 @@ class ReachTask:
         self.frames = max(1, round(config.duration_s * fps))
         self._hold = max(1, round(config.hold_s * fps))
         self._target = np.zeros((n, 7))
+        self._camera_error = np.zeros((n, 3))
         self._first, self._last = np.ones(n), np.ones(n)
         self._angle = np.zeros(n)
         self._within, self._frame = np.zeros(n, np.int64), np.zeros(n, np.int64)
@@ -109,12 +110,15 @@ class ReachTask:
             if scene.target_pose is None:
                 raise ConfigError(f"The scene {scene.name!r} has no target pose to reach.")
             self._target[sim] = scene.target_pose
+            self._camera_error[sim] = scene.variation.camera_error
         self._within[ids] = self._frame[ids] = 0
         self._started[ids] = False
 
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
-        """Return the targets in the base frame: position [m] and quaternion wxyz, shape (n, 7)."""
-        return self._target.copy()
+        """Return the targets in the base frame, as a camera sees them: position [m], quaternion wxyz, shape (n, 7)."""
+        told = self._target.copy()
+        told[:, :3] += self._camera_error
+        return told
 
     def judge(self, truth: ArmTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""

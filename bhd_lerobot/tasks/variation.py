@@ -1,4 +1,4 @@
-"""Domain randomisation: how much one episode's world may differ from the next."""
+"""Domain randomisation: how much one episode's world may differ from the next, and from the nominal one."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.bodies.tabletop import Variation
+from bhd_lerobot.bodies.tabletop import Variation, check_camera_error
 from bhd_lerobot.errors import ConfigError
 
 MAX_LATENCY_S = 0.05  # [s] what a `LatePlant` can delay by, at the control rate
@@ -14,7 +14,7 @@ MAX_LATENCY_S = 0.05  # [s] what a `LatePlant` can delay by, at the control rate
 
 @dataclass
 class RandomisationConfig:
-    """Ranges of domain randomisation. What is drawn is recorded with every episode, in its scene.
+    """Ranges of domain randomisation, and what is off in every episode. It is recorded with each, in its scene.
 
     Attributes:
         enabled: whether anything of this is done.
@@ -30,6 +30,8 @@ class RandomisationConfig:
             times that [rad/s].
         latency_s: the servos get their commands up to this late, at most 0.05 [s].
         latency_min_s: and at least this late; with `latency_s` as large, always [s].
+        camera_error_m: added to the positions that the task tells, the same in every episode: x, y, z in the base
+            frame, each at most 0.2 [m]. As if the camera that sees target and objects were not where it is taken to be.
     """
 
     enabled: bool = False
@@ -44,10 +46,17 @@ class RandomisationConfig:
     sensor_noise_rad: float = 0.0005
     latency_s: float = 0.01
     latency_min_s: float = 0.0
+    camera_error_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        check_camera_error("randomisation.camera_error_m", self.camera_error_m)
+        if any(self.camera_error_m) and not self.enabled:
+            raise ConfigError(
+                f"randomisation.camera_error_m is {list(self.camera_error_m)}, but randomisation.enabled is false, so "
+                "that nothing would be off; set --task.randomisation.enabled=true."
+            )
         for name, value in asdict(self).items():
-            if name != "enabled" and not 0 <= value < math.inf:
+            if name not in ("enabled", "camera_error_m") and not 0 <= value < math.inf:
                 raise ConfigError(f"randomisation.{name} is {value}; it must be 0 (off) or positive, and finite.")
         if self.latency_s > MAX_LATENCY_S:
             raise ConfigError(f"randomisation.latency_s is {self.latency_s}; it must be at most {MAX_LATENCY_S}.")
@@ -80,6 +89,7 @@ def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Var
         sensor_noise=float(uniform(0, config.sensor_noise_rad)),
         latency_s=float(uniform(config.latency_min_s, config.latency_s)),
         finger_friction=_factor(config.friction, rng),
+        camera_error=_floats(config.camera_error_m),
     )
 
 

@@ -18,6 +18,7 @@ from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import Event, episode_seed
+from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.policies.arm_desk import BOX, CUP, OBSERVED, Desk, scene
 
 GRASPED = 0.06  # [m] the opening when the cup is between the fingers
@@ -67,6 +68,26 @@ def test_above_down_close_lift_and_done() -> None:
     plan = desk.brain.plan(0)
     assert (plan["target"], plan["problem"], plan["attempts"]) == (0, "", 1)
     assert [skill for skill, _ in plan["steps"]] == ["locate", "approach", "grasp", "lift", "hold"]
+
+
+def test_a_known_camera_error_is_subtracted_from_every_position() -> None:
+    error = (0.02, -0.01, 0.015)
+    right = Desk(PickBrain(), [scene(CUP, BOX)])
+    wrong = Desk(PickBrain(PickBrainConfig(camera_error_m=error)), [scene(CUP, BOX)])
+    wrong.table[:, :, 3:6] += error
+    for desk in (right, wrong):
+        desk.look()
+        grasp(desk)
+        assert desk.end() is not None  # lift
+        desk.lift(0)
+        assert desk.end() is None
+    assert wrong.steps() == right.steps() == ["above", "down", "close", "lift"]
+    for one, two in zip(wrong.given[0], right.given[0], strict=True):
+        assert one.gripper == two.gripper
+        if two.target_pose is not None:
+            assert one.target_pose is not None
+            assert one.target_pose.position == pytest.approx(two.target_pose.position, abs=1e-12)
+            assert one.target_pose.quaternion == pytest.approx(two.target_pose.quaternion, abs=1e-12)
 
 
 def test_it_says_what_it_is_doing() -> None:
@@ -281,6 +302,20 @@ def test_it_picks() -> None:
         assert episode.outcome.success, episode.plan
         assert episode.plan["attempts"] == 1
         assert [result.task_id for _, result in episode.results] == [command.task_id for _, command in episode.commands]
+
+
+def test_with_a_camera_error_that_it_knows_it_picks_as_before() -> None:
+    error = (0.0, 0.05, 0.02)
+    seeds = [episode_seed(11, episode, "train") for episode in range(2)]
+    off = PickConfig(randomisation=RandomisationConfig(enabled=True, camera_error_m=error))
+    right = episodes(PickBrain(), seeds, PickConfig(randomisation=RandomisationConfig(enabled=True)))
+    knows = episodes(PickBrain(PickBrainConfig(camera_error_m=error)), seeds, off)
+    for before, one in zip(right, knows, strict=True):
+        assert one.outcome.success
+        assert len(one.columns["action"]) == len(before.columns["action"])
+        assert [(frame, result.task_id) for frame, result in one.results] == [
+            (frame, result.task_id) for frame, result in before.results
+        ]
 
 
 class Thief(PickBrain):

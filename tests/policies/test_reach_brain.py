@@ -1,5 +1,7 @@
 """The scripted reach: its goals on a made-up target, and a few reaches in the simulator."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -11,9 +13,9 @@ from bhd_lerobot.policies.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.runs.episode import EpisodeLoop
-from bhd_lerobot.runs.episode_types import EpisodeSpec
+from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.reach import ENVIRONMENT, ReachConfig, ReachTask
-from bhd_lerobot.tasks.task import episode_seed
+from bhd_lerobot.tasks.task import Event, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
 
 TARGET = np.array([0.5, 0.1, 0.3, 0.0, 0.6, 0.8, 0.0])
@@ -22,8 +24,8 @@ TARGET = np.array([0.5, 0.1, 0.3, 0.0, 0.6, 0.8, 0.0])
 class Desk:
     """n targets, a brain, and the goals that it gives."""
 
-    def __init__(self, n: int = 1, **options: float) -> None:
-        self.n, self.brain = n, ReachBrain(ReachBrainConfig(**options))  # type: ignore[arg-type]
+    def __init__(self, n: int = 1, **options: Any) -> None:
+        self.n, self.brain = n, ReachBrain(ReachBrainConfig(**options))
         self.targets = np.tile(TARGET, (n, 1))
         self.last: dict[int, BrainCommand] = {}
         self.names: list[tuple[int, str]] = []
@@ -57,6 +59,14 @@ def test_it_asks_for_the_target_once_and_holds() -> None:
     assert desk.end() is None
     assert desk.brain.subtasks()[0] == "hold"
     assert desk.look() == {}
+
+
+def test_a_known_camera_error_is_subtracted() -> None:
+    desk = Desk(camera_error_m=(0.02, -0.01, 0.1))
+    goal = desk.look()[0]
+    assert goal.target_pose is not None
+    assert goal.target_pose.position == pytest.approx(TARGET[:3] - (0.02, -0.01, 0.1), abs=1e-15)
+    assert goal.target_pose.quaternion == pytest.approx(tuple(TARGET[3:]))
 
 
 def test_a_quaternion_in_single_precision_is_made_a_unit_again() -> None:
@@ -163,3 +173,27 @@ def test_it_reaches(randomised: bool) -> None:
         assert episode.outcome.success, episode.results
         assert episode.outcome.details["error_m"] <= config.tolerance_m
         assert [result.task_id for _, result in episode.results] == ["1-reach"]
+
+
+def test_with_a_camera_error_it_reaches_as_before_if_it_knows_and_misses_if_not() -> None:
+    error = (0.012, -0.009, 0.01)  # 18 mm
+    simulation = UR5Simulation(UR5Config(), 4, threads=1)
+    off = RandomisationConfig(enabled=True, camera_error_m=error)
+
+    def run(randomisation: RandomisationConfig, brain: ReachBrainConfig) -> list[Episode]:
+        task = ReachTask(ReachConfig(duration_s=4.0, randomisation=randomisation), 4, simulation.config.fps)
+        loop = EpisodeLoop(simulation, task, ReachBrain(brain))
+        return list(loop.run([EpisodeSpec(index, episode_seed(3, index, "train")) for index in range(4)]))
+
+    right = run(RandomisationConfig(enabled=True), ReachBrainConfig())
+    knows, trusts = run(off, ReachBrainConfig(camera_error_m=error)), run(off, ReachBrainConfig())
+    # To the simulator and the judge the error is nothing: a rule that is wrong by it moves the same, in either world.
+    same = run(RandomisationConfig(enabled=True), ReachBrainConfig(camera_error_m=tuple(-one for one in error)))
+    for before, one, two, three in zip(right, knows, trusts, same, strict=True):
+        assert before.outcome.success
+        assert one.outcome.success
+        assert len(one.columns["action"]) == len(before.columns["action"])
+        assert not two.outcome.success
+        assert two.outcome.event == Event.TIMEOUT
+        assert two.outcome.details["error_m"] == pytest.approx(np.linalg.norm(error), abs=1e-3)
+        assert three.outcome.details["error_m"] == pytest.approx(two.outcome.details["error_m"], abs=1e-6)

@@ -1,5 +1,6 @@
 """The pick task: tables that can be cleared, instructions that name one object, and a judge on made-up truth."""
 
+import dataclasses
 import itertools
 import math
 
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
+from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.grasp import plan_grasp, read_objects
@@ -202,6 +203,25 @@ def test_the_environment_state_is_what_its_names_say() -> None:
     for sim, number in ((0, 3), (0, 4), (1, 1), (1, 4)):
         assert of(sim, number, *OBJECT_FIELDS) == [0] * 6 + [1] + [0] * 9
     assert of(1, 0, "present", "target") == [1, 1]
+
+
+def test_a_camera_error_moves_the_positions_that_are_told_and_not_what_is_judged() -> None:
+    error = (0.015, -0.01, 0.005)
+    off = dataclasses.replace(SCENE, variation=Variation(camera_error=error))
+    run = Run(n=2)
+    run.scenes = [off, SCENE]
+    run.task.begin(np.arange(2), run.scenes)
+    told = run.task.environment_state(truth_of(run.scenes)).reshape(2, MAX_OBJECTS, -1)
+    there = np.arange(MAX_OBJECTS) < len(SCENE.objects)
+    moved = told[1, there]
+    moved[:, 3:6] += error
+    np.testing.assert_array_equal(told[0, there], moved)
+    np.testing.assert_array_equal(told[0, ~there], told[1, ~there])  # a place without an object has nothing to be seen
+    for _ in range(2 * FPS):
+        reward = run.frame(0.12)
+        assert reward[0] == reward[1]
+    assert run.events.tolist() == [Event.SUCCESS] * 2
+    assert run.task.outcome(0, Event.SUCCESS) == run.task.outcome(1, Event.SUCCESS)
 
 
 def test_a_smaller_table_leaves_nothing_of_a_larger_one() -> None:

@@ -1,5 +1,6 @@
 """The reach task: scenes that can be done, and its judge on made-up truth."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -118,6 +119,24 @@ def test_the_brain_is_told_the_target() -> None:
     assert state.shape[1] == len(task.environment_names)
     state[:] = 0  # a copy
     assert task.environment_state(None).any()  # type: ignore[arg-type]
+
+
+def test_a_camera_error_moves_what_is_told_and_not_what_is_judged() -> None:
+    error = (0.015, -0.01, 0.005)
+    off = dataclasses.replace(SCENE, variation=Variation(camera_error=error))
+    run = Run(n=2)
+    run.task.begin(np.arange(2), [off, SCENE])
+    told = run.task.environment_state(None)  # type: ignore[arg-type]
+    assert told[0].tolist() == [*np.add(TARGET[:3], error), *TARGET[3:]]
+    assert told[1].tolist() == list(TARGET)
+    for _ in range(FPS):
+        reward = run.frame(0.004)
+        assert reward[0] == reward[1]
+    assert run.events.tolist() == [Event.SUCCESS] * 2
+    assert run.outcome(0) == run.outcome(1)
+    # The next episode's camera may be right again.
+    run.task.begin(np.arange(1), [SCENE])
+    assert run.task.environment_state(None)[0].tolist() == list(TARGET)  # type: ignore[arg-type]
 
 
 def test_a_scene_without_a_target_is_refused() -> None:

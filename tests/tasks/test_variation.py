@@ -1,24 +1,35 @@
 """Domain randomisation: off is nominal, on stays in its ranges, and what was drawn can be recorded."""
 
 import dataclasses
+import json
 import math
+import re
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.tabletop import Variation
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, Variation
+from bhd_lerobot.data import features as keys
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
+from bhd_lerobot.policies.language_brain import LanguageBrainConfig
+from bhd_lerobot.policies.pick import PickBrainConfig
+from bhd_lerobot.policies.reach import ReachBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.latency import MAX_LATENCY
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.runs.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.variation import MAX_LATENCY_S, RandomisationConfig, draw_object_changes, draw_variation
 
 ON = RandomisationConfig(enabled=True)
-RANGES = [field.name for field in dataclasses.fields(RandomisationConfig) if field.name != "enabled"]
+FIXED = ("enabled", "camera_error_m")
+RANGES = [field.name for field in dataclasses.fields(RandomisationConfig) if field.name not in FIXED]
 
 
 def test_off_is_exactly_nominal_and_draws_nothing() -> None:
@@ -124,3 +135,74 @@ def test_a_delay_may_be_the_same_in_every_episode() -> None:
 def test_a_least_delay_above_the_largest_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"latency_min_s is 0\.02; it must be at most .*latency_s, which is 0\.01"):
         RandomisationConfig(latency_min_s=0.02, latency_s=0.01)
+
+
+# --- a camera that is not where it is taken to be ---------------------------------------------------------------------
+
+
+def test_a_camera_error_is_the_same_in_every_episode_and_changes_nothing_else_that_is_drawn() -> None:
+    off = dataclasses.replace(ON, camera_error_m=(0.01, -0.02, 0.2))
+    for make in (
+        lambda config: ReachTask(ReachConfig(randomisation=config), 1, 25),
+        lambda config: PickTask(PickConfig(randomisation=config), 1, 25),
+    ):
+        for seed in range(10):
+            right, wrong = make(ON).sample(seed), make(off).sample(seed)
+            assert wrong.variation.camera_error == (0.01, -0.02, 0.2)
+            assert right.variation.camera_error == (0.0, 0.0, 0.0)
+            assert dataclasses.replace(wrong, variation=right.variation) == right
+            assert dataclasses.replace(wrong.variation, camera_error=(0.0, 0.0, 0.0)) == right.variation
+            assert scene_from_json(scene_to_json(wrong)) == wrong
+
+
+def test_to_the_simulator_and_the_judge_a_camera_error_is_nothing() -> None:
+    off = dataclasses.replace(ON, camera_error_m=(0.01, -0.02, 0.1))
+    simulation = UR5Simulation(UR5Config(), 2, threads=1)
+
+    def run(randomisation: RandomisationConfig) -> list[Episode]:
+        task = PickTask(PickConfig(duration_s=1.0, min_objects=3, randomisation=randomisation), 2, 25)
+        loop = EpisodeLoop(simulation, task, RandomBrain(RandomConfig(scale=0.1)))  # it looks at nothing
+        return list(loop.run([EpisodeSpec(index, index) for index in range(2)]))
+
+    for right, wrong in zip(run(ON), run(off), strict=True):
+        np.testing.assert_array_equal(right.initial_state, wrong.initial_state)
+        for key, values in right.columns.items():
+            if key == keys.ENVIRONMENT_STATE:
+                moved = (wrong.columns[key] - values).reshape(len(values), MAX_OBJECTS, -1)
+                there = np.arange(MAX_OBJECTS) < len(right.scene.objects)
+                assert np.abs(moved[:, there, 3:6] - (0.01, -0.02, 0.1)).max() < 1e-6
+                assert not np.delete(moved, (3, 4, 5), axis=2).any()
+                assert not moved[:, ~there].any()
+            elif key != keys.INFERENCE_TIME:
+                np.testing.assert_array_equal(values, wrong.columns[key], err_msg=key)
+        assert right.outcome == wrong.outcome
+
+
+def test_a_scene_that_was_recorded_before_there_were_camera_errors_has_none() -> None:
+    scene = ReachTask(ReachConfig(randomisation=ON), 1, 25).sample(0)
+    fields = json.loads(scene_to_json(scene))
+    del fields["variation"]["camera_error"]
+    assert scene_from_json(json.dumps(fields)) == scene
+
+
+@pytest.mark.parametrize(
+    "error",
+    [(0.0, 0.0), (0.0,) * 4, (), (math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, -math.inf), (0.0, -0.201, 0.0)],
+)
+def test_what_no_calibration_is_off_by_is_refused_for_the_task_and_for_the_rules(error: tuple[float, ...]) -> None:
+    for make, name in (
+        (lambda **one: RandomisationConfig(enabled=True, **one), "randomisation"),
+        (ReachBrainConfig, "brain"),
+        (PickBrainConfig, "brain"),
+        (LanguageBrainConfig, "brain"),
+    ):
+        message = rf"^{name}.camera_error_m is {re.escape(str(list(error)))}; it must be three numbers, .* -0.2 and 0.2"
+        with pytest.raises(ConfigError, match=message):
+            make(camera_error_m=error)
+
+
+def test_a_camera_error_that_would_not_be_honoured_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"camera_error_m is \[0.0, 0.01, 0.0\], but .* --task.randomisation.enabled=true"
+    ):
+        RandomisationConfig(camera_error_m=(0.0, 0.01, 0.0))
