@@ -136,6 +136,21 @@ def test_the_preprocessor_hands_the_ranges_over_in_metres(tmp_path: Path) -> Non
         assert torch.allclose(done[OBS_STATE], (state - 1.5) / 0.5, atol=1e-6)
 
 
+def test_what_hardly_varies_is_not_blown_up(tmp_path: Path) -> None:
+    made = config(min_std=1e-3)
+    std = np.array([0.5, 1e-5])
+    stats = {ACTION: {"mean": np.zeros(2), "std": std}, OBS_STATE: {"mean": np.zeros(10), "std": np.full(10, 1e-7)}}
+    before, after = make_pre_post_processors(made, dataset_stats=stats)
+    state, action = torch.full((1, 10), 1e-3), torch.tensor([[1.0, 1.0]])
+    assert before({OBS_STATE: state, OBS_ENV_STATE: torch.zeros(1, 3)})[OBS_STATE].numpy() == pytest.approx(1, rel=1e-4)
+    assert after(action).numpy() == pytest.approx(np.array([[0.5, 1e-3]]), rel=1e-4)
+    assert std.tolist() == [0.5, 1e-5]  # the dataset's own are as they were
+    for processor in (before, after):
+        processor.save_pretrained(tmp_path)
+    _, again = make_pre_post_processors(made, pretrained_path=str(tmp_path))
+    assert torch.equal(again(action), after(action))
+
+
 def test_turning_the_robot_turns_what_the_convolutions_see() -> None:
     torch.manual_seed(0)
     encoder = ScanEncoder(ScanConfig(channels=[4, 6], beams=16, start=0, stride=2), 1, nn.ReLU)
@@ -352,6 +367,7 @@ def test_it_is_saved_and_loaded_as_a_lerobot_policy(tmp_path: Path) -> None:
         ({"dropout": 1.0}, "policy.dropout"),
         ({"feature_clip": 0.0}, "policy.feature_clip"),
         ({"huber_delta": 0.0}, "policy.huber_delta"),
+        ({"min_std": -1.0}, "policy.min_std"),
         ({"scan": ScanConfig(transform="invers")}, "Did you mean 'inverse'"),
         ({"scan": ScanConfig(scale=0)}, "policy.scan.scale"),
         ({"scan": ScanConfig(kernel_size=4)}, "policy.scan.kernel_size is 4"),

@@ -105,6 +105,8 @@ class MlpConfig(PreTrainedConfig):
         dropout: share of hidden values that are dropped in training.
         feature_clip: normalised inputs beyond ± this count as this: a number that never changed in the dataset has no
             scale; nothing turns it off.
+        min_std: least standard deviation that an input or an action is divided by, in its own unit: what varies by less
+            than a millimetre or a milliradian is noise, and would be blown up to the size of everything else.
         loss: ``"l1"``, ``"mse"``, ``"huber"`` or, with `gaussian`, ``"nll"``; if nothing, ``"nll"`` with `gaussian` and
             ``"l1"`` without.
         huber_delta: where ``"huber"`` goes from a square to a line, in normalised actions.
@@ -135,6 +137,7 @@ class MlpConfig(PreTrainedConfig):
     layer_norm: bool = False
     dropout: float = 0.0
     feature_clip: float | None = 10.0
+    min_std: float = 1e-3
     loss: str | None = None
     huber_delta: float = 0.5
     gaussian: bool = False
@@ -191,6 +194,8 @@ class MlpConfig(PreTrainedConfig):
             raise ConfigError(f"policy.dropout is {self.dropout}; it must be in [0, 1).")
         if self.feature_clip is not None and not self.feature_clip > 0:
             raise ConfigError(f"policy.feature_clip is {self.feature_clip}; it must be positive, or nothing.")
+        if not 0 <= self.min_std < math.inf:
+            raise ConfigError(f"policy.min_std is {self.min_std}; it must be 0 or positive, and finite.")
         if not 0 < self.huber_delta < math.inf:
             raise ConfigError(f"policy.huber_delta is {self.huber_delta}; it must be positive.")
         for name, asked in (("loss=nll", self.loss == "nll"), ("sample", self.sample)):

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch
 from lerobot.lerobot_types import PolicyAction
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
@@ -30,10 +31,18 @@ def make_bhd_mlp_pre_post_processors(
     Raises:
         ConfigError: the configuration treats beams and does not know yet where they are.
     """
-    steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
+    stats = (
+        None if dataset_stats is None else {key: _floored(one, config.min_std) for key, one in dataset_stats.items()}
+    )
+    steps = make_default_policy_processor_steps(config, stats, normalizer_device=config.device)
     before = [steps.rename_observations, steps.add_batch_dim, steps.to_device]
     if config.scan.is_used and config.scan.transform != "none":
         if config.scan.start is None:
             raise ConfigError("policy.scan.start is not known yet; make the policy before its processors.")
         before.append(ScanProcessorStep(start=config.scan.start, beams=config.scan.beams))
     return make_policy_processor_pipelines([*before, steps.normalize], [steps.unnormalize, steps.to_cpu])
+
+
+def _floored(stats: dict[str, Tensor], least: float) -> dict[str, Tensor]:
+    """Return a feature's statistics with no standard deviation below the least; theirs are not changed."""
+    return {name: torch.as_tensor(value).clamp(min=least) if name == "std" else value for name, value in stats.items()}
