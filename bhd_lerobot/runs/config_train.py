@@ -79,6 +79,9 @@ class BhdTrainConfig(TrainPipelineConfig):
             checked against what the checkpoint was trained on.
         fine_tune_statistics: with `fine_tune`, by which statistics observations and actions are normalised: those of
             the `checkpoint`, which keep the meaning of its weights, or those of the `dataset`.
+        fine_tune_parameters: which of the policy's parameters are trained, by name or pattern; the others stay as they
+            are. `["*.bias"]` changes so little that a few episodes suffice for a shift (E. Ben Zaken et al., "BitFit",
+            2022).
         threads: threads of a training process on the CPU; PyTorch's own number if nothing. The last bits of a loss
             depend on it.
     """
@@ -87,6 +90,7 @@ class BhdTrainConfig(TrainPipelineConfig):
     budget_gib: float = 4.0
     fine_tune: str | None = None
     fine_tune_statistics: str = "checkpoint"
+    fine_tune_parameters: list[str] = field(default_factory=lambda: ["*"])
     threads: int | None = None
 
     def _resolve_pretrained_from_cli(self) -> None:

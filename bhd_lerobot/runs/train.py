@@ -35,6 +35,7 @@ from bhd_lerobot.runs.train_setup import (
     check_contract,
     make_accelerator,
     refuse_unsupported,
+    select_parameters,
 )
 from bhd_lerobot.runs.train_step import Learner
 from bhd_lerobot.runs.train_summary import tell_start, tell_summary
@@ -91,6 +92,7 @@ def train(request: Request, console: Console | None = None) -> TrainResult:
         check_contract(request.contract, meta)
     select_episodes(config, meta)
     policy = build_policy(config, meta, accelerator)
+    select_parameters(policy, config.fine_tune_parameters)
     keep = config.resume or (request.contract is not None and config.fine_tune_statistics == "checkpoint")
     preprocessor, postprocessor = build_processors(config, policy, meta, accelerator.device, keep_statistics=keep)
     optimizer, scheduler = build_optimizer(config, policy)

@@ -1,6 +1,7 @@
 """What a training run is made of, from LeRobot's pieces: accelerator, policy, processors, and their checks."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +146,32 @@ def build_policy(config: BhdTrainConfig, meta: LeRobotDatasetMetadata, accelerat
             f"The policy {policy.type!r} cannot be made{whence} for {meta.root}, which has "
             f"{', '.join(dataset_to_policy_features(meta.features))}: {error}"
         ) from error
+
+
+def select_parameters(policy: Any, patterns: Sequence[str]) -> None:
+    """Let only some of a policy's parameters be trained.
+
+    Args:
+        policy: the policy; what it keeps from training itself stays so.
+        patterns: names of parameters, or patterns of them such as ``*.bias``.
+
+    Raises:
+        ConfigError: a pattern matches none, or there is no pattern.
+    """
+    trained = {name: one for name, one in policy.named_parameters() if one.requires_grad}
+    unknown = [pattern for pattern in patterns if not any(fnmatchcase(name, pattern) for name in trained)]
+    if unknown or not patterns:
+        names = list(trained)
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        raise ConfigError(
+            f"fine_tune_parameters is {list(patterns)}; {repr(unknown[0]) if unknown else 'it'} matches no "
+            f"parameter of the policy, which has {', '.join(names[:_NAMED])}{more}. Give names, or ['*'] for all."
+        )
+    for name, one in trained.items():
+        one.requires_grad_(any(fnmatchcase(name, pattern) for pattern in patterns))
+
+
+_NAMED = 20  # parameters that a message names
 
 
 def build_optimizer(config: BhdTrainConfig, policy: Any) -> tuple[Any, Any]:

@@ -159,6 +159,27 @@ def test_fine_tuning_starts_from_the_weights(data: Path, trained: Path, tmp_path
     assert curve(tmp_path / "more")[0]["loss"] < curve(tmp_path / "new")[0]["loss"]
 
 
+def test_fine_tuning_changes_only_the_parameters_that_are_asked_for(data: Path, trained: Path, tmp_path: Path) -> None:
+    changes = {"steps": 4, "save_freq": 2, "log_freq": 1, "fine_tune_parameters": "['*.bias']"}
+    result, _ = run_train(options(data, tmp_path / "run", {}, fine_tune=trained, **changes))
+    assert result.checkpoint is not None
+    from safetensors.torch import load_file
+
+    folders = (trained / "checkpoints" / "last", result.checkpoint)
+    old, new = (load_file(folder / "pretrained_model" / "model.safetensors") for folder in folders)
+    assert set(old) == set(new)
+    for name, values in old.items():
+        assert bool(torch.equal(values, new[name])) != name.endswith(".bias"), name
+    # A run that goes on knows which they were.
+    whole = curve(tmp_path / "run")
+    again = tmp_path / "run" / "checkpoints" / "000002" / "pretrained_model"
+    resumed, _ = run_train([f"--config_path={again / 'train_config.json'}", "--resume=true"])
+    assert resumed.checkpoint is not None
+    assert curve(tmp_path / "run") == whole
+    again_new = load_file(resumed.checkpoint / "pretrained_model" / "model.safetensors")
+    assert all(torch.equal(values, again_new[name]) for name, values in new.items())
+
+
 def test_a_checkpoint_that_is_not_there(data: Path, tmp_path: Path) -> None:
     arguments = options(data, tmp_path / "run", {}, fine_tune=tmp_path / "none")
     refused(arguments, ConfigError, r"no policy at .*none.*does not exist")
@@ -283,6 +304,11 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
         ({"budget_gib": 0}, "budget_gib is 0"),
         ({"threads": 0}, "threads is 0"),
         ({"fine_tune_statistics": "both"}, "both.*checkpoint, dataset"),
+        (
+            {"fine_tune_parameters": "[model.*,net.9.*]"},
+            r"'net\.9\.\*' matches no parameter of the policy, which has model",
+        ),
+        ({"fine_tune_parameters": "[]"}, r"fine_tune_parameters is \[\]; it matches no parameter .* and \d+ more"),
         ({"selection.min_score": 2}, "min_score is 2"),
         ({"selection.intervention_weight": -1}, "intervention_weight is -1"),
         ({"selection.hold_out": "task"}, "Unknown selection.hold_out 'task'. Valid: episode, instruction"),
