@@ -77,7 +77,7 @@ class Lesson(Recording):
             "--policy.type=bhd_mlp",
             "--policy.device=cpu",
             *self.policy,
-            "--batch_size=128",
+            "--batch_size=256",
             f"--steps={self.steps}",
             f"--log_freq={max(self.steps // 30, 1)}",
             f"--eval_steps={max(self.steps // 5, 1)}",
@@ -127,7 +127,7 @@ AVOID = Lesson(
     # Half of the task's usual time: more arenas in the same number of frames.
     world=("--robot.type=turtlebot3", "--task.type=avoid", "--task.duration_s=30"),
     brain="avoidance",
-    episodes=64,
+    episodes=128,
     seed=1,
     policy=(
         "--policy.chunk_size=1",
@@ -135,7 +135,7 @@ AVOID = Lesson(
         "--policy.scan.transform=inverse",
         "--policy.ignore=['*.vel']",  # docs/policies.md says what happens otherwise
     ),
-    steps=2000,
+    steps=3000,
     yardstick="random",
     score="share of the free floor that was visited before a contact",
     recipe="configs/train/bc_turtlebot3_avoid.yaml",
@@ -149,7 +149,7 @@ REACH = Lesson(
         *("--task.type=reach", "--task.tolerance_m=0.03", "--task.tolerance_deg=10", "--task.duration_s=6"),
     ),
     brain="reach",
-    episodes=320,
+    episodes=480,
     seed=1,
     # Recorded episodes stay at the target for a second, so that there are frames to learn that from.
     options=("--task.hold_s=1.0",),
@@ -161,7 +161,7 @@ REACH = Lesson(
         "--policy.activation=gelu",
         "--selection.outcome=[success]",
     ),
-    steps=2000,
+    steps=2500,
     # `random` and `noop` drive joints, not tool poses.
     early_steps=500,
     score="share of the way to the target that was covered",
