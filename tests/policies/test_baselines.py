@@ -32,8 +32,9 @@ def actions(brain: Any, names: tuple[str, ...], frames: int, seeds: list[int], f
 
 
 def run(kind: str, brain: Any, n: int, episodes: int = 3) -> list[Episode]:
-    if kind == "ur5":
-        simulation, task = make_simulation(UR5Config(), n), make_task(ReachConfig(duration_s=1), n, 25)
+    if kind != "turtlebot3":
+        config = UR5Config(action_space="tool", tool_pose=True) if kind == "ur5 tool" else UR5Config()
+        simulation, task = make_simulation(config, n), make_task(ReachConfig(duration_s=1), n, 25)
     else:
         simulation, task = make_simulation(TurtleBot3Config(beams=12), n), make_task(AvoidConfig(duration_s=2), n, 10)
     return list(EpisodeLoop(simulation, task, brain).run([EpisodeSpec(i, 2 * i) for i in range(episodes)]))
@@ -55,11 +56,11 @@ def test_a_new_episode_is_held_where_it_begins() -> None:
     assert brain.act(Observation(("other", *ARM), np.ones((2, 8))))[1] == pytest.approx(1)
 
 
-@pytest.mark.parametrize("kind", ["ur5", "turtlebot3"])
+@pytest.mark.parametrize("kind", ["ur5", "ur5 tool", "turtlebot3"])
 def test_a_robot_that_does_nothing_stays_where_it_is(kind: str) -> None:
     for episode in run(kind, NoopBrain(), 2):
         state = episode.columns["observation.state"]
-        columns = slice(0, 6) if kind == "ur5" else slice(0, 2)
+        columns = slice(0, 2) if kind == "turtlebot3" else slice(0, 6)
         assert np.abs(state[:, columns] - state[0, columns]).max() < 1e-3
 
 
