@@ -68,7 +68,8 @@ _EXPLANATIONS = {
     Reason.FIFO_FULL: "the command queue is full; send later or make it longer",
     Reason.NOT_ACTIVE: "the robot is not active; call activate() first, after a deactivation reset() and activate()",
     Reason.ESTOP: "the emergency stop is latched; clear its cause, then call reset() and activate()",
-    Reason.FAULT: "a plant fault is latched; clear its cause, then call reset() and activate()",
+    Reason.FAULT: "a fault is latched: something was in the arm's way (protective stop), or the plant reported a "
+    "fault, fell silent or was too late; clear the cause, then call reset() and activate()",
     Reason.WRONG_MODE: "the request does not apply in the present mode",
     Reason.NO_POSTURE: "no admissible posture of the arm puts the tool there",
     Reason.NOT_AT_REST: "the robot is still stopping; ask again when it is at rest",
