@@ -28,7 +28,7 @@ REACH = replace(
     demo_lessons.REACH,
     **SMALL,
     early_steps=2,
-    world=(*demo_lessons.REACH.world[:3], "--task.duration_s=2", "--threads=1"),
+    world=(*demo_lessons.REACH.world, "--threads=1"),
 )
 PICK = replace(demo_lessons.PICK, episodes=1, film=False, options=("--threads=1",))
 
