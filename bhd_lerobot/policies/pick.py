@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -48,7 +48,7 @@ class PickBrainConfig(BrainConfig):
     line_acceleration: float = 1.0
     lift_m: float = 0.15
     attempts: int = 2
-    camera_error_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def __post_init__(self) -> None:
         for name in ("max_velocity", "max_acceleration", "line_velocity", "line_acceleration", "lift_m"):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ class ReachBrainConfig(BrainConfig):
     max_velocity: float = 2.0
     max_acceleration: float = 8.0
     attempts: int = 3
-    camera_error_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def __post_init__(self) -> None:
         for name in ("max_velocity", "max_acceleration"):

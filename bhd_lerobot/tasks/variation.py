@@ -1,7 +1,7 @@
 """Domain randomisation: how much one episode's world may differ from the next, and from the nominal one."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ class RandomisationConfig:
     sensor_noise_rad: float = 0.0005
     latency_s: float = 0.01
     latency_min_s: float = 0.0
-    camera_error_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def __post_init__(self) -> None:
         check_camera_error("randomisation.camera_error_m", self.camera_error_m)

@@ -73,7 +73,7 @@ def test_above_down_close_lift_and_done() -> None:
 def test_a_known_camera_error_is_subtracted_from_every_position() -> None:
     error = (0.02, -0.01, 0.015)
     right = Desk(PickBrain(), [scene(CUP, BOX)])
-    wrong = Desk(PickBrain(PickBrainConfig(camera_error_m=error)), [scene(CUP, BOX)])
+    wrong = Desk(PickBrain(PickBrainConfig(camera_error_m=list(error))), [scene(CUP, BOX)])
     wrong.table[:, :, 3:6] += error
     for desk in (right, wrong):
         desk.look()
@@ -307,9 +307,9 @@ def test_it_picks() -> None:
 def test_with_a_camera_error_that_it_knows_it_picks_as_before() -> None:
     error = (0.0, 0.05, 0.02)
     seeds = [episode_seed(11, episode, "train") for episode in range(2)]
-    off = PickConfig(randomisation=RandomisationConfig(enabled=True, camera_error_m=error))
+    off = PickConfig(randomisation=RandomisationConfig(enabled=True, camera_error_m=list(error)))
     right = episodes(PickBrain(), seeds, PickConfig(randomisation=RandomisationConfig(enabled=True)))
-    knows = episodes(PickBrain(PickBrainConfig(camera_error_m=error)), seeds, off)
+    knows = episodes(PickBrain(PickBrainConfig(camera_error_m=list(error))), seeds, off)
     for before, one in zip(right, knows, strict=True):
         assert one.outcome.success
         assert len(one.columns["action"]) == len(before.columns["action"])

@@ -62,7 +62,7 @@ def test_it_asks_for_the_target_once_and_holds() -> None:
 
 
 def test_a_known_camera_error_is_subtracted() -> None:
-    desk = Desk(camera_error_m=(0.02, -0.01, 0.1))
+    desk = Desk(camera_error_m=[0.02, -0.01, 0.1])
     goal = desk.look()[0]
     assert goal.target_pose is not None
     assert goal.target_pose.position == pytest.approx(TARGET[:3] - (0.02, -0.01, 0.1), abs=1e-15)
@@ -178,7 +178,7 @@ def test_it_reaches(randomised: bool) -> None:
 def test_with_a_camera_error_it_reaches_as_before_if_it_knows_and_misses_if_not() -> None:
     error = (0.012, -0.009, 0.01)  # 18 mm
     simulation = UR5Simulation(UR5Config(), 4, threads=1)
-    off = RandomisationConfig(enabled=True, camera_error_m=error)
+    off = RandomisationConfig(enabled=True, camera_error_m=list(error))
 
     def run(randomisation: RandomisationConfig, brain: ReachBrainConfig) -> list[Episode]:
         task = ReachTask(ReachConfig(duration_s=4.0, randomisation=randomisation), 4, simulation.config.fps)
@@ -186,9 +186,9 @@ def test_with_a_camera_error_it_reaches_as_before_if_it_knows_and_misses_if_not(
         return list(loop.run([EpisodeSpec(index, episode_seed(3, index, "train")) for index in range(4)]))
 
     right = run(RandomisationConfig(enabled=True), ReachBrainConfig())
-    knows, trusts = run(off, ReachBrainConfig(camera_error_m=error)), run(off, ReachBrainConfig())
+    knows, trusts = run(off, ReachBrainConfig(camera_error_m=list(error))), run(off, ReachBrainConfig())
     # To the simulator and the judge the error is nothing: a rule that is wrong by it moves the same, in either world.
-    same = run(RandomisationConfig(enabled=True), ReachBrainConfig(camera_error_m=tuple(-one for one in error)))
+    same = run(RandomisationConfig(enabled=True), ReachBrainConfig(camera_error_m=[-one for one in error]))
     for before, one, two, three in zip(right, knows, trusts, same, strict=True):
         assert before.outcome.success
         assert one.outcome.success

@@ -141,7 +141,7 @@ def test_a_least_delay_above_the_largest_is_refused() -> None:
 
 
 def test_a_camera_error_is_the_same_in_every_episode_and_changes_nothing_else_that_is_drawn() -> None:
-    off = dataclasses.replace(ON, camera_error_m=(0.01, -0.02, 0.2))
+    off = dataclasses.replace(ON, camera_error_m=[0.01, -0.02, 0.2])
     for make in (
         lambda config: ReachTask(ReachConfig(randomisation=config), 1, 25),
         lambda config: PickTask(PickConfig(randomisation=config), 1, 25),
@@ -156,7 +156,7 @@ def test_a_camera_error_is_the_same_in_every_episode_and_changes_nothing_else_th
 
 
 def test_to_the_simulator_and_the_judge_a_camera_error_is_nothing() -> None:
-    off = dataclasses.replace(ON, camera_error_m=(0.01, -0.02, 0.1))
+    off = dataclasses.replace(ON, camera_error_m=[0.01, -0.02, 0.1])
     simulation = UR5Simulation(UR5Config(), 2, threads=1)
 
     def run(randomisation: RandomisationConfig) -> list[Episode]:
@@ -198,11 +198,11 @@ def test_what_no_calibration_is_off_by_is_refused_for_the_task_and_for_the_rules
     ):
         message = rf"^{name}.camera_error_m is {re.escape(str(list(error)))}; it must be three numbers, .* -0.2 and 0.2"
         with pytest.raises(ConfigError, match=message):
-            make(camera_error_m=error)
+            make(camera_error_m=list(error))
 
 
 def test_a_camera_error_that_would_not_be_honoured_is_refused() -> None:
     with pytest.raises(
         ConfigError, match=r"camera_error_m is \[0.0, 0.01, 0.0\], but .* --task.randomisation.enabled=true"
     ):
-        RandomisationConfig(camera_error_m=(0.0, 0.01, 0.0))
+        RandomisationConfig(camera_error_m=[0.0, 0.01, 0.0])
