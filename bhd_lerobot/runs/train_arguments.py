@@ -135,9 +135,9 @@ def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
     path = policy.pop("path", None)
     fine_tune = values.get("fine_tune")
     source = fine_tune or path
-    if "type" in policy or source is not None:
-        if "device" not in policy:  # asked first: LeRobot's choice comes with a warning where there is no GPU
-            policy["device"] = auto_select_torch_device().type
+    # Only where nothing else was asked for: LeRobot's choice comes with a warning where there is no GPU.
+    if ("type" in policy or source is not None) and "device" not in policy:
+        policy["device"] = auto_select_torch_device().type
     if resume or source is None:
         if policy:
             policy.setdefault("push_to_hub", bool(policy.get("repo_id")))

@@ -32,7 +32,8 @@ def test_of_many_episodes_the_failures_are_shown_before_others(tmp_path, monkeyp
     for i in range(20):
         album.add(plots.Trajectory(str(i), arena, np.array([[-2.0, -0.5], [-1.6, -0.5]]), i not in failed))
     shown = [int(one.title) for one in album.shown]
-    assert len(shown) == 5 and shown == sorted(shown)
+    assert len(shown) == 5
+    assert shown == sorted(shown)
     assert len(failed & set(shown)) == min(5, len(failed))
     headings = []
     monkeypatch.setattr(plots, "draw_trajectories", lambda trajectories, path, heading: headings.append(heading))

@@ -6,6 +6,9 @@ from types import SimpleNamespace
 import pytest
 from lerobot.policies.factory import make_policy
 
+from bhd_lerobot.robots.catalog import make_robot
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.runs.train_arguments import parse_train
 from tests.runs.train_support import MLP, make_dataset, options, run_train
 
@@ -15,9 +18,9 @@ CONFIGS = sorted(one for one in FOLDER.glob("*.yaml") if one.name.startswith(("b
 
 def described(name: str) -> dict[str, dict]:
     """Return the features of the robot's datasets."""
-    scan = [f"scan_{beam:03d}.pos" for beam in range(36)]
-    state = [*scan, "x.vel", "theta.vel"] if "turtlebot3" in name else [f"joint_{joint}.pos" for joint in range(14)]
-    action = ["x.vel", "theta.vel"] if "turtlebot3" in name else state[:7]
+    config = TurtleBot3Config(beams=36) if "turtlebot3" in name else UR5Config(tool_pose=True)
+    robot = make_robot(config)
+    state, action = list(robot.observation_names), list(robot.action_names)
     vectors = {"observation.state": state, "observation.environment_state": ["goal_x", "goal_y"], "action": action}
     if "avoid" in name:
         del vectors["observation.environment_state"]
