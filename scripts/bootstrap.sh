@@ -116,7 +116,9 @@ if [ "$runs" = no ]; then
     "$uv" venv --quiet --no-project --python "$python" .venv
 fi
 say "installing what constraints.txt lists (with PyTorch, several GB; the first time takes minutes)"
-VIRTUAL_ENV="$PWD/.venv" "$uv" pip install --quiet --constraint constraints.txt --build-constraint constraints.txt \
+# Compiled once here: where PYTHONDONTWRITEBYTECODE is set, each start would compile LeRobot and all that it imports anew.
+VIRTUAL_ENV="$PWD/.venv" "$uv" pip install --quiet --compile-bytecode \
+    --constraint constraints.txt --build-constraint constraints.txt \
     --editable '.[test,dev,bench]' </dev/null || die "uv could not install the packages; its message is above." \
     "Is the package index reachable, and is there 8 GB of free disk space?"
 fingerprint >"$stamp"
