@@ -23,6 +23,7 @@ from torch import Tensor
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned_policy import LoadedPolicy, torch_device
 from bhd_lerobot.policies.mlp.scan_mlp import ScanProcessorStep
+from bhd_lerobot.policies.mlp.yaw_mlp import YawProcessorStep
 
 type Rows = dict[str, NDArray]
 """Observations of some simulations: by key, shape (simulations, frames, …), oldest first; images uint8 (…, h, w, 3)."""
@@ -35,6 +36,7 @@ _ELEMENTWISE = (
     NormalizerProcessorStep,
     UnnormalizerProcessorStep,
     ScanProcessorStep,
+    YawProcessorStep,
 )
 _SMALL = 2_000_000  # parameters; below, a second thread costs more than it does
 _BLOCK, _BLOCK_LARGE = 64, 8

@@ -11,12 +11,14 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import ACTIVATIONS, MlpConfig, ScanConfig
 from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder
+from bhd_lerobot.policies.mlp.yaw_mlp import harmonics, quaternion_columns, yaw
 
 NAMES = ["x.vel", *(f"scan_{i:03}.pos" for i in range(8)), "theta.vel"]
 
@@ -149,6 +151,81 @@ def test_what_hardly_varies_is_not_blown_up(tmp_path: Path) -> None:
         processor.save_pretrained(tmp_path)
     _, again = make_pre_post_processors(made, pretrained_path=str(tmp_path))
     assert torch.equal(again(action), after(action))
+
+
+QUATERNIONS = [f"thing_{part}" for part in ("x", "qw", "qx", "qy", "qz")]
+
+
+def with_things(things: int, **options: Any) -> MlpConfig:
+    """Return a configuration whose environment state tells of things with an orientation."""
+    made = config(environment=5 * things, **options)
+    made.set_dataset_feature_metadata({OBS_STATE: {"names": NAMES}, OBS_ENV_STATE: {"names": QUATERNIONS * things}})
+    return made
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_yaws_become_cosines_and_sines_of_their_multiples(tmp_path: Path, steps: int) -> None:
+    made = with_things(2, yaw_harmonics=3, n_obs_steps=steps)
+    assert made.environment_quaternions == [1, 6]
+    policy = MlpPolicy(made).eval()
+    turns = np.random.default_rng(0).uniform(-math.pi, math.pi, (4, steps, 2))
+    tilts = Rotation.from_euler("xy", [0.2, -0.1])  # the yaw is that of the rotated x axis
+    quaternions = (
+        (Rotation.from_euler("z", turns.reshape(-1, 1)) * tilts).as_quat(scalar_first=True).reshape(4, steps, 2, 4)
+    )
+    pointing = Rotation.from_euler("z", turns.reshape(-1, 1)) * tilts
+    ahead = pointing.apply([1.0, 0.0, 0.0])
+    expected = np.arctan2(ahead[:, 1], ahead[:, 0]).reshape(4, steps, 2)
+    environment = np.concatenate([np.zeros((4, steps, 2, 1)), quaternions], axis=-1).reshape(4, steps, 10)
+    stats = {key: {"mean": np.full(size, 0.3), "std": np.full(size, 0.5)} for key, size in ((OBS_ENV_STATE, 10),)}
+    before, after = make_pre_post_processors(made, dataset_stats=stats)
+    for processor in (before, after):
+        processor.save_pretrained(tmp_path)
+    again, _ = make_pre_post_processors(made, pretrained_path=str(tmp_path))
+    given = {OBS_STATE: torch.zeros(4, steps, 10), OBS_ENV_STATE: torch.tensor(environment, dtype=torch.float32)}
+    if steps == 1:
+        given = {key: value[:, 0] for key, value in given.items()}
+    for one in (before, again):
+        features = policy.features(one(given)).reshape(4, steps, -1)
+        assert features.shape[-1] * steps == policy.feature_size
+        wanted = np.concatenate([f(k * expected) for f in (np.cos, np.sin) for k in (1, 2, 3)], axis=-1)
+        # In which order they stand is the network's affair.
+        assert np.sort(features[..., 20:].numpy()) == pytest.approx(np.sort(wanted), abs=1e-5)
+
+
+def test_a_box_turned_by_half_looks_the_same_to_the_second_harmonic() -> None:
+    quaternions = torch.tensor(
+        Rotation.from_euler("z", [[0.4], [0.4 + math.pi], [0.4 - math.pi]]).as_quat(scalar_first=True)
+    )
+    both = harmonics(yaw(quaternions).unsqueeze(-1), 2)  # cos 1, cos 2, sin 1, sin 2
+    assert torch.allclose(both[:, [1, 3]], both[:1, [1, 3]].expand(3, 2))
+    assert not torch.allclose(both[:1, [0, 2]], both[1:2, [0, 2]])
+    assert torch.allclose(yaw(-3 * quaternions), yaw(quaternions))  # of any length, and either sign
+
+
+@pytest.mark.parametrize(
+    ("names", "columns"),
+    [
+        (QUATERNIONS, [1]),
+        (["tool_qw.pos", "tool_qx.pos", "tool_qy.pos", "tool_qz.pos"], [0]),
+        (["a_qw", "a_qx", "b_qy", "a_qz"], []),
+        (["a_qx", "a_qy", "a_qz", "a_qw"], []),  # another order
+        (["a_qw", "a_qx", "a_qy"], []),
+        ([], []),
+    ],
+)
+def test_quaternions_are_found_by_their_names(names: list[str], columns: list[int]) -> None:
+    assert quaternion_columns(names) == columns
+
+
+def test_yaws_need_quaternions() -> None:
+    with pytest.raises(ConfigError, match="no quaternion"):
+        MlpPolicy(config(yaw_harmonics=2))
+    with pytest.raises(ConfigError, match="do not fit into the 3"):
+        MlpPolicy(config(yaw_harmonics=2, environment_quaternions=[0]))
+    made = with_things(1, yaw_harmonics=2)
+    with pytest.raises(ConfigError, match="own preprocessor"):
+        MlpPolicy(made).predict_action_chunk(batch(made))
 
 
 def test_turning_the_robot_turns_what_the_convolutions_see() -> None:
@@ -357,6 +434,7 @@ def test_it_is_saved_and_loaded_as_a_lerobot_policy(tmp_path: Path) -> None:
     ("options", "message"),
     [
         ({"n_obs_steps": 0}, "policy.n_obs_steps is 0"),
+        ({"yaw_harmonics": -1}, "policy.yaw_harmonics is -1"),
         ({"n_action_steps": 5}, "policy.n_action_steps is 5"),
         ({"hidden_dims": [8, 0]}, "policy.hidden_dims"),
         ({"activation": "rely"}, "Did you mean 'relu'"),

@@ -12,6 +12,7 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.policies.mlp.yaw_mlp import quaternion_columns
 
 ACTIVATIONS = ("relu", "tanh", "gelu", "silu", "elu")
 LOSSES = ("l1", "mse", "huber", "nll")
@@ -74,6 +75,11 @@ class ScanConfig:
             )
 
 
+def _names(features: Mapping[str, Mapping[str, Any]], key: str) -> list[str]:
+    known = (features.get(key) or {}).get("names")
+    return list(known) if isinstance(known, list | tuple) else []
+
+
 def _matching(patterns: Sequence[str], names: Sequence[str]) -> list[int]:
     """Return the columns whose names match a pattern.
 
@@ -119,6 +125,11 @@ class MlpConfig(PreTrainedConfig):
             robot measures of its own motion is nearly the last action, and a network that imitates learns to repeat it
             instead of looking where it goes (P. de Haan et al., "Causal confusion in imitation learning", 2019).
         ignored_columns: their columns; found by their names.
+        yaw_harmonics: of every quaternion among the inputs (`…_qw` to `…_qz`), cosine and sine of 1 to this many times
+            its yaw become inputs, too; none if 0. A box looks the same after half a turn, and how to grasp it depends
+            on twice its yaw, which a network learns badly from a quaternion.
+        state_quaternions: columns of `observation.state` at which quaternions begin; found by their names.
+        environment_quaternions: likewise of `observation.environment_state`.
         optimizer_lr: learning rate of AdamW.
         optimizer_betas: of AdamW.
         optimizer_eps: of AdamW.
@@ -146,6 +157,9 @@ class MlpConfig(PreTrainedConfig):
     scan: ScanConfig = field(default_factory=ScanConfig)
     ignore: list[str] = field(default_factory=list)
     ignored_columns: list[int] = field(default_factory=list)
+    yaw_harmonics: int = 0
+    state_quaternions: list[int] = field(default_factory=list)
+    environment_quaternions: list[int] = field(default_factory=list)
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -173,9 +187,10 @@ class MlpConfig(PreTrainedConfig):
             ConfigError: names the value and the valid ones.
         """
         super().__post_init__()
-        for name in ("n_obs_steps", "obs_stride", "chunk_size", "n_action_steps"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least 1.")
+        positive = dict.fromkeys(("n_obs_steps", "obs_stride", "chunk_size", "n_action_steps"), 1)
+        for name, least in {**positive, "yaw_harmonics": 0}.items():
+            if getattr(self, name) < least:
+                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least {least}.")
         if self.n_action_steps > self.chunk_size:
             raise ConfigError(
                 f"policy.n_action_steps is {self.n_action_steps}, but only policy.chunk_size = {self.chunk_size} "
@@ -202,6 +217,11 @@ class MlpConfig(PreTrainedConfig):
             if asked and not self.gaussian:
                 raise ConfigError(f"policy.{name} needs a distribution; set --policy.gaussian=true.")
         self.scan.check()
+
+    @property
+    def quaternions(self) -> int:
+        """How many quaternions there are among the inputs, as far as is known."""
+        return len(self.state_quaternions) + len(self.environment_quaternions)
 
     @property
     def loss_name(self) -> str:
@@ -247,13 +267,15 @@ class MlpConfig(PreTrainedConfig):
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Find beams, and what is to be ignored, by their names; LeRobot's `make_policy` calls it.
+        """Find beams, quaternions and what is to be ignored by their names; LeRobot's `make_policy` calls it.
 
         Raises:
             ConfigError: there are none.
         """
-        known = (features.get(OBS_STATE) or {}).get("names")
-        names = list(known) if isinstance(known, list | tuple) else []
+        names = _names(features, OBS_STATE)
+        if self.yaw_harmonics and not self.quaternions:
+            self.state_quaternions = quaternion_columns(names)
+            self.environment_quaternions = quaternion_columns(_names(features, OBS_ENV_STATE))
         if self.ignore and not self.ignored_columns:
             self.ignored_columns = _matching(self.ignore, names)
         if not self.scan.is_used or self.scan.beams:
@@ -294,6 +316,16 @@ class MlpConfig(PreTrainedConfig):
             raise ConfigError(
                 f"policy.ignored_columns is {self.ignored_columns}; {OBS_STATE} has the columns 0 to {width - 1}."
             )
+        if self.yaw_harmonics and not self.quaternions:
+            raise ConfigError(
+                f"policy.yaw_harmonics is {self.yaw_harmonics}, but no quaternion (…_qw, …_qx, …_qy, …_qz) is known "
+                "among the inputs. Set it to 0, or name the columns with policy.state_quaternions and "
+                "policy.environment_quaternions."
+            )
+        for key, columns in ((OBS_STATE, self.state_quaternions), (OBS_ENV_STATE, self.environment_quaternions)):
+            size = kept[key].shape[0] if key in kept else 0
+            if not all(0 <= column <= size - 4 for column in columns):
+                raise ConfigError(f"Quaternions at the columns {columns} do not fit into the {size} of {key}.")
         if len(set(self.ignored_columns)) == width and OBS_ENV_STATE not in kept:
             raise ConfigError(f"policy.ignore is {self.ignore}, which leaves nothing to look at.")
         scan = self.scan

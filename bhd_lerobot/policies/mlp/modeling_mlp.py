@@ -14,6 +14,7 @@ from torch.nn import functional
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder, other_columns, transformed
+from bhd_lerobot.policies.mlp.yaw_mlp import OBS_YAW, harmonics
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {
     "relu": nn.ReLU,
@@ -26,6 +27,7 @@ _LOG_STD = (-5.0, 2.0)  # a standard deviation that goes to 0 makes the loss go 
 _PADDING = "action_is_pad"
 _HINTS = {
     OBS_SCAN: " Run the policy's own preprocessor first.",
+    OBS_YAW: " Run the policy's own preprocessor first.",
     OBS_ENV_STATE: " A task tells it; a robot's own sensors, and so lerobot-rollout, do not. Run this policy in "
     "bhd-eval or lerobot-eval, or train one on the sensors alone: "
     "--policy.input_features='{observation.state: {type: STATE, shape: [WIDTH]}}'.",
@@ -69,7 +71,8 @@ class MlpPolicy(PreTrainedPolicy):
         activation = _ACTIVATIONS[config.activation]
         self.scan_encoder = ScanEncoder(scan, steps, activation) if scan.is_used and scan.channels else None
         beams = 0 if not scan.is_used else self.scan_encoder.size if self.scan_encoder else steps * scan.beams
-        self.feature_size = steps * (len(columns) + environment_size) + beams
+        yaws = 2 * config.yaw_harmonics * config.quaternions
+        self.feature_size = steps * (len(columns) + environment_size + yaws) + beams
         self.net = nn.Sequential(*_perceptron(config, self.feature_size, config.chunk_size * self._action_size))
         self.log_std: nn.Parameter | None = None
         if config.gaussian:
@@ -134,8 +137,8 @@ class MlpPolicy(PreTrainedPolicy):
                 (batch, width) or, oldest first, (batch, n_obs_steps, width).
 
         Returns:
-            shape (batch, feature_size): of each observation, oldest first, the state without beams and the environment
-            state; then the beams.
+            shape (batch, feature_size): of each observation, oldest first, the state without beams, the environment
+            state, and cosines and sines of yaws; then the beams.
         """
         config = self.config
         rows = {key: self._history(batch, key) for key in self._keys}
@@ -148,6 +151,8 @@ class MlpPolicy(PreTrainedPolicy):
             parts.append(state[..., self._columns])
         if OBS_ENV_STATE in rows:
             parts.append(rows[OBS_ENV_STATE])
+        if config.yaw_harmonics:
+            parts.append(harmonics(self._history(batch, OBS_YAW), config.yaw_harmonics))
         numbers = self._clipped(torch.cat(parts, dim=-1)).flatten(1)
         if scan is None:
             return numbers
@@ -205,7 +210,7 @@ class MlpPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], noise: Tensor | None = None, **_: Any) -> Tensor:
         """Return the next action, normalised, shape (batch, actions); look again when the last chunk is used up."""
-        for key in (*self._keys, OBS_SCAN):
+        for key in (*self._keys, OBS_SCAN, OBS_YAW):
             if key not in batch:
                 continue
             seen = self._seen.setdefault(key, deque(maxlen=self.config.history))

@@ -11,6 +11,7 @@ from torch import Tensor
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.mlp.scan_mlp import ScanProcessorStep
+from bhd_lerobot.policies.mlp.yaw_mlp import YawProcessorStep
 
 type Pipelines = tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
@@ -40,6 +41,10 @@ def make_bhd_mlp_pre_post_processors(
         if config.scan.start is None:
             raise ConfigError("policy.scan.start is not known yet; make the policy before its processors.")
         before.append(ScanProcessorStep(start=config.scan.start, beams=config.scan.beams))
+    if config.yaw_harmonics:
+        if not config.quaternions:
+            raise ConfigError("The quaternions' columns are not known yet; make the policy before its processors.")
+        before.append(YawProcessorStep(config.state_quaternions, config.environment_quaternions))
     return make_policy_processor_pipelines([*before, steps.normalize], [steps.unnormalize, steps.to_cpu])
 
 

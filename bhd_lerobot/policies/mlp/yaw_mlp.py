@@ -1,0 +1,79 @@
+"""Orientations on their way into the network: as sines and cosines of multiples of the yaw, past the normalisation."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from torch import Tensor
+
+OBS_YAW = "observation.bhd_yaw"
+"""Key of the yaws [rad] of all quaternions, beside the normalised inputs that they were computed from."""
+
+_PARTS = ("qw", "qx", "qy", "qz")
+
+
+@ProcessorStepRegistry.register(name="bhd_yaw_processor")
+@dataclass
+class YawProcessorStep(ObservationProcessorStep):
+    """Computes the yaws of quaternions before the normaliser changes them.
+
+    Attributes:
+        state: columns of `observation.state` at which a quaternion wxyz begins.
+        environment: likewise of `observation.environment_state`.
+    """
+
+    state: list[int] = field(default_factory=list)
+    environment: list[int] = field(default_factory=list)
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Return the observation with the yaws added: those in the state, then those in the environment state."""
+        parts = []
+        for key, columns in ((OBS_STATE, self.state), (OBS_ENV_STATE, self.environment)):
+            values = observation.get(key)
+            if isinstance(values, Tensor):
+                parts += [yaw(values[..., first : first + 4]) for first in columns]
+        # If an input is missing, the policy says so.
+        if parts and len(parts) == len(self.state) + len(self.environment):
+            observation[OBS_YAW] = torch.stack(parts, dim=-1)
+        return observation
+
+    def get_config(self) -> dict[str, Any]:
+        """Return what the step is made from again."""
+        return {"state": list(self.state), "environment": list(self.environment)}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        """Return the features unchanged: what is added is not a feature of the dataset."""
+        return features
+
+
+def yaw(quaternions: Tensor) -> Tensor:
+    """Return the rotation about the vertical axis [rad], shape (...), of quaternions wxyz, shape (..., 4).
+
+    That of the rotated x axis, seen from above; 0 where it is vertical. The quaternions need not be of unit length.
+    """
+    w, x, y, z = quaternions.unbind(-1)
+    return torch.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def harmonics(yaws: Tensor, count: int) -> Tensor:
+    """Return cosines and sines of 1 to `count` times the yaws, shape (..., 2 * count * m), of yaws, shape (..., m)."""
+    multiples = torch.arange(1, count + 1, dtype=yaws.dtype, device=yaws.device)
+    angles = (yaws.unsqueeze(-1) * multiples).flatten(-2)
+    return torch.cat([angles.cos(), angles.sin()], dim=-1)
+
+
+def quaternion_columns(names: Sequence[str]) -> list[int]:
+    """Return the columns at which quaternions begin: `…_qw`, `…_qx`, `…_qy`, `…_qz`, by option with `.pos` after it."""
+    plain = [name.removesuffix(".pos") for name in names]
+    found = []
+    for column, name in enumerate(plain[:-3]):
+        stem = name.removesuffix(_PARTS[0])
+        if stem != name and plain[column : column + 4] == [stem + part for part in _PARTS]:
+            found.append(column)
+    return found
