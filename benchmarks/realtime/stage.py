@@ -31,7 +31,8 @@ def settled_robot(hz: int = HZ) -> UR5Simulation:
         hz: physics steps and control ticks a second [Hz].
     """
     body, rates = ur5(), Rates(hz, hz, FPS)
-    values = {"control": "servo", "action_space": "joint", "camera": False, "physics_hz": hz, "control_hz": hz}
+    values = {"control": "servo", "action_space": "joint", "tool_pose": False, "camera": False}
+    values |= {"physics_hz": hz, "control_hz": hz}
     config = SimpleNamespace(**values, fps=FPS, rates=rates, body=lambda: body, clock="lockstep")
     simulation = UR5Simulation(config, 1, 1)  # type: ignore[arg-type]
     simulation.reset(np.zeros(1, np.intp), [pick_scene()], [SEED])
