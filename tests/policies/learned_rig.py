@@ -50,6 +50,11 @@ KINDS: dict[str, tuple[type, dict[str, Any]]] = {
     "mlp": (MlpConfig, _MLP),
     "mlp_history": (MlpConfig, {**_MLP, "n_obs_steps": 3, "obs_stride": 2, "layer_norm": True, "activation": "tanh"}),
     "mlp_scan": (MlpConfig, {**_MLP, "n_obs_steps": 2, "scan": {"transform": "inverse", "channels": [3, 4]}}),
+    # Any four numbers are a quaternion of some length.
+    "mlp_yaw": (
+        MlpConfig,
+        {**_MLP, "n_obs_steps": 2, "yaw_harmonics": 2, "state_quaternions": [2, 7], "ignore": ["*.vel"]},
+    ),
     "mlp_sample": (MlpConfig, {**_MLP, "gaussian": True, "sample": True}),
     "act": (ACTConfig, {**_SMALL_ACT, "n_action_steps": 3}),
     "act_average": (ACTConfig, {**_SMALL_ACT, "n_action_steps": 1, "temporal_ensemble_coeff": 0.01}),
