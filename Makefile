@@ -12,7 +12,7 @@ LOCK_ARGS ?=
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-15s %s\n", $$1, $$2}' Makefile
 
-demo: venv ## record, replay and summarise a small dataset
+demo: venv ## record, replay, train and evaluate both robots
 	$(PYTHON_IN_VENV) -m bhd_lerobot.runs.demo
 
 test: venv ## run the tests; PYTEST_ARGS='-k name' narrows them down
