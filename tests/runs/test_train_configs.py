@@ -50,6 +50,8 @@ def test_a_configuration_is_valid_and_its_policy_can_be_built(path: Path, tmp_pa
         return  # building it loads a model from the Hub
     meta = SimpleNamespace(features=described(path.stem), stats={}, fps=25)
     policy = make_policy(config.policy, ds_meta=meta)
+    if "cameras" in path.stem:
+        assert "observation.environment_state" not in policy.config.input_features  # it would tell what is to be seen
     assert sum(one.numel() for one in policy.parameters()) > 1000
 
 
