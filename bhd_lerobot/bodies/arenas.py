@@ -83,7 +83,10 @@ class Arena:
     def free_cells(self, size: float) -> NDArray[np.int64]:
         """Return the numbers of the cells that the robot's centre can get into, sorted."""
         points, free = self.reachable
-        return np.unique(self.cell_of(points[free], size))
+        columns, rows = self.cells(size)
+        is_free = np.zeros(columns * rows, np.bool_)
+        is_free[self.cell_of(points[free], size)] = True
+        return np.flatnonzero(is_free)
 
 
 def make_arena(name: str, seed: int, random_start: bool = False) -> Arena:
@@ -141,15 +144,18 @@ def random_arena(seed: int) -> Arena:
         obstacles: list[Shape] = []
         x, y = _axes((-half_x, half_x, -half_y, half_y))
         clearance = _clearance(_outer_walls(half_x, half_y), x, y)
+        free = clearance > ROBOT_RADIUS + CLEARANCE
         builders = (_cylinders, _boxes, _walls, _corridor, _dead_end)
         # Each arena has its own mixture: some are forests of posts, some mazes.
         for builder, count in zip(builders, rng.integers((2, 1, 0, 0, 0), (9, 6, 4, 2, 3)), strict=True):
             for _ in range(count):
                 group = builder(rng, half_x, half_y)
-                trial = np.minimum(clearance, _clearance(group, x, y))
-                if _is_connected(trial):
+                trial = _closer(clearance, group, x, y)
+                left = trial > ROBOT_RADIUS + CLEARANCE
+                # Not crowded: at least a third of the floor stays free for the robot's centre.
+                if np.count_nonzero(left) / left.size > 1 / 3 and _stays_connected(free, left):
                     obstacles += group
-                    clearance = trial
+                    clearance, free = trial, left
         if (clearance > START_CLEARANCE).any():
             points = _points(x, y)
             arena = _closed("random", half_x, half_y, obstacles, _random_pose(points, clearance, rng))
@@ -227,11 +233,16 @@ def _beside(pose: tuple[float, float, float], ahead: float, left: float, size_x:
     return Shape("box", x + c * ahead - s * left, y + s * ahead + c * left, yaw, size_x, size_y)
 
 
-def _is_connected(clearance: NDArray[np.float64]) -> bool:
-    free = clearance > ROBOT_RADIUS + CLEARANCE
-    _, count = ndimage.label(free)
-    # Not crowded: at least a third of the floor stays free for the robot's centre.
-    return count == 1 and float(free.mean()) > 1 / 3
+def _stays_connected(before: NDArray[np.bool_], free: NDArray[np.bool_]) -> bool:
+    """Return whether the free places are connected, given those of a connected set that were free before."""
+    lost = before & ~free
+    rows, columns = np.flatnonzero(lost.any(axis=1)), np.flatnonzero(lost.any(axis=0))
+    if not len(rows):
+        return True
+    # Where the places just around the lost ones are connected, every way through those has a way around them: most
+    # obstacles are small, and all of the floor need not be looked at.
+    around = tuple(slice(max(0, lines[0] - 1), lines[-1] + 2) for lines in (rows, columns))
+    return bool(ndimage.label(free[around])[1] == 1 or ndimage.label(free)[1] == 1)
 
 
 def _axes(extent: tuple[float, float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -258,6 +269,28 @@ def _clearance(shapes: Iterable[Shape], x: NDArray[np.float64], y: NDArray[np.fl
     for shape in shapes:
         np.minimum(distance, _distance(shape, x, y), out=distance)
     return distance
+
+
+def _closer(
+    clearance: NDArray[np.float64], shapes: Iterable[Shape], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return what the clearance on a grid becomes with further shapes; the one given stays as it is.
+
+    A shape changes nothing that is farther from it than the largest clearance: the rest of the grid is left out.
+    """
+    closer, largest = clearance.copy(), float(clearance.max()) + RESOLUTION
+    for shape in shapes:
+        reach = math.hypot(shape.size_x, shape.size_y) + largest
+        rows, columns = _within(y[:, 0], shape.y, reach), _within(x[0], shape.x, reach)
+        part = closer[rows, columns]
+        np.minimum(part, _distance(shape, x[:, columns], y[rows]), out=part)
+    return closer
+
+
+def _within(places: NDArray[np.float64], centre: float, reach: float) -> slice:
+    """Return which of the places, ascending by `RESOLUTION`, are no farther from the centre, and perhaps a few more."""
+    first, last = ((centre + side * reach - float(places[0])) / RESOLUTION for side in (-1, 1))
+    return slice(max(0, math.floor(first)), max(0, math.ceil(last) + 1))
 
 
 def _distance(shape: Shape, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:

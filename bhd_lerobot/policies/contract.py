@@ -160,7 +160,7 @@ class PolicyContract:
         for what, trained, here, remedy in (
             ("observation", self.observation_names, observation_names, "the same --robot options"),
             ("action", self.action_names, action_names, "the same --robot options, such as action_space"),
-            ("environment", self.environment_names, environment_names, "the same task"),
+            ("environment", self.environment_names, environment_names, "the same task with the same --task options"),
         ):
             if trained is not None and here is not None and tuple(trained) != tuple(here):
                 raise ConfigError(

@@ -1,6 +1,8 @@
 """What `bhd-train` says before and after."""
 
 import json
+from collections.abc import Mapping
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
@@ -15,6 +17,7 @@ from bhd_lerobot.runs.registry import SIMULATED_ROBOTS
 from bhd_lerobot.runs.train_checkpoint import resume_command
 from bhd_lerobot.runs.train_data import TrainingData
 from bhd_lerobot.runs.train_log import METRICS_NAME, PLOT_NAME
+from bhd_lerobot.tasks.config_task import TaskConfig
 
 if TYPE_CHECKING:
     from bhd_lerobot.runs.train import TrainResult
@@ -71,17 +74,25 @@ def tell_summary(console: Console, config: BhdTrainConfig, result: "TrainResult"
 def evaluate_command(contract: PolicyContract, checkpoint: str) -> str:
     """Return the command that evaluates a checkpoint on held-out episodes of what it was trained on.
 
-    It names the robot's options that are not at their defaults: with others the observations or actions do not fit.
+    It names the options of robot and task that are not at their defaults: with others the observations or actions do
+    not fit.
     """
     path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
     kinds = {str(kind.get_choice_name(kind)): kind for kind in SIMULATED_ROBOTS}
     task = (contract.task or {}).get("type")
-    if contract.robot_type not in kinds or task is None:
+    if contract.robot_type not in kinds or task not in TaskConfig.get_known_choices():
         return f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={path}"
-    usual = describe(kinds[contract.robot_type]())
-    options = "".join(
-        f" --robot.{name}={json.dumps(value) if isinstance(value, bool | int | float) else value}"
-        for name, value in (contract.robot or {}).items()
-        if name in usual and isinstance(value, str | bool | int | float) and value != usual[name]
-    )
-    return f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task} --brain.path={path}"
+    options = _options("robot", contract.robot or {}, describe(kinds[contract.robot_type]()))
+    asked = _options("task", contract.task or {}, asdict(TaskConfig.get_choice_class(task)()))
+    return f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task}{asked} --brain.path={path}"
+
+
+def _options(name: str, values: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
+    """Return the options that make a configuration have these values, each with a space before it."""
+    options = ""
+    for key, value in values.items():
+        if isinstance(value, Mapping) and isinstance(usual.get(key), Mapping):
+            options += _options(f"{name}.{key}", value, usual[key])
+        elif isinstance(value, str | bool | int | float) and key in usual and value != usual[key]:
+            options += f" --{name}.{key}={json.dumps(value) if isinstance(value, bool | int | float) else value}"
+    return options

@@ -13,6 +13,15 @@ from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import BaseTruth, Event, Outcome
 
+_BEARINGS_DEG = np.arange(0.0, 360.0, 22.5)
+_DISTANCES_M = np.arange(1, 9) * 0.25
+
+TRAIL = tuple(f"trail_{bearing:g}deg_{distance:g}m" for bearing in _BEARINGS_DEG for distance in _DISTANCES_M)
+"""Places around the robot, bearing counter-clockwise from its front [deg] and distance [m]: 1 in a cell that it has
+visited in this episode, 0 in any other."""
+
+_TRAIL_XY = np.stack([f(np.radians(_BEARINGS_DEG))[:, None] * _DISTANCES_M for f in (np.cos, np.sin)]).reshape(2, -1)
+
 
 @TaskConfig.register_subclass("avoid")
 @dataclass
@@ -27,6 +36,8 @@ class AvoidConfig(TaskConfig):
         cell_m: edge length of the cells that the score counts [m].
         stuck_path_m: a path shorter than this in `stuck_time_s` means stuck [m].
         stuck_time_s: see `stuck_path_m` [s].
+        trail: tell the brain which ground around the robot it has visited: `TRAIL`, the task's memory for brains that
+            have none of their own.
     """
 
     arena: str = "random"
@@ -36,6 +47,7 @@ class AvoidConfig(TaskConfig):
     cell_m: float = 0.25
     stuck_path_m: float = 0.1
     stuck_time_s: float = 10.0
+    trail: bool = False
 
     def __post_init__(self) -> None:
         if self.arena not in ARENAS:
@@ -64,10 +76,11 @@ class AvoidTask:
 
     name = "avoid"
     robot_type = "turtlebot3"
-    environment_names: tuple[str, ...] = ()
+    environment_names: tuple[str, ...]
 
     def __init__(self, config: AvoidConfig, n: int, fps: int) -> None:
         self.config = config
+        self.environment_names = TRAIL if config.trail else ()
         self.duration_s = config.duration_s
         self.frames = max(1, round(config.duration_s * fps))
         self._window = max(1, round(config.stuck_time_s * fps))
@@ -91,8 +104,14 @@ class AvoidTask:
         return "Roam without touching anything."
 
     def environment_state(self, truth: BaseTruth) -> NDArray[np.float64]:
-        """Return nothing: the robot's own sensors tell all that the brain may know, shape (n, 0)."""
-        return np.zeros((len(truth.touched), 0))
+        """Return `TRAIL` if the configuration asks for it, shape (n, 128); else nothing, shape (n, 0)."""
+        if not self.config.trail:
+            return np.zeros((len(truth.touched), 0))
+        x, y, yaw = truth.base_pose_in_world.T[:, :, None]
+        cos, sin, (ahead, left) = np.cos(yaw), np.sin(yaw), _TRAIL_XY
+        points = np.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left], axis=-1)
+        cell, inside = self._cells(points)
+        return (self._visited[self._sims[:, None], cell] & inside).astype(np.float64)
 
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
         """Start episodes: the robot stands at each arena's start."""
@@ -155,10 +174,17 @@ class AvoidTask:
 
     def _count_cells(self, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Count the cells that robots are in, and return what they add to the scores, shape (n,)."""
-        column, row = np.floor((self._pose - self._origin) / self.config.cell_m).astype(np.int64).T
-        cell = np.clip(row * self._columns + column, 0, self._free.shape[1] - 1)
-        # Outside the arena is no free cell, also where the last row of cells sticks out of it.
-        inside = ((self._pose >= self._origin) & (self._pose < self._end)).all(axis=1)
+        cell, inside = (one[:, 0] for one in self._cells(self._pose[:, None]))
         new = mask & inside & self._free[self._sims, cell] & ~self._visited[self._sims, cell]
         self._visited[self._sims[new], cell[new]] = True
         return np.where(new, 1.0 / np.maximum(self._free.sum(axis=1), 1), 0.0)
+
+    def _cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the cells of points [m], shape (n, k, 2), and which points lie in the arena, both of shape (n, k)."""
+        column, row = np.moveaxis(
+            np.floor((points - self._origin[:, None]) / self.config.cell_m).astype(np.int64), -1, 0
+        )
+        cell = np.clip(row * self._columns[:, None] + column, 0, self._free.shape[1] - 1)
+        # Outside the arena is no free cell, also where the last row of cells sticks out of it.
+        is_inside = (points >= self._origin[:, None]) & (points < self._end[:, None])
+        return cell, np.asarray(is_inside.all(axis=-1))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.arenas import make_arena, random_arena
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
+from bhd_lerobot.tasks.avoid import TRAIL, AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import BaseTruth, Event
 
 FPS = 10
@@ -260,3 +261,68 @@ def test_parameters_are_plain_values_that_define_the_task() -> None:
     parameters = AvoidTask(AvoidConfig(arena="empty", duration_s=30.0), 1, FPS).parameters()
     assert parameters.pop("type") == "avoid"
     assert AvoidConfig(**parameters) == AvoidConfig(arena="empty", duration_s=30.0)
+
+
+def told(task: AvoidTask, pose: np.ndarray) -> np.ndarray:
+    """What the task tells about the trail, shape (n, bearings, distances)."""
+    state = task.environment_state(BaseTruth(pose, np.zeros(len(pose), np.bool_)))
+    assert state.shape == (len(pose), len(task.environment_names))
+    return state.reshape(len(pose), 16, 8)
+
+
+def test_the_trail_is_told_only_when_asked_for() -> None:
+    task = AvoidTask(AvoidConfig(), 2, FPS)
+    assert task.environment_names == ()
+    assert task.environment_state(BaseTruth(np.zeros((2, 3)), np.zeros(2, np.bool_))).shape == (2, 0)
+    assert len(set(AvoidTask(AvoidConfig(trail=True), 2, FPS).environment_names)) == len(TRAIL) == 128
+
+
+def test_the_trail_is_where_the_robot_was_as_it_sees_it() -> None:
+    run = Run(AvoidConfig(trail=True))
+    x, y = EMPTY.start[0] + 0.1, EMPTY.start[1] + 0.1  # away from the edges of cells
+    run.task.begin(np.array([0]), [replace(EMPTY, start=(x, y, 0.0))])
+    for step in range(11):  # one metre along x
+        run.frame(np.array([[x + 0.1 * step, y]]))
+    for bearing in range(16):
+        yaw = math.radians(22.5 * bearing)
+        seen = told(run.task, np.array([[x + 1.0, y, yaw]]))[0]
+        behind = (8 - bearing) % 16
+        assert seen[behind, :4].tolist() == [1, 1, 1, 1]  # 0.25 m to 1 m back the way it came
+        assert not seen[behind, 5:].any()  # it never was farther back
+        assert not seen[(behind + 8) % 16].any()  # nor ahead of where it stands
+    assert not told(run.task, np.array([[x + 1.0, y + 2.0, 0.0]]))[0, 4].any()  # nothing to the left, up there
+
+
+@given(st.integers(0, 200), st.floats(-math.pi, math.pi))
+def test_the_trail_agrees_with_the_cells_that_the_score_counts(seed: int, yaw: float) -> None:
+    arenas = [random_arena(seed), EMPTY]
+    run = Run(AvoidConfig(trail=True), arenas)
+    rng = np.random.default_rng(seed)
+    visited: list[set[int]] = [{int(arena.cell_of(np.array([arena.start[:2]]), 0.25)[0])} for arena in arenas]
+    for _ in range(30):
+        positions = np.array([rng.uniform(arena.extent[0::2], arena.extent[1::2]) for arena in arenas])
+        rewards = run.frame(positions)
+        for sim, arena in enumerate(arenas):
+            if rewards[sim] > 0:
+                visited[sim].add(int(arena.cell_of(positions[sim : sim + 1], 0.25)[0]))
+    pose = np.column_stack([positions, [yaw, yaw]])
+    seen = told(run.task, pose)
+    for sim, arena in enumerate(arenas):
+        for b, bearing in enumerate(yaw + np.radians(22.5) * np.arange(16)):
+            points = pose[sim, :2] + 0.25 * np.arange(1, 9)[:, None] * [math.cos(bearing), math.sin(bearing)]
+            inside = ((points >= arena.extent[0::2]) & (points < arena.extent[1::2])).all(axis=1)
+            cells = arena.cell_of(points, 0.25)
+            expected = [bool(i) and int(c) in visited[sim] for i, c in zip(inside, cells, strict=True)]
+            # Two ways to add up a place may differ where it lies on the edge of a cell.
+            edge = np.abs((points - arena.extent[0::2]) / 0.25 % 1 - 0.5).max(axis=1) > 0.5 - 1e-9
+            assert ((seen[sim, b] == expected) | edge).all()
+
+
+def test_a_new_episode_has_no_trail() -> None:
+    run = Run(AvoidConfig(trail=True), [EMPTY, EMPTY])
+    for frame in range(60):
+        run.frame(np.repeat(on_circle(frame, 0.3), 2, axis=0))
+    run.task.begin(np.array([0]), [EMPTY])
+    seen = told(run.task, np.array([EMPTY.start, EMPTY.start], float))
+    assert seen[0].sum() <= 3  # its own cell, on whose edge it stands
+    assert seen[1].sum() > 5

@@ -19,6 +19,8 @@ LOSSES = ("l1", "mse", "huber", "nll")
 SCAN_TRANSFORMS = ("none", "inverse", "log")
 SCHEDULES = ("cosine", "constant")
 
+_SHOWN = 8  # names in a message
+
 
 @dataclass
 class ScanConfig:
@@ -88,7 +90,8 @@ def _matching(patterns: Sequence[str], names: Sequence[str]) -> list[int]:
     """
     for pattern in patterns:
         if not any(fnmatch.fnmatchcase(name, pattern) for name in names):
-            raise ConfigError(f"policy.ignore: {pattern!r} matches no number of {OBS_STATE}: {', '.join(names)}.")
+            some = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+            raise ConfigError(f"policy.ignore: {pattern!r} matches no number of {OBS_STATE}: {some}.")
     return [i for i, name in enumerate(names) if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
 
 
