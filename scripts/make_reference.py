@@ -33,7 +33,7 @@ from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.config_train import BhdTrainConfig, own_fields
 from bhd_lerobot.runs.replay import ReplayConfig
 from bhd_lerobot.runs.rl.config import RlConfig
-from bhd_lerobot.tasks import pick, reach
+from bhd_lerobot.tasks import avoid, navigate, pick, reach
 from bhd_lerobot.tasks.task import Event
 
 FILE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
@@ -235,7 +235,11 @@ def _columns() -> str:
         "base frame, position [m] and unit quaternion.\n\n"
         f"`pick`, {len(pick.ENVIRONMENT)} numbers: for each of five places `object_0` to `object_4` the "
         f"{len(OBJECT_FIELDS)} numbers {_names(OBJECT_FIELDS)}: whether there is an object, whether it is the one "
-        "asked for, whether it is a box; its pose in the base frame; its measures [m]; its colour.\n"
+        "asked for, whether it is a box; its pose in the base frame; its measures [m]; its colour.\n\n"
+        f"`navigate`, {len(navigate.ENVIRONMENT)} numbers: {_names(navigate.ENVIRONMENT)}: the goal in the robot's "
+        "frame, position [m] and cosine and sine of the angle to its heading.\n\n"
+        f"`avoid` with `task.trail`, {len(avoid.TRAIL)} numbers: `{avoid.TRAIL[0]}` to `{avoid.TRAIL[-1]}`: whether "
+        "the robot has visited the cell at that bearing and distance from it.\n"
     )
     return "\n".join(
         (
