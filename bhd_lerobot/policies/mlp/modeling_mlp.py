@@ -70,9 +70,9 @@ class MlpPolicy(PreTrainedPolicy):
         self.register_buffer("_columns", torch.tensor(columns, dtype=torch.long), persistent=False)
         activation = _ACTIVATIONS[config.activation]
         self.scan_encoder = ScanEncoder(scan, steps, activation) if scan.is_used and scan.channels else None
-        beams = 0 if not scan.is_used else self.scan_encoder.size if self.scan_encoder else steps * scan.beams
+        self._beams = 0 if not scan.is_used else self.scan_encoder.size if self.scan_encoder else steps * scan.beams
         yaws = 2 * config.yaw_harmonics * config.quaternions
-        self.feature_size = steps * (len(columns) + environment_size + yaws) + beams
+        self.feature_size = steps * (len(columns) + environment_size + yaws) + self._beams
         self.net = nn.Sequential(*_perceptron(config, self.feature_size, config.chunk_size * self._action_size))
         self.log_std: nn.Parameter | None = None
         if config.gaussian:
@@ -160,6 +160,19 @@ class MlpPolicy(PreTrainedPolicy):
             scan = transformed(self._history(batch, OBS_SCAN), config.scan)
         beams = scan.flatten(1) if self.scan_encoder is None else self.scan_encoder(scan)
         return torch.cat([numbers, beams], dim=-1)
+
+    def features_in(self, other: "MlpPolicy") -> list[int]:
+        """Return where this policy's features are among those of another, which ignores fewer columns or none.
+
+        Both are to have the same configuration but for `ignored_columns`.
+        """
+        own, others = self._columns.tolist(), other._columns.tolist()
+        steps, beams = self.config.n_obs_steps, self._beams
+        rest = (self.feature_size - beams) // steps - len(own)  # environment state and yaws, the same in both
+        of_step = [*(others.index(column) for column in own), *range(len(others), len(others) + rest)]
+        width = len(others) + rest
+        numbers = [step * width + place for step in range(steps) for place in of_step]
+        return numbers + list(range(steps * width, steps * width + beams))
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a preprocessed batch, and its parts for the log.

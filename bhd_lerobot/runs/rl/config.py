@@ -49,6 +49,8 @@ class RlConfig:
         start_from: a checkpoint of a `bhd_mlp`, whose weights become the actor.
         start_action: which action of the checkpoint's chunk becomes the actor's, from 0. A later one asks at once for
             what the checkpoint would ask for some frames later, and so hurries.
+        see_ignored: let the actor see what the checkpoint ignores (`policy.ignore`); it begins as if it did not. A clone
+            must not see its own speed, because it would repeat it; who learns from what comes of it may.
         critic_warmup: environment steps in which only the critic learns.
         output_dir: folder of the run; a new one in `outputs/train` if nothing.
         resume: go on with the run in `output_dir`.
@@ -69,6 +71,7 @@ class RlConfig:
     max_minutes: float | None = None
     start_from: str | None = None
     start_action: int = 0
+    see_ignored: bool = False
     critic_warmup: int = 0
     output_dir: str | None = None
     resume: bool = False
@@ -95,6 +98,8 @@ class RlConfig:
             for name, asked in (("anchor.coef", self.anchor.coef), ("critic_warmup", self.critic_warmup)):
                 if asked:
                     raise ConfigError(f"{name} is {asked}; it needs --start_from, a checkpoint to stay near.")
+            if self.see_ignored:
+                raise ConfigError("see_ignored is true; it needs --start_from, a checkpoint that ignores something.")
         if self.policy.scan.channels and self.policy.scan.transform == "none":
             raise ConfigError("policy.scan.channels needs policy.scan.transform: inverse or log.")
         if self.resume and self.output_dir is None:

@@ -75,7 +75,7 @@ def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] 
         versions=versions(),
     )
     if config.start_from is not None:
-        return _from_checkpoint(config.start_from, contract, config.start_action)
+        return _from_checkpoint(config.start_from, contract, config.start_action, see_ignored=config.see_ignored)
     if config.resume:
         # With the normalisation that the run began with.
         return _from_checkpoint(str(config.output_dir), contract)
@@ -94,7 +94,7 @@ def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] 
     return RlParts(MlpPolicy(mlp), _front(mlp), before, after, contract, fresh=True)
 
 
-def _from_checkpoint(path: str, contract: PolicyContract, action: int = 0) -> RlParts:
+def _from_checkpoint(path: str, contract: PolicyContract, action: int = 0, *, see_ignored: bool = False) -> RlParts:
     folder = find_checkpoint(path)
     loaded = load_policy(folder)
     who = f"The policy {path!r}"
@@ -121,7 +121,9 @@ def _from_checkpoint(path: str, contract: PolicyContract, action: int = 0) -> Rl
     chunk = loaded.config.chunk_size
     if action >= chunk:
         raise ConfigError(f"start_action is {action}; {who[0].lower()}{who[1:]} predicts {chunk}: 0 to {chunk - 1}.")
-    actor = single_action(loaded.policy, action)
+    if see_ignored and not loaded.config.ignored_columns:
+        raise ConfigError(f"see_ignored is true, and {who[0].lower()}{who[1:]} ignores nothing. Leave it out.")
+    actor = single_action(seeing_all(loaded.policy) if see_ignored else loaded.policy, action)
     known = dataclasses.replace(contract, dataset=trained.dataset)
     return RlParts(actor, _front(actor.config), loaded.before, loaded.after, known, fresh=False)
 
@@ -152,6 +154,19 @@ def single_action(policy: MlpPolicy, action: int = 0) -> MlpPolicy:
         state["log_std"] = torch.zeros(1, size)
     actor.load_state_dict(state)
     return actor
+
+
+def seeing_all(policy: MlpPolicy) -> MlpPolicy:
+    """Return a policy that does the same, and that sees what the other ignores: the weights of that are 0."""
+    config = dataclasses.replace(policy.config, ignore=[], ignored_columns=[])
+    config.scan = copy.deepcopy(policy.config.scan)
+    wider = MlpPolicy(config)
+    state = dict(policy.state_dict())
+    old = state["net.0.weight"]
+    state["net.0.weight"] = old.new_zeros(old.shape[0], wider.feature_size)
+    state["net.0.weight"][:, policy.features_in(wider)] = old
+    wider.load_state_dict(state)
+    return wider
 
 
 def _front(config: MlpConfig) -> MlpPolicy:

@@ -1,0 +1,87 @@
+"""What an actor begins as: the checkpoint that it starts from, seeing more than that did."""
+
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from torch import Tensor
+
+pytest.importorskip("stable_baselines3")
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
+from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
+from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN
+from bhd_lerobot.policies.mlp.yaw_mlp import OBS_YAW
+from bhd_lerobot.runs.rl.config import parse_rl
+from bhd_lerobot.runs.rl.parts import seeing_all
+
+WIDTH, BEAMS, TOLD = 14, 8, 9  # two numbers, the beams, four more numbers; what the task tells
+IGNORED = [0, 11, 13]
+CASES = {
+    "beams as numbers": {},
+    "three observations": {"n_obs_steps": 3, "obs_stride": 2},
+    "beams inverted": {"n_obs_steps": 2, "scan": ScanConfig(transform="inverse", start=2, beams=BEAMS)},
+    "beams convolved": {
+        "n_obs_steps": 2,
+        "scan": ScanConfig(transform="log", start=2, beams=BEAMS, channels=[3], kernel_size=3, stride=2),
+    },
+    "yaws": {"yaw_harmonics": 2, "environment_quaternions": [3]},
+    "no hidden layer": {"hidden_dims": []},
+    "norms": {"layer_norm": True},
+}
+
+
+def policy(**values: object) -> MlpPolicy:
+    torch.manual_seed(0)
+    options = {"hidden_dims": [16], "chunk_size": 2, "n_action_steps": 1, **values}
+    config = MlpConfig(device="cpu", push_to_hub=False, ignore=["?"], ignored_columns=IGNORED, **options)  # type: ignore[arg-type]
+    config.input_features = {
+        "observation.state": PolicyFeature(FeatureType.STATE, (WIDTH,)),
+        "observation.environment_state": PolicyFeature(FeatureType.ENV, (TOLD,)),
+    }
+    config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
+    return MlpPolicy(config)
+
+
+def batch(one: MlpPolicy, seed: int = 0) -> dict[str, Tensor]:
+    draw = torch.Generator().manual_seed(seed)
+    steps = one.config.n_obs_steps
+    rows = {
+        "observation.state": torch.randn(5, steps, WIDTH, generator=draw),
+        "observation.environment_state": torch.randn(5, steps, TOLD, generator=draw),
+    }
+    if one.config.scan.is_used:
+        rows[OBS_SCAN] = torch.rand(5, steps, BEAMS, generator=draw) + 0.2
+    if one.config.yaw_harmonics:
+        rows[OBS_YAW] = torch.randn(5, steps, 1, generator=draw)
+    return rows
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_does_the_same_at_first_whatever_the_ignored_numbers_are(case: str) -> None:
+    narrow = policy(**CASES[case])
+    wide = seeing_all(narrow)
+    assert (wide.config.ignore, wide.config.ignored_columns) == ([], [])
+    assert narrow.config.ignored_columns == IGNORED  # the checkpoint's own is left alone
+    for seed in range(3):
+        rows = batch(narrow, seed)
+        before = narrow.predict_action_chunk(rows)
+        rows["observation.state"][..., IGNORED] = 100.0 * (seed - 1)
+        torch.testing.assert_close(wide.predict_action_chunk(rows), before, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_can_learn_from_what_was_ignored(case: str) -> None:
+    wide = seeing_all(policy(**CASES[case]))
+    rows = batch(wide)
+    wide.train()
+    wide._chunk(rows).square().sum().backward()
+    gradient = wide.net[0].weight.grad
+    unused = (wide.net[0].weight == 0).all(dim=0)
+    assert int(unused.sum()) == len(IGNORED) * wide.config.n_obs_steps
+    assert (gradient[:, unused].abs().sum(dim=0) > 0).all()
+
+
+def test_seeing_what_is_ignored_needs_a_checkpoint() -> None:
+    with pytest.raises(ConfigError, match="see_ignored is true; it needs --start_from"):
+        parse_rl(["--config_path=configs/train/ppo_turtlebot3.yaml", "--see_ignored=true"])
