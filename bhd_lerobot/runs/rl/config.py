@@ -49,8 +49,8 @@ class RlConfig:
         start_from: a checkpoint of a `bhd_mlp`, whose weights become the actor.
         start_action: which action of the checkpoint's chunk becomes the actor's, from 0. A later one asks at once for
             what the checkpoint would ask for some frames later, and so hurries.
-        see_ignored: let the actor see what the checkpoint ignores (`policy.ignore`); it begins as if it did not. A clone
-            must not see its own speed, because it would repeat it; who learns from what comes of it may.
+        see_ignored: let the actor see what the checkpoint ignores (`policy.ignore`); it begins as if it did not. A
+            clone must not see its own speed, because it would repeat it; who learns from what comes of it may.
         critic_warmup: environment steps in which only the critic learns.
         output_dir: folder of the run; a new one in `outputs/train` if nothing.
         resume: go on with the run in `output_dir`.
