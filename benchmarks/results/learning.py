@@ -26,7 +26,10 @@ def avoid(run: Runner, section: Section) -> None:
     gap = ("--seed=100", "--brain.type=gap_follower", *_TRAIL)
     _record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=400, options=gap)
     _train(run, "avoid_gap_bc", "bc_turtlebot3_avoid", "avoid/gap_bc", "avoid/gap_data")
-    start = (f"--start_from={run.path('avoid/gap_bc')}", "--critic_warmup=65536", "--ppo.log_std_init=-1.0")
+    start = (
+        *(f"--start_from={run.path('avoid/gap_bc')}", "--see_ignored=true"),
+        *("--critic_warmup=65536", "--ppo.log_std_init=-1.0"),
+    )
     ppo_seconds = _train(run, "avoid_ppo", "ppo_turtlebot3", "avoid/ppo", options=start)
     results = _evaluate(run, "avoid_eval", "turtlebot3_avoid", {"bc": "avoid/bc"}, rules=_ROAMING, baseline="avoidance")
     # The task tells these two more; the episodes are the same.
