@@ -1,4 +1,4 @@
-"""`bhd-data`: look at a dataset and its timing, mend one."""
+"""`bhd-data`: look at a dataset and its timing, check one, mend one."""
 
 import argparse
 import json
@@ -18,24 +18,29 @@ from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.inspect import DatasetSummary, dataset_info
 from bhd_lerobot.data.repair import repair
 from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.runs.data_check import check
 from bhd_lerobot.runs.timing_report import load_timing, timing_of
 from bhd_lerobot.runs.timing_tables import fitting, ms, print_timing
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="bhd-data", description="Look at a LeRobotDataset, or mend one.")
+    parser = argparse.ArgumentParser(prog="bhd-data", description="Look at a LeRobotDataset, check or mend one.")
     commands = parser.add_subparsers(dest="command", required=True)
     for name, help_text in (
         ("info", "what is in a dataset: features, and outcome and timing of every episode; changes nothing"),
         ("timing", "how punctual a recording was: tables and a picture; changes nothing"),
+        ("check", "is a dataset sound? Exit status 0 if it is, 1 if not; changes nothing"),
         ("repair", "complete or drop what an interrupted recording left, and leave the dataset compact"),
     ):
         command = commands.add_parser(name, help=help_text, description=help_text)
         command.add_argument("root", nargs="?", type=Path, help="folder of the dataset")
         command.add_argument("--root", dest="root_option", type=Path, help="the same, as an option")
         command.add_argument("--repo_id", help="name of the dataset, to find it in LeRobot's default place")
-        if name in ("info", "timing"):
+        if name in ("info", "timing", "check"):
             command.add_argument("--json", action="store_true", help="print everything as JSON")
+        if name == "check":
+            command.add_argument("--strict", action="store_true", help="a warning is enough for exit status 1")
+            command.add_argument("--no-videos", action="store_true", help="leave the films out, which take longest")
         if name == "timing":
             command.add_argument("--episode", type=int, help="this episode only")
             command.add_argument(
@@ -224,6 +229,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif options.command == "timing":
             output = options.output.expanduser() if options.output is not None else None
             timing(root, Console(), options.episode, output, options.json)
+        elif options.command == "check":
+            return check(root, Console(), as_json=options.json, is_strict=options.strict, videos=not options.no_videos)
         else:
             print(repair(root))
     except BhdError as error:

@@ -1,0 +1,254 @@
+"""Whether the files of a dataset are there, can be read, and agree on what they count.
+
+`state.load_state` asks the same and stops at the first contradiction, because a recorder must not go on from it. Here
+all of them are wanted, also in datasets that another program left behind.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.findings import Findings, few, one_line
+from bhd_lerobot.data.schema import DEFAULT_FEATURES
+from bhd_lerobot.errors import DatasetError
+
+_COPY = "Restore it from a copy, or try bhd-data repair."
+_RECORD = "Restore it from a copy, or record again."
+_NEEDED = ("codebase_version", "features", "fps", "total_episodes", "total_frames", "total_tasks")
+_LIGHT = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "tasks")
+_STATISTICS = ("min", "max", "mean", "std", "count")
+
+
+@dataclass
+class Files:
+    """What the small files of a dataset say.
+
+    Attributes:
+        root: the dataset.
+        info: `meta/info.json`.
+        episodes: columns of `meta/episodes` by name, one entry for each episode, in order, without statistics.
+        stats: `meta/stats.json`, empty if there is none.
+        tasks: how many instructions there are.
+        is_ours: whether this package recorded it.
+    """
+
+    root: Path
+    info: dict[str, Any]
+    episodes: dict[str, list[Any]] = field(default_factory=dict)
+    stats: dict[str, dict[str, Any]] = field(default_factory=dict)
+    tasks: int = 0
+    is_ours: bool = False
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        """The features."""
+        return self.info["features"]
+
+    @property
+    def fps(self) -> float:
+        """Frames a second; NaN if the dataset names no such rate."""
+        fps = self.info["fps"]
+        return float(fps) if isinstance(fps, int | float) and not isinstance(fps, bool) and fps > 0 else math.nan
+
+    @property
+    def cameras(self) -> list[str]:
+        """Features that are videos."""
+        return [key for key, one in self.features.items() if one.get("dtype") == "video"]
+
+    def slots(self, kind: str) -> dict[layout.Slot, NDArray[np.int64]]:
+        """Return the files of one kind, `data` or `videos/KEY`, each with the positions of its episodes."""
+        places: dict[layout.Slot, list[int]] = {}
+        chunks, files = (self.episodes.get(f"{kind}/{name}_index", []) for name in ("chunk", "file"))
+        for position, slot in enumerate(zip(chunks, files, strict=True)):
+            places.setdefault(slot, []).append(position)
+        return {slot: np.array(found) for slot, found in places.items()}
+
+
+def read_files(root: Path, findings: Findings) -> Files:
+    """Read the small files, and check them.
+
+    Args:
+        root: the dataset.
+        findings: what is found is added to it.
+
+    Raises:
+        DatasetError: there is no dataset that could be checked.
+    """
+    files = Files(root, _read_info(root), is_ours=(root / layout.IDENTITY).is_file())
+    _check_features(files, findings)
+    _read_tasks(files, findings)
+    _read_episodes(files, findings)
+    _check_counts(files, findings)
+    _check_names(files, findings)
+    _read_stats(files, findings)
+    return files
+
+
+def _read_info(root: Path) -> dict[str, Any]:
+    path = root / layout.INFO
+    if not path.is_file():
+        found = "has no meta/info.json" if root.is_dir() else "does not exist"
+        raise DatasetError(f"{root} is not a LeRobot dataset: it {found}.")
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+        missing = [key for key in _NEEDED if key not in info]
+    except (OSError, ValueError, TypeError) as error:
+        raise DatasetError(f"{path} cannot be read, and nothing can be checked without it: {error}. {_COPY}") from error
+    if not isinstance(info, dict) or missing or not isinstance(info["features"], dict):
+        raise DatasetError(f"{path} has no {few(missing) or 'features'}; nothing can be checked without. {_COPY}")
+    if not str(info["codebase_version"]).startswith("v3."):
+        raise DatasetError(
+            f"{root} has dataset format {info['codebase_version']}; this program reads v3.x. LeRobot converts older "
+            "ones."
+        )
+    return info
+
+
+def _check_features(files: Files, findings: Findings) -> None:
+    for key in DEFAULT_FEATURES:
+        if key not in files.features:
+            findings.error("schema", layout.INFO, f"the feature {key!r} is missing, which every dataset has", _COPY)
+    for key, feature in files.features.items():
+        shape, names = feature.get("shape"), feature.get("names")
+        if "dtype" not in feature or not isinstance(shape, list | tuple) or not all(size > 0 for size in shape):
+            findings.error("schema", f"{layout.INFO}: {key}", f"dtype and shape are {feature!r}", _COPY)
+        elif feature["dtype"] not in ("video", "image") and isinstance(names, list) and len(names) != shape[0]:
+            findings.error("schema", f"{layout.INFO}: {key}", f"{len(names)} names for {shape[0]} numbers", _COPY)
+    if math.isnan(files.fps):
+        findings.error("schema", layout.INFO, f"fps is {files.info['fps']!r}; it must be positive [Hz]", _COPY)
+
+
+def _read_tasks(files: Files, findings: Findings) -> None:
+    path = files.root / layout.TASKS
+    if not path.is_file() and not files.info["total_episodes"]:
+        return
+    try:
+        indices = pq.read_table(path, columns=["task_index"])["task_index"].to_pylist()
+    except (OSError, pa.ArrowException, KeyError) as error:
+        findings.error("files", layout.TASKS, f"it cannot be read: {one_line(error)}", _COPY)
+        return
+    files.tasks = len(indices)
+    if sorted(indices) != list(range(len(indices))):
+        findings.error("counts", layout.TASKS, f"its numbers are not 0 to {len(indices) - 1}, each once", _COPY)
+    elif files.tasks < files.info["total_tasks"]:
+        what = f"it holds {files.tasks} instructions; meta/info.json counts {files.info['total_tasks']}"
+        findings.error("counts", layout.TASKS, what, _COPY)
+
+
+def _read_episodes(files: Files, findings: Findings) -> None:
+    parts: list[dict[str, list[Any]]] = []
+    for path in sorted((files.root / "meta/episodes").glob("chunk-*/file-*.parquet")):
+        name = path.relative_to(files.root).as_posix()
+        try:
+            file = pq.ParquetFile(path, page_checksum_verification=True)
+            columns = [column for column in file.schema_arrow.names if not column.startswith("stats/")]
+            part = file.read(columns=columns).to_pydict()
+        except (OSError, pa.ArrowException) as error:
+            findings.error("files", name, f"it cannot be read: {one_line(error)}", _COPY)
+            continue
+        missing = [column for column in _LIGHT if column not in part]
+        if missing:
+            findings.error("schema", name, f"it lacks {few(missing)}", _COPY)
+            continue
+        parts.append(part)
+    if not parts:
+        if files.info["total_episodes"]:
+            what = f"no episode is described; meta/info.json counts {files.info['total_episodes']}"
+            findings.error("counts", "meta/episodes", what, _COPY)
+        return
+    # An episode that info.json does not count yet was being saved when the recording was cut off.
+    keep = set.intersection(*(set(part) for part in parts))
+    rows: dict[int, tuple[dict[str, list[Any]], int]] = {}
+    for part in parts:
+        for position, index in enumerate(part["episode_index"]):
+            if index in rows:
+                findings.error("counts", "meta/episodes", f"episode {index} is described twice", _COPY)
+            elif index < files.info["total_episodes"]:
+                rows[index] = part, position
+    order = sorted(rows)
+    files.episodes = {name: [rows[index][0][name][rows[index][1]] for index in order] for name in sorted(keep)}
+    lost = sorted(set(range(files.info["total_episodes"])) - set(order))
+    if lost:
+        what = f"episodes {few(lost)} are not described; meta/info.json counts {files.info['total_episodes']}"
+        findings.error("counts", "meta/episodes", what, _COPY)
+
+
+def _check_counts(files: Files, findings: Findings) -> None:
+    episodes = files.episodes
+    if not episodes:
+        if files.info["total_episodes"] == 0:
+            findings.warning("counts", layout.INFO, "the dataset has no episode", "Record some with bhd-record.")
+        return
+    length, first, last = (
+        np.array(episodes[name], np.int64) for name in ("length", "dataset_from_index", "dataset_to_index")
+    )
+    for index in np.flatnonzero((last - first != length) | (length < 1))[:3]:
+        number = episodes["episode_index"][index]
+        what = f"episode {number} has {length[index]} frames, from {first[index]} to {last[index]}"
+        findings.error("counts", "meta/episodes", what, _COPY)
+    gaps = np.flatnonzero(first[1:] != last[:-1]) + 1
+    for index in gaps[:3]:
+        what = f"episode {episodes['episode_index'][index]} starts at frame {first[index]}, not at {last[index - 1]}"
+        findings.error("counts", "meta/episodes", what, _COPY)
+    if length.sum() != files.info["total_frames"]:
+        what = f"it counts {files.info['total_frames']} frames; the episodes have {length.sum()}"
+        findings.error("counts", layout.INFO, what, _COPY)
+
+
+def _check_names(files: Files, findings: Findings) -> None:
+    """Compare the files that there are with those that the episodes name."""
+    wanted = {layout.data_file(slot) for slot in files.slots("data")}
+    for key in files.cameras:
+        wanted |= {layout.video_file(key, slot) for slot in files.slots(f"videos/{key}")}
+    there = {name for name in layout.recorded_files(files.root) if not name.startswith("meta/")}
+    for name in sorted(wanted - there):
+        findings.error("files", name, "it is missing", _RECORD)
+    leftovers = sorted(there - wanted)
+    remedy = "bhd-data repair removes it." if files.is_ours else "Look what it is; it may hold unfinished episodes."
+    if leftovers:
+        findings.warning("files", few(leftovers, 3), "no saved episode is in it", remedy)
+    if (files.root / layout.STAGING).exists():
+        what = "a recording was interrupted; what it saved is complete, and not yet merged"
+        findings.warning("files", layout.STAGING, what, "bhd-data repair finishes it.")
+
+
+def _read_stats(files: Files, findings: Findings) -> None:
+    path, name = files.root / layout.STATS, layout.STATS
+    if not files.episodes:
+        return
+    remedy = "bhd-data repair computes them." if files.is_ours else "LeRobot's recompute_stats computes them."
+    if not path.is_file():
+        findings.error("stats", name, "it is missing, so no policy can be normalised", remedy)
+        return
+    try:
+        stats = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        findings.error("stats", name, f"it cannot be read: {one_line(error)}", remedy)
+        return
+    files.stats = stats
+    for key, feature in files.features.items():
+        if feature.get("dtype") in ("string", "language"):
+            continue
+        lacking = [one for one in _STATISTICS if one not in stats.get(key, {})]
+        if lacking:
+            findings.error("stats", f"{name}: {key}", f"it has no {few(lacking)}", remedy)
+        elif feature.get("dtype") not in ("video", "image"):
+            count = _first(stats[key]["count"])
+            if count != files.info["total_frames"]:
+                what = f"they are of {count} frames; the dataset has {files.info['total_frames']}"
+                findings.error("stats", f"{name}: {key}", what, remedy)
+
+
+def _first(value: Any) -> Any:
+    while isinstance(value, Sequence):
+        value = value[0]
+    return value

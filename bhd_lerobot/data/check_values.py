@@ -1,0 +1,319 @@
+"""Whether the numbers of a dataset can be learned from: finite, alive, within limits, and where they say they are.
+
+Data files are read one after the other, so that memory holds one of them.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from bhd_lerobot.data import features as keys
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.check_files import Files
+from bhd_lerobot.data.check_steps import StepCheck
+from bhd_lerobot.data.findings import Findings, few, name_of, one_line
+
+Limits = Mapping[str, Mapping[str, tuple[float, float]]]
+"""Feature -> name of one of its numbers -> least and largest value."""
+
+_TIMESTAMP_TOLERANCE = 1e-4  # [s] LeRobot's own
+_INDEX = ("index", "episode_index", "frame_index", "timestamp", "task_index")
+_LEAVE = "Leave the episode out (dataset.episodes), or record it again."
+_MOVING = (keys.OBSERVATION_STATE, keys.ACTION)  # what is to change; what a task tells often does not, by design
+_SHORTEST = 10  # frames; in fewer, a number may well stand still
+_MEAN_TOLERANCE = 1e-3  # of the range
+_LIMIT_TOLERANCE = 0.01  # of the limits' distance: a joint gives way a little at its end
+_LATE_SHARE = 0.01
+
+
+@dataclass
+class _Column:
+    """What is known of one feature, over the files so far."""
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    total: NDArray[np.float64]
+    frozen: list[NDArray[np.bool_]] = field(default_factory=list)  # of each episode, shape (d,)
+    level: list[NDArray[np.float64]] = field(default_factory=list)  # its first value
+
+
+class ValueCheck:
+    """The check of all numbers.
+
+    Attributes:
+        frames: how many were read.
+
+    Args:
+        files: what the small files say.
+        findings: what is found is added to it.
+        limits: of numbers by feature and name; only these are compared.
+    """
+
+    def __init__(self, files: Files, findings: Findings, limits: Limits | None = None) -> None:
+        self.frames = 0
+        self._files, self._findings, self._limits = files, findings, limits or {}
+        self._columns: dict[str, _Column] = {}
+        self._episodes: list[int] = []
+        self._lengths: list[int] = []
+        self._broken: dict[
+            str, list[tuple[int, str]]
+        ] = {}  # feature -> frames that are not finite, and where the first is
+        self._steps = StepCheck(files.features)
+        self._late = self._skipped = 0
+
+    def run(self) -> None:
+        """Read everything."""
+        for slot, positions in self._files.slots("data").items():
+            name = layout.data_file(slot)
+            if (self._files.root / name).is_file():
+                table = self._read(name)
+                if table is not None and self._check_rows(name, table, positions):
+                    self._check_table(table)
+        self._judge_columns()
+        self._steps.judge(self._findings)
+        self._judge_stats()
+        if self.frames and self._late > _LATE_SHARE * self.frames:
+            what = f"{self._late} of {self.frames} frames were late"
+            self._findings.warning("timing", keys.LATE, what, "bhd-data timing says which.")
+        if self._skipped:
+            self._findings.note("timing", keys.SKIPPED, f"{self._skipped} control ticks were skipped")
+
+    # --- files -------------------------------------------------------------------------------------------------------
+
+    def _read(self, name: str) -> pa.Table | None:
+        stored = [
+            key for key, one in self._files.features.items() if one.get("dtype") not in ("video", "image", "language")
+        ]
+        try:
+            file = pq.ParquetFile(self._files.root / name, page_checksum_verification=True, memory_map=True)
+            missing = [key for key in stored if key not in file.schema_arrow.names]
+            if missing:
+                self._findings.error("schema", name, f"it has no column {few(missing)}", _LEAVE)
+                return None
+            extra = [key for key in file.schema_arrow.names if key not in self._files.features]
+            if extra:
+                self._findings.warning(
+                    "schema", name, f"meta/info.json knows no {few(extra)}", "Programs leave it out."
+                )
+            return file.read(columns=stored)
+        except (OSError, pa.ArrowException) as error:
+            self._findings.error("files", name, f"it cannot be read: {one_line(error)}", "Restore it from a copy.")
+            return None
+
+    def _check_rows(self, name: str, table: pa.Table, positions: NDArray[np.int64]) -> bool:
+        """Check that the rows are those of these episodes, in order; return whether they are."""
+        episodes = self._files.episodes
+        wanted = np.array([episodes["episode_index"][i] for i in positions])
+        lengths = np.array([episodes["length"][i] for i in positions])
+        starts = np.array([episodes["dataset_from_index"][i] for i in positions])
+        if len(table) != lengths.sum():
+            what = f"it has {len(table)} frames; its episodes have {lengths.sum()}"
+            self._findings.error("counts", name, what, "bhd-data repair, or restore it from a copy.")
+            return False
+        got = {key: table[key].to_numpy() for key in _INDEX if key in table.column_names}
+        frame = np.arange(len(table)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+        expected = {
+            "episode_index": np.repeat(wanted, lengths),
+            "frame_index": frame,
+            "index": np.repeat(starts, lengths) + frame,
+        }
+        for key, values in expected.items():
+            wrong: NDArray[np.intp] = np.flatnonzero(got[key] != values) if key in got else np.zeros(0, np.intp)
+            if len(wrong):
+                row = wrong[0]
+                what = f"{key} is {got[key][row]} in row {row}, where meta/episodes has {values[row]}"
+                self._findings.error("counts", name, what, "Restore the file, or meta/episodes, from a copy.")
+                return False
+        self._check_times(name, got, frame)
+        self._episodes += wanted.tolist()
+        self._lengths += lengths.tolist()
+        return True
+
+    def _check_times(self, name: str, got: Mapping[str, NDArray[Any]], frame: NDArray[np.int64]) -> None:
+        fps = self._files.fps
+        if "timestamp" in got and not math.isnan(fps):
+            off = np.abs(got["timestamp"] - frame / fps)
+            # Single precision cannot say it better after a while.
+            wrong = np.flatnonzero(~(off <= np.maximum(_TIMESTAMP_TOLERANCE, 1e-6 * frame / fps)))
+            if len(wrong):
+                row = wrong[0]
+                what = (
+                    f"{len(wrong)} timestamps are not frame_index / fps; the first in episode "
+                    f"{got['episode_index'][row]}, frame {frame[row]}: {got['timestamp'][row]:.6g} s"
+                )
+                self._findings.error("timing", name, what, "LeRobot refuses to load it; record it again.")
+        if "task_index" in got and self._files.tasks:
+            wrong = np.flatnonzero((got["task_index"] < 0) | (got["task_index"] >= self._files.tasks))
+            if len(wrong):
+                what = f"task_index is {got['task_index'][wrong[0]]}; there are {self._files.tasks} instructions"
+                self._findings.error("counts", name, what, "Restore meta/tasks.parquet from a copy.")
+
+    # --- numbers -----------------------------------------------------------------------------------------------------
+
+    def _check_table(self, table: pa.Table) -> None:
+        lengths = np.array(self._lengths[len(self._lengths) - self._count_new(table) :])
+        starts = np.cumsum(lengths) - lengths
+        self.frames += len(table)
+        for key in table.column_names:
+            missing = table[key].null_count
+            if missing:
+                self._findings.error("finite", key, f"{missing} frames hold nothing", _LEAVE)
+                continue
+            values = _numbers(table[key])
+            if values is None:
+                continue
+            size = int(np.prod(self._files.features[key]["shape"]))
+            if values.size != len(table) * size:
+                what = f"it holds {values.size} numbers in {len(table)} frames; its shape is {size}"
+                self._findings.error("schema", key, what, "Mend the shape in meta/info.json, or record again.")
+                continue
+            self._check_column(key, values.reshape(len(table), size), starts, lengths)
+        for key in (keys.LATE, keys.SKIPPED):
+            if key in table.column_names:
+                count = int(table[key].to_numpy().sum())
+                self._late, self._skipped = (
+                    (self._late + count, self._skipped) if key == keys.LATE else (self._late, self._skipped + count)
+                )
+
+    def _count_new(self, table: pa.Table) -> int:
+        """Return how many of the episodes known last are in this table."""
+        rows = count = 0
+        while rows < len(table):
+            count += 1
+            rows += self._lengths[-count]
+        return count
+
+    def _check_column(
+        self, key: str, values: NDArray[Any], starts: NDArray[np.int64], lengths: NDArray[np.int64]
+    ) -> None:
+        low, high = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):  # both of a column with a NaN are NaN
+            self._note_broken(key, values, starts)
+            finite = np.where(np.isfinite(values), values, 0)
+            low, high, values = finite.min(axis=0), finite.max(axis=0), finite
+        total = values.sum(axis=0, dtype=np.float64)
+        known = self._columns.get(key)
+        if known is None:
+            known = self._columns[key] = _Column(low, high, total)
+        else:
+            np.minimum(known.low, low, out=known.low)
+            np.maximum(known.high, high, out=known.high)
+            known.total += total
+        if key in _MOVING:
+            known.frozen.append(_frozen(values, starts, lengths))
+            known.level.append(values[starts].astype(np.float64))
+            self._steps.look(key, values, starts, self._episodes[len(self._episodes) - len(starts) :])
+
+    def _note_broken(self, key: str, values: NDArray[Any], starts: NDArray[np.int64]) -> None:
+        rows, elements = np.nonzero(~np.isfinite(values))
+        row, element = int(rows[0]), int(elements[0])
+        episode = int(np.searchsorted(starts, row, side="right")) - 1
+        number = self._episodes[len(self._episodes) - len(starts) + episode]
+        frame, name = row - int(starts[episode]), name_of(self._files.features[key], element)
+        where = f"episode {number}, frame {frame}: {name} is {values[row, element]}"
+        self._broken.setdefault(key, []).append((len(np.unique(rows)), where))
+
+    # --- over all files ----------------------------------------------------------------------------------------------
+
+    def _judge_columns(self) -> None:
+        for key, places in self._broken.items():
+            count = sum(one for one, _ in places)
+            what = f"{count} frames hold numbers that are not finite; the first in {places[0][1]}"
+            if key.startswith(("observation", "action")):
+                self._findings.error("finite", key, what, _LEAVE)
+            else:
+                self._findings.note("finite", key, what)
+        for key, column in self._columns.items():
+            if column.frozen:
+                self._judge_frozen(key, column)
+            for name, (low, high) in self._limits.get(key, {}).items():
+                self._judge_limit(key, name, low, high)
+
+    def _judge_frozen(self, key: str, column: _Column) -> None:
+        frozen, level = np.concatenate(column.frozen), np.concatenate(column.level)
+        usable = np.array(self._lengths) >= _SHORTEST
+        if not usable.any():
+            return
+        never = [name_of(self._files.features[key], int(i)) for i in np.flatnonzero(column.low == column.high)]
+        if len(never) == frozen.shape[1]:
+            self._findings.warning("frozen", key, "none of its numbers ever changes", "Look whether it was connected.")
+            return
+        if never:
+            self._findings.note("frozen", key, f"these never change: {few(never)}")
+        if key == keys.ACTION:
+            return  # a brain may well want the same all the time; a sensor that reads the same is broken
+        share = frozen[usable].mean(axis=0)
+        # A number that stands still in most episodes does so by its nature; one at the end of its range may be clipped.
+        odd = (share > 0) & (share <= 0.5) & (column.low < column.high)
+        still = frozen & usable[:, None] & odd & (level > column.low) & (level < column.high)
+        whole = (frozen | (column.low == column.high)).all(axis=1) & usable
+        for episode in np.flatnonzero(whole)[:3]:
+            what = f"nothing changes in episode {self._episodes[episode]}"
+            self._findings.warning("frozen", key, what, _LEAVE)
+        still[whole] = False
+        for element in np.flatnonzero(still.any(axis=0)):
+            episodes = [self._episodes[i] for i in np.flatnonzero(still[:, element])]
+            what = f"it does not change in episode {few(episodes)}, and does in most others"
+            self._findings.warning(
+                "frozen", f"{key}: {name_of(self._files.features[key], int(element))}", what, "Look at the sensor."
+            )
+
+    def _judge_limit(self, key: str, name: str, low: float, high: float) -> None:
+        names = self._files.features[key].get("names") or []
+        if name not in names:
+            return
+        element, room = names.index(name), _LIMIT_TOLERANCE * (high - low)
+        found = self._columns[key].low[element], self._columns[key].high[element]
+        if found[0] < low - room or found[1] > high + room:
+            what = f"it goes from {found[0]:.4g} to {found[1]:.4g}; the robot's limits are {low:.4g} and {high:.4g}"
+            self._findings.warning("limits", f"{key}: {name}", what, "Look whether units and robot are right.")
+
+    def _judge_stats(self) -> None:
+        """Compare `meta/stats.json` with what was read."""
+        if not self.frames or self.frames != self._files.info["total_frames"]:
+            return
+        remedy = "bhd-data repair computes them." if self._files.is_ours else "LeRobot's recompute_stats computes them."
+        for key, column in self._columns.items():
+            known = self._files.stats.get(key, {})
+            if key in self._broken or not {"min", "max", "mean"} <= set(known):
+                continue
+            if len(self._files.features[key]["shape"]) > 1:
+                continue  # LeRobot's are over other axes
+            span = np.maximum(column.high - column.low, 1e-9)
+            found = {"min": column.low, "max": column.high, "mean": column.total / self.frames}
+            for name, values in found.items():
+                told = np.asarray(known[name], np.float64).reshape(-1)
+                if told.shape != values.shape or (np.abs(told - values) > _MEAN_TOLERANCE * span + 1e-6).any():
+                    self._findings.error("stats", f"{layout.STATS}: {key}", f"{name} is not that of the data", remedy)
+                    break
+
+
+def _frozen(values: NDArray[Any], starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which numbers do not change in each episode, shape (episodes, d)."""
+    first = values[starts]
+    # Most numbers differ between the first frame and one in the middle or the last, so few are left to look at.
+    same = (first == values[starts + lengths // 2]) & (first == values[starts + lengths - 1])
+    for episode, element in zip(*np.nonzero(same), strict=True):
+        rows = slice(starts[episode], starts[episode] + lengths[episode])
+        same[episode, element] = (values[rows, element] == first[episode, element]).all()
+    return same
+
+
+def _numbers(column: pa.ChunkedArray) -> NDArray[Any] | None:
+    """Return the numbers of a column, flat; None if it holds something else."""
+    arrays = []
+    for chunk in column.chunks:
+        array = chunk
+        while isinstance(array, pa.ExtensionArray) or pa.types.is_nested(array.type):
+            array = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten()
+        kind = array.type
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+            return None
+        arrays.append(array.to_numpy(zero_copy_only=False))
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays) if arrays else None

@@ -1,0 +1,93 @@
+"""What a check of a dataset finds."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+
+class Severity(IntEnum):
+    """How bad a finding is."""
+
+    NOTE = 0
+    WARNING = 1
+    ERROR = 2
+
+    @property
+    def word(self) -> str:
+        """Its name."""
+        return self.name.lower()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a check found.
+
+    Attributes:
+        severity: error: a program stumbles over it, or learns something wrong; warning: somebody should look at it;
+            note: good to know.
+        check: which check found it.
+        where: the file, or the feature and the place in it.
+        what: what is so, with the numbers.
+        remedy: what to do about it; empty for notes.
+    """
+
+    severity: Severity
+    check: str
+    where: str
+    what: str
+    remedy: str = ""
+
+
+@dataclass
+class Findings:
+    """Findings, as they come."""
+
+    items: list[Finding] = field(default_factory=list)
+
+    def __iter__(self) -> Iterator[Finding]:
+        """Iterate over them, the worst first, otherwise as they came."""
+        return iter(sorted(self.items, key=lambda one: -one.severity))
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.items)
+
+    def error(self, check: str, where: str, what: str, remedy: str) -> None:
+        """Add an error."""
+        self.items.append(Finding(Severity.ERROR, check, where, what, remedy))
+
+    def warning(self, check: str, where: str, what: str, remedy: str) -> None:
+        """Add a warning."""
+        self.items.append(Finding(Severity.WARNING, check, where, what, remedy))
+
+    def note(self, check: str, where: str, what: str) -> None:
+        """Add a note."""
+        self.items.append(Finding(Severity.NOTE, check, where, what))
+
+    def count(self, severity: Severity) -> int:
+        """Return how many there are of a severity."""
+        return sum(one.severity == severity for one in self.items)
+
+    @property
+    def worst(self) -> Severity:
+        """The worst severity; a note if there is nothing."""
+        return max((one.severity for one in self.items), default=Severity.NOTE)
+
+
+def few(values: Iterable[Any], shown: int = 6) -> str:
+    """Return the first few of some values, and how many more there are."""
+    texts = [str(value) for value in values]
+    more = len(texts) - shown
+    return ", ".join(texts[:shown]) + (f" and {more} more" if more > 0 else "")
+
+
+def name_of(feature: Mapping[str, Any], element: int) -> str:
+    """Return the name of one of a feature's numbers."""
+    names = feature.get("names")
+    return str(names[element]) if isinstance(names, list) and element < len(names) else f"number {element}"
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an error says, on one line."""
+    return " ".join(str(error).split()).rstrip(".")

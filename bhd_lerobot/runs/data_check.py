@@ -1,0 +1,92 @@
+"""What `bhd-data check` prints, and which limits it knows."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.data import features as keys
+from bhd_lerobot.data.check_dataset import CHECKS, DatasetCheck, Severity, check_dataset
+from bhd_lerobot.data.check_values import Limits
+from bhd_lerobot.data.inspect import robot_type_of
+from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS
+
+_COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
+
+
+def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, videos: bool) -> int:
+    """Check a dataset and print what was found; return 0 if it is sound and 1 if it is not.
+
+    Args:
+        root: the dataset.
+        console: where it is printed.
+        as_json: print plain values.
+        is_strict: a warning is enough to call it unsound.
+        videos: read the films, too.
+
+    Raises:
+        DatasetError: there is no dataset that could be checked.
+    """
+    found = check_dataset(root, limits_of(robot_type_of(root)), videos=videos)
+    is_sound = found.worst < (Severity.WARNING if is_strict else Severity.ERROR)
+    if as_json:
+        print(json.dumps(_plain(found, is_sound), indent=1))
+    else:
+        _print(found, console, is_sound)
+    return 0 if is_sound else 1
+
+
+def limits_of(robot_type: str | None) -> Limits:
+    """Return what a robot of ours keeps to: the ranges of its joints, or the largest speeds of a base."""
+    kinds = {str(kind.get_choice_name(kind)): kind for kind in SIMULATED_ROBOTS}
+    if robot_type not in kinds:
+        return {}
+    body = kinds[robot_type]().body()
+    limits = body.limits
+    if isinstance(body, Arm):
+        low, high = np.asarray(limits.lower), np.asarray(limits.upper)
+    else:
+        high = np.asarray(limits.velocity)
+        low = -high
+    ranges = dict(zip(limits.names, zip(low.tolist(), high.tolist(), strict=True), strict=True))
+    # What a base measures, slip and all, may be a little more than what it is asked for.
+    return {keys.APPLIED_ACTION: ranges, **({keys.OBSERVATION_STATE: ranges} if isinstance(body, Arm) else {})}
+
+
+def _print(found: DatasetCheck, console: Console, is_sound: bool) -> None:
+    if found.findings:
+        table = Table(title=str(found.root), title_justify="left")
+        for heading in ("", "check", "where", "what"):
+            table.add_column(heading, overflow="fold")
+        for one in found.findings:
+            colour = _COLOURS[one.severity]
+            what = escape(one.what + (f". {one.remedy}" if one.remedy else ""))
+            table.add_row(f"[{colour}]{one.severity.word}[/]", one.check, escape(one.where), what)
+        console.print(table)
+    errors, warnings = found.count(Severity.ERROR), found.count(Severity.WARNING)
+    console.print(
+        f"{found.root}: {found.episodes} episodes, {found.frames} frames: "
+        f"{'sound' if is_sound else 'not sound'}, {_some(errors, 'error')}, {_some(warnings, 'warning')}.",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+def _some(count: int, name: str) -> str:
+    return f"{count or 'no'} {name}{'' if count == 1 else 's'}"
+
+
+def _plain(found: DatasetCheck, is_sound: bool) -> dict[str, object]:
+    return {
+        "root": str(found.root),
+        "sound": is_sound,
+        "episodes": found.episodes,
+        "frames": found.frames,
+        "checks": list(CHECKS),
+        "findings": [{**asdict(one), "severity": one.severity.word} for one in found.findings],
+    }
