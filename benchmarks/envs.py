@@ -1,6 +1,6 @@
 """Steps a second of the environments: `python -m benchmarks.envs`.
 
-64 avoid environments as one `BhdVectorEnv`, beside (a) the bare `Batch.step` with as many physics steps and scans, and
+64 avoid environments as one `BhdVectorEnv`, beside (a) the bare `Batch.step` and scans of such a run again, and
 (b) Gymnasium's `SyncVectorEnv` and `AsyncVectorEnv` of the single environment. They run in turns, a short while each;
 the table shows medians, and medians of the ratios within a turn, because a noisy neighbour disturbs all of a turn.
 """
@@ -27,7 +27,7 @@ from bhd_lerobot.envs.config_env import BhdEnvConfig
 # imports this module anew, and 64 of them would be busy with that for minutes.
 
 GOAL = 0.70  # of the bare physics and scans
-FPS = 10
+BARE_FRAMES = 200
 OURS, BARE = "BhdVectorEnv", "Batch.step and lidar alone"
 PEERS = {"SyncVectorEnv": "sync", "AsyncVectorEnv": "async"}
 TASK = "TurtleBot3Avoid-v0"
@@ -68,14 +68,16 @@ def stepper(env: VectorEnv) -> Callable[[float], float]:
 
 
 def bare(n: int) -> Callable[[float], float]:
-    """Return the same for the physics steps and the scans alone; each scan is worth two frames."""
-    from benchmarks.record import bare_step
+    """Return the same for the physics steps and the scans alone, of such a run."""
+    from benchmarks.bare_physics import again, write_down
+
+    log, state = write_down(TASK, actions(n), BARE_FRAMES)
 
     def run(seconds: float) -> float:
         steps, used = 0, 0.0
         while used < seconds:
-            used += bare_step(n, 2.0)  # building the scenes is not counted
-            steps += round(2.0 * FPS) * n
+            used += again(log, state)
+            steps += BARE_FRAMES * n
         return steps / used
 
     return run

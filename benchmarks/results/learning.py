@@ -77,6 +77,8 @@ def avoid(run: Runner, section: Section) -> None:
             ratio.value >= _PPO_GOAL and ratio.low > 1,
         ),
     ]
+    over = ratio_of_means(_scores(results, "ppo"), _scores(results, "avoidance"))
+    section.rows.append(Row("ppo / avoidance, the rule of the articles: mean score, paired", _estimate(asdict(over))))
     section.remarks.append(
         "`bc` imitates `avoidance`, `gap_bc` imitates `gap_follower`. That rule remembers where it has been; a network "
         "does not, so the task tells `gap_bc` and `ppo`, which starts from it, what ground around them they have "

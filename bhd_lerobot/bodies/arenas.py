@@ -20,6 +20,7 @@ CLEARANCE = 0.051  # [m] what must be free beside the robot for a place to count
 RESOLUTION = 0.05  # [m] of the grid that reachability is computed on
 START_CLEARANCE = 0.35  # [m] from the robot's centre to the nearest obstacle at the start
 WALL = 0.05  # [m] half the thickness of the outer walls
+_NEXT = ndimage.generate_binary_structure(2, 1)  # which places of the grid are neighbours: those beside each other
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Arena:
 
     def _reached(self, clearance: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return where the robot's centre can get to from the start, on the grid that the clearance is of."""
-        labels, _ = ndimage.label(clearance > ROBOT_RADIUS + CLEARANCE)
+        labels, _ = ndimage.label(clearance > ROBOT_RADIUS + CLEARANCE, _NEXT)
         row, column = _nearest(self.extent, self.start[:2])
         label = labels[row, column]
         reached: NDArray[np.bool_] = (labels == label) & (label > 0)
@@ -242,7 +243,7 @@ def _stays_connected(before: NDArray[np.bool_], free: NDArray[np.bool_]) -> bool
     # Where the places just around the lost ones are connected, every way through those has a way around them: most
     # obstacles are small, and all of the floor need not be looked at.
     around = tuple(slice(max(0, lines[0] - 1), lines[-1] + 2) for lines in (rows, columns))
-    return bool(ndimage.label(free[around])[1] == 1 or ndimage.label(free)[1] == 1)
+    return bool(ndimage.label(free[around], _NEXT)[1] == 1 or ndimage.label(free, _NEXT)[1] == 1)
 
 
 def _axes(extent: tuple[float, float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -299,9 +300,15 @@ def _distance(shape: Shape, x: NDArray[np.float64], y: NDArray[np.float64]) -> N
     dx, dy = x - shape.x, y - shape.y
     if shape.kind == "cylinder":
         return np.hypot(dx, dy) - shape.size_x
-    c, s = math.cos(shape.yaw), math.sin(shape.yaw)
-    ax = np.abs(c * dx + s * dy) - shape.size_x
-    ay = np.abs(c * dy - s * dx) - shape.size_y
+    if shape.yaw == 0.0:  # outer walls, on the whole grid: a row and a column say it all
+        ax, ay = np.abs(dx) - shape.size_x, np.abs(dy) - shape.size_y
+    else:
+        c, s = math.cos(shape.yaw), math.sin(shape.yaw)
+        ax = np.abs(c * dx + s * dy) - shape.size_x
+        ay = np.abs(c * dy - s * dx) - shape.size_y
     outside = np.asarray(np.maximum(ax, ay))
+    beside_x, beside_y = ax > 0, ay > 0
+    if not (beside_x.any() and beside_y.any()):
+        return outside
     # At a corner; elsewhere one of the two is 0, and what is left is the other.
-    return np.hypot(ax, ay, out=outside, where=(ax > 0) & (ay > 0))
+    return np.hypot(ax, ay, out=outside, where=beside_x & beside_y)

@@ -53,7 +53,7 @@ class BaseController(Controller):
         self._largest = np.broadcast_to(self._change, (n, width)).copy()
         self._clipped = np.zeros((n, width))
         self._reference = np.zeros((n, self.joints))
-        self._settled = False
+        self._settled = self._is_clipped = False
         # The sum of 0 * x is 0 if and only if every x is finite; unlike a plain sum it neither overflows nor warns.
         self._flat_target, self._zeros = self._target.reshape(-1), np.zeros(n * width)
         self._limited_velocity = np.zeros((n, width), np.bool_)
@@ -67,14 +67,14 @@ class BaseController(Controller):
         """Head for new twists, with the normal accelerations."""
         np.copyto(self._target, values, where=mask[:, None])
         np.copyto(self._largest, self._change, where=mask[:, None])
-        self._settled = False
+        self._settled = self._is_clipped = False
 
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
         """Head for rest, with the normal decelerations or with those of an emergency stop."""
         hard = cause in (Mode.ESTOP, Mode.FAULT)
         self._target[mask] = 0.0
         self._largest[mask] = self._stop_change if hard else self._change
-        self._settled = False
+        self._settled = self._is_clipped = False
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
@@ -87,6 +87,17 @@ class BaseController(Controller):
 
     def _filter(self) -> None:
         """From the targets to the commands applied in this tick, and the wheel speeds that they mean."""
+        if not self._is_clipped:
+            self._clip()
+        arrived = safety.limit_change(self._clipped, self.command, self._largest, self.command, self._limited_change)
+        # Both ends of a change can be within the wheels' limit and the way between them not: the two dimensions
+        # change at different rates.
+        limited = safety.limit_wheel_speed(self.command, *self._wheels)
+        self._settled = arrived and not limited
+        self.drive.wheels_from_twist(self.command, self._reference)
+
+    def _clip(self) -> None:
+        """From the targets to targets within the limits; they stand until there are others."""
         if self._flat_target.dot(self._zeros) != 0.0:
             # Commands are checked when they are sent; a queue in shared memory is written by another process.
             bad = ~np.isfinite(self._target).all(axis=1)
@@ -94,12 +105,7 @@ class BaseController(Controller):
             self._target[bad] = 0.0
         safety.limit_velocity(self._target, self._velocity, self._clipped, self._limited_velocity)
         safety.limit_wheel_speed(self._clipped, *self._wheels)
-        arrived = safety.limit_change(self._clipped, self.command, self._largest, self.command, self._limited_change)
-        # Both ends of a change can be within the wheels' limit and the way between them not: the two dimensions
-        # change at different rates.
-        limited = safety.limit_wheel_speed(self.command, *self._wheels)
-        self._settled = arrived and not limited
-        self.drive.wheels_from_twist(self.command, self._reference)
+        self._is_clipped = True
 
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each base is commanded to be at rest, shape (n,)."""
@@ -116,7 +122,7 @@ class BaseController(Controller):
         self._largest[ids] = self._change
         for flags in self._flags():
             flags[ids] = False
-        self._settled = False
+        self._settled = self._is_clipped = False
 
     def take_limits(self) -> NDArray[np.int64]:
         """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
@@ -128,7 +134,7 @@ class BaseController(Controller):
         )
         for flags in self._flags():
             flags[:] = False
-        self._settled = False  # a limit that still holds is reported again in the next frame
+        self._settled = self._is_clipped = False  # a limit that still holds is reported again in the next frame
         return limits
 
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
