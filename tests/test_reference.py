@@ -158,7 +158,7 @@ def parse_training(arguments: list[str]) -> None:
     try:
         parse_train(arguments)
     except ConfigError as error:
-        if "outputs/train" not in str(error):
+        if not re.search("outputs/(train|results)/", str(error)):
             raise
 
 
