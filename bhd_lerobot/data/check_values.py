@@ -1,10 +1,12 @@
 """Whether the numbers of a dataset can be learned from: finite, alive, within limits, and where they say they are.
 
-Data files are read one after the other, so that memory holds one of them.
+Data files are read one after the other, so that memory holds two of them.
 """
 
 import math
+from collections import deque
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -69,10 +71,18 @@ class ValueCheck:
 
     def run(self) -> None:
         """Read everything."""
-        for slot, positions in self._files.slots("data").items():
-            name = layout.data_file(slot)
-            if (self._files.root / name).is_file():
-                table = self._read(name)
+        slots = [
+            (layout.data_file(slot), positions)
+            for slot, positions in self._files.slots("data").items()
+            if (self._files.root / layout.data_file(slot)).is_file()
+        ]
+        # The next file is read while one is looked at. Findings are added to a list, which threads may do.
+        with ThreadPoolExecutor(1) as reader:
+            tables = deque(reader.submit(self._read, name) for name, _ in slots[:1])
+            for (name, positions), following in zip(slots, [*slots[1:], None], strict=False):
+                table = tables.popleft().result()
+                if following is not None:
+                    tables.append(reader.submit(self._read, following[0]))
                 if table is not None and self._check_rows(name, table, positions):
                     self._check_table(table)
         self._judge_columns()
@@ -91,7 +101,7 @@ class ValueCheck:
             key for key, one in self._files.features.items() if one.get("dtype") not in ("video", "image", "language")
         ]
         try:
-            file = pq.ParquetFile(self._files.root / name, page_checksum_verification=True, memory_map=True)
+            file = pq.ParquetFile(self._files.root / name, page_checksum_verification=True)
             missing = [key for key in stored if key not in file.schema_arrow.names]
             if missing:
                 self._findings.error("schema", name, f"it has no column {few(missing)}", _LEAVE)
