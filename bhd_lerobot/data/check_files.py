@@ -24,7 +24,11 @@ from bhd_lerobot.errors import DatasetError
 _COPY = "Restore it from a copy, or try bhd-data repair."
 _RECORD = "Restore it from a copy, or record again."
 _NEEDED = ("codebase_version", "features", "fps", "total_episodes", "total_frames", "total_tasks")
-_LIGHT = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "tasks")
+_LIGHT = (
+    *("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index"),
+    "tasks",
+)
+_SLOT = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 _STATISTICS = ("min", "max", "mean", "std", "count")
 
 
@@ -155,9 +159,10 @@ def _read_episodes(files: Files, findings: Findings) -> None:
         except (OSError, pa.ArrowException) as error:
             findings.error("files", name, f"it cannot be read: {one_line(error)}", _COPY)
             continue
-        missing = [column for column in _LIGHT if column not in part]
+        wanted = [*_LIGHT, *(f"videos/{key}/{one}" for key in files.cameras for one in _SLOT)]
+        missing = [column for column in wanted if column not in part or None in part[column]]
         if missing:
-            findings.error("schema", name, f"it lacks {few(missing)}", _COPY)
+            findings.error("schema", name, f"it lacks {few(missing)}, or some of them", _COPY)
             continue
         parts.append(part)
     if not parts:

@@ -4,10 +4,10 @@ Data files are read one after the other, so that memory holds two of them.
 """
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.check_files import Files
+from bhd_lerobot.data.check_frozen import FrozenCheck
 from bhd_lerobot.data.check_steps import StepCheck
 from bhd_lerobot.data.findings import Findings, few, name_of, one_line
 
@@ -28,7 +29,6 @@ _TIMESTAMP_TOLERANCE = 1e-4  # [s] LeRobot's own
 _INDEX = ("index", "episode_index", "frame_index", "timestamp", "task_index")
 _LEAVE = "Leave the episode out (dataset.episodes), or record it again."
 _MOVING = (keys.OBSERVATION_STATE, keys.ACTION)  # what is to change; what a task tells often does not, by design
-_SHORTEST = 10  # frames; in fewer, a number may well stand still
 _MEAN_TOLERANCE = 1e-3  # of the range
 _LIMIT_TOLERANCE = 0.01  # of the limits' distance: a joint gives way a little at its end
 _LATE_SHARE = 0.01
@@ -41,8 +41,6 @@ class _Column:
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     total: NDArray[np.float64]
-    frozen: list[NDArray[np.bool_]] = field(default_factory=list)  # of each episode, shape (d,)
-    level: list[NDArray[np.float64]] = field(default_factory=list)  # its first value
 
 
 class ValueCheck:
@@ -63,11 +61,10 @@ class ValueCheck:
         self._columns: dict[str, _Column] = {}
         self._episodes: list[int] = []
         self._lengths: list[int] = []
-        self._broken: dict[
-            str, list[tuple[int, str]]
-        ] = {}  # feature -> frames that are not finite, and where the first is
-        self._steps = StepCheck(files.features)
-        self._late = self._skipped = 0
+        # By feature: how many frames are not finite, and where the first is, for each file.
+        self._broken: dict[str, list[tuple[int, str]]] = {}
+        self._frozen, self._steps = FrozenCheck(files.features), StepCheck(files.features)
+        self._counted = Counter[str]()  # late frames, skipped ticks
 
     def run(self) -> None:
         """Read everything."""
@@ -86,13 +83,14 @@ class ValueCheck:
                 if table is not None and self._check_rows(name, table, positions):
                     self._check_table(table)
         self._judge_columns()
+        self._frozen.judge(self._findings)
         self._steps.judge(self._findings)
         self._judge_stats()
-        if self.frames and self._late > _LATE_SHARE * self.frames:
-            what = f"{self._late} of {self.frames} frames were late"
+        if self.frames and self._counted[keys.LATE] > _LATE_SHARE * self.frames:
+            what = f"{self._counted[keys.LATE]} of {self.frames} frames were late"
             self._findings.warning("timing", keys.LATE, what, "bhd-data timing says which.")
-        if self._skipped:
-            self._findings.note("timing", keys.SKIPPED, f"{self._skipped} control ticks were skipped")
+        if self._counted[keys.SKIPPED]:
+            self._findings.note("timing", keys.SKIPPED, f"{self._counted[keys.SKIPPED]} control ticks were skipped")
 
     # --- files -------------------------------------------------------------------------------------------------------
 
@@ -122,6 +120,8 @@ class ValueCheck:
         wanted = np.array([episodes["episode_index"][i] for i in positions])
         lengths = np.array([episodes["length"][i] for i in positions])
         starts = np.array([episodes["dataset_from_index"][i] for i in positions])
+        if (lengths < 1).any():
+            return False  # said already, of meta/episodes
         if len(table) != lengths.sum():
             what = f"it has {len(table)} frames; its episodes have {lengths.sum()}"
             self._findings.error("counts", name, what, "bhd-data repair, or restore it from a copy.")
@@ -187,9 +187,7 @@ class ValueCheck:
         for key in (keys.LATE, keys.SKIPPED):
             if key in table.column_names:
                 count = int(table[key].to_numpy().sum())
-                self._late, self._skipped = (
-                    (self._late + count, self._skipped) if key == keys.LATE else (self._late, self._skipped + count)
-                )
+                self._counted[key] += count
 
     def _count_new(self, table: pa.Table) -> int:
         """Return how many of the episodes known last are in this table."""
@@ -216,9 +214,9 @@ class ValueCheck:
             np.maximum(known.high, high, out=known.high)
             known.total += total
         if key in _MOVING:
-            known.frozen.append(_frozen(values, starts, lengths))
-            known.level.append(values[starts].astype(np.float64))
-            self._steps.look(key, values, starts, self._episodes[len(self._episodes) - len(starts) :])
+            episodes = self._episodes[len(self._episodes) - len(starts) :]
+            self._frozen.look(key, values, starts, lengths, episodes)
+            self._steps.look(key, values, starts, episodes)
 
     def _note_broken(self, key: str, values: NDArray[Any], starts: NDArray[np.int64]) -> None:
         rows, elements = np.nonzero(~np.isfinite(values))
@@ -240,46 +238,15 @@ class ValueCheck:
             else:
                 self._findings.note("finite", key, what)
         for key, column in self._columns.items():
-            if column.frozen:
-                self._judge_frozen(key, column)
             for name, (low, high) in self._limits.get(key, {}).items():
-                self._judge_limit(key, name, low, high)
+                self._judge_limit(column, key, name, (low, high))
 
-    def _judge_frozen(self, key: str, column: _Column) -> None:
-        frozen, level = np.concatenate(column.frozen), np.concatenate(column.level)
-        usable = np.array(self._lengths) >= _SHORTEST
-        if not usable.any():
-            return
-        never = [name_of(self._files.features[key], int(i)) for i in np.flatnonzero(column.low == column.high)]
-        if len(never) == frozen.shape[1]:
-            self._findings.warning("frozen", key, "none of its numbers ever changes", "Look whether it was connected.")
-            return
-        if never:
-            self._findings.note("frozen", key, f"these never change: {few(never)}")
-        if key == keys.ACTION:
-            return  # a brain may well want the same all the time; a sensor that reads the same is broken
-        share = frozen[usable].mean(axis=0)
-        # A number that stands still in most episodes does so by its nature; one at the end of its range may be clipped.
-        odd = (share > 0) & (share <= 0.5) & (column.low < column.high)
-        still = frozen & usable[:, None] & odd & (level > column.low) & (level < column.high)
-        whole = (frozen | (column.low == column.high)).all(axis=1) & usable
-        for episode in np.flatnonzero(whole)[:3]:
-            what = f"nothing changes in episode {self._episodes[episode]}"
-            self._findings.warning("frozen", key, what, _LEAVE)
-        still[whole] = False
-        for element in np.flatnonzero(still.any(axis=0)):
-            episodes = [self._episodes[i] for i in np.flatnonzero(still[:, element])]
-            what = f"it does not change in episode {few(episodes)}, and does in most others"
-            self._findings.warning(
-                "frozen", f"{key}: {name_of(self._files.features[key], int(element))}", what, "Look at the sensor."
-            )
-
-    def _judge_limit(self, key: str, name: str, low: float, high: float) -> None:
+    def _judge_limit(self, column: _Column, key: str, name: str, limits: tuple[float, float]) -> None:
         names = self._files.features[key].get("names") or []
         if name not in names:
             return
-        element, room = names.index(name), _LIMIT_TOLERANCE * (high - low)
-        found = self._columns[key].low[element], self._columns[key].high[element]
+        (low, high), element = limits, names.index(name)
+        found, room = (column.low[element], column.high[element]), _LIMIT_TOLERANCE * (high - low)
         if found[0] < low - room or found[1] > high + room:
             what = f"it goes from {found[0]:.4g} to {found[1]:.4g}; the robot's limits are {low:.4g} and {high:.4g}"
             self._findings.warning("limits", f"{key}: {name}", what, "Look whether units and robot are right.")
@@ -302,17 +269,6 @@ class ValueCheck:
                 if told.shape != values.shape or (np.abs(told - values) > _MEAN_TOLERANCE * span + 1e-6).any():
                     self._findings.error("stats", f"{layout.STATS}: {key}", f"{name} is not that of the data", remedy)
                     break
-
-
-def _frozen(values: NDArray[Any], starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return which numbers do not change in each episode, shape (episodes, d)."""
-    first = values[starts]
-    # Most numbers differ between the first frame and one in the middle or the last, so few are left to look at.
-    same = (first == values[starts + lengths // 2]) & (first == values[starts + lengths - 1])
-    for episode, element in zip(*np.nonzero(same), strict=True):
-        rows = slice(starts[episode], starts[episode] + lengths[episode])
-        same[episode, element] = (values[rows, element] == first[episode, element]).all()
-    return same
 
 
 def _numbers(column: pa.ChunkedArray) -> NDArray[Any] | None:

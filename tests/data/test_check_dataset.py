@@ -236,6 +236,19 @@ def test_a_nan_that_no_policy_learns_from_is_a_note(sound: Path, tmp_path: Path)
     assert "episode 0, frame 3" in note.what
 
 
+def test_a_column_with_gaps_is_found_and_the_rest_is_checked(sound: Path, tmp_path: Path) -> None:
+    def gap(rows: dict[str, Any]) -> None:
+        rows["observation.state"][3] = None
+        frozen_episode({"observation.state": rows["observation.state"]})
+        jump(rows)
+
+    root = copy(sound, tmp_path)
+    edit(data_file(root), gap)
+    found = bad(check_dataset(root))
+    assert [one.what for one in found if one.check == "finite"] == ["1 frames hold nothing"]
+    assert [one.where for one in found if one.check == "jumps"] == ["action: a.pos"]
+
+
 def test_a_gripper_that_closes_once_in_every_episode_does_not_jump(sound: Path) -> None:
     assert not [one for one in check_dataset(sound).findings if one.check == "jumps"]
 
@@ -264,7 +277,7 @@ def stats(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
     return lambda root: edit_json(root / "meta/stats.json", change)
 
 
-def row(name: str, value: int) -> Callable[[Path], None]:
+def row(name: str, value: int | None) -> Callable[[Path], None]:
     return lambda root: edit(episodes_file(root), lambda rows: rows[name].__setitem__(2, value))
 
 
@@ -287,6 +300,8 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str, str, str]] = {
     "rate": (info(fps=0), "schema", "info.json", "fps is 0"),
     "names": (one_name, "schema", "meta/info.json: action", "1 names for 2 numbers"),
     "start": (row("dataset_from_index", 40), "counts", "meta/episodes", "episode 2 "),
+    "no place": (row("data/file_index", None), "schema", "meta/episodes", "it lacks data/file_index"),
+    "no frame": (row("length", 0), "counts", "meta/episodes", "episode 2 has 0 frames"),
     "twice": (row("episode_index", 1), "counts", "meta/episodes", "episode 1 is described twice"),
 }
 
