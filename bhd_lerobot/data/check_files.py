@@ -121,12 +121,15 @@ def _check_features(files: Files, findings: Findings) -> None:
     for key in DEFAULT_FEATURES:
         if key not in files.features:
             findings.error("schema", layout.INFO, f"the feature {key!r} is missing, which every dataset has", _COPY)
-    for key, feature in files.features.items():
-        shape, names = feature.get("shape"), feature.get("names")
-        if "dtype" not in feature or not isinstance(shape, list | tuple) or not all(size > 0 for size in shape):
-            findings.error("schema", f"{layout.INFO}: {key}", f"dtype and shape are {feature!r}", _COPY)
-        elif feature["dtype"] not in ("video", "image") and isinstance(names, list) and len(names) != shape[0]:
-            findings.error("schema", f"{layout.INFO}: {key}", f"{len(names)} names for {shape[0]} numbers", _COPY)
+    for key, feature in list(files.features.items()):
+        described = feature if isinstance(feature, dict) else {}
+        shape, names = described.get("shape"), described.get("names")
+        sizes = list(shape) if isinstance(shape, list | tuple) else [None]
+        if "dtype" not in described or not all(isinstance(size, int) and size > 0 for size in sizes):
+            findings.error("schema", f"{layout.INFO}: {key}", f"it is described by {feature!r}", _COPY)
+            del files.features[key]  # nothing can be said about it
+        elif described["dtype"] not in ("video", "image") and isinstance(names, list) and len(names) != sizes[0]:
+            findings.error("schema", f"{layout.INFO}: {key}", f"{len(names)} names for {sizes[0]} numbers", _COPY)
     if math.isnan(files.fps):
         findings.error("schema", layout.INFO, f"fps is {files.info['fps']!r}; it must be positive [Hz]", _COPY)
 
@@ -136,12 +139,14 @@ def _read_tasks(files: Files, findings: Findings) -> None:
     if not path.is_file() and not files.info["total_episodes"]:
         return
     try:
-        indices = pq.read_table(path, columns=["task_index"])["task_index"].to_pylist()
-    except (OSError, pa.ArrowException, KeyError) as error:
+        # All of it, though one column is looked at: what is damaged elsewhere shows in the pages' checksums.
+        table = pq.ParquetFile(path, page_checksum_verification=True).read()
+        indices = table["task_index"].to_pylist()
+    except (OSError, pa.ArrowException, ValueError, KeyError) as error:
         findings.error("files", layout.TASKS, f"it cannot be read: {one_line(error)}", _COPY)
         return
     files.tasks = len(indices)
-    if sorted(indices) != list(range(len(indices))):
+    if set(indices) != set(range(len(indices))):
         findings.error("counts", layout.TASKS, f"its numbers are not 0 to {len(indices) - 1}, each once", _COPY)
     elif files.tasks < files.info["total_tasks"]:
         what = f"it holds {files.tasks} instructions; meta/info.json counts {files.info['total_tasks']}"
@@ -155,8 +160,8 @@ def _read_episodes(files: Files, findings: Findings) -> None:
         try:
             file = pq.ParquetFile(path, page_checksum_verification=True)
             columns = [column for column in file.schema_arrow.names if not column.startswith("stats/")]
-            part = file.read(columns=columns).to_pydict()
-        except (OSError, pa.ArrowException) as error:
+            part = file.read().select(columns).to_pydict()
+        except (OSError, pa.ArrowException, ValueError) as error:
             findings.error("files", name, f"it cannot be read: {one_line(error)}", _COPY)
             continue
         wanted = [*_LIGHT, *(f"videos/{key}/{one}" for key in files.cameras for one in _SLOT)]

@@ -110,7 +110,7 @@ class ValueCheck:
                     "schema", name, f"meta/info.json knows no {few(extra)}", "Programs leave it out."
                 )
             return file.read(columns=stored)
-        except (OSError, pa.ArrowException) as error:
+        except (OSError, pa.ArrowException, ValueError) as error:
             self._findings.error("files", name, f"it cannot be read: {one_line(error)}", "Restore it from a copy.")
             return None
 

@@ -281,6 +281,10 @@ def row(name: str, value: int | None) -> Callable[[Path], None]:
     return lambda root: edit(episodes_file(root), lambda rows: rows[name].__setitem__(2, value))
 
 
+def no_shape(root: Path) -> None:
+    edit_json(root / "meta/info.json", lambda content: content["features"]["action"].pop("shape"))
+
+
 def one_name(root: Path) -> None:
     edit_json(root / "meta/info.json", lambda content: content["features"]["action"].update(names=["a"]))
 
@@ -299,6 +303,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str, str, str]] = {
     "episodes": (info(total_episodes=7), "counts", "meta/episodes", "episodes 6 are not described"),
     "rate": (info(fps=0), "schema", "info.json", "fps is 0"),
     "names": (one_name, "schema", "meta/info.json: action", "1 names for 2 numbers"),
+    "shape": (no_shape, "schema", "meta/info.json: action", "it is described by"),
     "start": (row("dataset_from_index", 40), "counts", "meta/episodes", "episode 2 "),
     "no place": (row("data/file_index", None), "schema", "meta/episodes", "it lacks data/file_index"),
     "no frame": (row("length", 0), "counts", "meta/episodes", "episode 2 has 0 frames"),
@@ -358,3 +363,27 @@ def test_what_cannot_be_checked_is_an_error(sound: Path, tmp_path: Path) -> None
     (root / "meta/info.json").write_text("{}")
     with pytest.raises(DatasetError, match="has no codebase_version"):
         check_dataset(root)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_whatever_happened_to_a_file_is_a_finding_or_a_clear_error(filmed: Path, tmp_path: Path, seed: int) -> None:
+    root, rng = copy(filmed, tmp_path), np.random.default_rng(seed)
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    path = files[rng.integers(len(files))]
+    content = bytearray(path.read_bytes())
+    where = int(rng.integers(len(content)))
+    if seed % 4 == 0:
+        path.unlink()
+    elif seed % 4 == 1:
+        path.write_bytes(content[:where])
+    elif seed % 4 == 2:
+        path.write_bytes(content[:where] + bytes(7) + content[where:])
+    else:
+        content[where] ^= 1 << int(rng.integers(8))
+        path.write_bytes(content)
+    try:
+        worst = check_dataset(root).worst
+    except DatasetError:  # of meta/info.json
+        worst = Severity.ERROR
+    # Films are not decoded, and of a Parquet file the footer has no checksum: a flipped bit may be in a comment.
+    assert worst == Severity.ERROR or path.suffix in {".mp4", ".json"} or seed % 4 == 3
