@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from benchmarks.spread import ratios, spread, write
+from benchmarks._spread import ratios, spread, write
 from bhd_lerobot.envs.config_env import BhdEnvConfig
 
 # Not imported here: the recorder and the rest that only the measuring process needs. Every process of `AsyncVectorEnv`
@@ -69,7 +69,7 @@ def stepper(env: VectorEnv) -> Callable[[float], float]:
 
 def bare(n: int) -> Callable[[float], float]:
     """Return the same for the physics steps and the scans alone, of such a run."""
-    from benchmarks.bare_physics import again, write_down
+    from benchmarks._bare_physics import again, write_down
 
     log, state = write_down(TASK, actions(n), BARE_FRAMES)
 

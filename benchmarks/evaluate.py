@@ -30,7 +30,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy
 from rich.console import Console
 
-from benchmarks.spread import ratios, spread, write
+from benchmarks._spread import ratios, spread, write
 from bhd_lerobot.envs.config_env import BhdEnvConfig
 from bhd_lerobot.policies.contract import find_checkpoint
 from bhd_lerobot.runs.config_eval import EvalConfig

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.spread import write
+from benchmarks._spread import write
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.navigator import NavigatorBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks._spread import ratios, spread, write
 from benchmarks.envs import BARE, OURS, TooLateError, summary, time_limit
 from benchmarks.results.__main__ import MEASURES
 from benchmarks.results.adaptation import recovered, successes
@@ -16,7 +17,6 @@ from benchmarks.results.page import write_page
 from benchmarks.results.runner import FailedError, Runner
 from benchmarks.results.section import Row, Section
 from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
-from benchmarks.spread import ratios, spread, write
 
 RATIO = {"median": 12.3, "low": 11.0, "high": 14.0, "turns": 3}
 

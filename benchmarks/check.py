@@ -1,0 +1,109 @@
+"""Frames a second of `bhd-data check`: `python -m benchmarks.check`.
+
+A dataset of 1,000 episodes without cameras, as an arm with six joints and a gripper gives it (14 numbers of state, 7
+of action, LeRobot's index columns), beside reading the same files with Arrow and doing nothing with them. They run in
+turns; the first of each is not counted.
+"""
+
+import argparse
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from benchmarks._spread import ratios, spread, write
+from bhd_lerobot.data.check_dataset import check_dataset
+from bhd_lerobot.data.recorder import DatasetRecorder
+
+GOAL = 1e6  # frames a second
+FPS = 25
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "gripper")
+
+
+def record(root: Path, episodes: int, frames: int) -> None:
+    """Record arms that move smoothly."""
+    names = [f"{joint}.pos" for joint in JOINTS]
+    features = {
+        "observation.state": {
+            "dtype": "float32",
+            "shape": (14,),
+            "names": names + [f"{joint}.vel" for joint in JOINTS],
+        },
+        "action": {"dtype": "float32", "shape": (7,), "names": names},
+    }
+    recorder = DatasetRecorder.create("bench/check", FPS, features, robot_type="ur5", root=root, recording={"seed": 0})
+    time_s = np.arange(frames)[:, None] / FPS
+    for episode in range(episodes):
+        rng = np.random.default_rng(episode)
+        phase, rate = rng.uniform(0, 6.28, (2, 7))
+        position = np.abs(0.04 * np.sin(rate * time_s + phase))
+        speed = 0.04 * rate * np.cos(rate * time_s + phase)
+        noise = rng.normal(0, 1e-5, position.shape)
+        writer = recorder.begin_episode()
+        writer.set_columns(
+            {
+                "observation.state": np.concatenate([position + np.abs(noise), speed], axis=1).astype(np.float32),
+                "action": position.astype(np.float32),
+            }
+        )
+        recorder.save(writer, task="move", metadata={"outcome": "success"})
+    recorder.finalize()
+
+
+def read(root: Path) -> float:
+    """Return how long it takes to read all data files [s]."""
+    started = time.perf_counter()
+    for path in sorted((root / "data").rglob("*.parquet")):
+        pq.ParquetFile(path, page_checksum_verification=True).read()
+    return time.perf_counter() - started
+
+
+def check(root: Path) -> float:
+    """Return how long the check takes [s]."""
+    started = time.perf_counter()
+    found = check_dataset(root)
+    took = time.perf_counter() - started
+    if any(one.severity for one in found.findings):
+        raise AssertionError(f"The dataset is not sound: {found.findings}")
+    return took
+
+
+def main() -> int:
+    """Print what was measured; return 1 if the goal was missed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--frames", type=int, default=500, help="of an episode")
+    parser.add_argument("--turns", type=int, default=7)
+    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
+    options = parser.parse_args()
+    total = options.episodes * options.frames
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "data"
+        record(root, options.episodes, options.frames)
+        turns = [(check(root), read(root)) for _ in range(options.turns + 1)][1:]
+    speeds = [total / took for took, _ in turns]
+    shares = ratios([total / took for took, _ in turns], [total / took for _, took in turns])
+    results = {
+        "episodes": options.episodes,
+        "frames": total,
+        "frames_per_s": spread(speeds),
+        "of_reading_alone": spread(shares),
+        "goal": GOAL,
+        "met": statistics.median(speeds) >= GOAL,
+    }
+    write(options.json, results)
+    share = results["of_reading_alone"]
+    print(
+        f"{options.episodes} episodes, {total:,} frames: {statistics.median(speeds):,.0f} frames/s "
+        f"({min(speeds):,.0f} to {max(speeds):,.0f}), goal {GOAL:,.0f}; {share['median']:.2f} of the speed of reading "
+        f"alone ({share['low']:.2f} to {share['high']:.2f})"
+    )
+    return int(not results["met"])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
