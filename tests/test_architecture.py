@@ -29,7 +29,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "control": ("bodies.body",),
     "tasks": ("bodies", "control.commands", "control.kinematics", "control.poses"),
     "policies": ("bodies", "control.messages", "control.commands", "control.kinematics", "control.poses"),
-    "data": ("tasks", "bodies", "control.messages"),
+    "data": ("tasks", "bodies", "control.messages", "control.poses"),
     "robots": ("tasks", "bodies", "sim", "control"),
     "envs": ("tasks", "bodies", "sim", "control", "robots"),
     "runs": EVERYTHING,

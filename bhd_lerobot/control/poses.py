@@ -1,11 +1,14 @@
 """Poses as numbers: homogeneous transforms to position and quaternion."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 # A quaternion and its negative are one orientation. Of the two, the one on the side of this is written: the tool that
 # points down. It is the orientation farthest from where the sign flips, so that a recording near it has no jumps.
 _DOWN = np.array([0.0, 1.0, 0.0, 0.0])
+_PARTS = ("qw", "qx", "qy", "qz")
 
 
 def pose_vectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -32,3 +35,14 @@ def pose_vectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     first = np.take_along_axis(quaternion, (quaternion != 0).argmax(axis=-1)[..., None], axis=-1)
     sign = np.where(side != 0, np.sign(side), np.sign(first))
     return np.concatenate([matrices[..., :3, 3], quaternion * sign], axis=-1)
+
+
+def quaternion_columns(names: Sequence[str]) -> list[int]:
+    """Return the columns at which quaternions begin: `…_qw`, `…_qx`, `…_qy`, `…_qz`, by option with `.pos` after it."""
+    plain = [name.removesuffix(".pos") for name in names]
+    found = []
+    for column, name in enumerate(plain[:-3]):
+        stem = name.removesuffix(_PARTS[0])
+        if stem != name and plain[column : column + 4] == [stem + part for part in _PARTS]:
+            found.append(column)
+    return found

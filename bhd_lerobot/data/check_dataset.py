@@ -1,6 +1,7 @@
 """`bhd-data check`: is a dataset sound? Nothing is changed."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,12 +57,14 @@ class DatasetCheck:
         return sum(one.severity == severity for one in self.findings)
 
 
-def check_dataset(root: Path | str, limits: Limits | None = None, *, videos: bool = True) -> DatasetCheck:
+def check_dataset(
+    root: Path | str, limits_of: Callable[[str | None], Limits] = lambda robot_type: {}, *, videos: bool = True
+) -> DatasetCheck:
     """Check a dataset, of this package or of another program.
 
     Args:
         root: the dataset.
-        limits: of numbers by feature and name; only these are compared.
+        limits_of: gives the limits of a robot, by its type; only those numbers are compared.
         videos: read the films, too, which takes longer than all the rest.
 
     Raises:
@@ -69,7 +72,8 @@ def check_dataset(root: Path | str, limits: Limits | None = None, *, videos: boo
     """
     findings = Findings()
     files = read_files(Path(root), findings)
-    values = ValueCheck(files, findings, limits)
+    robot = files.info.get("robot_type")
+    values = ValueCheck(files, findings, limits_of(robot if isinstance(robot, str) else None))
     values.run()
     if videos:
         _check_videos(files, findings)

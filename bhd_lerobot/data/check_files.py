@@ -4,9 +4,10 @@
 all of them are wanted, also in datasets that another program left behind.
 """
 
+import contextlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,8 @@ from bhd_lerobot.errors import DatasetError
 
 _COPY = "Restore it from a copy, or try bhd-data repair."
 _RECORD = "Restore it from a copy, or record again."
-_NEEDED = ("codebase_version", "features", "fps", "total_episodes", "total_frames", "total_tasks")
+_COUNTS = ("total_episodes", "total_frames", "total_tasks")
+_NEEDED = ("codebase_version", "features", "fps", *_COUNTS)
 _LIGHT = (
     *("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index"),
     "tasks",
@@ -40,7 +42,7 @@ class Files:
         root: the dataset.
         info: `meta/info.json`.
         episodes: columns of `meta/episodes` by name, one entry for each episode, in order, without statistics.
-        stats: `meta/stats.json`, empty if there is none.
+        stats: `meta/stats.json`, by feature and name, flat; what is missing there, or no numbers, is not here.
         tasks: how many instructions there are.
         is_ours: whether this package recorded it.
     """
@@ -48,7 +50,7 @@ class Files:
     root: Path
     info: dict[str, Any]
     episodes: dict[str, list[Any]] = field(default_factory=dict)
-    stats: dict[str, dict[str, Any]] = field(default_factory=dict)
+    stats: dict[str, dict[str, NDArray[np.float64]]] = field(default_factory=dict)
     tasks: int = 0
     is_ours: bool = False
 
@@ -109,6 +111,9 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise DatasetError(f"{path} cannot be read, and nothing can be checked without it: {error}. {_COPY}") from error
     if not isinstance(info, dict) or missing or not isinstance(info["features"], dict):
         raise DatasetError(f"{path} has no {few(missing) or 'features'}; nothing can be checked without. {_COPY}")
+    for key in _COUNTS:
+        if isinstance(info[key], bool) or not isinstance(info[key], int) or info[key] < 0:
+            raise DatasetError(f"{path} has {info[key]!r} as {key}; it must be a whole number from 0. {_COPY}")
     if not str(info["codebase_version"]).startswith("v3."):
         raise DatasetError(
             f"{root} has dataset format {info['codebase_version']}; this program reads v3.x. LeRobot converts older "
@@ -124,7 +129,7 @@ def _check_features(files: Files, findings: Findings) -> None:
     for key, feature in list(files.features.items()):
         described = feature if isinstance(feature, dict) else {}
         shape, names = described.get("shape"), described.get("names")
-        sizes = list(shape) if isinstance(shape, list | tuple) else [None]
+        sizes = list(shape) if isinstance(shape, list | tuple) and shape else [None]
         if "dtype" not in described or not all(isinstance(size, int) and size > 0 for size in sizes):
             findings.error("schema", f"{layout.INFO}: {key}", f"it is described by {feature!r}", _COPY)
             del files.features[key]  # nothing can be said about it
@@ -186,9 +191,10 @@ def _read_episodes(files: Files, findings: Findings) -> None:
                 rows[index] = part, position
     order = sorted(rows)
     files.episodes = {name: [rows[index][0][name][rows[index][1]] for index in order] for name in sorted(keep)}
-    lost = sorted(set(range(files.info["total_episodes"])) - set(order))
-    if lost:
-        what = f"episodes {few(lost)} are not described; meta/info.json counts {files.info['total_episodes']}"
+    total = files.info["total_episodes"]
+    if len(rows) < total:
+        first = next(index for index in range(total) if index not in rows)
+        what = f"{total - len(rows)} episodes are not described, {first} first; meta/info.json counts {total}"
         findings.error("counts", "meta/episodes", what, _COPY)
 
 
@@ -244,21 +250,27 @@ def _read_stats(files: Files, findings: Findings) -> None:
     except (OSError, ValueError) as error:
         findings.error("stats", name, f"it cannot be read: {one_line(error)}", remedy)
         return
-    files.stats = stats
     for key, feature in files.features.items():
-        if feature.get("dtype") in ("string", "language"):
+        if feature["dtype"] in ("string", "language"):
             continue
-        lacking = [one for one in _STATISTICS if one not in stats.get(key, {})]
+        told = stats.get(key) if isinstance(stats, dict) else None
+        known = files.stats[key] = _vectors(told if isinstance(told, dict) else {})
+        lacking = [one for one in _STATISTICS if one not in known]
         if lacking:
             findings.error("stats", f"{name}: {key}", f"it has no {few(lacking)}", remedy)
-        elif feature.get("dtype") not in ("video", "image"):
-            count = _first(stats[key]["count"])
+        elif feature["dtype"] not in ("video", "image"):
+            count = known["count"][0]
             if count != files.info["total_frames"]:
-                what = f"they are of {count} frames; the dataset has {files.info['total_frames']}"
+                what = f"they are of {count:g} frames; the dataset has {files.info['total_frames']}"
                 findings.error("stats", f"{name}: {key}", what, remedy)
 
 
-def _first(value: Any) -> Any:
-    while isinstance(value, Sequence):
-        value = value[0]
-    return value
+def _vectors(told: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+    """Return what there are numbers for, flat."""
+    vectors: dict[str, NDArray[np.float64]] = {}
+    for name, value in told.items():
+        with contextlib.suppress(TypeError, ValueError):
+            values = np.asarray(value, np.float64).reshape(-1)
+            if values.size:
+                vectors[name] = values
+    return vectors

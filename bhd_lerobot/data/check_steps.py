@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.poses import quaternion_columns
 from bhd_lerobot.data import features as keys
-from bhd_lerobot.data.findings import Findings, name_of
+from bhd_lerobot.data.findings import Findings, name_of, names_of
 
 _JUMP_OF_RANGE, _JUMP_OF_USUAL = 0.5, 5.0  # a jump: more than that of the range, and of what is usual
-_QUATERNION = ("qw", "qx", "qy", "qz")
 
 
 @dataclass
@@ -54,7 +54,7 @@ class StepCheck:
             return
         step = np.diff(values.astype(np.float64), axis=0)
         step[starts[1:] - 1] = 0.0  # from one episode to the next
-        for first in _quaternions(self._features[key]):
+        for first in quaternion_columns(names_of(self._features[key])):
             part = slice(first, first + 4)
             # The nearer of two signs is the other one: the orientation goes on, its numbers do not.
             flips = (step[:, part] ** 2).sum(axis=1) > 2.0
@@ -102,10 +102,3 @@ def _add(
     known = kind.setdefault(what, _Steps(numbers[0], int(rows[0] + 1 - starts[inside[0]])))
     known.count += len(rows)
     known.episodes.update(numbers)
-
-
-def _quaternions(feature: Mapping[str, Any]) -> list[int]:
-    """Return where quaternions begin among the numbers of a feature."""
-    names = feature.get("names")
-    ends = [str(name).removesuffix(".pos")[-2:] for name in names] if isinstance(names, list) else []
-    return [i for i in range(len(ends) - 3) if tuple(ends[i : i + 4]) == _QUATERNION]

@@ -178,7 +178,7 @@ class ValueCheck:
             values = _numbers(table[key])
             if values is None:
                 continue
-            size = int(np.prod(self._files.features[key]["shape"]))
+            size = math.prod(self._files.features[key]["shape"])
             if values.size != len(table) * size:
                 what = f"it holds {values.size} numbers in {len(table)} frames; its shape is {size}"
                 self._findings.error("schema", key, what, "Mend the shape in meta/info.json, or record again.")
@@ -265,7 +265,7 @@ class ValueCheck:
             span = np.maximum(column.high - column.low, 1e-9)
             found = {"min": column.low, "max": column.high, "mean": column.total / self.frames}
             for name, values in found.items():
-                told = np.asarray(known[name], np.float64).reshape(-1)
+                told = known[name]
                 if told.shape != values.shape or (np.abs(told - values) > _MEAN_TOLERANCE * span + 1e-6).any():
                     self._findings.error("stats", f"{layout.STATS}: {key}", f"{name} is not that of the data", remedy)
                     break

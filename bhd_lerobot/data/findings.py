@@ -49,10 +49,6 @@ class Findings:
         """Iterate over them, the worst first, otherwise as they came."""
         return iter(sorted(self.items, key=lambda one: -one.severity))
 
-    def __len__(self) -> int:
-        """Return how many there are."""
-        return len(self.items)
-
     def error(self, check: str, where: str, what: str, remedy: str) -> None:
         """Add an error."""
         self.items.append(Finding(Severity.ERROR, check, where, what, remedy))
@@ -65,15 +61,6 @@ class Findings:
         """Add a note."""
         self.items.append(Finding(Severity.NOTE, check, where, what))
 
-    def count(self, severity: Severity) -> int:
-        """Return how many there are of a severity."""
-        return sum(one.severity == severity for one in self.items)
-
-    @property
-    def worst(self) -> Severity:
-        """The worst severity; a note if there is nothing."""
-        return max((one.severity for one in self.items), default=Severity.NOTE)
-
 
 def few(values: Iterable[Any], shown: int = 6) -> str:
     """Return the first few of some values, and how many more there are."""
@@ -82,10 +69,16 @@ def few(values: Iterable[Any], shown: int = 6) -> str:
     return ", ".join(texts[:shown]) + (f" and {more} more" if more > 0 else "")
 
 
+def names_of(feature: Mapping[str, Any]) -> list[str]:
+    """Return the names of a feature's numbers; none if it does not name them one by one."""
+    names = feature.get("names")
+    return [str(name) for name in names] if isinstance(names, list) else []
+
+
 def name_of(feature: Mapping[str, Any], element: int) -> str:
     """Return the name of one of a feature's numbers."""
-    names = feature.get("names")
-    return str(names[element]) if isinstance(names, list) and element < len(names) else f"number {element}"
+    names = names_of(feature)
+    return names[element] if element < len(names) else f"number {element}"
 
 
 def one_line(error: BaseException) -> str:

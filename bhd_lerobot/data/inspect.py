@@ -1,11 +1,9 @@
 """What is in a dataset, without loading its frames."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.data import layout
 from bhd_lerobot.data.episode_table import PREFIX
 from bhd_lerobot.data.state import load_state
 
@@ -91,13 +89,3 @@ def dataset_info(root: Path | str) -> DatasetSummary:
         size=sum((root / name).stat().st_size for name in files),
         compact=not state.without_stats,
     )
-
-
-def robot_type_of(root: Path | str) -> str | None:
-    """Return the robot that a dataset is of; None if that cannot be told."""
-    try:
-        info = json.loads((Path(root) / layout.INFO).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    kind = info.get("robot_type") if isinstance(info, dict) else None
-    return kind if isinstance(kind, str) else None

@@ -13,7 +13,6 @@ from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.check_dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.data.check_values import Limits
-from bhd_lerobot.data.inspect import robot_type_of
 from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS
 
 _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
@@ -32,7 +31,7 @@ def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, video
     Raises:
         DatasetError: there is no dataset that could be checked.
     """
-    found = check_dataset(root, limits_of(robot_type_of(root)), videos=videos)
+    found = check_dataset(root, limits_of, videos=videos)
     is_sound = found.worst < (Severity.WARNING if is_strict else Severity.ERROR)
     if as_json:
         print(json.dumps(_plain(found, is_sound), indent=1))

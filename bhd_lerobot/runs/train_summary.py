@@ -1,6 +1,7 @@
 """What `bhd-train` says before and after."""
 
 import json
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -93,6 +94,6 @@ def _options(name: str, values: Mapping[str, Any], usual: Mapping[str, Any]) -> 
     for key, value in values.items():
         if isinstance(value, Mapping) and isinstance(usual.get(key), Mapping):
             options += _options(f"{name}.{key}", value, usual[key])
-        elif isinstance(value, str | bool | int | float) and key in usual and value != usual[key]:
-            options += f" --{name}.{key}={json.dumps(value) if isinstance(value, bool | int | float) else value}"
+        elif isinstance(value, str | bool | int | float | list) and key in usual and value != usual[key]:
+            options += f" --{name}.{key}={shlex.quote(value if isinstance(value, str) else json.dumps(value))}"
     return options

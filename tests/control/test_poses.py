@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.control.commands import Pose
-from bhd_lerobot.control.poses import pose_vectors
+from bhd_lerobot.control.poses import pose_vectors, quaternion_columns
 
 DOWN = np.array([0.0, 1.0, 0.0, 0.0])  # wxyz: half a turn about x
 
@@ -85,3 +85,18 @@ def test_any_number_of_leading_axes(shape: tuple[int, ...]) -> None:
     several = rotations[:count].reshape(*shape, 4, 4)
     assert pose_vectors(several).shape == (*shape, 7)
     assert np.array_equal(pose_vectors(several).reshape(-1, 7), pose_vectors(rotations)[:count])
+
+
+@pytest.mark.parametrize(
+    ("names", "columns"),
+    [
+        (["x", "a_qw", "a_qx", "a_qy", "a_qz"], [1]),
+        (["tool_qw.pos", "tool_qx.pos", "tool_qy.pos", "tool_qz.pos"], [0]),
+        (["a_qw", "a_qx", "b_qy", "a_qz"], []),
+        (["a_qx", "a_qy", "a_qz", "a_qw"], []),  # another order
+        (["a_qw", "a_qx", "a_qy"], []),
+        ([], []),
+    ],
+)
+def test_quaternions_are_found_by_their_names(names: list[str], columns: list[int]) -> None:
+    assert quaternion_columns(names) == columns

@@ -1,9 +1,11 @@
 """A sound dataset has no finding; each kind of damage has one, which names the place."""
 
+import contextlib
 import json
+import math
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,11 @@ FEATURES: dict[str, dict[str, Any]] = {
     "note": {"dtype": "string", "shape": (1,), "names": None},
 }
 VIDEO = {CAMERA: {"dtype": "video", "shape": (32, 48, 3), "names": ["height", "width", "channels"]}}
-LIMITS = {"observation.state": {"a.pos": (-2.0, 2.0), "nothing.pos": (0.0, 1.0)}}
+
+
+def limits(robot_type: str | None) -> dict[str, dict[str, tuple[float, float]]]:
+    assert robot_type == "toy"
+    return {"observation.state": {"a.pos": (-2.0, 2.0), "nothing.pos": (0.0, 1.0)}}
 
 
 def length(episode: int) -> int:
@@ -112,7 +118,7 @@ def bad(found: DatasetCheck) -> list[Finding]:
 
 def test_a_sound_dataset_has_no_finding_and_is_left_alone(sound: Path) -> None:
     before = contents(sound)
-    found = check_dataset(sound, LIMITS)
+    found = check_dataset(sound, limits)
     assert bad(found) == []
     assert (found.episodes, found.frames) == (EPISODES, sum(map(length, range(EPISODES))))
     assert [one.what for one in found.findings if one.check == "outcome"] == ["success 6"]
@@ -120,7 +126,7 @@ def test_a_sound_dataset_has_no_finding_and_is_left_alone(sound: Path) -> None:
 
 
 def test_films_are_counted(filmed: Path) -> None:
-    assert bad(check_dataset(filmed, LIMITS)) == []
+    assert bad(check_dataset(filmed, limits)) == []
 
 
 def test_a_dataset_of_stock_lerobot_is_sound(tmp_path: Path) -> None:
@@ -218,7 +224,7 @@ ERROR, WARNING = Severity.ERROR, Severity.WARNING
 def test_damaged_numbers_are_found(sound: Path, tmp_path: Path, damage, expected) -> None:
     root = copy(sound, tmp_path)
     edit(data_file(root), damage)
-    found = check_dataset(root, LIMITS)
+    found = check_dataset(root, limits)
     severity, check, where, what = expected
     matching = [one for one in bad(found) if (one.severity, one.check) == (severity, check)]
     assert any(where in one.where and re.search(what, one.what) for one in matching), found.findings
@@ -300,7 +306,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str, str, str]] = {
     "mean": (stats(lambda all_: all_["action"]["mean"].reverse()), "stats", "action", "mean is not that of the data"),
     "stats of": (stats(lambda all_: all_.pop("action")), "stats", "meta/stats.json: action", "no min"),
     "frames": (info(total_frames=134), "counts", "info.json", "counts 134 frames; the episodes have 135"),
-    "episodes": (info(total_episodes=7), "counts", "meta/episodes", "episodes 6 are not described"),
+    "episodes": (info(total_episodes=7), "counts", "meta/episodes", "1 episodes are not described, 6 first"),
     "rate": (info(fps=0), "schema", "info.json", "fps is 0"),
     "names": (one_name, "schema", "meta/info.json: action", "1 names for 2 numbers"),
     "shape": (no_shape, "schema", "meta/info.json: action", "it is described by"),
@@ -387,3 +393,27 @@ def test_whatever_happened_to_a_file_is_a_finding_or_a_clear_error(filmed: Path,
         worst = Severity.ERROR
     # Films are not decoded, and of a Parquet file the footer has no checksum: a flipped bit may be in a comment.
     assert worst == Severity.ERROR or path.suffix in {".mp4", ".json"} or seed % 4 == 3
+
+
+def nodes(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    yield path
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, one in inside:
+        yield from nodes(one, (*path, key))
+
+
+@pytest.mark.parametrize("name", ["meta/info.json", "meta/stats.json"])
+@pytest.mark.parametrize("wrong", [None, "x", -1, 0, True, [], {}, ["a"], math.nan, 10**20, [[1]]])
+def test_a_value_of_any_other_kind_is_a_finding_or_a_clear_error(sound: Path, tmp_path: Path, name, wrong) -> None:
+    root = copy(sound, tmp_path)
+    whole = json.loads((root / name).read_text())
+    for path in [one for one in nodes(whole) if len(one) <= 2][:12]:  # one after the other
+        value = wrong if not path else json.loads(json.dumps(whole))
+        if path:
+            inside = value
+            for key in path[:-1]:
+                inside = inside[key]
+            inside[path[-1]] = wrong
+        (root / name).write_text(json.dumps(value))
+        with contextlib.suppress(DatasetError):
+            assert check_dataset(root).frames in {0, 135}

@@ -18,7 +18,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import ACTIVATIONS, MlpConfig, ScanConfig
 from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder
-from bhd_lerobot.policies.mlp.yaw_mlp import harmonics, quaternion_columns, yaw
+from bhd_lerobot.policies.mlp.yaw_mlp import harmonics, yaw
 
 NAMES = ["x.vel", *(f"scan_{i:03}.pos" for i in range(8)), "theta.vel"]
 
@@ -201,21 +201,6 @@ def test_a_box_turned_by_half_looks_the_same_to_the_second_harmonic() -> None:
     assert torch.allclose(both[:, [1, 3]], both[:1, [1, 3]].expand(3, 2))
     assert not torch.allclose(both[:1, [0, 2]], both[1:2, [0, 2]])
     assert torch.allclose(yaw(-3 * quaternions), yaw(quaternions))  # of any length, and either sign
-
-
-@pytest.mark.parametrize(
-    ("names", "columns"),
-    [
-        (QUATERNIONS, [1]),
-        (["tool_qw.pos", "tool_qx.pos", "tool_qy.pos", "tool_qz.pos"], [0]),
-        (["a_qw", "a_qx", "b_qy", "a_qz"], []),
-        (["a_qx", "a_qy", "a_qz", "a_qw"], []),  # another order
-        (["a_qw", "a_qx", "a_qy"], []),
-        ([], []),
-    ],
-)
-def test_quaternions_are_found_by_their_names(names: list[str], columns: list[int]) -> None:
-    assert quaternion_columns(names) == columns
 
 
 def test_yaws_need_quaternions() -> None:

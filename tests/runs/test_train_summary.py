@@ -25,7 +25,7 @@ from bhd_lerobot.tasks.variation import RandomisationConfig
         (UR5Config(action_space="tool", tool_pose=True, fps=50), PickConfig(max_objects=1)),
         (
             UR5Config(control="impedance", action_space="tool", stale_after_s=0.05),
-            ReachConfig(hold_s=1.0, randomisation=RandomisationConfig(enabled=True, latency_s=0.02)),
+            ReachConfig(hold_s=1.0, randomisation=RandomisationConfig(enabled=True, camera_error_m=[0.01, 0.0, 0.02])),
         ),
         (TurtleBot3Config(odometry=True, beams=36), AvoidConfig(trail=True, arena="empty")),
         (TurtleBot3Config(), AvoidConfig()),

@@ -11,8 +11,8 @@ from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
+from bhd_lerobot.control.poses import quaternion_columns
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.policies.mlp.yaw_mlp import quaternion_columns
 
 ACTIVATIONS = ("relu", "tanh", "gelu", "silu", "elu")
 LOSSES = ("l1", "mse", "huber", "nll")

@@ -1,6 +1,5 @@
 """Orientations on their way into the network: as sines and cosines of multiples of the yaw, past the normalisation."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,8 +11,6 @@ from torch import Tensor
 
 OBS_YAW = "observation.bhd_yaw"
 """Key of the yaws [rad] of all quaternions, beside the normalised inputs that they were computed from."""
-
-_PARTS = ("qw", "qx", "qy", "qz")
 
 
 @ProcessorStepRegistry.register(name="bhd_yaw_processor")
@@ -66,14 +63,3 @@ def harmonics(yaws: Tensor, count: int) -> Tensor:
     multiples = torch.arange(1, count + 1, dtype=yaws.dtype, device=yaws.device)
     angles = (yaws.unsqueeze(-1) * multiples).flatten(-2)
     return torch.cat([angles.cos(), angles.sin()], dim=-1)
-
-
-def quaternion_columns(names: Sequence[str]) -> list[int]:
-    """Return the columns at which quaternions begin: `…_qw`, `…_qx`, `…_qy`, `…_qz`, by option with `.pos` after it."""
-    plain = [name.removesuffix(".pos") for name in names]
-    found = []
-    for column, name in enumerate(plain[:-3]):
-        stem = name.removesuffix(_PARTS[0])
-        if stem != name and plain[column : column + 4] == [stem + part for part in _PARTS]:
-            found.append(column)
-    return found
