@@ -236,6 +236,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BhdError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        rest = "run it again to finish" if options.command == "repair" else "nothing was changed"
+        print(f"Stopped; {rest}.", file=sys.stderr)
+        return 130
     return 0
 
 

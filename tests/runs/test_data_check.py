@@ -72,3 +72,13 @@ def test_limits_are_those_of_the_robots() -> None:
     assert 6.2 < high < 6.3
     assert arm["observation.state"]["gripper.pos"] == (0.0, 0.085)
     assert limits_of("so101_follower") == limits_of(None) == {}
+
+
+@pytest.mark.parametrize(("command", "said"), [("check", "nothing was changed"), ("repair", "run it again to finish")])
+def test_ctrl_c_is_a_line_and_status_130(recorded: Path, capsys, monkeypatch, command: str, said: str) -> None:
+    def interrupted(*args: object, **kwargs: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(data, command, interrupted)
+    assert data.main([command, str(recorded)]) == 130
+    assert capsys.readouterr().err == f"Stopped; {said}.\n"
