@@ -1,5 +1,6 @@
 """What `bhd-data check` prints, and which limits it knows."""
 
+import argparse
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -14,8 +15,24 @@ from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.check_dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.data.check_values import Limits
 from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS
+from bhd_lerobot.runs.data_command import Commands, add_command, root_of
 
 _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
+
+
+def add_to(commands: Commands) -> None:
+    """Add `check`."""
+    help_text = "is a dataset sound? Exit status 0 if it is, 1 if not; changes nothing"
+    command = add_command(commands, "check", help_text, _run)
+    command.add_argument("--json", action="store_true", help="print everything as JSON")
+    command.add_argument("--strict", action="store_true", help="a warning is enough for exit status 1")
+    command.add_argument("--no-videos", action="store_true", help="leave the films out, which take longest")
+
+
+def _run(options: argparse.Namespace) -> int:
+    return check(
+        root_of(options), Console(), as_json=options.json, is_strict=options.strict, videos=not options.no_videos
+    )
 
 
 def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, videos: bool) -> int:

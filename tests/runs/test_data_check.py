@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bhd_lerobot.runs import data
+from bhd_lerobot.runs import data, data_check, data_repair
 from bhd_lerobot.runs.data_check import limits_of
 from tests.runs.support import run_record
 
@@ -79,6 +79,7 @@ def test_ctrl_c_is_a_line_and_status_130(recorded: Path, capsys, monkeypatch, co
     def interrupted(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(data, command, interrupted)
+    module = {"check": data_check, "repair": data_repair}[command]
+    monkeypatch.setattr(module, command, interrupted)
     assert data.main([command, str(recorded)]) == 130
     assert capsys.readouterr().err == f"Stopped; {said}.\n"

@@ -1,0 +1,156 @@
+"""`bhd-data info`: what is in a dataset."""
+
+import argparse
+import json
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bhd_lerobot.control.timing import TimingSummary
+from bhd_lerobot.data import features as keys
+from bhd_lerobot.data.inspect import DatasetSummary, dataset_info
+from bhd_lerobot.runs.data_command import Commands, add_command, root_of
+from bhd_lerobot.runs.timing_report import timing_of
+from bhd_lerobot.runs.timing_tables import fitting, ms
+
+
+def add_to(commands: Commands) -> None:
+    """Add `info`."""
+    help_text = "what is in a dataset: features, and outcome and timing of every episode; changes nothing"
+    command = add_command(commands, "info", help_text, _run)
+    command.add_argument("--json", action="store_true", help="print everything as JSON")
+
+
+def _run(options: argparse.Namespace) -> int:
+    info(root_of(options), Console(), options.json)
+    return 0
+
+
+def info(root: Path, console: Console, as_json: bool = False) -> None:
+    """Print what is in a dataset.
+
+    Raises:
+        DatasetError: there is none, or a file cannot be read.
+    """
+    summary = dataset_info(root)
+    if as_json:
+        print(json.dumps(_plain(summary), indent=1))
+        return
+    state = "finalised" if summary.compact else "not finalised: an interrupted recording; `bhd-data repair` finishes it"
+    table = Table(title=str(summary.root), title_justify="left", show_header=False)
+    table.add_row("robot", f"{summary.robot_type}, {summary.fps} frames/s")
+    table.add_row("episodes", f"{len(summary.episodes)}, {summary.frames} frames, {summary.frames / summary.fps:.0f} s")
+    table.add_row("files", f"{summary.files}, {summary.size / 1e6:.1f} MB, {state}")
+    table.add_row("tasks", "; ".join(summary.tasks))
+    for part in ("brain", "task"):
+        if part in summary.recording:
+            chosen = summary.recording[part]
+            table.add_row(part, ", ".join(f"{key} {value}" for key, value in chosen.items()))
+    if "seed" in summary.recording:
+        table.add_row("seed", f"{summary.recording['seed']} ({summary.recording.get('split')})")
+    timings = [timing_of(episode) for episode in summary.episodes]
+    if any(timings):
+        table.add_row("timing", _timing([t for t in timings if t is not None]))
+    outcomes = Counter(str(e.metadata["outcome"]) for e in summary.episodes if "outcome" in e.metadata)
+    if outcomes:
+        table.add_row("outcomes", ", ".join(f"{name} {count}" for name, count in outcomes.most_common()))
+    console.print(table)
+    features = Table(title="Features", title_justify="left")
+    for heading in ("key", "type", "shape", "meaning"):
+        features.add_column(heading)
+    for key, feature in summary.features.items():
+        # Units stand in square brackets, which rich would take for markup.
+        features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), escape(_meaning(key, feature)))
+    console.print(features)
+    episodes = Table(title="Episodes", title_justify="left")
+    columns = _episode_columns(summary, timings)
+    told = len({episode.task for episode in summary.episodes}) > 1
+    # At least a few words of the instruction, if it is told; it wraps.
+    shown = fitting(columns, console.width - 33 * told) if summary.episodes else columns
+    for heading, _ in shown:
+        episodes.add_column(heading, justify="left" if heading == "outcome" else "right", no_wrap=True)
+    if told:
+        episodes.add_column("instruction")
+    for row, episode in zip(zip(*(cells for _, cells in shown), strict=True), summary.episodes, strict=True):
+        episodes.add_row(*row, *[escape(episode.task)] * told)
+    console.print(episodes)
+
+
+def _episode_columns(summary: DatasetSummary, timings: Sequence[TimingSummary | None]) -> list[tuple[str, list[str]]]:
+    """Return the table of episodes by columns, the most telling ones first."""
+    measured: tuple[tuple[str, Callable[[TimingSummary], str]], ...] = (
+        ("late frames", lambda t: str(t.late_frames)),
+        ("skipped", lambda t: str(t.skipped)),
+        ("late p99 / ms", lambda t: ms(t.lateness_p99)),
+        ("overruns", lambda t: str(t.overruns)),
+        ("drops", lambda t: str(t.drops)),
+        ("age max / ms", lambda t: ms(t.age_max)),
+    )
+    timing = [(heading, ["" if t is None else cell(t) for t in timings]) for heading, cell in measured]
+    metadata = [episode.metadata for episode in summary.episodes]
+    seed = ("seed", [str(one.get("seed", "")) for one in metadata])
+    simulated = all(t is None or t.clock == "lockstep" for t in timings)
+    return [
+        ("episode", [str(one.index) for one in summary.episodes]),
+        ("frames", [str(one.frames) for one in summary.episodes]),
+        ("seconds", [f"{one.frames / summary.fps:.1f}" for one in summary.episodes]),
+        ("outcome", [str(one.get("outcome", "")) for one in metadata]),
+        ("score", ["" if one.get("score") is None else f"{one['score']:.3f}" for one in metadata]),
+        *([seed, *timing] if simulated else [*timing, seed]),
+    ]
+
+
+def _timing(timings: Sequence[TimingSummary]) -> str:
+    measured = [t for t in timings if t.clock != "lockstep"]
+    if not measured:
+        return "simulated time: nothing can be late"
+    late, frames = sum(t.late_frames for t in measured), sum(t.frames for t in measured)
+    skipped, drops = sum(t.skipped for t in measured), sum(t.drops for t in measured)
+    return (
+        f"wall-clock time: {late} of {frames} frames out of tolerance, {skipped} ticks skipped, {drops} frames or "
+        "states lost; `bhd-data timing` says more"
+    )
+
+
+def _meaning(key: str, feature: dict[str, Any]) -> str:
+    if key in keys.SCALARS:
+        return keys.SCALARS[key][1]
+    if key in _LEROBOT_COLUMNS:
+        return _LEROBOT_COLUMNS[key]
+    names = feature.get("names") or []
+    if isinstance(names, list) and len(names) > 6:
+        return f"{', '.join(map(str, names[:3]))}, … {names[-1]}"
+    return ", ".join(map(str, names)) if isinstance(names, list) else ""
+
+
+_LEROBOT_COLUMNS = {
+    keys.SUBTASK: "what the brain was doing, in words",
+    "timestamp": "frame_index / fps [s]",
+    "frame_index": "number of the frame in its episode",
+    "episode_index": "number of the episode in the dataset",
+    "index": "number of the frame in the dataset",
+    "task_index": "number of the instruction",
+}
+
+
+def _plain(summary: DatasetSummary) -> dict[str, Any]:
+    return {
+        "root": str(summary.root),
+        "robot_type": summary.robot_type,
+        "fps": summary.fps,
+        "frames": summary.frames,
+        "files": summary.files,
+        "bytes": summary.size,
+        "compact": summary.compact,
+        "tasks": list(summary.tasks),
+        "recording": summary.recording,
+        "features": summary.features,
+        "episodes": [
+            {"index": e.index, "frames": e.frames, "task": e.task, "metadata": e.metadata} for e in summary.episodes
+        ],
+    }
