@@ -73,6 +73,10 @@ class UnsupportedDatasetError(DatasetError):
     """LeRobot's own loader is needed: a kind of feature that is not kept in memory."""
 
 
+class TransferError(BhdError):
+    """An upload or download that did not come to its end: no permission, no network, no such place."""
+
+
 class FrameError(DatasetError, ValueError):
     """A frame, an image or episode metadata that does not fit the features of the dataset."""
 
