@@ -1,9 +1,6 @@
 """From one file per episode to few files, in one step that a kill cannot leave half done.
 
-The new ``data``, ``videos`` and ``meta`` folders are built completely beside the old ones; files that need no change
-are linked. Then a marker is written, and from there on the folders are exchanged, each with two renames. A kill before
-the marker leaves the old dataset and some rubbish in the staging folder; a kill after it is completed by
-`roll_forward` at the next open.
+New folders are built beside the old ones; files that need no change are linked. See `bhd_lerobot.data.exchange`.
 """
 
 import json
@@ -15,16 +12,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.data import layout, statistics, video
+from bhd_lerobot.data import exchange, layout, statistics, video
 from bhd_lerobot.data.disk import Disk
 from bhd_lerobot.data.episode_table import episode_table, read_stats
 from bhd_lerobot.data.layout import Slot
 from bhd_lerobot.data.schema import Schema, as_numpy
 from bhd_lerobot.data.state import DatasetState, Row, corrupt, ordered_slots, slot_columns, slot_of
 
-_WORK = f"{layout.STAGING}/compact"
-_MARKER = f"{_WORK}/ready"
-_FOLDERS = ("videos", "data", "meta")
 _MEBIBYTE = 1024**2
 
 EpisodeStats = dict[str, statistics.Stats]
@@ -43,23 +37,6 @@ class _Group:
     @property
     def unchanged(self) -> bool:
         return self.sources == [self.target]
-
-
-def roll_forward(root: Path, disk: Disk) -> bool:
-    """Complete a compaction that had been decided; return whether there was one."""
-    if not (root / _MARKER).exists():
-        return False
-    new, old = root / _WORK / "new", root / _WORK / "old"
-    disk.make_folder(old)
-    for name in _FOLDERS:
-        if (new / name).exists():
-            # If the old folder is gone already, the kill came between these two renames.
-            if (root / name).exists():
-                disk.move(root / name, old / name)
-            disk.move(new / name, root / name)
-    disk.remove(root / _MARKER)
-    disk.remove_tree(root / _WORK)
-    return True
 
 
 def compact(state: DatasetState, schema: Schema, disk: Disk, known: Mapping[int, EpisodeStats]) -> bool:
@@ -83,15 +60,14 @@ def compact(state: DatasetState, schema: Schema, disk: Disk, known: Mapping[int,
     moved = any(not group.unchanged for groups in (data, *videos.values()) for group in groups)
     if not state.rows or (not moved and not state.without_stats and (state.root / layout.STATS).exists()):
         return False
-    disk.remove_tree(state.root / _WORK)
+    new = exchange.begin(state.root, disk)
     stats = _all_stats(state, schema, known)
     rows = [dict(row) for row in state.rows]
-    _build_data(state, schema, disk, data, rows)
-    _build_videos(state, disk, videos, rows)
-    _build_meta(state, disk, rows, stats)
-    disk.write(state.root / f"{_MARKER}.tmp", b"")
-    disk.move(state.root / f"{_MARKER}.tmp", state.root / _MARKER)
-    return roll_forward(state.root, disk)
+    _build_data(state, schema, disk, data, rows, new=new)
+    _build_videos(state, disk, videos, rows, new=new)
+    _build_meta(state, disk, rows, stats, new=new)
+    exchange.complete(state.root, disk)
+    return True
 
 
 def _groups(sizes: Mapping[Slot, int], limit: float, chunks_size: int, split: Callable[[Slot], bool]) -> list[_Group]:
@@ -128,14 +104,15 @@ def _video_groups(state: DatasetState, key: str) -> list[_Group]:
     return _groups(sizes, limit, state.info["chunks_size"], differs)
 
 
-def _build_data(state: DatasetState, schema: Schema, disk: Disk, groups: list[_Group], rows: list[Row]) -> None:
+def _build_data(
+    state: DatasetState, schema: Schema, disk: Disk, groups: list[_Group], rows: list[Row], *, new: Path
+) -> None:
     if all(group.unchanged for group in groups):
         return
-    old, new = state.root / "data", state.root / _WORK / "new/data"
     targets = {source: group.target for group in groups for source in group.sources}
-    _link_others(old, new, disk, "chunk-*/file-*.parquet")
+    exchange.link_others(state.root / "data", new / "data", disk, "chunk-*/file-*.parquet")
     for group in groups:
-        target = state.root / _WORK / "new" / layout.data_file(group.target)
+        target = new / layout.data_file(group.target)
         disk.make_folder(target.parent)
         sources = [state.root / layout.data_file(source) for source in group.sources]
         if len(sources) == 1:
@@ -167,16 +144,18 @@ def _row_groups(source: Path) -> Iterator[pa.Table]:
         raise corrupt(source, error) from error
 
 
-def _build_videos(state: DatasetState, disk: Disk, videos: Mapping[str, list[_Group]], rows: list[Row]) -> None:
+def _build_videos(
+    state: DatasetState, disk: Disk, videos: Mapping[str, list[_Group]], rows: list[Row], *, new: Path
+) -> None:
     if all(group.unchanged for groups in videos.values() for group in groups):
         return
     fps = state.info["fps"]
-    _link_others(state.root / "videos", state.root / _WORK / "new/videos", disk, "*/chunk-*/file-*.mp4")
+    exchange.link_others(state.root / "videos", new / "videos", disk, "*/chunk-*/file-*.mp4")
     for key, groups in videos.items():
         kind = f"videos/{key}"
         by_slot = ordered_slots(rows, kind)
         for group in groups:
-            target = state.root / _WORK / "new" / layout.video_file(key, group.target)
+            target = new / layout.video_file(key, group.target)
             disk.make_folder(target.parent)
             sources = [state.root / layout.video_file(key, source) for source in group.sources]
             lengths = [sum(row["length"] for row in by_slot[source]) for source in group.sources]
@@ -198,9 +177,10 @@ def _build_videos(state: DatasetState, disk: Disk, videos: Mapping[str, list[_Gr
                 row[f"{kind}/to_timestamp"] = start / fps
 
 
-def _build_meta(state: DatasetState, disk: Disk, rows: list[Row], stats: Mapping[str, statistics.Stats]) -> None:
-    new = state.root / _WORK / "new"
-    _link_others(state.root / "meta", new / "meta", disk, "episodes/chunk-*/file-*.parquet", "stats.json")
+def _build_meta(
+    state: DatasetState, disk: Disk, rows: list[Row], stats: Mapping[str, statistics.Stats], *, new: Path
+) -> None:
+    exchange.link_others(state.root / "meta", new / "meta", disk, "episodes/chunk-*/file-*.parquet", "stats.json")
     limit = state.info["data_files_size_in_mb"] * _MEBIBYTE
     # Full files whose rows did not change are kept; everything after the first other one is written again.
     done, slot = 0, None
@@ -230,16 +210,6 @@ def _build_meta(state: DatasetState, disk: Disk, rows: list[Row], stats: Mapping
     total = {key: statistics.aggregate(stat) for key, stat in stats.items()}
     lists = {key: {name: values.tolist() for name, values in stat.items()} for key, stat in total.items()}
     disk.write(new / layout.STATS, json.dumps(lists).encode())
-
-
-def _link_others(old: Path, new: Path, disk: Disk, *replaced: str) -> None:
-    """Link everything below `old` into `new`, but the files that match `replaced`."""
-    disk.make_folder(new)
-    skipped = {path for pattern in replaced for path in old.glob(pattern)}
-    for path in sorted(old.rglob("*")):
-        if path.is_file() and path not in skipped:
-            disk.make_folder((new / path.relative_to(old)).parent)
-            disk.link(path, new / path.relative_to(old))
 
 
 def _all_stats(state: DatasetState, schema: Schema, known: Mapping[int, EpisodeStats]) -> dict[str, statistics.Stats]:

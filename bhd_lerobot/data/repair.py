@@ -7,8 +7,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data import layout, video
-from bhd_lerobot.data.compact import compact, roll_forward
+from bhd_lerobot.data.compact import compact
 from bhd_lerobot.data.disk import Disk, RootLock, write_errors
+from bhd_lerobot.data.exchange import roll_forward
 from bhd_lerobot.data.schema import Schema
 from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots
 from bhd_lerobot.errors import DatasetError

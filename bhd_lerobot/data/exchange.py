@@ -1,0 +1,55 @@
+"""Other contents for a dataset, in one step that a kill cannot leave half done.
+
+The new ``data``, ``videos`` and ``meta`` folders are built completely beside the old ones. Then a marker is written,
+and from there on the folders are exchanged, each with two renames. A kill before the marker leaves the old dataset and
+some rubbish in the staging folder; a kill after it is completed by `roll_forward` at the next open.
+"""
+
+from pathlib import Path
+
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.disk import Disk
+
+_WORK = f"{layout.STAGING}/compact"  # the name that versions before had, so that what they left is found
+_MARKER = f"{_WORK}/ready"
+_FOLDERS = ("videos", "data", "meta")
+
+
+def begin(root: Path, disk: Disk) -> Path:
+    """Return the empty place in which the new folders are to be built; a folder that is not built stays as it is."""
+    disk.remove_tree(root / _WORK)
+    return root / _WORK / "new"
+
+
+def complete(root: Path, disk: Disk) -> None:
+    """Put what was built since `begin` in place of the old folders."""
+    disk.write(root / f"{_MARKER}.tmp", b"")
+    disk.move(root / f"{_MARKER}.tmp", root / _MARKER)
+    roll_forward(root, disk)
+
+
+def roll_forward(root: Path, disk: Disk) -> bool:
+    """Complete an exchange that had been decided; return whether there was one."""
+    if not (root / _MARKER).exists():
+        return False
+    new, old = root / _WORK / "new", root / _WORK / "old"
+    disk.make_folder(old)
+    for name in _FOLDERS:
+        if (new / name).exists():
+            # If the old folder is gone already, the kill came between these two renames.
+            if (root / name).exists():
+                disk.move(root / name, old / name)
+            disk.move(new / name, root / name)
+    disk.remove(root / _MARKER)
+    disk.remove_tree(root / _WORK)
+    return True
+
+
+def link_others(old: Path, new: Path, disk: Disk, *replaced: str) -> None:
+    """Link everything below `old` into `new`, but the files that match `replaced`."""
+    disk.make_folder(new)
+    skipped = {path for pattern in replaced for path in old.glob(pattern)}
+    for path in sorted(old.rglob("*")):
+        if path.is_file() and path not in skipped:
+            disk.make_folder((new / path.relative_to(old)).parent)
+            disk.link(path, new / path.relative_to(old))

@@ -1,0 +1,170 @@
+"""A copy of a dataset somewhere else, on the Hub or below a URL: what both have in common.
+
+A `Remote` lists its files with a checksum each, so that a transfer that is repeated moves only what differs.
+"""
+
+import hashlib
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from bhd_lerobot.data import layout
+from bhd_lerobot.errors import ConfigError
+
+CARD = "README.md"
+PICTURE = "preview.png"
+SUBSET = "meta/bhd_subset.json"
+"""Says that a folder holds the files of some episodes only. It is never uploaded."""
+
+_CHUNK = 1 << 20
+_REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """A file of a remote dataset.
+
+    Attributes:
+        size: its bytes.
+        digest: its checksum in hexadecimal; None if the place knows none.
+        algorithm: how the checksum is made: `sha256`, or `git`, the name that git gives to the content.
+    """
+
+    size: int
+    digest: str | None
+    algorithm: str = "sha256"
+
+
+@dataclass(frozen=True)
+class Item:
+    """A file that is to lie in a remote dataset.
+
+    Attributes:
+        path: where, relative to the dataset, with slashes.
+        content: the file on this machine, or its bytes.
+        size: its bytes.
+    """
+
+    path: str
+    content: Path | bytes
+    size: int
+
+    def is_like(self, file: RemoteFile | None) -> bool:
+        """Return whether the remote file has this content; false where that cannot be known."""
+        if file is None or file.size != self.size or file.digest is None:
+            return False
+        return digest(self.content, file.algorithm) == file.digest
+
+
+class Remote(Protocol):
+    """A place that a dataset is copied to or from.
+
+    Attributes:
+        name: what the user calls it.
+        kind: `hub` or `store`.
+    """
+
+    name: str
+    kind: str
+
+    def files(self) -> dict[str, RemoteFile]:
+        """Return all files by path; none if there is nothing yet.
+
+        Raises:
+            TransferError: the place cannot be asked, or does not let this user in.
+        """
+
+    def read(self, path: str) -> bytes | None:
+        """Return the content of a small file; None if there is none."""
+
+    def fetch(self, paths: Sequence[str], folder: Path) -> None:
+        """Copy files into a folder. Those that it holds from an earlier attempt are not fetched again.
+
+        Raises:
+            TransferError: not all of them came; those that did are kept.
+        """
+
+    def send(self, items: Sequence[Item], deleted: Sequence[str], check: Callable[[], None]) -> None:
+        """Put files there and remove others, so that a reader never takes a part for the whole.
+
+        Args:
+            items: what is to be written.
+            deleted: paths that are to go.
+            check: raises if the dataset on this machine changed meanwhile; called before anything becomes visible.
+
+        Raises:
+            TransferError: not all was sent; what was need not be sent again.
+        """
+
+
+def digest(content: Path | bytes, algorithm: str) -> str:
+    """Return the checksum of some content, as `RemoteFile` names them."""
+    if algorithm == "git":
+        size = len(content) if isinstance(content, bytes) else content.stat().st_size
+        hasher = hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
+    else:
+        hasher = hashlib.sha256()
+    if isinstance(content, bytes):
+        hasher.update(content)
+    else:
+        with open(content, "rb") as file:
+            while chunk := file.read(_CHUNK):
+                hasher.update(chunk)
+    return hasher.hexdigest()
+
+
+def is_url(place: str) -> bool:
+    """Return whether a place is a URL, and not the name of a dataset on the Hub."""
+    return "://" in place
+
+
+def check_repo_id(name: str) -> str:
+    """Return a name on the Hub if it is one.
+
+    Raises:
+        ConfigError: it is not of the form user/name.
+    """
+    if not _REPO_ID.fullmatch(name) or ".." in name or "--" in name or name.endswith((".git", ".", "-")):
+        raise ConfigError(
+            f"{name!r} is neither a name on the Hub, such as user/name, nor a URL, such as s3://bucket/folder or "
+            "file:///folder."
+        )
+    return name
+
+
+def is_recorded(path: str) -> bool:
+    """Return whether a path is that of a data, video or episode-metadata file in LeRobot's layout."""
+    return bool(_RECORDED.fullmatch(path))
+
+
+_CHUNK_FILE = r"chunk-\d+/file-\d+"
+_RECORDED = re.compile(rf"(data|meta/episodes)/{_CHUNK_FILE}\.parquet|videos/[^/]+/{_CHUNK_FILE}\.mp4")
+
+
+def total(items: Iterable[Item | RemoteFile]) -> int:
+    """Return the bytes of some files."""
+    return sum(one.size for one in items)
+
+
+def megabytes(size: int) -> str:
+    """Return a number of bytes in words."""
+    return f"{size / 1e6:.1f} MB" if size < 1e9 else f"{size / 1e9:.2f} GB"
+
+
+def counted(names: Sequence[str] | Mapping[str, Any]) -> str:
+    """Return how many files there are, in words."""
+    return "1 file" if len(names) == 1 else f"{len(names)} files"
+
+
+def listed(names: Iterable[str], at_most: int = 3) -> str:
+    """Return some names in words, and how many more there are."""
+    names = sorted(names)
+    more = f" and {len(names) - at_most} more" if len(names) > at_most else ""
+    return f"{', '.join(names[:at_most])}{more}"
+
+
+def in_order(paths: Iterable[str]) -> list[str]:
+    """Return paths so that what makes the others count comes last: `meta/info.json`."""
+    return sorted(paths, key=lambda path: (path.startswith("meta/"), path == layout.INFO, path))
