@@ -1,7 +1,7 @@
 """The steps that turn one finished episode into a part of the dataset."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data import layout
-from bhd_lerobot.data.compact import PARQUET_OPTIONS, EpisodeStats
+from bhd_lerobot.data.compact import EpisodeStats
 from bhd_lerobot.data.disk import Disk
 from bhd_lerobot.data.episode_table import episode_table
 from bhd_lerobot.data.layout import Slot
+from bhd_lerobot.data.meta_files import PARQUET_OPTIONS, tasks_table
 from bhd_lerobot.data.schema import Schema
 from bhd_lerobot.data.state import DatasetState, Row, slot_columns, slot_of
 from bhd_lerobot.data.video import VideoSettings, video_info
@@ -92,7 +93,7 @@ class Committer:
         moves.append((self._stage(staging / "episodes.parquet", table, **options), layout.episodes_file(slot)))
 
         if len(content.tasks) > len(state.tasks):
-            moves.insert(0, (self._stage(staging / "tasks.parquet", _tasks_table(content.tasks)), layout.TASKS))
+            moves.insert(0, (self._stage(staging / "tasks.parquet", tasks_table(content.tasks)), layout.TASKS))
         info |= {"total_episodes": index + 1, "total_frames": start + length, "total_tasks": len(content.tasks)}
         info["splits"] = {"train": f"0:{index + 1}"}
         self._disk.write(staging / "info.json", self._info_text(info))
@@ -126,19 +127,3 @@ class Committer:
 def _next_slot(state: DatasetState, kind: str) -> Slot:
     last = slot_of(state.rows[-1], kind) if state.rows else None
     return layout.next_slot(last, state.info["chunks_size"])
-
-
-def _tasks_table(tasks: Sequence[str]) -> pa.Table:
-    """Return ``tasks.parquet``: LeRobot expects a pandas table whose index is the sentence."""
-
-    def described(name: str | None, kind: str, dtype: str) -> dict[str, Any]:
-        return {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": dtype, "metadata": None}
-
-    note = {
-        "index_columns": ["task"],
-        "column_indexes": [described(None, "unicode", "object")],
-        "columns": [described("task_index", "int64", "int64"), described("task", "unicode", "object")],
-        "pandas_version": "2.0.0",
-    }
-    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
-    return table.replace_schema_metadata({"pandas": json.dumps(note)})

@@ -3,7 +3,6 @@
 New folders are built beside the old ones; files that need no change are linked. See `bhd_lerobot.data.exchange`.
 """
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,17 +13,13 @@ import pyarrow.parquet as pq
 
 from bhd_lerobot.data import exchange, layout, statistics, video
 from bhd_lerobot.data.disk import Disk
-from bhd_lerobot.data.episode_table import episode_table, read_stats
+from bhd_lerobot.data.episode_table import read_stats
 from bhd_lerobot.data.layout import Slot
+from bhd_lerobot.data.meta_files import MEBIBYTE, PARQUET_OPTIONS, write_meta
 from bhd_lerobot.data.schema import Schema, as_numpy
 from bhd_lerobot.data.state import DatasetState, Row, corrupt, ordered_slots, slot_columns, slot_of
 
-_MEBIBYTE = 1024**2
-
 EpisodeStats = dict[str, statistics.Stats]
-
-PARQUET_OPTIONS = {"compression": "snappy", "use_dictionary": False, "write_page_checksum": True}
-"""Plain pages: dictionaries cost three times the time on floats and save nothing. Checksums find damaged values."""
 
 
 @dataclass
@@ -85,7 +80,7 @@ def _groups(sizes: Mapping[Slot, int], limit: float, chunks_size: int, split: Ca
 
 def _data_groups(state: DatasetState) -> list[_Group]:
     sizes = {slot: (state.root / layout.data_file(slot)).stat().st_size for slot in ordered_slots(state.rows, "data")}
-    limit = state.info["data_files_size_in_mb"] * _MEBIBYTE
+    limit = state.info["data_files_size_in_mb"] * MEBIBYTE
     return _groups(sizes, limit, state.info["chunks_size"], lambda slot: False)
 
 
@@ -99,7 +94,7 @@ def _video_groups(state: DatasetState, key: str) -> list[_Group]:
         previous.append(slot)
         return signatures[before] != signatures[slot]
 
-    limit = state.info["video_files_size_in_mb"] * _MEBIBYTE
+    limit = state.info["video_files_size_in_mb"] * MEBIBYTE
     sizes = {slot: path.stat().st_size for slot, path in paths.items()}
     return _groups(sizes, limit, state.info["chunks_size"], differs)
 
@@ -181,7 +176,7 @@ def _build_meta(
     state: DatasetState, disk: Disk, rows: list[Row], stats: Mapping[str, statistics.Stats], *, new: Path
 ) -> None:
     exchange.link_others(state.root / "meta", new / "meta", disk, "episodes/chunk-*/file-*.parquet", "stats.json")
-    limit = state.info["data_files_size_in_mb"] * _MEBIBYTE
+    limit = state.info["data_files_size_in_mb"] * MEBIBYTE
     # Full files whose rows did not change are kept; everything after the first other one is written again.
     done, slot = 0, None
     for source, old_rows in ordered_slots(state.rows, "meta/episodes").items():
@@ -194,22 +189,7 @@ def _build_meta(
         disk.make_folder((new / layout.episodes_file(source)).parent)
         disk.link(path, new / layout.episodes_file(source))
         done, slot = done + len(old_rows), source
-    bytes_per_row = 512 + sum(values[:1].nbytes for stat in stats.values() for values in stat.values())
-    step = max(1, int(0.9 * limit / bytes_per_row))
-    for start in range(done, len(rows), step):
-        part = slice(start, min(start + step, len(rows)))
-        slot = layout.next_slot(slot, state.info["chunks_size"])
-        for row in rows[part]:
-            row.update(slot_columns("meta/episodes", slot))
-        values = {key: {name: array[part] for name, array in stat.items()} for key, stat in stats.items()}
-        sink = pa.BufferOutputStream()
-        table = episode_table(rows[part], state.metadata_types, values)
-        pq.write_table(table, sink, write_statistics=False, **PARQUET_OPTIONS)
-        disk.make_folder((new / layout.episodes_file(slot)).parent)
-        disk.write(new / layout.episodes_file(slot), sink.getvalue())
-    total = {key: statistics.aggregate(stat) for key, stat in stats.items()}
-    lists = {key: {name: values.tolist() for name, values in stat.items()} for key, stat in total.items()}
-    disk.write(new / layout.STATS, json.dumps(lists).encode())
+    write_meta(new, state.info, rows, state.metadata_types, stats, disk=disk, done=done, slot=slot)
 
 
 def _all_stats(state: DatasetState, schema: Schema, known: Mapping[int, EpisodeStats]) -> dict[str, statistics.Stats]:

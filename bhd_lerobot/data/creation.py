@@ -4,7 +4,7 @@ import contextlib
 import glob
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +48,31 @@ def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any]
         DatasetExistsError: `root` exists.
         DatasetWriteError: it cannot be written.
     """
+
+    def fill(building: Path) -> None:
+        disk.make_folder(building / "meta")
+        disk.write(building / layout.INFO, to_json(info))
+        disk.write(building / layout.IDENTITY, to_json(identity))
+
+    return build_root(root, fill, disk)
+
+
+def build_root(root: Path, fill: Callable[[Path], None], disk: Disk) -> RootLock:
+    """Build a dataset beside its place, rename it, and return the lock on it.
+
+    Args:
+        root: where to put it; must not exist.
+        fill: writes everything into the folder that it is given.
+        disk: how to write.
+
+    Raises:
+        DatasetExistsError: `root` exists.
+        DatasetWriteError: it cannot be written.
+    """
     exists = DatasetExistsError(f"{root} exists already. Resume it (--resume=true), remove it, or choose another root.")
     if root.exists() or root.is_symlink():
         raise exists
-    with write_errors("create the dataset", root, "Nothing was recorded."):
+    with write_errors("create the dataset", root, "Nothing was written there."):
         disk.make_folder(root.parent)
         prefix = f".{root.name}.bhd-"
         _remove_abandoned(root.parent, prefix)
@@ -59,9 +80,7 @@ def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any]
         lock = RootLock(building, shown_as=root)
         try:
             building.chmod(0o755)
-            disk.make_folder(building / "meta")
-            disk.write(building / layout.INFO, to_json(info))
-            disk.write(building / layout.IDENTITY, to_json(identity))
+            fill(building)
             if root.exists():
                 raise exists
             disk.move(building, root)

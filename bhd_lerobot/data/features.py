@@ -63,7 +63,7 @@ SCALARS: dict[str, tuple[str, str]] = {
     EVENT: (
         "int64",
         "0 nothing, 1 success, 2 collision, 3 stuck, 4 time-out, 5 intervention, 6 emergency stop, 7 wrong object, "
-        "8 dropped, 9 unreachable, 10 fault",
+        "8 dropped, 9 unreachable, 10 fault, 11 failure, of which a person did not say the cause",
     ),
 }
 

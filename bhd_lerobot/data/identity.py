@@ -58,30 +58,31 @@ def check_identity(
         )
     recorded: dict[str, Any] = {"robot_type": state.info.get("robot_type"), "fps": state.info["fps"]}
     requested: dict[str, Any] = {"robot_type": robot_type, "fps": fps}
-    recorded["features"] = _comparable(state.info["features"])
-    requested["features"] = _comparable(schema.features)
+    recorded["features"] = comparable(state.info["features"])
+    requested["features"] = comparable(schema.features)
     if recording is not None:
         recorded["recording"], requested["recording"] = state.identity["recording"], as_json(recording)
     if video is not None:
         recorded["video"], requested["video"] = state.identity["video"], as_json(video)
-    differences = list(_differences("", recorded, requested))
-    if not differences and list(recorded["features"]) != list(requested["features"]):
+    found = list(differences("", recorded, requested))
+    if not found and list(recorded["features"]) != list(requested["features"]):
         old, new = list(recorded["features"]), list(requested["features"])
-        differences = [f"order of features: recorded {old}, requested {new}"]
-    if differences:
-        text = "\n  ".join(differences)
+        found = [f"order of features: recorded {old}, requested {new}"]
+    if found:
+        text = "\n  ".join(found)
         raise DatasetMismatchError(
             f"{state.root} cannot be resumed, because it was recorded differently:\n  {text}\n"
             "Use the recorded values, or record into another root."
         )
 
 
-def _comparable(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def comparable(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return the features without what the encoder added later."""
     return {key: {k: v for k, v in as_json(feature).items() if k != "info"} for key, feature in features.items()}
 
 
-def _differences(prefix: str, recorded: Any, requested: Any) -> Iterator[str]:
+def differences(prefix: str, recorded: Any, requested: Any) -> Iterator[str]:
+    """Yield a line for every value below `prefix` that is not the same in both."""
     if isinstance(recorded, dict) and isinstance(requested, dict):
         for key in [*recorded, *(key for key in requested if key not in recorded)]:
             name = f"{prefix}.{key}" if prefix else str(key)
@@ -90,7 +91,7 @@ def _differences(prefix: str, recorded: Any, requested: Any) -> Iterator[str]:
             elif key not in requested:
                 yield f"{name}: recorded {_short(recorded[key])}, not requested"
             else:
-                yield from _differences(name, recorded[key], requested[key])
+                yield from differences(name, recorded[key], requested[key])
     elif recorded != requested:
         yield f"{prefix}: recorded {_short(recorded)}, requested {_short(requested)}"
 

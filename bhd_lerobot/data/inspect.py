@@ -72,7 +72,12 @@ def dataset_info(root: Path | str) -> DatasetSummary:
             index=row["episode_index"],
             frames=row["length"],
             task=", ".join(row["tasks"]),
-            metadata={key.removeprefix(PREFIX): value for key, value in row.items() if key.startswith(PREFIX)},
+            metadata={
+                # Of a mixture, an episode may lack what others have.
+                key.removeprefix(PREFIX): value
+                for key, value in row.items()
+                if key.startswith(PREFIX) and value is not None
+            },
         )
         for row in state.rows
     )

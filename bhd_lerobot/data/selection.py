@@ -14,13 +14,10 @@ from bhd_lerobot.data.episode_table import PREFIX
 from bhd_lerobot.data.features import EVENT
 from bhd_lerobot.data.table import FrameTable, checked_episodes
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
-from bhd_lerobot.tasks.task import Event
+from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
-OUTCOMES = tuple(event.cause for event in Event if event not in (Event.NOTHING, Event.INTERVENTION))
-"""The events that an episode can end with, by name."""
 
 HOLD_OUTS = ("episode", "instruction")
 """Of what a share is held out: of all episodes, or of those of each instruction, as LeRobot does it."""
@@ -78,10 +75,10 @@ class EpisodeFilter:
             wanted = [episode for episode in wanted if values[episode] in self.outcomes]
         if self.min_score is not None:
             scores = _metadata(meta, "score", "no min_score")
-            wanted = [episode for episode in wanted if scores[episode] >= self.min_score]
+            wanted = [episode for episode in wanted if (scores[episode] or 0.0) >= self.min_score]
         if self.exclude_late:
             timings = _metadata(meta, "timing", "exclude_late false")
-            wanted = [episode for episode in wanted if not _is_late(json.loads(timings[episode]))]
+            wanted = [episode for episode in wanted if not _is_late(json.loads(timings[episode] or "{}"))]
         if not wanted:
             raise DatasetError(self._nothing_left(meta, candidates))
         return wanted

@@ -151,7 +151,8 @@ def aggregate(stacked: Mapping[str, np.ndarray]) -> Stats:
     weighted by their frames, which is LeRobot's convention and only an approximation of the quantile of all frames.
 
     Args:
-        stacked: statistic -> values of all episodes, shape (E, ...); counts have the shape (E, 1).
+        stacked: statistic -> values of all episodes, shape (E, ...); counts have the shape (E, 1). Quantiles may be
+            absent: datasets of older versions have none.
     """
     counts = stacked["count"].astype(np.float64)
     weights = counts.reshape(-1, *[1] * (stacked["mean"].ndim - 1)) / counts.sum()
@@ -163,5 +164,5 @@ def aggregate(stacked: Mapping[str, np.ndarray]) -> Stats:
         "mean": mean,
         "std": np.sqrt(variance),
         "count": stacked["count"].sum(axis=0),
-        **{name: (weights * stacked[name]).sum(axis=0) for name in QUANTILES},
+        **{name: (weights * stacked[name]).sum(axis=0) for name in QUANTILES if name in stacked},
     }

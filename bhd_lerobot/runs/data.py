@@ -5,10 +5,17 @@ import sys
 from collections.abc import Sequence
 
 from bhd_lerobot.errors import BhdError
-from bhd_lerobot.runs import data_check, data_info, data_repair, data_timing
+from bhd_lerobot.runs import data_check, data_edit, data_info, data_mark, data_repair, data_timing
 
 # In the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
-COMMANDS = (data_info, data_timing, data_check, data_repair)
+COMMANDS = (
+    data_info,
+    data_timing,
+    data_check,
+    data_repair,
+    data_mark,
+    data_edit,
+)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -33,6 +33,7 @@ OUTCOMES: dict[str, tuple[str, str]] = {
     "unreachable": ("#009E73", "++++"),
     "fault": ("#222222", ""),
     "estop": ("#E69F00", "oooo"),
+    "failure": ("#a6611a", "||||"),
     "intervention": ("#ffffff", "----"),
 }
 SHOWN = 6  # episodes whose trajectories are shown

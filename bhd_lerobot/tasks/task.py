@@ -28,11 +28,16 @@ class Event(IntEnum):
     DROPPED = 8
     UNREACHABLE = 9
     FAULT = 10
+    FAILURE = 11  # without a cause: only a person says so
 
     @property
     def cause(self) -> str:
         """The event's name in an episode's metadata."""
         return self.name.lower()
+
+
+OUTCOMES = tuple(event.cause for event in Event if event not in (Event.NOTHING, Event.INTERVENTION))
+"""The events that an episode can end with, by name."""
 
 
 def episode_seed(seed: int, episode: int, split: Split) -> int:

@@ -1,0 +1,222 @@
+"""A dataset made of episodes of others: what merging, filtering, splitting, deleting and marking have in common.
+
+LeRobot's own tools encode films again when they take episodes out of one, write without the columns of
+``meta/episodes`` that they do not know, and leave a half dataset behind a kill. Here films are cut without encoding,
+every column comes along, and the new dataset appears complete or not at all. Files that stay as they are are linked.
+"""
+
+import copy
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.data import layout, statistics
+from bhd_lerobot.data.assemble_files import build_data, build_videos
+from bhd_lerobot.data.disk import Disk, to_json
+from bhd_lerobot.data.episode_table import PREFIX, read_stats
+from bhd_lerobot.data.identity import comparable, differences
+from bhd_lerobot.data.layout import Slot
+from bhd_lerobot.data.meta_files import tasks_table, write_meta
+from bhd_lerobot.data.picks import Files, Pick, Plan
+from bhd_lerobot.data.state import DatasetState, Row, corrupt, slot_of
+from bhd_lerobot.errors import DatasetError, DatasetMismatchError
+
+EDITS = "meta/edits.jsonl"
+"""What was done to a dataset after its recording: one JSON object a line."""
+
+_INDEXES = ("episode_index", "index", "task_index")
+
+
+def assemble(
+    picks: Sequence[Pick],
+    new: Path,
+    disk: Disk,
+    *,
+    types: Mapping[str, pa.DataType] | None = None,
+    edit: Mapping[str, Any],
+    identity: Mapping[str, Any] | None,
+) -> None:
+    """Write a dataset.
+
+    Args:
+        picks: its episodes, in order; at least one.
+        new: an empty or missing folder: becomes the dataset's root, or the place that `exchange.begin` gave.
+        disk: how to write.
+        types: Arrow types of metadata columns that no source has, by name without prefix.
+        edit: what is told in ``meta/edits.jsonl`` of this step.
+        identity: content of ``meta/bhd.json``; no such file if None.
+
+    Raises:
+        DatasetMismatchError: the sources have other columns, frame rates or robots.
+        DatasetCorruptError: a file of a source cannot be read.
+        UnsupportedDatasetError: a film cannot be cut without encoding again.
+        OSError: a file cannot be written.
+    """
+    sources = _sources(picks)
+    check_alike(sources)
+    kinds = {**_metadata_types(sources), **(types or {})}
+    tasks = _tasks(picks)
+    info = _info(sources, len(picks), sum(pick.row["length"] for pick in picks), len(tasks))
+    rows = _rows(picks, kinds)
+    plan = Plan(picks, rows, tasks, info, Files(picks))
+    build_data(plan, new, disk)
+    build_videos(plan, new, disk)
+    disk.make_folder(new / "meta")
+    sink = pa.BufferOutputStream()
+    pq.write_table(tasks_table(list(tasks)), sink)
+    disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
+    write_meta(new, info, rows, kinds, _stats(picks, rows, tasks), disk=disk)
+    if identity is not None:
+        disk.write(new / layout.IDENTITY, to_json(identity))
+    lines = [line for source in sources for line in _edits_of(source)] + [json.dumps(edit, ensure_ascii=False)]
+    disk.write(new / EDITS, "".join(f"{line}\n" for line in lines).encode())
+    disk.write(new / layout.INFO, to_json(info))
+
+
+def check_alike(sources: Sequence[DatasetState]) -> None:
+    """Check that episodes of several datasets can be in one.
+
+    Raises:
+        DatasetMismatchError: they cannot; every difference is told.
+    """
+    first = sources[0]
+    for other in sources[1:]:
+        found = list(differences("", _kind(first), _kind(other)))
+        if found:
+            lines = "\n  ".join(line.replace("recorded", "there").replace("requested", "here") for line in found)
+            raise DatasetMismatchError(
+                f"{other.root} does not fit {first.root}:\n  {lines}\nOnly datasets with the same robot, frame rate "
+                "and features can be one. lerobot-edit-dataset can remove features from one of them."
+            )
+
+
+def _kind(state: DatasetState) -> dict[str, Any]:
+    features = comparable(state.info["features"])
+    return {
+        "fps": state.info["fps"],
+        "robot_type": state.info.get("robot_type"),
+        "features": {
+            key: {name: feature.get(name) for name in ("dtype", "shape", "names")} for key, feature in features.items()
+        },
+    }
+
+
+def _sources(picks: Sequence[Pick]) -> list[DatasetState]:
+    if not picks:
+        raise DatasetError("No episode is left, and a dataset needs one. Nothing was changed.")
+    sources: list[DatasetState] = []
+    for pick in picks:
+        if not any(pick.source is source for source in sources):
+            sources.append(pick.source)
+    for source in sources:
+        if (source.root / layout.STAGING).exists() or source.without_stats:
+            raise DatasetError(
+                f"{source.root} is not finalised: its recording was interrupted, or goes on. Run `bhd-data repair "
+                f"{source.root}` first."
+            )
+    return sources
+
+
+def _metadata_types(sources: Sequence[DatasetState]) -> dict[str, pa.DataType]:
+    types: dict[str, pa.DataType] = {}
+    for source in sources:
+        for name, kind in source.metadata_types.items():
+            if types.setdefault(name, kind) != kind and not pa.types.is_null(kind):
+                raise DatasetMismatchError(
+                    f"{source.root}: the metadata {PREFIX}{name} of its episodes is {kind}; in {sources[0].root} it is "
+                    f"{types[name]}. They cannot be one column."
+                )
+    return types
+
+
+def _tasks(picks: Sequence[Pick]) -> dict[str, int]:
+    """Return the index of each instruction that is used: those of the first dataset in its order, then the next's."""
+    tasks: dict[str, None] = {}
+    for source in _sources(picks):
+        used = {task for pick in picks if pick.source is source for task in pick.row["tasks"]}
+        tasks |= dict.fromkeys(task for task in source.tasks if task in used)
+    return {task: index for index, task in enumerate(tasks)}
+
+
+def _info(sources: Sequence[DatasetState], episodes: int, frames: int, tasks: int) -> dict[str, Any]:
+    info = copy.deepcopy(sources[0].info)
+    for key, feature in info["features"].items():
+        told = [source.info["features"][key].get("info") or {} for source in sources]
+        if any(told):
+            # What films of several encoders do not share is not known of their mixture.
+            feature["info"] = {
+                name: value if all(one.get(name) == value for one in told) else None for name, value in told[0].items()
+            }
+    return info | {
+        "total_episodes": episodes,
+        "total_frames": frames,
+        "total_tasks": tasks,
+        "splits": {"train": f"0:{episodes}"},
+        "data_path": layout.DATA_PATH,
+        "video_path": layout.VIDEO_PATH if info.get("video_path") else info.get("video_path"),
+    }
+
+
+def _rows(picks: Sequence[Pick], types: Mapping[str, pa.DataType]) -> list[Row]:
+    rows, start = [], 0
+    for index, pick in enumerate(picks):
+        length = pick.row["length"]
+        row = {"episode_index": index, "tasks": list(pick.row["tasks"]), "length": length}
+        row |= {"dataset_from_index": start, "dataset_to_index": start + length}
+        row |= {PREFIX + name: pick.metadata.get(name, pick.row.get(PREFIX + name)) for name in types}
+        rows.append(row)
+        start += length
+    return rows
+
+
+def _stats(picks: Sequence[Pick], rows: Sequence[Row], tasks: Mapping[str, int]) -> dict[str, statistics.Stats]:
+    """Return feature -> statistic -> values of all episodes, shape (E, ...): the old ones where nothing changed."""
+    files: dict[tuple[int, Slot], tuple[dict[int, int], dict[str, statistics.Stats]]] = {}
+    stacked: dict[str, dict[str, list[np.ndarray]]] = {}
+    for place, pick in enumerate(picks):
+        slot = slot_of(pick.row, "meta/episodes")
+        if (id(pick.source), slot) not in files:
+            files[id(pick.source), slot] = _stored(pick.source, slot)
+        order, stored = files[id(pick.source), slot]
+        index = order[pick.row["episode_index"]]
+        own = {key: {name: values[index] for name, values in stat.items()} for key, stat in stored.items()}
+        row, length = rows[place], pick.row["length"]
+        task = tasks[pick.row["tasks"][0]]
+        columns: dict[str, np.ndarray] = {
+            "episode_index": np.full(length, place),
+            "index": np.arange(row["dataset_from_index"], row["dataset_to_index"]),
+            **({"task_index": np.full(length, task)} if len(pick.row["tasks"]) == 1 else {}),
+            **pick.columns,
+        }
+        fresh = statistics.column_stats({key: values for key, values in columns.items() if key in own})
+        for key, stat in {**own, **fresh}.items():
+            for name in own[key]:
+                stacked.setdefault(key, {}).setdefault(name, []).append(stat[name])
+    whole = {
+        key: {name: np.stack(values) for name, values in stat.items() if len(values) == len(picks)}
+        for key, stat in stacked.items()
+    }
+    return {key: stat for key, stat in whole.items() if {"min", "max", "mean", "std", "count"} <= stat.keys()}
+
+
+def _stored(source: DatasetState, slot: Slot) -> tuple[dict[int, int], dict[str, statistics.Stats]]:
+    path = source.root / layout.episodes_file(slot)
+    try:
+        file = pq.ParquetFile(path)
+        order = file.read(columns=["episode_index"], use_threads=False)["episode_index"].to_pylist()
+        return {index: place for place, index in enumerate(order)}, read_stats(file)
+    except (OSError, pa.ArrowException, ValueError) as error:
+        raise corrupt(path, error) from error
+
+
+def _edits_of(source: DatasetState) -> list[str]:
+    path = source.root / EDITS
+    try:
+        return path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    except (OSError, ValueError) as error:
+        raise corrupt(path, error) from error

@@ -1,0 +1,150 @@
+"""What a person says about episodes after they were recorded: how they ended, and where somebody intervened."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.data import features as keys
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.edits import EditReport, opened, rewrite
+from bhd_lerobot.data.picks import Pick
+from bhd_lerobot.data.schema import as_numpy
+from bhd_lerobot.data.state import DatasetState, Row, corrupt, ordered_slots, slot_of
+from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
+from bhd_lerobot.tasks.task import OUTCOMES, Event
+
+_SAID = "said afterwards"
+_COLUMNS: Mapping[str, pa.DataType] = {"outcome": pa.string(), "success": pa.bool_()}
+
+
+def mark(
+    root: Path | str,
+    episodes: Sequence[int],
+    *,
+    outcome: str | None = None,
+    intervention: tuple[int, int] | None = None,
+    clear_interventions: bool = False,
+    note: str = "",
+) -> EditReport:
+    """Say how episodes ended, or in which of their frames somebody intervened.
+
+    The columns ``event`` and ``next.success``, ``bhd/outcome`` and ``bhd/success`` of the episodes, and the statistics
+    follow; ``meta/edits.jsonl`` keeps what was said before. A dataset that another program recorded gets
+    ``bhd/outcome`` and ``bhd/success``, empty where nothing was said; its frames stay as they are. The score stays the
+    task's.
+
+    Args:
+        root: the dataset.
+        episodes: the episodes meant.
+        outcome: what they ended with, one of `OUTCOMES`; ``failure`` is a failure without a cause.
+        intervention: first and last frame of an intervention.
+        clear_interventions: take back all interventions.
+        note: why; for the log.
+
+    Raises:
+        ConfigError: nothing is said, or an unknown outcome or impossible frames.
+        DatasetLockedError: the dataset is being recorded.
+        DatasetError: there is no such episode or no sound, finalised dataset, the dataset has no column for it, or the
+            disk refuses; it is then as it was.
+    """
+    if outcome is not None and outcome not in OUTCOMES:
+        raise ConfigError(unknown_name("outcome", outcome, OUTCOMES))
+    if outcome is None and intervention is None and not clear_interventions:
+        raise ConfigError(f"Say what to mark: an outcome ({', '.join(OUTCOMES)}), or frames of an intervention.")
+    if not episodes:
+        raise ConfigError("Say which episodes to mark.")
+    with opened([Path(root)]) as (state,):
+        wrong = [episode for episode in episodes if not 0 <= episode < len(state.rows)]
+        if wrong:
+            raise DatasetError(f"There is no episode {wrong[0]} in {root}; valid: 0 to {len(state.rows) - 1}.")
+        changes = _Changes(state, outcome, intervention, clear_interventions)
+        picks = [changes.pick(row) if row["episode_index"] in set(episodes) else Pick(state, row) for row in state.rows]
+        edit = {"edit": "mark", "episodes": changes.log, **({"note": note} if note else {})}
+        types = {name: kind for name, kind in _COLUMNS.items() if outcome is not None}
+        return rewrite(state, picks, edit, state.identity, types)
+
+
+class _Changes:
+    """Makes the picks of the episodes that are marked, and tells what each was before."""
+
+    def __init__(
+        self, state: DatasetState, outcome: str | None, intervention: tuple[int, int] | None, clear: bool
+    ) -> None:
+        self.log: list[dict[str, Any]] = []
+        self._state, self._outcome, self._intervention, self._clear = state, outcome, intervention, clear
+        self._slots = ordered_slots(state.rows, "data")
+        self._features = state.info["features"]
+        if keys.EVENT not in self._features and (intervention is not None or clear):
+            raise DatasetError(
+                f"{state.root} has no column {keys.EVENT!r}, so no frame can be marked. Its outcome can (--outcome)."
+            )
+
+    def pick(self, row: Row) -> Pick:
+        length = row["length"]
+        metadata: dict[str, Any] = {}
+        columns: dict[str, np.ndarray] = {}
+        told: dict[str, Any] = {"episode": row["episode_index"]}
+        if keys.EVENT in self._features:
+            events = self._column(row, keys.EVENT)
+            columns[keys.EVENT] = events
+            told |= self._intervene(events, row, metadata)
+        if self._outcome is not None:
+            told["outcome"] = [row.get("bhd/outcome"), self._outcome]
+            metadata |= {"outcome": self._outcome, "success": self._outcome == Event.SUCCESS.cause}
+            if keys.EVENT in self._features:
+                columns[keys.EVENT][-1] = Event[self._outcome.upper()]
+            if keys.SUCCESS in self._features:
+                columns[keys.SUCCESS] = np.zeros(length, np.bool_)
+                columns[keys.SUCCESS][-1] = metadata["success"]
+        self.log.append(told)
+        return Pick(self._state, row, metadata, columns)
+
+    def _intervene(self, events: np.ndarray, row: Row, metadata: dict[str, Any]) -> dict[str, Any]:
+        """Change the events of an episode, and what its metadata tells of interventions; return what is logged."""
+        if not self._clear and self._intervention is None:
+            return {}
+        recorded = json.loads(row.get("bhd/interventions") or "[]")
+        driven = events == Event.INTERVENTION
+        for first, end, _ in recorded:  # the last frame's event is what ended the episode, whoever drove
+            driven[first:end] = True
+        before = _spans(driven)
+        if self._clear:
+            driven[:] = False
+        if self._intervention is not None:
+            first, last = self._intervention
+            if not 0 <= first <= last < row["length"]:
+                raise ConfigError(
+                    f"Frames {first} to {last} are not frames of episode {row['episode_index']}; valid: 0 to "
+                    f"{row['length'] - 1}, the first not after the last."
+                )
+            driven[first : last + 1] = True
+        events[(events == Event.INTERVENTION) & ~driven] = Event.NOTHING
+        events[(events == Event.NOTHING) & driven] = Event.INTERVENTION
+        if "interventions" in self._state.metadata_types:
+            reasons = {first: why for first, _, why in recorded}
+            spans = [[first, last + 1, reasons.get(first, _SAID)] for first, last in _spans(driven)]
+            metadata["interventions"] = json.dumps(spans)
+        if "intervened_frames" in self._state.metadata_types:
+            metadata["intervened_frames"] = int(driven.sum())
+        return {"interventions": [before, _spans(driven)]}
+
+    def _column(self, row: Row, key: str) -> np.ndarray:
+        slot = slot_of(row, "data")
+        path = self._state.root / layout.data_file(slot)
+        try:
+            table = pq.ParquetFile(path, page_checksum_verification=True).read(columns=[key], use_threads=False)
+        except (OSError, pa.ArrowException) as error:
+            raise corrupt(path, error) from error
+        first = row["dataset_from_index"] - self._slots[slot][0]["dataset_from_index"]
+        return as_numpy(table[key])[first : first + row["length"]].copy()
+
+
+def _spans(flags: np.ndarray) -> list[list[int]]:
+    """Return the first and the last frame of every run of true flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [[int(first), int(end) - 1] for first, end in edges.reshape(-1, 2)]
