@@ -9,7 +9,7 @@ from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock
-from bhd_lerobot.data.remote import CARD, PICTURE, SUBSET, Item, is_recorded, listed
+from bhd_lerobot.data.remote import SUBSET, Item, is_recorded, listed
 from bhd_lerobot.data.state import DatasetState, load_state
 from bhd_lerobot.errors import DatasetError, DatasetLockedError
 
@@ -98,7 +98,7 @@ def _files(state: DatasetState, stamps: dict[str, Any]) -> tuple[list[str], list
     """Return the files that belong to the dataset, and those that look like its own and belong to no episode."""
     needed = state.files()
     left_out = sorted(name for name in stamps if is_recorded(name) and name not in needed)
-    skipped = {*left_out, PICTURE, SUBSET}
+    skipped = {*left_out, SUBSET}
     names = [name for name in sorted(stamps) if name not in skipped and name.split("/")[0] not in _TEMPORARY]
     return names, left_out
 
@@ -108,20 +108,17 @@ def _stamps(root: Path) -> dict[str, tuple[int, ...]]:
     found: dict[str, tuple[int, ...]] = {}
     pending = [""]
     while pending:
-        folder = pending.pop()
-        with os.scandir(root / folder) as entries:
-            for entry in entries:
-                name = f"{folder}{entry.name}"
-                if entry.name.startswith(".") and name != layout.STAGING:
-                    continue
-                if entry.is_dir():
-                    pending.append(f"{name}/")
-                elif entry.is_file() and not name.startswith(f"{layout.STAGING}/"):
-                    stat = entry.stat()
-                    found[name] = (stat.st_size, stat.st_mtime_ns, stat.st_ino)
+        prefix = pending.pop()
+        try:
+            with os.scandir(root / prefix) as entries:
+                for entry in entries:
+                    if entry.name.startswith("."):
+                        continue
+                    if entry.is_dir(follow_symlinks=False):
+                        pending.append(f"{prefix}{entry.name}/")
+                    elif entry.is_file():
+                        stat = entry.stat()
+                        found[f"{prefix}{entry.name}"] = (stat.st_size, stat.st_mtime_ns, stat.st_ino)
+        except FileNotFoundError:
+            continue  # it went just now: whoever compares notices
     return found
-
-
-def card_of(local: LocalDataset) -> Item | None:
-    """Return the user's own card among the files of a dataset, if there is one."""
-    return next((item for item in local.items if item.path == CARD), None)

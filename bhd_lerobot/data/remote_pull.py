@@ -1,0 +1,258 @@
+"""Copy a dataset from the Hub or from below a URL: all of it, or the files of some episodes.
+
+Everything goes into a folder beside the target first, is compared with its checksums there, and becomes the dataset by
+a rename. What an interruption leaves is in that folder, and the next attempt goes on with it.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.disk import RootLock, to_json, write_errors
+from bhd_lerobot.data.remote import SUBSET, Remote, RemoteFile, digest, in_order, is_recorded, listed, megabytes, total
+from bhd_lerobot.data.remote_subset import Subset, files_of, read_subset
+from bhd_lerobot.data.state import load_state
+from bhd_lerobot.errors import DatasetError, DatasetExistsError, TransferError
+
+type Select = Callable[[Path], Sequence[int]]
+"""Chooses episodes, given a folder that holds the metadata of the dataset."""
+
+_HASHERS = 4
+_SPARE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class PullReport:
+    """What a pull did.
+
+    Attributes:
+        root: the dataset on this machine.
+        episodes: the episodes whose files it holds, by number; None if it is whole.
+        total_episodes: episodes of the whole dataset.
+        fetched: files that were fetched.
+        fetched_bytes: their bytes.
+        kept: files that were there already.
+    """
+
+    root: Path
+    episodes: list[int] | None
+    total_episodes: int
+    fetched: list[str]
+    fetched_bytes: int
+    kept: int
+
+
+def pull(remote: Remote, root: Path | str, *, select: Select | None = None, replace: bool = False) -> PullReport:
+    """Make the dataset on this machine the same as a remote one.
+
+    Of a dataset that is there already, files that are the same are not fetched again.
+
+    Args:
+        remote: where from.
+        root: where to.
+        select: chooses the episodes whose files are wanted; None wants all.
+        replace: put the remote dataset in the place of another one, or of a changed one; files that belong to no
+            dataset stay.
+
+    Raises:
+        DatasetExistsError: there is another dataset at `root`, or a changed one, and `replace` is false.
+        DatasetError: the remote dataset is not sound, or has none of the wanted episodes.
+        DatasetLockedError: `root` is being recorded, repaired or pulled by another process.
+        DatasetWriteError: this disk refuses the files.
+        TransferError: not all of it came; what did is kept, and the next attempt goes on with it.
+    """
+    root = Path(root).expanduser()
+    root = root.parent.resolve() / root.name if not root.is_symlink() else root.resolve()
+    with write_errors("pull the dataset", root, "What arrived is kept beside it; the dataset itself was not touched."):
+        return _Pull(remote, root, replace).run(select)
+
+
+class _Pull:
+    def __init__(self, remote: Remote, root: Path, replace: bool) -> None:
+        self._remote, self._root, self._replace = remote, root, replace
+        self._staging = root.with_name(f".{root.name}.pull")
+        self._old = root.with_name(f".{root.name}.old")
+        self._fetched: list[str] = []
+
+    def run(self, select: Select | None) -> PullReport:
+        there = self._files()
+        if os.path.ismount(self._root):
+            raise DatasetError(f"{self._root} is a mount point, which cannot be exchanged. Name a folder in it.")
+        if self._old.is_dir() and not self._root.exists():
+            self._old.rename(self._root)  # a kill between the two renames
+        self._staging.mkdir(parents=True, exist_ok=True)
+        locks = [RootLock(self._staging, self._root)]
+        try:
+            if self._root.is_dir():
+                locks.append(RootLock(self._root))
+            same = self._same(there)
+            meta = [path for path in there if not is_recorded(path) or path.startswith("meta/")]
+            self._get(meta, there, same)
+            subset = self._wanted(select, there, same)
+            wanted = {path for path in there if subset is None or path in subset.files or path in meta} | same
+            self._get(sorted(wanted), there, same)
+            whole = all(path in wanted for path in there if is_recorded(path))
+            if self._fetched or not self._is_complete(wanted, same, whole):
+                self._show(wanted, same, None if whole else subset)
+            else:
+                shutil.rmtree(self._staging)
+            info = json.loads((self._root / layout.INFO).read_bytes())
+            return PullReport(
+                root=self._root,
+                episodes=None if whole or subset is None else subset.episodes,
+                total_episodes=info["total_episodes"],
+                fetched=in_order(self._fetched),
+                fetched_bytes=total(there[path] for path in self._fetched),
+                kept=len(wanted) - len(self._fetched),
+            )
+        finally:
+            for lock in locks:
+                lock.release()
+            with contextlib.suppress(OSError):
+                self._staging.rmdir()  # if nothing came
+
+    def _files(self) -> dict[str, RemoteFile]:
+        there = self._remote.files()
+        name = self._remote.name
+        if layout.INFO not in there:
+            raise TransferError(
+                f"There is no LeRobot dataset at {name}: it has no {layout.INFO}. If it is being uploaded at this "
+                "moment, wait until that ends; otherwise check the name and the revision."
+            )
+        for path in there:
+            if path.startswith("/") or ".." in PurePosixPath(path).parts:
+                raise TransferError(f"{name} has a file {path!r}, which would lie outside of the dataset.")
+        hidden = {path for path in there if path.startswith(".") or path == SUBSET}
+        return {path: file for path, file in there.items() if path not in hidden}
+
+    def _same(self, there: Mapping[str, RemoteFile]) -> set[str]:
+        """Return what need not be fetched because `root` has it; refuse a root that holds something else."""
+        root = self._root
+        if not root.exists():
+            return set()
+        if not root.is_dir():
+            raise DatasetExistsError(f"{root} is a file. Choose another folder with --root.")
+        if (root / layout.STAGING).exists():
+            raise DatasetExistsError(
+                f"{root} is a recording that was interrupted. Run bhd-data repair {root}, or choose another --root."
+            )
+        if any(root.iterdir()) and not (root / layout.INFO).is_file() and not self._replace:
+            raise DatasetExistsError(f"{root} exists and is no dataset. Choose another folder with --root.")
+        same = _compare(root, [path for path in there if (root / path).is_file()], there)
+        changed = {path for path in there if (root / path).is_file() and path not in same}
+        changed |= layout.recorded_files(root) - there.keys()
+        if changed and not self._replace:
+            raise DatasetExistsError(
+                f"{root} holds another dataset, or was changed since it was pulled: {listed(changed)}. Choose another "
+                "folder with --root, or give what is there up with --replace."
+            )
+        return same
+
+    def _get(self, paths: Sequence[str], there: Mapping[str, RemoteFile], same: set[str]) -> None:
+        """Bring files into the staging folder, from the root or from afar, and check that they are whole."""
+        staging = self._staging
+        for path in (one for one in paths if one in same and not (staging / one).exists()):
+            _link(self._root / path, staging / path)
+        staged = [path for path in paths if (staging / path).is_file() and path not in same]
+        arrived = _compare(staging, staged, there) | same | set(self._fetched)
+        for path in staged:
+            if path not in arrived:
+                (staging / path).unlink()  # of another version
+        missing = [path for path in paths if path not in arrived]
+        if not missing:
+            return
+        need, free = total(there[path] for path in missing), shutil.disk_usage(staging).free
+        if need + _SPARE_BYTES > free:
+            raise TransferError(
+                f"Could not download {self._remote.name}: {megabytes(need)} are missing, and the disk of {staging} has "
+                f"{megabytes(free)} free. Free some space, or name another --root."
+            )
+        self._remote.fetch(missing, staging)
+        whole = _compare(staging, missing, there)
+        torn = [path for path in missing if path not in whole]
+        for path in torn:
+            (staging / path).unlink(missing_ok=True)
+        if torn:
+            raise TransferError(
+                f"Could not download {self._remote.name}: {listed(torn)} came otherwise than they were listed. It was "
+                "changed meanwhile, or they were damaged on the way. Repeat."
+            )
+        self._fetched += missing
+
+    def _wanted(self, select: Select | None, there: Mapping[str, RemoteFile], same: set[str]) -> Subset | None:
+        if select is None:
+            return None
+        episodes = {int(one) for one in select(self._staging)}
+        if (self._root / SUBSET).is_file():
+            episodes |= set(read_subset(self._root))
+        files = files_of(self._staging, sorted(episodes))
+        lost = files - there.keys()
+        if lost:
+            raise DatasetError(f"{self._remote.name} is not whole: {listed(lost)} are missing there.")
+        return Subset(sorted(episodes), files)
+
+    def _is_complete(self, wanted: set[str], same: set[str], whole: bool) -> bool:
+        return wanted <= same and whole != (self._root / SUBSET).exists()
+
+    def _show(self, wanted: set[str], same: set[str], subset: Subset | None) -> None:
+        """Let the staging folder become the dataset."""
+        root, staging = self._root, self._staging
+        shutil.rmtree(staging / ".cache", ignore_errors=True)
+        _remove_others(staging, wanted)
+        if subset is None:
+            load_state(staging)
+        else:
+            about = {"source": self._remote.name, "episodes": subset.episodes}
+            (staging / SUBSET).write_bytes(to_json(about))
+        if root.is_dir() and any(root.iterdir()):
+            for path in _foreign(root, wanted):
+                _link(root / path, staging / path)
+            shutil.rmtree(self._old, ignore_errors=True)
+            root.rename(self._old)
+            staging.rename(root)
+            shutil.rmtree(self._old)
+        else:
+            staging.rename(root)
+
+
+def _compare(folder: Path, paths: Sequence[str], there: Mapping[str, RemoteFile]) -> set[str]:
+    """Return which files have the listed size and checksum; where no checksum is known, the size decides."""
+
+    def is_same(path: str) -> bool:
+        file, local = there[path], folder / path
+        if not local.is_file() or local.stat().st_size != file.size:
+            return False
+        return file.digest is None or digest(local, file.algorithm) == file.digest
+
+    with ThreadPoolExecutor(_HASHERS) as pool:
+        return {path for path, same in zip(paths, pool.map(is_same, paths), strict=True) if same}
+
+
+def _link(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
+def _foreign(root: Path, wanted: Iterable[str]) -> list[str]:
+    """Return the files of a folder that belong to no dataset: notes, for example."""
+    ours = {*wanted, SUBSET, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY}
+    found = (path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
+    return [path for path in found if path not in ours and not is_recorded(path) and not path.startswith(".cache/")]
+
+
+def _remove_others(folder: Path, wanted: set[str]) -> None:
+    """Remove what an attempt for another version left."""
+    for path in sorted(folder.rglob("*"), reverse=True):
+        if path.is_file() and path.relative_to(folder).as_posix() not in wanted:
+            path.unlink()
+        elif path.is_dir() and not any(path.iterdir()):
+            path.rmdir()

@@ -1,0 +1,246 @@
+"""A dataset below a URL: an object store, a folder, anything that fsspec knows.
+
+Beside the dataset lies a list of its files with their checksums, because object stores keep none that all of them mean
+the same by. `meta/info.json` is written last and removed first, so that there is either all of a dataset or none.
+"""
+
+import contextlib
+import errno
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.remote import Item, RemoteFile, digest, in_order
+from bhd_lerobot.errors import BhdError, ConfigError, TransferError
+
+MANIFEST = "bhd_files.json"
+"""The list of files with size and SHA-256; not a part of the dataset."""
+
+_EXTRAS = {"s3": "lerobot_robot_bhd[s3]", "s3a": "lerobot_robot_bhd[s3]", "gs": "gcsfs", "gcs": "gcsfs"}
+_EXTRAS |= {"az": "adlfs", "abfs": "adlfs", "abfss": "adlfs", "sftp": "paramiko", "ssh": "paramiko"}
+
+_BATCH_BYTES = 64e6
+"""Bytes that are sent at once, after which the list is written: as much is sent again at most after a kill."""
+
+_BATCH_FILES = 64
+
+
+class StoreDataset:
+    """A dataset below a URL.
+
+    Attributes:
+        name: the URL.
+        kind: `store`.
+    """
+
+    kind = "store"
+
+    def __init__(self, url: str, storage_options: dict[str, Any] | None = None) -> None:
+        """Name it; nothing is asked for yet.
+
+        Args:
+            url: for example ``s3://bucket/folder``.
+            storage_options: what fsspec's file system takes: keys, endpoint; else its environment variables count.
+
+        Raises:
+            ConfigError: an unknown protocol, or a URL without a folder.
+            TransferError: what serves this protocol is not installed.
+        """
+        import fsspec  # type: ignore[import-untyped]
+        from fsspec.core import url_to_fs  # type: ignore[import-untyped]
+
+        protocol, _, path = url.partition("://")
+        self.name = url.rstrip("/")
+        if protocol in ("http", "https", "data", "hf", "lerobot"):
+            raise ConfigError(f"{url} cannot be written to or listed. Name a folder, or a dataset as user/name.")
+        if not path.strip("/"):
+            raise ConfigError(f"{url} names no folder. Give one, for example {protocol}://bucket/folder.")
+        try:
+            self._fs, self._root = url_to_fs(self.name, **(storage_options or {}))
+        except ImportError as error:
+            package = _EXTRAS.get(protocol, "")
+            remedy = f" Install it: pip install '{package}'" if package else ""
+            raise TransferError(f"What serves {protocol}:// is not installed ({error}).{remedy}") from error
+        except ValueError as error:
+            known = ", ".join(sorted(str(one) for one in fsspec.available_protocols()))
+            raise ConfigError(f"{url} cannot be used: {error}. Known protocols: {known}.") from error
+        self._known: dict[str, RemoteFile] = {}
+        self._there: dict[str, RemoteFile] = {}
+
+    def files(self) -> dict[str, RemoteFile]:
+        """Return all files by path; those that another program put there have no checksum.
+
+        Raises:
+            TransferError: the place does not exist, or no permission.
+        """
+        with store_errors(self.name, "look at"):
+            self._fs.invalidate_cache()
+            try:
+                found = self._fs.find(self._root, detail=True)
+            except (FileNotFoundError, NotADirectoryError):
+                found = {}  # a folder or a prefix that nobody wrote to yet; a missing bucket fails when it is written
+            root = self._fs._strip_protocol(self._root).rstrip("/")
+            sizes = {name[len(root) :].lstrip("/"): int(about["size"] or 0) for name, about in found.items()}
+            self._known = self._read_manifest() if MANIFEST in sizes else {}
+        sizes.pop(MANIFEST, None)
+        self._there = {}
+        for path, size in sizes.items():
+            known = self._known.get(path)
+            is_known = known is not None and known.size == size
+            self._there[path] = known if known is not None and is_known else RemoteFile(size, None)
+        return dict(self._there)
+
+    def read(self, path: str) -> bytes | None:
+        """Return a file; None if there is none of this name."""
+        with store_errors(self.name, f"read {path} of"):
+            try:
+                return bytes(self._fs.cat_file(self._at(path)))
+            except FileNotFoundError:
+                return None
+
+    def fetch(self, paths: Sequence[str], folder: Path) -> None:
+        """Copy files into a folder. Those that it holds whole from an earlier attempt are not fetched again.
+
+        Raises:
+            TransferError: not all of them came; those that did are kept.
+        """
+        with store_errors(self.name, "download"):
+            wanted = [path for path in paths if not (folder / path).is_file()]
+            for batch in _batches(wanted, lambda path: self._there[path].size):
+                parts = {path: folder / f"{path}.part" for path in batch}
+                for part in parts.values():
+                    part.parent.mkdir(parents=True, exist_ok=True)
+                self._fs.get([self._at(path) for path in batch], [str(part) for part in parts.values()])
+                for path, part in parts.items():
+                    part.replace(folder / path)
+
+    def send(self, items: Sequence[Item], deleted: Sequence[str], check: Callable[[], None]) -> None:
+        """Write files and remove others; the list of files after each batch, and `meta/info.json` last.
+
+        Raises:
+            TransferError: not all was written. What was is not sent again; there is no `meta/info.json` then.
+        """
+        if not items and not deleted:
+            return
+        by_path = {item.path: item for item in items}
+        info = by_path.pop(layout.INFO, None)
+        with store_errors(self.name, "upload the dataset to"):
+            is_shown = layout.INFO in self._there
+            if is_shown and (deleted or any(path in self._there and _matters(path) for path in by_path)):
+                # A reader who comes now finds no dataset; better than one of two versions.
+                if info is None:
+                    info = self._keep_info()
+                self._fs.rm_file(self._at(layout.INFO))
+                del self._there[layout.INFO]
+            stale = {*by_path, *deleted} & self._known.keys()
+            for path in stale:
+                del self._known[path]  # before it is overwritten: it must never be taken for what it was
+            if stale:
+                self._write_manifest()
+            if deleted:
+                self._fs.rm([self._at(path) for path in deleted])
+            for batch in _batches(in_order(by_path), lambda path: by_path[path].size):
+                self._put([by_path[path] for path in batch])
+            check()
+            if info is not None:
+                self._known[layout.INFO] = RemoteFile(info.size, digest(info.content, "sha256"))
+                self._write_manifest()
+                self._put([info], note=False)
+
+    def _put(self, items: Sequence[Item], note: bool = True) -> None:
+        files = [item for item in items if isinstance(item.content, Path)]
+        sums = {item.path: RemoteFile(item.size, digest(item.content, "sha256")) for item in items} if note else {}
+        for folder in {str(Path(self._at(item.path)).parent) for item in items}:
+            with contextlib.suppress(FileExistsError):
+                self._fs.makedirs(folder, exist_ok=True)
+        if files:
+            self._fs.put([str(item.content) for item in files], [self._at(item.path) for item in files])
+        for item in items:
+            if isinstance(item.content, bytes):
+                self._fs.pipe_file(self._at(item.path), item.content)
+        self._known |= sums
+        if note:
+            self._write_manifest()
+
+    def _keep_info(self) -> Item:
+        content = self._fs.cat_file(self._at(layout.INFO))
+        return Item(layout.INFO, bytes(content), len(content))
+
+    def _read_manifest(self) -> dict[str, RemoteFile]:
+        try:
+            listed = json.loads(self._fs.cat_file(self._at(MANIFEST)))
+            return {path: RemoteFile(int(one["size"]), str(one["sha256"])) for path, one in listed["files"].items()}
+        except (ValueError, KeyError, TypeError, AttributeError):
+            return {}  # a kill left half of it: nothing is known, so everything is compared by sending it again
+
+    def _write_manifest(self) -> None:
+        listed = {path: {"size": one.size, "sha256": one.digest} for path, one in sorted(self._known.items())}
+        self._fs.pipe_file(self._at(MANIFEST), json.dumps({"format": 1, "files": listed}, indent=1).encode())
+
+    def _at(self, path: str) -> str:
+        return f"{self._root.rstrip('/')}/{path}"
+
+
+@contextmanager
+def store_errors(url: str, action: str) -> Iterator[None]:
+    """Turn what goes wrong between this machine and a store into a `TransferError`."""
+    try:
+        yield
+    except BhdError:
+        raise
+    except Exception as error:  # of fsspec, of the store's own client: each has its own tree
+        raise TransferError(f"Could not {action} {url}: {_explain(error)}") from error
+
+
+def _explain(error: BaseException) -> str:
+    kind, text = type(error).__name__, " ".join(str(error).split())[:300].rstrip(".")
+    for holds, meaning in (
+        (
+            "Credentials" in kind or "Unable to locate credentials" in text,
+            "no credentials were found ({}). For S3 set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile.",
+        ),
+        (
+            "EndpointConnection" in kind or isinstance(error, ConnectionError) or "Could not connect" in text,
+            "the store cannot be reached ({}). Check the connection, and AWS_ENDPOINT_URL for a store of your own.",
+        ),
+        (
+            isinstance(error, FileNotFoundError),
+            "it does not exist ({}). Check the name; a bucket must be made first.",
+        ),
+        (
+            isinstance(error, PermissionError),
+            "no permission ({}). The key may be wrong or have expired, or may not be used for this.",
+        ),
+        (
+            isinstance(error, TimeoutError) or "Timeout" in kind,
+            "the store did not answer in time ({}). Check the connection.",
+        ),
+        (
+            isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
+            "the disk is full ({}). Free some space on it.",
+        ),
+    ):
+        if holds:
+            return meaning.format(text or kind)
+    return f"{text or 'no reason given'} ({kind})."
+
+
+def _matters(path: str) -> bool:
+    """Return whether a file decides what the dataset is: not its card."""
+    return path.startswith(("data/", "videos/", "meta/"))
+
+
+def _batches(paths: Sequence[str], size: Callable[[str], int]) -> Iterator[list[str]]:
+    batch: list[str] = []
+    held = 0.0
+    for path in paths:
+        if batch and (held + size(path) > _BATCH_BYTES or len(batch) == _BATCH_FILES):
+            yield batch
+            batch, held = [], 0.0
+        batch.append(path)
+        held += size(path)
+    if batch:
+        yield batch

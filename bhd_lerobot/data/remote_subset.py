@@ -1,0 +1,99 @@
+"""Which files hold some episodes, and the note that a folder has only those."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.remote import SUBSET
+from bhd_lerobot.data.state import corrupt
+from bhd_lerobot.errors import ConfigError, DatasetError
+
+
+@dataclass(frozen=True)
+class Subset:
+    """Some episodes of a dataset.
+
+    Attributes:
+        episodes: their numbers, ascending.
+        files: the data and video files that hold them, relative to the dataset.
+    """
+
+    episodes: list[int]
+    files: set[str]
+
+
+def parse_episodes(text: str) -> list[int]:
+    """Return the numbers in a list such as ``0,3,5-9``, ascending.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    found: set[int] = set()
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d+)(?:-(\d+))?\s*", part)
+        if match is None or (match[2] is not None and int(match[2]) < int(match[1])):
+            raise ConfigError(f"episodes is {text!r}; give numbers and ranges, such as 0,3,5-9.")
+        found.update(range(int(match[1]), int(match[2] or match[1]) + 1))
+    return sorted(found)
+
+
+def files_of(root: Path, episodes: Sequence[int]) -> set[str]:
+    """Return the data and video files that hold some episodes, by the metadata in `root`.
+
+    Raises:
+        DatasetError: there is no such episode.
+        DatasetCorruptError: the metadata cannot be read.
+    """
+    try:
+        info = json.loads((root / layout.INFO).read_bytes())
+        rows = [row for path in _tables(root) for row in _rows(path)]
+    except (OSError, ValueError) as error:
+        raise corrupt(root / layout.INFO, error) from error
+    by_index = {row["episode_index"]: row for row in rows}
+    unknown = [episode for episode in episodes if episode not in by_index]
+    if unknown:
+        raise DatasetError(
+            f"There is no episode {', '.join(map(str, unknown[:5]))}; the dataset has {len(by_index)}, from 0 to "
+            f"{len(by_index) - 1}."
+        )
+    patterns = {"data": info.get("data_path") or layout.DATA_PATH}
+    for key, feature in info["features"].items():
+        if feature["dtype"] == "video":
+            patterns[f"videos/{key}"] = (info.get("video_path") or layout.VIDEO_PATH).replace("{video_key}", key)
+    return {
+        pattern.format(chunk_index=row[f"{kind}/chunk_index"], file_index=row[f"{kind}/file_index"])
+        for row in (by_index[episode] for episode in episodes)
+        for kind, pattern in patterns.items()
+    }
+
+
+def read_subset(root: Path) -> list[int]:
+    """Return the episodes whose files a folder holds, as `SUBSET` says; none if that cannot be read."""
+    try:
+        return [int(one) for one in json.loads((root / SUBSET).read_bytes())["episodes"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def _tables(root: Path) -> list[Path]:
+    return sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet"))
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    try:
+        names = [
+            name
+            for name in pq.read_schema(path).names
+            if name == "episode_index" or name.endswith(("/chunk_index", "/file_index"))
+        ]
+        rows: list[dict[str, Any]] = pq.read_table(path, columns=names).to_pylist()
+    except (OSError, pa.ArrowException) as error:
+        raise corrupt(path, error) from error
+    return rows
