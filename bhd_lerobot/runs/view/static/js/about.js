@@ -1,0 +1,62 @@
+// The line above the views: which episode this is, how it ended, and what was stored about it.
+
+import { byId, make } from "./dom.js";
+import { markButtons } from "./marking.js";
+import { outcomeColour, outcomeWords } from "./outcomes.js";
+import { on, shown, state } from "./store.js";
+
+const MEASURES = { path_m: ["way", "m"], error_m: ["error", "m"], error_rad: ["error", "rad"], lifted_m: ["lifted", "m"] };
+
+export function startAbout(onCompareEnd) {
+  const build = () => byId("about").replaceChildren(
+    ...shown().map(([name, episode]) => card(name, episode, onCompareEnd)),
+    ...(state.a ? [markButtons()] : []));
+  on("episodes", build);
+}
+
+function card(name, episode, onCompareEnd) {
+  const outcome = state.dataset.episodes.outcome[episode.index] ?? "";
+  return make("div", { class: `card-${name}`, "data-episode": `${episode.index}` },
+    make("span", { class: "who" }, `#${episode.index}`),
+    make("span", { class: "badge", style: { "--colour": outcomeColour(outcome) } }, make("span", { class: "dot" }), outcomeWords(outcome)),
+    make("span", { class: "instruction" }, episode.instruction),
+    make("span", { class: "facts", title: stored(episode) }, facts(episode).join("  ·  ")),
+    make("button", { class: "quiet", title: "Everything that was stored about the episode", onclick: () => showAll(episode) }, "more"),
+    name === "b" ? make("button", { class: "quiet", title: "End the comparison (c)", onclick: onCompareEnd }, "✕") : null);
+}
+
+function facts(episode) {
+  const { score, seed, split } = episode.metadata;
+  const found = [`${(episode.frames / episode.fps).toFixed(1)} s`, `${episode.frames} frames`];
+  if (typeof score === "number") found.push(`score ${score.toFixed(3)}`);
+  for (const [key, [word, unit]] of Object.entries(MEASURES)) {
+    if (typeof episode.metadata[key] === "number") found.push(`${word} ${episode.metadata[key].toPrecision(3)} ${unit}`);
+  }
+  const clock = episode.timing?.clock;
+  if (clock === "lockstep") found.push("simulated time");
+  else if (clock) found.push(`${episode.timing.late_frames ?? 0} late frames, ${episode.timing.skipped ?? 0} ticks skipped`);
+  if (episode.plan?.problem) found.push(`problem: ${episode.plan.problem}`);
+  if (seed !== undefined) found.push(`${split ?? "seed"} …${`${seed}`.slice(-6)}`);
+  return found;
+}
+
+function stored(episode) {
+  return Object.entries(episode.metadata).map(([key, value]) => `${key}: ${value}`).join("\n");
+}
+
+function showAll(episode) {
+  const dialog = byId("dialog");
+  const rows = [...Object.entries(episode.metadata), ...Object.entries(episode.timing ?? {}).map(([key, value]) => [`timing: ${key}`, value])];
+  for (const [frame, name, code, message] of episode.goals) rows.push([`goal ${name}`, `${code} in frame ${frame}: ${message}`]);
+  for (const { when, note, outcome, interventions } of episode.marks) {
+    const what = outcome ? `${outcome[0] ?? "nothing"} → ${outcome[1]}` : `interventions ${JSON.stringify(interventions?.[1])}`;
+    rows.push([`marked ${when}`, note ? `${what}: ${note}` : what]);
+  }
+  const text = (value) => (typeof value === "object" ? JSON.stringify(value) : `${value}`);
+  dialog.replaceChildren(
+    make("h2", {}, `Episode ${episode.index}`),
+    rows.length ? make("table", {}, ...rows.map(([key, value]) => make("tr", {}, make("td", {}, key), make("td", { style: { "word-break": "break-word" } }, text(value)))))
+      : make("p", {}, "Nothing but its frames was stored."),
+    make("div", { class: "end" }, make("button", { onclick: () => dialog.close() }, "Close")));
+  dialog.showModal();
+}

@@ -1,0 +1,85 @@
+// The row of views: which ones there are for the shown episodes, and that all follow the time.
+
+import { drawArm } from "./arm_view.js";
+import { byId, make } from "./dom.js";
+import { film } from "./films.js";
+import { drawScan } from "./scan_view.js";
+import { on, shown, state } from "./store.js";
+import { drawTop, sameScene } from "./top_view.js";
+
+let followers = []; // functions that show the present time
+
+export function startViews() {
+  on("episodes", build);
+  on("time", follow);
+  on("playing", follow);
+  on("theme", follow);
+}
+
+const follow = () => followers.forEach((show) => show());
+
+function build() {
+  const cards = [...films(), ...scans(), ...tops(), ...arms()];
+  followers = cards.flatMap((card) => card.follow);
+  byId("views").replaceChildren(...cards.map((card) => card.element));
+  byId("views").hidden = cards.length === 0;
+  follow();
+}
+
+function card(kind, title, { grow = 1, output = null, follow: show }, ...inside) {
+  const heading = make("h2", {}, make("span", { title }, title), output);
+  const element = make("section", { class: "view", "data-view": kind, style: { "flex-grow": `${grow}` } },
+    heading, make("div", { class: "inside" }, ...inside));
+  return { element, follow: show };
+}
+
+function drawing(kind, title, label, draw, options = {}) {
+  const canvas = make("canvas", { role: "img", "aria-label": label });
+  const show = () => { if (canvas.clientWidth > 0) draw(canvas); };
+  new ResizeObserver(show).observe(canvas);
+  return card(kind, title, { ...options, follow: [show] }, canvas);
+}
+
+function films() {
+  return state.dataset.cameras.map((camera) => {
+    const sources = shown().flatMap(([name, episode]) => {
+      const about = episode.films.find((one) => one.key === camera.key);
+      return about ? [[name, film(camera, episode, about)]] : [];
+    });
+    for (const [name, one] of sources) {
+      one.element.classList.add(name);
+      one.element.classList.toggle("paired", sources.length > 1);
+    }
+    const grow = (camera.shape[1] ?? 4) / (camera.shape[0] ?? 3);
+    return card("film", `camera ${camera.label}`, { grow: sources.length > 1 ? 1.6 * grow : grow, follow: sources.map(([, one]) => one.show) },
+      ...sources.map(([, one]) => one.element));
+  });
+}
+
+function scans() {
+  if (!shown().some(([, episode]) => episode.views.scan)) return [];
+  const output = make("output", { title: "of the selected episode" });
+  return [drawing("scan", "scan, ahead is up", "laser scan around the robot", (canvas) => drawScan(canvas, output), { output })];
+}
+
+// Episodes in the same surroundings are drawn into one picture, others side by side.
+function groups(has) {
+  const there = shown().filter(([, episode]) => has(episode));
+  return there.length === 2 && !sameScene(there[0][1], there[1][1]) ? there.map((one) => [one]) : there.length ? [there] : [];
+}
+
+const numbers = (together) => (state.b ? ` · ${together.map(([, episode]) => `episode ${episode.index}`).join(", ")}` : "");
+
+function tops() {
+  return groups((episode) => episode.views.base).map((together) => {
+    const odometry = together[0][1].views.base.from === "odometry" ? "odometry from above" : "from above";
+    return drawing("top", odometry + numbers(together), "the robot's way from above", (canvas) => drawTop(canvas, together));
+  });
+}
+
+function arms() {
+  return groups((episode) => episode.views.arm).flatMap((together) => [
+    drawing("arm-above", `from above${numbers(together)}`, "the arm from above", (canvas) => drawArm(canvas, "above", together)),
+    drawing("arm-side", `from the side${numbers(together)}`, "the arm from the side", (canvas) => drawArm(canvas, "side", together)),
+  ]);
+}
