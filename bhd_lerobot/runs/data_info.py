@@ -65,7 +65,7 @@ def info(root: Path, console: Console, as_json: bool = False) -> None:
         features.add_column(heading)
     for key, feature in summary.features.items():
         # Units stand in square brackets, which rich would take for markup.
-        features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), escape(_meaning(key, feature)))
+        features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), escape(meaning_of(key, feature)))
     console.print(features)
     episodes = Table(title="Episodes", title_justify="left")
     columns = _episode_columns(summary, timings)
@@ -117,7 +117,8 @@ def _timing(timings: Sequence[TimingSummary]) -> str:
     )
 
 
-def _meaning(key: str, feature: dict[str, Any]) -> str:
+def meaning_of(key: str, feature: dict[str, Any]) -> str:
+    """Return what a column holds, in words; the names of a vector where there is nothing better."""
     if key in keys.SCALARS:
         return keys.SCALARS[key][1]
     if key in _LEROBOT_COLUMNS:

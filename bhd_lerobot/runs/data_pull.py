@@ -1,0 +1,171 @@
+"""`bhd-data pull`: a dataset from the Hub, or from below a URL."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bhd_lerobot.data.identity import default_root
+from bhd_lerobot.data.remote import check_repo_id, counted, is_url, megabytes
+from bhd_lerobot.errors import ConfigError, DatasetWriteError, TransferError
+from bhd_lerobot.runs.data_command import Commands, add_command
+from bhd_lerobot.runs.data_transfer import command_line, prompt_interrupt, quiet_bars, split_list, storage_options
+
+if TYPE_CHECKING:
+    from bhd_lerobot.data.remote_pull import PullReport, Select
+
+
+def add_to(commands: Commands) -> None:
+    """Add `pull`."""
+    help_text = "download a dataset from the Hub or from below a URL, or some episodes of it; repeat it to go on"
+    command = add_command(commands, "pull", help_text, _run, names_dataset=False)
+    command.add_argument("source", nargs="?", help="user/name on the Hub, or a URL")
+    command.add_argument("--repo_id", help="the name on the Hub, as an option")
+    command.add_argument("--root", help="where to; of a name on the Hub, LeRobot's default place if nothing")
+    command.add_argument("--revision", help="branch, tag or commit; the one that stock LeRobot takes if nothing")
+    command.add_argument("--episodes", help="only the files of these episodes, such as 0,3,5-9")
+    command.add_argument("--outcome", help="only the files of episodes that ended so, such as success")
+    command.add_argument("--min_score", type=float, help="only the files of episodes with at least this score, 0 to 1")
+    command.add_argument("--replace", action="store_true", help="give up another or a changed dataset that is there")
+    command.add_argument("--storage_options", help="options of the URL's file system, JSON")
+
+
+def _run(options: argparse.Namespace) -> int:
+    source, root = _places(options)
+    again = command_line(
+        "pull",
+        [source],
+        root=root,
+        revision=options.revision,
+        episodes=options.episodes,
+        outcome=options.outcome,
+        min_score=options.min_score,
+        replace=options.replace,
+        storage_options=options.storage_options,
+    )
+    options.stopped = f"{root} is as it was, and what arrived is not fetched again. Go on with:\n  {again}"
+    with prompt_interrupt(options):
+        report = pull_dataset(
+            source,
+            root,
+            revision=options.revision,
+            select=_selection(options),
+            replace=options.replace,
+            storage=options.storage_options,
+            again=again,
+        )
+    print(tell(report, source))
+    return 0
+
+
+def pull_dataset(
+    source: str,
+    root: Path,
+    *,
+    revision: str | None = None,
+    select: "Select | None" = None,
+    replace: bool = False,
+    storage: str | None = None,
+    again: str | None = None,
+) -> "PullReport":
+    """Download a dataset, or some episodes of it.
+
+    Args:
+        source: name on the Hub, or a URL.
+        root: where to.
+        revision: branch, tag or commit of the Hub; the one that stock LeRobot takes if None.
+        select: chooses the episodes, given a folder with the metadata; None means all.
+        replace: give up another or a changed dataset that is there.
+        storage: options of the URL's file system, JSON.
+        again: the command to repeat.
+
+    Raises:
+        BhdError: it is not there; the message says why, and how to repeat.
+    """
+    from bhd_lerobot.data.hub import HubDataset
+    from bhd_lerobot.data.remote_pull import pull
+    from bhd_lerobot.data.remote_store import StoreDataset
+
+    quiet_bars()
+    remote = StoreDataset(source, storage_options(storage)) if is_url(source) else HubDataset(source, revision)
+    try:
+        return pull(remote, root, select=select, replace=replace)
+    except (TransferError, DatasetWriteError) as error:
+        again = again or command_line("pull", [source], root=root, revision=revision)
+        raise type(error)(
+            f"{error}\n{root} is as it was, and what arrived is not fetched again. When that is mended, repeat:\n"
+            f"  {again}"
+        ) from error
+
+
+def tell(report: "PullReport", source: str) -> str:
+    """Return a report for a terminal."""
+    lines = [f"{report.root}: {report.total_episodes} episodes"]
+    if report.fetched:
+        lines.append(
+            f"  fetched {counted(report.fetched)}, {megabytes(report.fetched_bytes)}; {report.kept} were there already"
+        )
+    else:
+        lines.append(f"  nothing to fetch: all {report.kept} files are there")
+    if report.episodes is not None:
+        chosen = _ranges(report.episodes)
+        name = "me/some" if is_url(source) else source
+        lines[0] = f"{report.root}: {len(report.episodes)} of {report.total_episodes} episodes: {chosen}"
+        lines += [
+            "  Name them where you load it:",
+            f"    bhd-train --dataset.repo_id={name} --dataset.root={report.root} --dataset.episodes="
+            f'"{report.episodes if len(report.episodes) <= 20 else "[...]"}"',
+        ]
+    return "\n".join(lines)
+
+
+def _selection(options: argparse.Namespace) -> "Select | None":
+    """Return what chooses the episodes; None if all are wanted.
+
+    Raises:
+        ConfigError: a value that cannot be honoured.
+    """
+    if options.episodes is None and options.outcome is None and options.min_score is None:
+        return None
+    from bhd_lerobot.data.remote_subset import parse_episodes
+
+    episodes = None if options.episodes is None else parse_episodes(options.episodes)
+    if options.outcome is None and options.min_score is None:
+        return lambda _: episodes or []
+    from bhd_lerobot.data.selection import EpisodeFilter
+
+    wanted = EpisodeFilter(outcome=split_list(options.outcome) or "all", min_score=options.min_score)
+
+    def select(folder: Path) -> Sequence[int]:
+        from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+        return wanted.select(LeRobotDatasetMetadata("bhd/pull", root=folder), episodes)
+
+    return select
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """Return ascending numbers in the form of --episodes."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
+
+
+def _places(options: argparse.Namespace) -> tuple[str, Path]:
+    source = options.source or options.repo_id
+    if source is None or (options.source and options.repo_id):
+        raise ConfigError("Say where from, once: bhd-data pull user/name, or bhd-data pull s3://bucket/dir --root=DIR.")
+    if is_url(source):
+        if options.root is None:
+            raise ConfigError(f"Say where to: bhd-data pull {source} --root=DIR.")
+        if options.revision is not None:
+            raise ConfigError(f"{source} is a URL: it has no revisions. Leave --revision out.")
+    else:
+        check_repo_id(source)
+        if options.storage_options is not None:
+            raise ConfigError("--storage_options is for URLs, not for the Hub.")
+    return source, Path(options.root).expanduser() if options.root else default_root(source)

@@ -1,0 +1,171 @@
+"""`bhd-data push`: a dataset to the Hub, or below a URL."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bhd_lerobot.data.identity import default_root
+from bhd_lerobot.data.remote import check_repo_id, counted, is_url, listed, megabytes
+from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.runs.data_command import Commands, add_command
+from bhd_lerobot.runs.data_transfer import command_line, prompt_interrupt, quiet_bars, split_list, storage_options
+
+if TYPE_CHECKING:
+    from bhd_lerobot.data.remote_push import PushReport
+
+
+def add_to(commands: Commands) -> None:
+    """Add `push`."""
+    help_text = "upload a dataset to the Hub or below a URL: what differs, with a card; repeat it to go on"
+    command = add_command(commands, "push", help_text, _run, names_dataset=False)
+    command.add_argument("places", nargs="*", metavar="ROOT [TARGET]", help="folder; user/name on the Hub, or a URL")
+    command.add_argument("--root", help="the folder, as an option; LeRobot's default place of the name if nothing")
+    command.add_argument("--repo_id", help="the name on the Hub, as an option")
+    command.add_argument("--branch", "--revision", help="branch to write to; it is made if it does not exist")
+    command.add_argument("--tag", help="a further tag for what is pushed")
+    seen = command.add_mutually_exclusive_group()
+    seen.add_argument("--private", dest="private", action="store_const", const=True, help="a repository for you alone")
+    seen.add_argument("--public", dest="private", action="store_const", const=False, help="a repository for everybody")
+    command.add_argument("--tags", help="tags of the card, separated by commas")
+    command.add_argument("--licence", "--license", default="apache-2.0", help="licence of the card")
+    command.add_argument("--no-card", action="store_true", help="send no card but one that lies in the folder")
+    command.add_argument("--replace-card", action="store_true", help="overwrite a card there that somebody edited")
+    command.add_argument("--storage_options", help="options of the URL's file system, JSON")
+
+
+def _run(options: argparse.Namespace) -> int:
+    root, target = _places(options)
+    again = command_line(
+        "push",
+        [root, target],
+        branch=options.branch,
+        tag=options.tag,
+        private=options.private is True,
+        public=options.private is False,
+        tags=split_list(options.tags),
+        licence=None if options.licence == "apache-2.0" else options.licence,
+        **{"no-card": options.no_card, "replace-card": options.replace_card},
+        storage_options=options.storage_options,
+    )
+    options.stopped = f"the dataset at {root} is unchanged, and what arrived is not sent again. Go on with:\n  {again}"
+    with prompt_interrupt(options):
+        report = push_dataset(
+            root,
+            target,
+            branch=options.branch,
+            tag=options.tag,
+            private=options.private,
+            tags=split_list(options.tags),
+            licence=options.licence,
+            card=not options.no_card,
+            replace_card=options.replace_card,
+            storage=options.storage_options,
+            again=again,
+        )
+    print(tell(report))
+    return 0
+
+
+def push_dataset(
+    root: Path,
+    target: str,
+    *,
+    branch: str | None = None,
+    tag: str | None = None,
+    private: bool | None = None,
+    tags: Sequence[str] = (),
+    licence: str = "apache-2.0",
+    card: bool = True,
+    replace_card: bool = False,
+    storage: str | None = None,
+    again: str | None = None,
+) -> "PushReport":
+    """Upload a dataset, with its card.
+
+    Args:
+        root: the dataset.
+        target: name on the Hub, or a URL.
+        branch: branch of the Hub to write to; the main one if None.
+        tag: a further tag for what is pushed.
+        private: whether a repository that is made is private; None leaves it to the Hub.
+        tags: tags of the card.
+        licence: licence of the card.
+        card: whether a card is made.
+        replace_card: overwrite a card that a person edited.
+        storage: options of the URL's file system, JSON.
+        again: the command to repeat.
+
+    Raises:
+        BhdError: it was not uploaded; the message says why, that the dataset is kept, and how to repeat.
+    """
+    from bhd_lerobot.data.hub import HubDataset
+    from bhd_lerobot.data.remote_push import Card, push
+    from bhd_lerobot.data.remote_store import StoreDataset
+    from bhd_lerobot.data.state import DatasetState
+
+    def make(state: DatasetState) -> Card:
+        from bhd_lerobot.runs.data_card import CardOptions, make_card
+
+        named = None if is_url(target) else target
+        return make_card(state, CardOptions(named, "" if named else target, licence, tags))
+
+    again = again or command_line("push", [root, target], private=private is True, tags=list(tags))
+    quiet_bars()
+    try:
+        remote = (
+            StoreDataset(target, storage_options(storage))
+            if is_url(target)
+            else HubDataset(target, branch, private=private, tag=tag, create=True)
+        )
+        return push(root, remote, make_card=make if card else None, replace_card=replace_card)
+    except ConfigError:
+        raise
+    except BhdError as error:
+        kept = f"The dataset at {root} is unchanged" if Path(root).exists() else "Nothing was sent"
+        raise type(error)(f"{error}\n{kept}. When that is mended, repeat:\n  {again}") from error
+
+
+def tell(report: "PushReport") -> str:
+    """Return a report for a terminal."""
+    lines = [f"{report.name}: {report.episodes} episodes"]
+    if report.sent:
+        lines.append(f"  sent {counted(report.sent)}, {megabytes(report.sent_bytes)}; {report.kept} were there already")
+    elif not report.deleted:
+        lines.append(f"  nothing to send: all {report.kept} files are there")
+    if report.deleted:
+        lines.append(f"  removed there, because no episode needs them: {listed(report.deleted)}")
+    if report.left_out:
+        lines.append(f"  not sent, because no episode needs them: {listed(report.left_out)}")
+    if report.kept_card:
+        lines.append("  its README.md was edited by somebody and is left as it is; --replace-card writes a new one")
+    return "\n".join(lines)
+
+
+def _places(options: argparse.Namespace) -> tuple[Path, str]:
+    """Return the folder and the target that were named in one way or another.
+
+    Raises:
+        ConfigError: one is missing, or named twice.
+    """
+    places = list(options.places)
+    if places and options.root is None and not is_url(places[0]):
+        options.root = places.pop(0)
+    if places and options.repo_id is None:
+        options.repo_id = places.pop(0)
+    if places:
+        raise ConfigError(f"{' '.join(places)} is too much; give the folder and one target.")
+    if options.repo_id is None:
+        raise ConfigError(
+            "Say where to: bhd-data push ROOT user/name for the Hub, or bhd-data push ROOT s3://bucket/dir for a URL."
+        )
+    if not is_url(options.repo_id):
+        check_repo_id(options.repo_id)
+        if options.storage_options is not None:
+            raise ConfigError("--storage_options is for URLs, not for the Hub.")
+    elif options.branch or options.tag or options.private is not None:
+        raise ConfigError(f"{options.repo_id} is a URL: it has no branches, tags or privacy of its own.")
+    if options.root is None and is_url(options.repo_id):
+        raise ConfigError("Name the folder of the dataset first: bhd-data push ROOT URL.")
+    root = Path(options.root).expanduser() if options.root else default_root(options.repo_id)
+    return root, options.repo_id
