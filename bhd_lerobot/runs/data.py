@@ -5,7 +5,17 @@ import sys
 from collections.abc import Sequence
 
 from bhd_lerobot.errors import BhdError
-from bhd_lerobot.runs import data_check, data_edit, data_info, data_mark, data_repair, data_timing
+from bhd_lerobot.runs import (
+    data_check,
+    data_edit,
+    data_info,
+    data_mark,
+    data_pull,
+    data_push,
+    data_repair,
+    data_timing,
+    data_view,
+)
 
 # In the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
 COMMANDS = (
@@ -15,6 +25,9 @@ COMMANDS = (
     data_repair,
     data_mark,
     data_edit,
+    data_view,
+    data_push,
+    data_pull,
 )
 
 
