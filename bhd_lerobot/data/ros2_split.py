@@ -1,0 +1,76 @@
+"""Which topics carry the numbers of a feature: the names decide."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bhd_lerobot.bodies.body import LidarSpec
+from bhd_lerobot.data import features as keys
+from bhd_lerobot.data.ros2_arm import TOOL, JointsPart, PosePart
+from bhd_lerobot.data.ros2_base import (
+    GYRO,
+    ODOMETRY,
+    TWIST,
+    BareTwistPart,
+    GyroPart,
+    OdometryPart,
+    ScanPart,
+    TwistPart,
+)
+from bhd_lerobot.data.ros2_parts import IntegersPart, NumbersPart, Part, own_topic
+
+PARTS: Mapping[str, type[Part]] = {
+    kind.__name__: kind
+    for kind in (
+        TwistPart, BareTwistPart, OdometryPart, GyroPart, ScanPart, JointsPart, PosePart, NumbersPart, IntegersPart,
+    )
+}  # fmt: skip
+"""What a part can be, by the name under which a bag says it."""
+
+_SCAN = re.compile(r"scan_\d+\.pos")
+_OBSERVED, _ASKED, _APPLIED = keys.OBSERVATION_STATE, keys.ACTION, keys.APPLIED_ACTION
+_SUFFIX = {_ASKED: "", _APPLIED: "_applied"}
+ROBOTS = ("turtlebot3", "ur5")
+"""Robots whose names and units are known: m, rad and s."""
+
+
+def parts_of(
+    key: str, names: Sequence[str], robot_type: str, *, lidar: LidarSpec | None, bare_twist: bool = False
+) -> list[Part]:
+    """Return what carries a vector of floats; every name is in exactly one part.
+
+    Args:
+        key: the feature.
+        names: of its numbers.
+        robot_type: of any but our robots' nothing is known about units, and `Numbers` carry everything.
+        lidar: of the robot, if it has one.
+        bare_twist: commands of a base without stamps.
+    """
+    left = list(names)
+    parts: list[Part] = []
+
+    def take(kind: type[Part], topic: str, wanted: Sequence[str], **options: Any) -> None:
+        if wanted and set(wanted) <= set(left):
+            parts.append(kind(topic, tuple(wanted), **options))
+            left[:] = [name for name in left if name not in wanted]
+
+    if robot_type in ROBOTS and len(set(names)) == len(names):
+        if key == _OBSERVED:
+            take(OdometryPart, "/odom", (*TWIST, *ODOMETRY))
+            take(OdometryPart, "/odom", TWIST)
+            take(GyroPart, "/imu", GYRO)
+            if lidar is not None:
+                take(ScanPart, "/scan", [name for name in names if _SCAN.fullmatch(name)], lidar=lidar)
+            take(PosePart, "/tool_pose", TOOL)
+            joints = [name.removesuffix(".pos") for name in left if name.endswith(".pos")]
+            speeds = [f"{joint}.vel" for joint in joints]
+            with_speeds = speeds if set(speeds) <= set(left) else []
+            take(JointsPart, "/joint_states", [f"{joint}.pos" for joint in joints] + with_speeds)
+        elif key in _SUFFIX:
+            end = _SUFFIX[key]
+            take(BareTwistPart if bare_twist else TwistPart, f"/cmd_vel{end}", TWIST)
+            take(PosePart, f"/tool_command{end}", TOOL)
+            take(JointsPart, f"/joint_command{end}", [name for name in left if name.endswith(".pos")])
+    if left:
+        parts.append(NumbersPart(own_topic(key), tuple(left)))
+    return parts
