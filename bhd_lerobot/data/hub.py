@@ -67,7 +67,7 @@ class HubDataset:
         """
         if self._create:
             self._make()
-        with hub_errors(self.name, "look at", revision=self.revision):
+        with hub_errors(self.name, "read", revision=self.revision):
             api = self._api
             info = api.repo_info(self.name, repo_type="dataset", revision=self._wanted())
             if self._create and self._private is not None and bool(info.private) != self._private:

@@ -188,7 +188,12 @@ class _Pull:
     def _wanted(self, select: Select | None, there: Mapping[str, RemoteFile], same: set[str]) -> Subset | None:
         if select is None:
             return None
-        episodes = {int(one) for one in select(self._staging)}
+        try:
+            chosen = {int(one) for one in select(self._staging)}
+            files_of(self._staging, sorted(chosen))
+        except DatasetError as error:
+            raise type(error)(str(error).replace(str(self._staging), self._remote.name)) from error
+        episodes = set(chosen)
         if (self._root / SUBSET).is_file():
             episodes |= set(read_subset(self._root))
         files = files_of(self._staging, sorted(episodes))

@@ -76,7 +76,7 @@ class StoreDataset:
         Raises:
             TransferError: the place does not exist, or no permission.
         """
-        with store_errors(self.name, "look at"):
+        with store_errors(self.name, "read"):
             self._fs.invalidate_cache()
             try:
                 found = self._fs.find(self._root, detail=True)

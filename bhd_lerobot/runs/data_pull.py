@@ -44,7 +44,7 @@ def _run(options: argparse.Namespace) -> int:
         storage_options=options.storage_options,
     )
     options.stopped = f"{root} is as it was, and what arrived is not fetched again. Go on with:\n  {again}"
-    with prompt_interrupt(options):
+    with prompt_interrupt(options.stopped):
         report = pull_dataset(
             source,
             root,

@@ -48,8 +48,8 @@ def _run(options: argparse.Namespace) -> int:
         **{"no-card": options.no_card, "replace-card": options.replace_card},
         storage_options=options.storage_options,
     )
-    options.stopped = f"the dataset at {root} is unchanged, and what arrived is not sent again. Go on with:\n  {again}"
-    with prompt_interrupt(options):
+    options.stopped = left_by_interrupt(root, again)
+    with prompt_interrupt(options.stopped):
         report = push_dataset(
             root,
             target,
@@ -110,7 +110,7 @@ def push_dataset(
         named = None if is_url(target) else target
         return make_card(state, CardOptions(named, "" if named else target, licence, tags))
 
-    again = again or command_line("push", [root, target], private=private is True, tags=list(tags))
+    again = again or push_command(root, target, private=private is True, tags=tags)
     quiet_bars()
     try:
         remote = (
@@ -124,6 +124,27 @@ def push_dataset(
     except BhdError as error:
         kept = f"The dataset at {root} is unchanged" if Path(root).exists() else "Nothing was sent"
         raise type(error)(f"{error}\n{kept}. When that is mended, repeat:\n  {again}") from error
+
+
+def push_command(root: Path, target: str, *, private: bool = False, tags: Sequence[str] = ()) -> str:
+    """Return the command that uploads a dataset."""
+    return command_line("push", [root, target], private=private, tags=list(tags))
+
+
+def left_by_interrupt(root: Path, again: str) -> str:
+    """Return what an interrupted push leaves, and how to go on."""
+    return f"the dataset at {root} is unchanged, and what arrived is not sent again. Go on with:\n  {again}"
+
+
+def check_pushable(repo_id: str) -> None:
+    """Check what can be checked without asking the Hub: the name, and that there is a token.
+
+    Raises:
+        BhdError: says what is missing.
+    """
+    from bhd_lerobot.data.hub_errors import require_token
+
+    require_token(check_repo_id(repo_id))
 
 
 def tell(report: "PushReport") -> str:

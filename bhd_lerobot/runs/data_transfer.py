@@ -1,6 +1,5 @@
 """What `bhd-data push` and `bhd-data pull` share: places, commands to repeat, and an end that comes at once."""
 
-import argparse
 import json
 import os
 import shlex
@@ -52,14 +51,15 @@ def split_list(text: str | None) -> list[str]:
 
 
 @contextmanager
-def prompt_interrupt(options: argparse.Namespace) -> Iterator[None]:
+def prompt_interrupt(stopped: str) -> Iterator[None]:
     """Let Ctrl-C end the program within `PATIENCE_S`.
 
     The Hub's client waits for its threads, and these for the network. What a transfer leaves is in order at any moment,
     so that the process may end at any.
 
     Args:
-        options: of the command; `stopped` is what is told.
+        stopped: what is left, and how to go on; told if the process ends here. Whoever catches the `KeyboardInterrupt`
+            tells it otherwise.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -67,7 +67,7 @@ def prompt_interrupt(options: argparse.Namespace) -> Iterator[None]:
     former = signal.getsignal(signal.SIGINT)
 
     def leave() -> None:
-        print(f"\nStopped; {options.stopped}.", file=sys.stderr, flush=True)
+        print(f"\nStopped; {stopped}.", file=sys.stderr, flush=True)
         os._exit(130)
 
     def handle(number: int, frame: FrameType | None) -> None:

@@ -19,11 +19,13 @@ from bhd_lerobot.control.tolerance import verdict
 from bhd_lerobot.data.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.errors import BhdError, ConfigError, RealtimeError, RenderingError
+from bhd_lerobot.errors import ConfigError, RealtimeError, RenderingError
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.robots.simulation import Simulation, describe
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import encode, run
+from bhd_lerobot.runs.data_push import check_pushable, left_by_interrupt, push_command, push_dataset, tell
+from bhd_lerobot.runs.data_transfer import prompt_interrupt
 from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.runs.language_rows import language_column
@@ -50,6 +52,8 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         BhdError: the configuration cannot be honoured, or the dataset cannot be written. Episodes that were saved
             before are intact.
     """
+    if config.dataset.push_to_hub:
+        check_pushable(config.dataset.repo_id)  # before hours of recording, not after
     console = console or Console(stderr=True)
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
     n = 1 if config.robot.clock == "realtime" else min(config.n_envs, config.dataset.num_episodes)
@@ -84,8 +88,8 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         preview.write_strip(first.scene, states, output_dir / "episode.png")
         preview.close()
     tell_summary(console, config, result, preview is not None and first is not None)
-    if config.dataset.push_to_hub and result.exit_status == 0:
-        _push(config, root)
+    if config.dataset.push_to_hub:
+        _push(config, result, console)
     return result
 
 
@@ -280,14 +284,21 @@ def _progress(console: Console) -> Progress:
     )
 
 
-def _push(config: RecordConfig, root: Path) -> None:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset  # seconds to import, and rarely needed
-
-    dataset = LeRobotDataset(config.dataset.repo_id, root=root, video_backend="pyav")
-    try:
-        dataset.push_to_hub(tags=config.dataset.tags, private=config.dataset.private)
-    except Exception as error:
-        raise BhdError(f"The dataset is complete at {root}, but it was not uploaded: {error}") from error
+def _push(config: RecordConfig, result: RecordResult, console: Console) -> None:
+    dataset = config.dataset
+    again = push_command(result.root, dataset.repo_id, private=dataset.private, tags=dataset.tags)
+    if result.exit_status:
+        said = f"The dataset is not complete, so it was not uploaded. To upload it as it is:\n  {again}"
+    else:
+        private = True if dataset.private else None  # of a repository that exists, whatever it is
+        left = left_by_interrupt(result.root, again)
+        try:
+            with prompt_interrupt(left):
+                said = tell(push_dataset(result.root, dataset.repo_id, private=private, tags=dataset.tags))
+        except KeyboardInterrupt:
+            console.print(escape(f"Stopped; {left}"), soft_wrap=True, highlight=False)
+            raise
+    console.print(escape(said), soft_wrap=True, highlight=False)
 
 
 def _main(config: RecordConfig) -> int:

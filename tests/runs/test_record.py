@@ -304,19 +304,6 @@ def test_the_command_line_prints_a_sentence_and_a_status(tmp_path, capsys):
     assert "--dataset.num_episodes" in capsys.readouterr().out
 
 
-def test_pushing_uploads_the_finished_dataset(tmp_path, monkeypatch):
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    seen = []
-
-    def push(self, **kwargs):
-        seen.append((self.repo_id, self.num_episodes, kwargs))
-
-    monkeypatch.setattr(LeRobotDataset, "push_to_hub", push)
-    run_record(tmp_path / "d", dataset__push_to_hub="true", dataset__private="true", dataset__tags="[avoid]")
-    assert seen == [("test/avoid", 3, {"tags": ["avoid"], "private": True})]
-
-
 def test_the_example_configuration_parses():
     path = Path(__file__).parents[2] / "configs" / "record" / "turtlebot3_avoid.yaml"
     config = parse(RecordConfig, [f"--config_path={path}", "--dataset.num_episodes=20", "--seed=1"])
