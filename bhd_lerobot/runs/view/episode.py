@@ -47,7 +47,7 @@ def packed_episode(state: DatasetState, row: Row, table: pa.Table) -> bytes:
         "marks": marks_of(state.root, row["episode_index"]),
         "names": {key: names_of(features[key], width) for key, width in widths.items()},
         "sections": sections(features, widths, robot),
-        "bands": _bands(table),
+        "bands": _bands(table, state.info["fps"]),
         "events": _events(columns.get(keys.EVENT)),
         "interventions": _interventions(row, columns.get(keys.EVENT)),
         "flags": {
@@ -82,13 +82,25 @@ def _not_finite(values: NDArray) -> int:
     return int(values.size - np.isfinite(values).sum()) if np.issubdtype(values.dtype, np.floating) else 0
 
 
-def _bands(table: pa.Table) -> list[dict[str, Any]]:
+def _bands(table: pa.Table, fps: float) -> list[dict[str, Any]]:
     """Return what was going on, in words: for every text column its runs of equal text."""
     bands = []
     for key in table.column_names:
         if pa.types.is_string(table[key].type) or pa.types.is_large_string(table[key].type):
             bands.append({"name": key, "runs": _runs(table[key].to_pylist())})
+    if keys.LANGUAGE in table.column_names and keys.SUBTASK not in table.column_names:
+        bands.append({"name": keys.SUBTASK, "runs": _said(table[keys.LANGUAGE][0].as_py(), len(table), fps)})
     return [band for band in bands if band["runs"]]
+
+
+def _said(rows: Any, frames: int, fps: float) -> list[list[Any]]:
+    """Return the subtasks of LeRobot's language column, each from when it began to the next one."""
+    try:
+        told = sorted((round(row["timestamp"] * fps), row["content"]) for row in rows if row["style"] == "subtask")
+    except (KeyError, TypeError):
+        return []
+    ends = [frame for frame, _ in told[1:]] + [frames]
+    return [[frame, end, text] for (frame, text), end in zip(told, ends, strict=True) if text and frame < end]
 
 
 def _runs(values: Iterable[Any]) -> list[list[Any]]:

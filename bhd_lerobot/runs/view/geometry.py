@@ -68,17 +68,19 @@ def views_of(
             "x": -0.032 if robot == "turtlebot3" else 0.0,  # of the scanner before the wheel axis [m]
         }
     if robot == "ur5" and (joints := _joints(names, observed, physics)) is not None:
-        about["arm"] = {"radii": [one.radius for one in _ur5().chain.capsules]}
+        capsules = _ur5().chain.capsules
+        palm = next(number for number, one in enumerate(capsules) if one.name == "palm")
+        about["arm"] = {"radii": [one.radius for one in capsules], "hand": palm}
         arrays |= _arm(*joints)
         if physics is not None and physics.shape[1] > _ARM_STATE:
             arrays["objects"] = _objects(physics)
     elif robot == "turtlebot3" and physics is not None and physics.shape[1] > _BASE_STATE:
-        about["base"] = {"from": "simulator", "radius": 0.105}
+        about["base"] = {"from": "simulator", "radius": turtlebot3_burger().radius}
         w, x, y, z = physics[:, 3:7].T
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         arrays["base"] = np.column_stack([physics[:, :2], yaw]).astype(np.float32)
     elif observed is not None and {"x.pos", "y.pos", "theta.pos"} <= set(names):
-        about["base"] = {"from": "odometry", "radius": 0.105}
+        about["base"] = {"from": "odometry", "radius": turtlebot3_burger().radius if robot == "turtlebot3" else 0.1}
         arrays["base"] = observed[:, [names.index(name) for name in ("x.pos", "y.pos", "theta.pos")]]
     return about, arrays
 

@@ -20,13 +20,13 @@ function card(name, episode, onCompareEnd) {
     make("span", { class: "who" }, `#${episode.index}`),
     make("span", { class: "badge", style: { "--colour": outcomeColour(outcome) } }, make("span", { class: "dot" }), outcomeWords(outcome)),
     make("span", { class: "instruction" }, episode.instruction),
-    make("span", { class: "facts", title: stored(episode) }, facts(episode).join("  ·  ")),
     make("button", { class: "quiet", title: "Everything that was stored about the episode", onclick: () => showAll(episode) }, "more"),
-    name === "b" ? make("button", { class: "quiet", title: "End the comparison (c)", onclick: onCompareEnd }, "✕") : null);
+    name === "b" ? make("button", { class: "quiet", title: "End the comparison (c)", onclick: onCompareEnd }, "✕") : null,
+    make("span", { class: "facts", title: stored(episode) }, facts(episode).join("  ·  ")));
 }
 
 function facts(episode) {
-  const { score, seed, split } = episode.metadata;
+  const { score } = episode.metadata;
   const found = [`${(episode.frames / episode.fps).toFixed(1)} s`, `${episode.frames} frames`];
   if (typeof score === "number") found.push(`score ${score.toFixed(3)}`);
   for (const [key, [word, unit]] of Object.entries(MEASURES)) {
@@ -36,7 +36,6 @@ function facts(episode) {
   if (clock === "lockstep") found.push("simulated time");
   else if (clock) found.push(`${episode.timing.late_frames ?? 0} late frames, ${episode.timing.skipped ?? 0} ticks skipped`);
   if (episode.plan?.problem) found.push(`problem: ${episode.plan.problem}`);
-  if (seed !== undefined) found.push(`${split ?? "seed"} …${`${seed}`.slice(-6)}`);
   return found;
 }
 

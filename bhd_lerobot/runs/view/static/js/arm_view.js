@@ -14,14 +14,15 @@ export function drawArm(canvas, side, together) {
   const look = SIDES[side];
   const { scale, point } = fit(bounds(together, look), [0, 0, width, height], 10);
   const at = (p) => point(p[look.right], p[look.up]);
-  if (side === "side") drawTable(context, width, point);
-  else drawGrid(context, width, height, scale, point);
+  if (side === "above") drawGrid(context, width, height, scale, point);
   for (const [name, episode] of [...together].reverse()) {
     const isFirst = name === together[0][0];
     context.globalAlpha = isFirst ? 1 : 0.55;
     drawEpisode(context, episode, name, isFirst && together.length === 1, look, at, scale);
     context.globalAlpha = 1;
   }
+  if (side === "side") drawTable(context, width, point); // over the foot, whose capsule reaches below
+  for (const [name, episode] of together) drawTool(context, episode, frameAt(episode), name, at);
   canvas.dataset.frame = frameAt(together[0][1]);
 }
 
@@ -78,13 +79,14 @@ function drawEpisode(context, episode, name, isAlone, look, at, scale) {
   const things = [...limbs(episode, frame, name, isAlone, look, at, scale), ...objects(episode, frame, look, at)];
   things.sort((x, y) => x.depth - y.depth);
   for (const thing of things) thing.draw(context);
-  drawTool(context, episode, frame, name, at);
   drawTarget(context, episode, frame, at, scale);
 }
 
 function limbs(episode, frame, name, isAlone, look, at, scale) {
   const { values, width } = episode.arrays["view.capsules"];
-  const own = colour(isAlone ? "--limb" : `--${name}`), edge = colour("--panel");
+  const edge = colour("--panel"), hands = episode.views.arm.hand;
+  const arm = isAlone ? [colour("--limb"), colour("--limb-light")] : [colour(`--${name}`), colour(`--${name}`)];
+  const hand = isAlone ? [colour("--hand"), colour("--hand")] : arm;
   return episode.views.arm.radii.map((radius, number) => {
     const from = frame * width + 6 * number;
     const one = values.subarray(from, from + 3), other = values.subarray(from + 3, from + 6);
@@ -92,10 +94,12 @@ function limbs(episode, frame, name, isAlone, look, at, scale) {
     return {
       depth: (look.depth(one) + look.depth(other)) / 2,
       draw: (context) => {
-        for (const [hue, extra] of [[edge, 1.5], [own, 0]]) {
+        const across = 2 * radius * scale * 0.72; // slimmer than in the checks, which are generous
+        const [own, light] = number >= hands ? hand : arm;
+        for (const [hue, wide] of [[edge, across + 1.5], [own, across], [light, 0.4 * across]]) {
           context.strokeStyle = hue;
-          context.lineWidth = 2 * radius * scale * 0.8 + extra; // a little slimmer: the checks are generous
-          polyline(context, ends[0].every((v, i) => Math.abs(v - ends[1][i]) < 0.01) ? [ends[0], [ends[1][0] + 0.01, ends[1][1]]] : ends);
+          context.lineWidth = wide;
+          polyline(context, [ends[0], [ends[1][0] + 0.01, ends[1][1]]]); // a line of no length would not be drawn
         }
       },
     };

@@ -3,10 +3,11 @@
 import { colour } from "./canvas.js";
 import { seek, pause } from "./clock.js";
 import { byId, make } from "./dom.js";
-import { duration, emit, frameAt, on, shown, state } from "./store.js";
+import { duration, emit, frameAt, on, shown, state, stretches } from "./store.js";
 
-const HEIGHT = 112; // [px] of a plot without its legend
+const HEIGHT = 108; // [px] of a plot without its legend
 const SYNC = "bhd";
+const ASKED = "asked for";
 const opened = new Map(); // title of a section -> whether it was opened or closed by hand
 let plots = []; // {plot, playhead, box}
 let isHovered = false;
@@ -48,17 +49,23 @@ function remarks(about) {
   const shade = (name, text) => told.push(make("small", {}, make("span", { class: "swatch", style: { background: `var(${name})` } }), text));
   if (about.kind === "action" && flagged("control.limits")) {
     const words = Object.entries(state.a.flags.limits).filter(([bit]) => state.a.arrays["control.limits"].values.some((v) => v & bit));
-    shade("--shade-limit", `the limiter changed the command: ${words.map(([, word]) => word).join(", ")}`);
+    shade("--shade-limit", `the limiter changed the command${whose()}: ${words.map(([, word]) => word).join(", ")}`);
   }
-  if (about.kind === "timing" && flagged("control.late")) shade("--shade-late", "frame out of tolerance");
-  if (state.a.interventions.length) shade("--shade-taken", "intervention");
-  if (state.b) told.push(make("small", {}, `solid: episode ${state.a.index}; dashed: episode ${state.b.index}`));
+  if (about.kind === "timing" && flagged("control.late")) shade("--shade-late", `frame out of tolerance${whose()}`);
+  if (state.a.interventions.length) shade("--shade-taken", `intervention${whose()}`);
+  if (state.b) {
+    const isPlain = about.plots.every((one) => one.lines.length === 1 || one.lines.some((line) => line.applied));
+    if (isPlain) shown().forEach(([name, episode]) => shade(`--${name}`, `episode ${episode.index}`));
+    else told.push(make("small", {}, `where there are several lines, episode ${state.b.index} is dashed`));
+  }
   const columns = new Set(about.plots.flatMap((one) => one.lines.map((line) => line.column)));
   for (const [key, count] of Object.entries(state.a.not_finite)) {
     if (columns.has(key)) told.push(make("small", { class: "problem" }, `${count} ${count === 1 ? "value is" : "values are"} not finite`));
   }
   return told;
 }
+
+const whose = () => (state.b ? ` of episode ${state.a.index}` : "");
 
 const flagged = (key) => state.a.arrays[key]?.values.some((value) => value);
 
@@ -71,19 +78,24 @@ function box(about, one) {
     const playhead = make("div", { class: "playhead" });
     plot.over.append(playhead);
     clicking(plot);
-    plots.push({ plot, playhead, place });
+    const drawn = { plot, playhead };
+    plots.push(drawn);
     new ResizeObserver(() => {
-      if (place.isConnected && plot.width !== place.clientWidth) plot.setSize({ width: place.clientWidth, height: HEIGHT });
+      if (!place.isConnected) return;
+      if (plot.width !== place.clientWidth) plot.setSize({ width: place.clientWidth, height: HEIGHT });
+      followOne(drawn); // a new size forgets the legend
     }).observe(place);
-    followOne(plots.at(-1));
   });
   return place;
 }
 
 function lines(one) {
+  // Where there is one line, or what was asked for and applied, two episodes have the colours that they have elsewhere.
+  const isPlain = one.lines.length === 1 || one.lines.some((line) => line.applied);
   return shown().flatMap(([name, episode]) => one.lines.filter((line) => episode.arrays[line.column]).map((line, number) => ({
-    ...line, name, episode, hue: colour(`--line-${number % 8}`),
-    label: name === "b" ? `${line.label} (${episode.index})` : line.label,
+    ...line, name, episode, hue: colour(state.b && isPlain ? `--${name}` : `--line-${number % 8}`),
+    isDashed: name === "b" && !isPlain, isAsked: line.label === ASKED,
+    label: state.b ? `${line.label} #${episode.index}` : line.label,
   })));
 }
 
@@ -105,16 +117,18 @@ function options(about, one, width) {
   const series = lines(one).map((line) => ({
     label: line.label,
     stroke: line.hue,
-    width: line.label.startsWith("asked for") ? 3.4 : 1.4,
-    alpha: line.label.startsWith("asked for") ? 0.45 : line.name === "b" ? 0.8 : 1,
-    dash: line.name === "b" ? [5, 4] : undefined,
+    width: line.isAsked ? 4 : 1.5, // what was applied is a thin line on the broad one of what was asked for
+    alpha: line.isAsked ? 0.35 : 1,
+    pxAlign: 0, // or broad and thin lines of the same values lie beside each other
+    dash: line.isDashed ? [5, 4] : undefined,
     points: { show: line.episode.frames < 3, size: 5 },
-    value: (_, value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(4)).toString()),
+    value: (_, value) => (value === null || value === undefined ? "–" : short(value)),
   }));
   return {
     width, height: HEIGHT, series: [{ label: "t", value: (_, value) => (value === null ? "–" : `${value.toFixed(2)} s`) }, ...series],
     scales: { x: { time: false, range: (_, min, max) => [min ?? 0, max > min ? max : (min ?? 0) + 1 / state.a.fps] }, y: { range: padded } },
-    axes: [{ ...axis, size: 18 }, { ...axis, size: 46 }],
+    padding: [5, 8, 0, 0],
+    axes: [{ ...axis, size: 18, space: 44 }, { ...axis, size: 46, space: 20, values: (_, values) => values.map(short) }],
     cursor: { sync: { key: SYNC, scales: ["x", null] }, drag: { x: true, y: false }, points: { size: 5 }, y: false },
     legend: { live: true },
     hooks: {
@@ -122,6 +136,12 @@ function options(about, one, width) {
       setCursor: [(plot) => hovered(plot)],
     },
   };
+}
+
+// Three digits, as short as they can be written.
+function short(value) {
+  const text = Number(value.toPrecision(3)).toString();
+  return text.length > 7 ? value.toExponential(0) : text;
 }
 
 // Some room above and below, and a range for lines that never move.
@@ -132,32 +152,22 @@ function padded(_, min, max) {
 }
 
 function shading(plot, about) {
-  const fill = (name, stretches) => {
+  const fill = (name, where) => {
     const { left, top, width, height } = plot.bbox;
     plot.ctx.save();
     plot.ctx.beginPath();
     plot.ctx.rect(left, top, width, height);
     plot.ctx.clip();
     plot.ctx.fillStyle = colour(name);
-    for (const [first, end] of stretches) {
+    for (const [first, end] of where) {
       const from = plot.valToPos(first / state.a.fps, "x", true), to = plot.valToPos(end / state.a.fps, "x", true);
       plot.ctx.fillRect(from, top, Math.max(1, to - from), height);
     }
     plot.ctx.restore();
   };
   if (state.a.interventions.length) fill("--shade-taken", state.a.interventions);
-  if (about.kind === "action") fill("--shade-limit", stretches("control.limits"));
-  if (about.kind === "timing") fill("--shade-late", stretches("control.late"));
-}
-
-function stretches(key) {
-  const found = [];
-  state.a.arrays[key]?.values.forEach((value, frame) => {
-    if (!value) return;
-    if (found.at(-1)?.[1] === frame) found.at(-1)[1] = frame + 1;
-    else found.push([frame, frame + 1]);
-  });
-  return found;
+  if (about.kind === "action") fill("--shade-limit", stretches(state.a.arrays["control.limits"]?.values));
+  if (about.kind === "timing") fill("--shade-late", stretches(state.a.arrays["control.late"]?.values));
 }
 
 function follow() {

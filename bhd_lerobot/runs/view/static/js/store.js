@@ -32,3 +32,14 @@ export function duration() {
 export function frameAt(episode, time = state.time) {
   return Math.min(episode.frames - 1, Math.max(0, Math.floor(time * episode.fps + 1e-6)));
 }
+
+// Return [first frame, frame after the last] of every run of values that are not zero.
+export function stretches(values = []) {
+  const found = [];
+  values.forEach((value, frame) => {
+    if (!value) return;
+    if (found.at(-1)?.[1] === frame) found.at(-1)[1] = frame + 1;
+    else found.push([frame, frame + 1]);
+  });
+  return found;
+}

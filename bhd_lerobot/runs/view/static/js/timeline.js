@@ -4,7 +4,7 @@ import { colour, prepare } from "./canvas.js";
 import { pause, play, seek, setRate } from "./clock.js";
 import { byId, make, seconds } from "./dom.js";
 import { outcomeColour } from "./outcomes.js";
-import { duration, emit, frameAt, on, shown, state } from "./store.js";
+import { duration, emit, frameAt, on, shown, state, stretches } from "./store.js";
 
 const RATES = [0.5, 1, 2];
 const HUES = ["--line-0", "--line-2", "--line-1", "--line-3", "--line-6", "--line-5", "--line-4"];
@@ -99,7 +99,8 @@ function rulerLane() {
   const marks = [];
   for (let time = 0; time <= whole + 1e-9; time += each) {
     const left = { left: `${(100 * time) / whole}%` };
-    marks.push(make("i", { style: left }), make("b", { style: left }, `${+time.toFixed(2)}`));
+    const edge = time === 0 ? "first" : time > 0.985 * whole ? "last" : "";
+    marks.push(make("i", { style: left }), make("b", { class: edge, style: left }, `${+time.toFixed(2)}`));
   }
   return { name: "time [s]", element: make("div", { class: "lane ruler" }, ...marks) };
 }
@@ -160,7 +161,7 @@ function flagLane(title, name, episode, values, hue) {
     const { context, width, height } = prepare(canvas);
     context.fillStyle = colour(hue);
     const each = (width * share(1, episode)) / 100;
-    values.forEach((value, frame) => { if (value) context.fillRect(frame * each, 0, Math.max(1, each), height); });
+    for (const [first, end] of stretches(values)) context.fillRect(first * each, 0, Math.max(1, (end - first) * each), height);
   });
   return { name: title, thin: true, element: make("div", { class: `${laneClass(name)} thin`, "data-lane": title }, canvas) };
 }

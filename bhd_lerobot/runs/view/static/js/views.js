@@ -26,9 +26,9 @@ function build() {
   follow();
 }
 
-function card(kind, title, { grow = 1, output = null, follow: show }, ...inside) {
+function card(kind, title, { output = null, follow: show }, ...inside) {
   const heading = make("h2", {}, make("span", { title }, title), output);
-  const element = make("section", { class: "view", "data-view": kind, style: { "flex-grow": `${grow}` } },
+  const element = make("section", { class: "view", "data-view": kind },
     heading, make("div", { class: "inside" }, ...inside));
   return { element, follow: show };
 }
@@ -38,6 +38,12 @@ function drawing(kind, title, label, draw, options = {}) {
   const show = () => { if (canvas.clientWidth > 0) draw(canvas); };
   new ResizeObserver(show).observe(canvas);
   return card(kind, title, { ...options, follow: [show] }, canvas);
+}
+
+// Height and width of an image, whose channels may come first or last.
+function aspect([one, two, three]) {
+  if (!(one > 0 && two > 0)) return [3, 4];
+  return one <= 4 && three > 4 ? [two, three] : [one, two];
 }
 
 function films() {
@@ -50,9 +56,12 @@ function films() {
       one.element.classList.add(name);
       one.element.classList.toggle("paired", sources.length > 1);
     }
-    const grow = (camera.shape[1] ?? 4) / (camera.shape[0] ?? 3);
-    return card("film", `camera ${camera.label}`, { grow: sources.length > 1 ? 1.6 * grow : grow, follow: sources.map(([, one]) => one.show) },
+    const made = card("film", `camera ${camera.label}`, { follow: sources.map(([, one]) => one.show) },
       ...sources.map(([, one]) => one.element));
+    const [high, wide] = aspect(camera.shape);
+    made.element.classList.add("of-film");
+    made.element.style.setProperty("--aspect", `${(wide * sources.length) / (high * 1.08)}`); // its heading takes some
+    return made;
   });
 }
 
