@@ -13,8 +13,8 @@ _CONNECTION = "Check the connection"
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 _STATUS = {
-    403: "this token has no permission for it. Use one that may write, and a name of your own or of an organisation that "
-    "you may write to.",
+    403: "this token has no permission for it. Use one that may write, and a name of your own or of an organisation "
+    "that you may write to.",
     409: "somebody else changed it at the same time. Look at what is there now.",
     412: "somebody else changed it at the same time. Look at what is there now.",
     413: "the Hub refuses so much at once.",

@@ -1,11 +1,12 @@
 """Where a dataset comes from: from this machine if it is there, else from the Hub, as LeRobot does it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bhd_lerobot.data import layout
-from bhd_lerobot.errors import BhdError, DatasetError
+from bhd_lerobot.data.hub_errors import explain
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetError
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -16,6 +17,7 @@ def local_metadata(
     root: Path | str | None = None,
     revision: str | None = None,
     episodes: Sequence[int] | None = None,
+    select: "Callable[[LeRobotDatasetMetadata], Sequence[int]] | None" = None,
 ) -> "LeRobotDatasetMetadata":
     """Return the metadata of a dataset all of whose wanted files are on this machine, downloading what is not.
 
@@ -24,8 +26,10 @@ def local_metadata(
         root: its folder; None looks where LeRobot keeps datasets.
         revision: version on the Hub, if it has to be downloaded.
         episodes: the episodes whose files are wanted; None wants all.
+        select: chooses the episodes by the metadata, for example those of an outcome; only their files are downloaded.
 
     Raises:
+        ConfigError: a revision is named of a dataset that is on this machine, where nobody knows which it is.
         DatasetError: it is not on this machine, and downloading it failed.
     """
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -33,10 +37,16 @@ def local_metadata(
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+    if revision is not None and (folder / layout.INFO).is_file() and not (folder / ".cache/huggingface").is_dir():
+        raise ConfigError(
+            f"Revision {revision!r} of {repo_id} is asked for, but {folder} holds a dataset that does not say which "
+            "revision it is, and LeRobot would take it whatever it is. Leave the revision out, or name another root."
+        )
     try:
         meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
-        if _missing(meta, episodes):
-            meta = LeRobotDataset(repo_id, root=root, revision=revision, episodes=_listed(episodes)).meta
+        wanted = episodes if select is None else select(meta)
+        if _missing(meta, wanted):
+            meta = LeRobotDataset(repo_id, root=root, revision=revision, episodes=_listed(wanted)).meta
     except BhdError:
         raise
     except Exception as error:  # of the Hub's client, of the network, of LeRobot: all mean that it is not there
@@ -46,10 +56,9 @@ def local_metadata(
             found = "has no meta/info.json"
         else:
             found = "does not exist"
-        reason = " ".join(str(error).split())
         raise DatasetError(
-            f"There is no complete dataset {repo_id!r}: {folder} {found}, and it could not be fetched from the Hub "
-            f"({type(error).__name__}: {reason[:300]}). Check dataset.root and dataset.repo_id, or record it first."
+            f"There is no complete dataset {repo_id!r}: {folder} {found}, and it could not be fetched from the Hub: "
+            f"{explain(error, repo_id, revision)} Check dataset.root and dataset.repo_id, or record it first."
         ) from error
     return meta
 

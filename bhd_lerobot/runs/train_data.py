@@ -50,7 +50,14 @@ def open_metadata(config: BhdTrainConfig) -> LeRobotDatasetMetadata:
     dataset = config.dataset
     root = Path(dataset.root).expanduser() if dataset.root else None
     _refuse_empty(root or default_root(dataset.repo_id))
-    meta = local_metadata(dataset.repo_id, root, dataset.revision, dataset.episodes)
+    chosen = config.selection
+
+    def select(found: LeRobotDatasetMetadata) -> list[int]:
+        return chosen.filter.select(found, dataset.episodes)
+
+    meta = local_metadata(
+        dataset.repo_id, root, dataset.revision, dataset.episodes, None if chosen.is_everything else select
+    )
     checked_episodes(meta, dataset.episodes)
     if not meta.stats:
         raise DatasetError(

@@ -1,5 +1,9 @@
 """What a training run leaves: its folder, and what of it goes to the Hub and to wandb."""
 
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -7,10 +11,13 @@ import yaml
 from lerobot.common.train_utils import push_checkpoint_to_hub
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
-from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.data.hub_errors import hub_errors
+from bhd_lerobot.errors import BhdError, ConfigError, TransferError
 from bhd_lerobot.policies.contract import CONTRACT_FILE
 from bhd_lerobot.runs import train_checkpoint
 from bhd_lerobot.runs.config_train import BhdTrainConfig, plain
+from bhd_lerobot.runs.data_push import check_pushable
+from bhd_lerobot.runs.data_transfer import prompt_interrupt
 from bhd_lerobot.runs.train_checkpoint import TrainingParts
 from bhd_lerobot.runs.train_log import METRICS_NAME, PLOT_NAME, MetricsFile, Row, draw_loss, read_metrics
 
@@ -39,6 +46,9 @@ class RunOutput:
             ConfigError: the folder cannot be written.
         """
         self.folder, self.checkpoint = Path(str(config.output_dir)), config.checkpoint_path
+        policy: Any = config.policy
+        if is_main and policy is not None and (policy.push_to_hub or config.save_checkpoint_to_hub):
+            check_pushable(str(policy.repo_id))  # before hours of training, not after
         self._config, self._parts, self._processes = config, parts, processes
         self._metrics = self._open(step) if is_main else None
         self._wandb = self._make_wandb() if is_main else None
@@ -79,12 +89,9 @@ class RunOutput:
         self.draw(step)
         config = self._config
         if config.save_checkpoint_to_hub and config.policy is not None:
-            try:
+            again = f"When that is mended, go on with:\n  {train_checkpoint.resume_command(self.checkpoint)}"
+            with self._uploading(str(config.policy.repo_id), "The checkpoint", again):
                 push_checkpoint_to_hub(self.checkpoint, config.policy.repo_id, private=config.policy.private)
-            except Exception as error:  # of the Hub's client or the network
-                raise BhdError(
-                    f"The checkpoint is complete at {self.checkpoint}, but it was not uploaded: {error}"
-                ) from error
         if self._wandb is not None:
             self._wandb.log_policy(self.checkpoint)
 
@@ -109,7 +116,12 @@ class RunOutput:
         if self._metrics is None or policy is None or not policy.push_to_hub:
             return
         parts = self._parts
-        try:
+        again = ""
+        if self.checkpoint is not None:
+            private = ["--private"] if policy.private else []
+            folder = str(self.checkpoint / PRETRAINED_MODEL_DIR)
+            again = f"When that is mended:\n  {shlex.join(['hf', 'upload', policy.repo_id, folder, '.', *private])}"
+        with self._uploading(policy.repo_id, "The policy", again):
             parts.policy.push_model_to_hub(self._config)
             parts.preprocessor.push_to_hub(policy.repo_id)
             parts.postprocessor.push_to_hub(policy.repo_id)
@@ -118,8 +130,20 @@ class RunOutput:
 
                 file = self.checkpoint / PRETRAINED_MODEL_DIR / CONTRACT_FILE
                 HfApi().upload_file(path_or_fileobj=file, path_in_repo=file.name, repo_id=policy.repo_id)
-        except Exception as error:  # of the Hub's client or the network
-            raise BhdError(f"The policy is complete at {self.checkpoint}, but it was not uploaded: {error}") from error
+
+    @contextmanager
+    def _uploading(self, repo_id: str, what: str, again: str) -> Iterator[None]:
+        """Say, where an upload fails or is interrupted, what is kept and how to repeat it."""
+        kept = "is not on this machine" if self.checkpoint is None else f"is complete at {self.checkpoint}"
+        left = f"{what} {kept}. {again}".rstrip()
+        try:
+            with prompt_interrupt(left), hub_errors(repo_id, "upload to"):
+                yield
+        except TransferError as error:
+            raise TransferError(f"{error}\n{left}") from error
+        except KeyboardInterrupt:
+            print(f"Stopped; {repo_id} may hold a part. {left}", file=sys.stderr)
+            raise
 
     def _open(self, step: int) -> MetricsFile:
         config, folder = self._config, self.folder
