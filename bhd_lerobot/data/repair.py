@@ -10,9 +10,10 @@ from bhd_lerobot.data import layout, video
 from bhd_lerobot.data.compact import compact
 from bhd_lerobot.data.disk import Disk, RootLock, write_errors
 from bhd_lerobot.data.exchange import roll_forward
+from bhd_lerobot.data.salvage import salvage
 from bhd_lerobot.data.schema import Schema
 from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,8 @@ class RepairReport:
         frames: frames it holds now.
         completed: steps that had been decided before the interruption and were completed.
         dropped: files of unfinished episodes that were removed, relative to the root.
+        lost: what of another program's wreck could not be recovered, and why.
+        aside: where its damaged files lie now; None if none were damaged.
     """
 
     root: Path
@@ -32,6 +35,8 @@ class RepairReport:
     frames: int
     completed: tuple[str, ...] = ()
     dropped: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
+    aside: Path | None = None
 
     def __bool__(self) -> bool:
         """Whether anything was mended."""
@@ -42,6 +47,9 @@ class RepairReport:
         lines = [f"{self.root}: {self.episodes} episodes, {self.frames} frames"]
         lines += [f"  completed: {item}" for item in self.completed]
         lines += [f"  dropped: {item}" for item in self.dropped]
+        lines += [f"  lost: {item}" for item in self.lost]
+        lines += ["  lost: nothing"] if self.aside is not None and not self.lost else []
+        lines += [f"  the damaged files are in {self.aside}"] if self.aside is not None else []
         return "\n".join(lines if self else [*lines, "  nothing to do"])
 
 
@@ -63,6 +71,8 @@ def repair(root: Path | str) -> RepairReport:
     lock = RootLock(root)
     try:
         disk = Disk()
+        if (root / layout.INFO).is_file() and not (root / layout.IDENTITY).exists():
+            return _repair_foreign(root, disk)
         with write_errors("repair the dataset", root, "Its saved episodes are intact."):
             state, report = settle(root, disk)
             _check_deeply(state)
@@ -74,6 +84,22 @@ def repair(root: Path | str) -> RepairReport:
         return report
     finally:
         lock.release()
+
+
+def _repair_foreign(root: Path, disk: Disk) -> RepairReport:
+    """Mend what another program recorded: nothing if it can be read, and else everything that is whole."""
+    with write_errors("repair the dataset", root, "Its files are as they were."):
+        roll_forward(root, disk)
+        disk.remove_tree(root / layout.STAGING)  # of an attempt that was interrupted
+    try:
+        state = load_state(root)
+        _check_deeply(state)
+    except DatasetCorruptError as error:
+        rescued = salvage(root, disk)
+        wrong = str(error).split(". ", 1)[0]
+        done = (f"{wrong}: {rescued.episodes} whole episodes were recovered; their statistics are new",)
+        return RepairReport(root, rescued.episodes, rescued.frames, done, (), rescued.lost, rescued.aside)
+    return RepairReport(root, state.num_episodes, state.num_frames)
 
 
 def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[DatasetState, RepairReport]:

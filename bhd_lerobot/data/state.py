@@ -103,16 +103,16 @@ def load_state(root: Path) -> DatasetState:
     if not (root / layout.INFO).is_file():
         found = "has no meta/info.json" if root.is_dir() else "does not exist"
         raise DatasetError(f"{root} is not a LeRobot dataset: it {found}.")
-    info = _read_json(root / layout.INFO)
+    info = read_json(root / layout.INFO)
     for key in ("codebase_version", "features", "fps", "total_episodes", "total_frames", "total_tasks"):
         if key not in info:
             raise corrupt(root / layout.INFO, f"it has no {key!r}")
     if not str(info["codebase_version"]).startswith("v3."):
         raise DatasetError(f"{root} has dataset format {info['codebase_version']}; this program reads v3.x.")
-    identity = _read_json(root / layout.IDENTITY) if (root / layout.IDENTITY).exists() else None
+    identity = read_json(root / layout.IDENTITY) if (root / layout.IDENTITY).exists() else None
     state = DatasetState(root, info, identity)
     if info["total_episodes"]:
-        state.tasks = _read_tasks(root / layout.TASKS)
+        state.tasks = read_tasks(root / layout.TASKS)
         if len(state.tasks) < info["total_tasks"]:
             raise corrupt(root / layout.TASKS, f"it has {len(state.tasks)} of {info['total_tasks']} tasks")
         _read_rows(state)
@@ -120,7 +120,12 @@ def load_state(root: Path) -> DatasetState:
     return state
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """Return a JSON object.
+
+    Raises:
+        DatasetCorruptError: there is none.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -130,7 +135,12 @@ def _read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _read_tasks(path: Path) -> list[str]:
+def read_tasks(path: Path) -> list[str]:
+    """Return the instructions in the order of their index.
+
+    Raises:
+        DatasetCorruptError: the file cannot be read.
+    """
     try:
         table = pq.ParquetFile(path).read(use_threads=False)
         # LeRobot keeps the sentence in the index of a pandas table; the column name differs between its versions.

@@ -1,0 +1,269 @@
+"""Bring back a dataset that another program's recorder left unreadable when it was killed.
+
+LeRobot keeps one Parquet file open for a whole recording, and a file without its footer is read by nobody; it writes
+``meta/episodes`` ten episodes at a time, and ``info.json`` and a film at each. So after a kill nothing loads, though
+nearly everything is on disk. Here the frames are read without the footer, films are counted, and an episode is kept if
+all of its frames are there in all of its columns and films. Everything else of ``meta`` is made anew from that.
+"""
+
+import contextlib
+import copy
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from bhd_lerobot.data import exchange, layout
+from bhd_lerobot.data.disk import Disk, to_json, write_errors
+from bhd_lerobot.data.meta_files import MEBIBYTE, PARQUET_OPTIONS, tasks_table, write_meta
+from bhd_lerobot.data.parquet_rescue import rescue
+from bhd_lerobot.data.salvage_films import Films
+from bhd_lerobot.data.salvage_stats import stats_of
+from bhd_lerobot.data.state import Row, corrupt, read_json, read_tasks, slot_columns
+from bhd_lerobot.errors import DatasetCorruptError, DatasetLockedError
+
+_LOST_TASK = "(the instruction was lost)"
+
+
+@dataclass(frozen=True)
+class Salvage:
+    """What became of a wreck.
+
+    Attributes:
+        episodes: whole episodes that were recovered.
+        frames: their frames.
+        lost: what was lost, and why, a line each.
+        aside: where the damaged files lie now.
+    """
+
+    episodes: int
+    frames: int
+    lost: tuple[str, ...]
+    aside: Path
+
+
+@dataclass
+class Found:
+    """An episode whose frames were found.
+
+    Attributes:
+        number: the number that it had.
+        table: its frames.
+        films: for each camera the parts of films that show it.
+    """
+
+    number: int
+    table: pa.Table
+    films: dict[str, Any] = field(default_factory=dict)
+
+
+def salvage(root: Path, disk: Disk) -> Salvage:
+    """Recover every whole episode; the caller holds the lock.
+
+    Damaged files go to a folder beside the dataset first, so nothing that was there is lost.
+
+    Raises:
+        DatasetCorruptError: no whole episode is left, or ``info.json`` is gone, which says what the columns are;
+            nothing was changed.
+        DatasetLockedError: a process has files of the dataset open, so perhaps records it.
+        DatasetWriteError: the disk refuses; the wreck is as it was.
+    """
+    check_unused(root)
+    info = read_json(root / layout.INFO)
+    lost: list[str] = []
+    found, tables_lost = _frames(root, info)
+    lost += tables_lost
+    films = Films(root, info)
+    kept = films.assign(found, lost)
+    if not kept:
+        reasons = "".join(f"\n  {line}" for line in lost)
+        raise DatasetCorruptError(f"No whole episode of {root} can be recovered; nothing was changed.{reasons}")
+    missing = int(info.get("total_episodes") or 0) - len(kept)
+    if missing > 0 and not lost:
+        lost.append(f"{missing} episodes that info.json counts: no file has a trace of them")
+    with write_errors("recover the dataset", root, "The damaged files are as they were."):
+        aside = _keep_aside(root, disk)
+        new = exchange.begin(root, disk)
+        tasks, known = _tasks(root, kept, lost)
+        rows = _rows(kept, tasks, known)
+        described = _info(info, kept, len(tasks))
+        _write_data(kept, rows, described, new, disk)
+        films.write(kept, rows, described, new, disk)
+        pairs = [(one.table, one.films) for one in kept]
+        stats = stats_of(pairs, described["features"], new, rows)
+        disk.make_folder(new / "meta")
+        sink = pa.BufferOutputStream()
+        pq.write_table(tasks_table(tasks), sink)
+        disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
+        write_meta(new, described, rows, {}, stats, disk=disk)
+        disk.write(new / layout.INFO, to_json(described))
+        exchange.complete(root, disk)
+        disk.remove_tree(root / layout.STAGING)
+        disk.remove_tree(root / "images")  # frames of films that were not encoded yet; they are in `aside`
+    return Salvage(len(kept), sum(one.table.num_rows for one in kept), tuple(lost), aside)
+
+
+def check_unused(root: Path) -> None:
+    """Check that no other process has a file below `root` open: LeRobot takes no lock.
+
+    Raises:
+        DatasetLockedError: one has.
+    """
+    own, place = str(os.getpid()), root.resolve()
+    for process in Path("/proc").glob("[0-9]*"):
+        if process.name == own:
+            continue
+        with contextlib.suppress(OSError):  # ended meanwhile, or somebody else's
+            for handle in (process / "fd").iterdir():
+                with contextlib.suppress(OSError):
+                    target = Path(os.readlink(handle))
+                    if target != place and place in target.parents:
+                        raise DatasetLockedError(
+                            f"Process {process.name} has {target} open, so {root} may be in the middle of a "
+                            "recording. Wait until it ends; without its last files a running recording looks like a "
+                            "wreck."
+                        )
+
+
+def _frames(root: Path, info: dict[str, Any]) -> tuple[list[Found], list[str]]:
+    """Return the episodes whose frames are whole, in order, and what is lost."""
+    found: list[Found] = []
+    lost: list[str] = []
+    schema = _schema(root, info)
+    for path in sorted((root / "data").glob("chunk-*/file-*.parquet")):
+        name = path.relative_to(root).as_posix()
+        try:
+            rescued = rescue(path, schema)
+        except OSError as error:
+            lost.append(f"{name}: {error.strerror or error}")
+            continue
+        if rescued.lost_bytes:
+            lost.append(f"{name}: {rescued.lost_bytes} bytes at its end, an episode that was being saved")
+        elif rescued.problem and not rescued.groups:
+            lost.append(f"{name}: {rescued.problem}")
+        if not rescued.groups:
+            continue
+        table = pa.concat_tables(rescued.groups).combine_chunks()
+        for number, part in _episodes(table):
+            frames = part["frame_index"].to_numpy()
+            if np.array_equal(frames, np.arange(len(frames))):
+                found.append(Found(number, part))
+            else:
+                lost.append(f"{name}: episode {number}, whose frames are not numbered from 0 on")
+    return found, lost
+
+
+def _schema(root: Path, info: dict[str, Any]) -> pa.Schema:
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+    try:
+        features = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in info["features"].items()}
+        return get_hf_features_from_features(features).arrow_schema
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise corrupt(root / layout.INFO, f"its features cannot be understood ({error})") from error
+
+
+def _episodes(table: pa.Table) -> Iterator[tuple[int, pa.Table]]:
+    numbers = table["episode_index"].to_numpy()
+    begins = np.flatnonzero((np.diff(numbers, prepend=-1) != 0) | (table["frame_index"].to_numpy() == 0))
+    for start, end in zip(begins, [*begins[1:], len(numbers)], strict=True):
+        yield int(numbers[start]), table.slice(start, end - start)
+
+
+def _tasks(root: Path, kept: Sequence[Found], lost: list[str]) -> tuple[list[str], dict[int, int]]:
+    """Return the instructions that are used, and the new number of each old one."""
+    used = sorted({int(index) for one in kept for index in pc.unique(one.table["task_index"]).to_pylist()})
+    try:
+        sentences = read_tasks(root / layout.TASKS)
+    except DatasetCorruptError as error:
+        sentences = []
+        lost.append(f"{layout.TASKS}: the instructions ({error})")
+    texts: dict[str, int] = {}
+    known: dict[int, int] = {}
+    for index in used:
+        sentence = sentences[index] if index < len(sentences) else f"{_LOST_TASK} {index}"
+        known[index] = texts.setdefault(sentence, len(texts))
+    return list(texts), known
+
+
+def _rows(kept: list[Found], tasks: Sequence[str], known: dict[int, int]) -> list[Row]:
+    """Return the rows of the new dataset, and number the frames of the episodes accordingly."""
+    rows: list[Row] = []
+    start = 0
+    for index, one in enumerate(kept):
+        length = one.table.num_rows
+        told = np.array([known[int(task)] for task in one.table["task_index"].to_numpy()])
+        numbered = {
+            "episode_index": np.full(length, index),
+            "index": np.arange(start, start + length),
+            "task_index": told,
+        }
+        for name, values in numbered.items():
+            place = one.table.schema.get_field_index(name)
+            column = pa.array(values, one.table.schema.types[place])
+            one.table = one.table.set_column(place, one.table.schema.field(place), column)
+        sentences = [tasks[task] for task in dict.fromkeys(told.tolist())]
+        rows.append(
+            {
+                "episode_index": index,
+                "tasks": sentences,
+                "length": length,
+                "dataset_from_index": start,
+                "dataset_to_index": start + length,
+            }
+        )
+        start += length
+    return rows
+
+
+def _info(info: dict[str, Any], kept: Sequence[Found], tasks: int) -> dict[str, Any]:
+    described = copy.deepcopy(info)
+    return described | {
+        "total_episodes": len(kept),
+        "total_frames": sum(one.table.num_rows for one in kept),
+        "total_tasks": tasks,
+        "splits": {"train": f"0:{len(kept)}"},
+        "chunks_size": info.get("chunks_size") or layout.CHUNKS_SIZE,
+        "data_files_size_in_mb": info.get("data_files_size_in_mb") or layout.DATA_FILES_SIZE_IN_MB,
+        "video_files_size_in_mb": info.get("video_files_size_in_mb") or layout.VIDEO_FILES_SIZE_IN_MB,
+        "data_path": layout.DATA_PATH,
+    }
+
+
+def _write_data(kept: Sequence[Found], rows: Sequence[Row], info: dict[str, Any], new: Path, disk: Disk) -> None:
+    limit = info["data_files_size_in_mb"] * MEBIBYTE
+    slot: layout.Slot | None = None
+    writer: pq.ParquetWriter | None = None
+    try:
+        for one, row in zip(kept, rows, strict=True):
+            if writer is None or (new / layout.data_file(slot or (0, 0))).stat().st_size >= limit:
+                if writer is not None:
+                    writer.close()
+                slot = layout.next_slot(slot, info["chunks_size"])
+                target = new / layout.data_file(slot)
+                disk.make_folder(target.parent)
+                disk.write(target, b"")
+                writer = pq.ParquetWriter(target, kept[0].table.schema, **PARQUET_OPTIONS)
+            writer.write_table(one.table.cast(kept[0].table.schema))
+            row.update(slot_columns("data", slot or (0, 0)))
+    finally:
+        if writer is not None:
+            writer.close()
+
+
+def _keep_aside(root: Path, disk: Disk) -> Path:
+    """Link every file into a new folder beside the dataset."""
+    number = 1
+    while (aside := root.with_name(f"{root.name}.damaged-{number}")).exists():
+        number += 1
+    for path in sorted(root.rglob("*")):
+        if path.is_file() and layout.STAGING not in path.relative_to(root).parts:
+            disk.make_folder((aside / path.relative_to(root)).parent)
+            disk.link(path, aside / path.relative_to(root))
+    return aside
