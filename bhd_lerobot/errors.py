@@ -41,6 +41,10 @@ class RenderingError(BhdError):
     """No image can be rendered on this machine; the message names the remedy."""
 
 
+class ClusterError(BhdError):
+    """The cluster cannot be reached or gives no machine, or its machines would not record the same bytes."""
+
+
 class DatasetError(BhdError):
     """Base class of everything that can be wrong with a dataset on disk."""
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from bhd_lerobot.data.disk import Disk, write_errors
 from bhd_lerobot.data.schema import LANGUAGE, Column, Schema
-from bhd_lerobot.data.video import CameraEncoder, VideoSettings
+from bhd_lerobot.data.video import CameraEncoder, EncodedVideo, VideoSettings
 from bhd_lerobot.errors import FrameError, unknown_name
 
 _FIRST_CAPACITY = 64
@@ -49,7 +49,7 @@ class EpisodeWriter:
         self._buffers: dict[str, np.ndarray] = {}
         self._rows = 0
         self._by_frame: bool | None = None
-        self._encoders: dict[str, CameraEncoder] = {}
+        self._encoders: dict[str, CameraEncoder | EncodedVideo] = {}
         self._closed = False
 
     @property
@@ -130,7 +130,36 @@ class EpisodeWriter:
                 path = self.folder / f"{key}.mp4"
                 encoder = CameraEncoder(path, self._fps, self._schema.videos[key], self._video)
                 self._encoders[key] = encoder
+            if isinstance(encoder, EncodedVideo):
+                raise FrameError(f"The video of camera {key!r} is complete; it takes no more images.")
             encoder.add(image)
+
+    @property
+    def video(self) -> VideoSettings:
+        """How its images are encoded."""
+        return self._video
+
+    def add_video(self, key: str, content: bytes, histograms: np.ndarray) -> None:
+        """Add all images of a camera at once, which were encoded elsewhere with the settings of `video`.
+
+        Args:
+            key: the video feature.
+            content: the MP4 file.
+            histograms: of its images, shape (T, 3, 256), see `image_histogram`.
+
+        Raises:
+            FrameError: unknown camera, or one that has images already.
+            DatasetWriteError: the disk refused it.
+        """
+        self._open(by_frame=self._by_frame)
+        if key not in self._schema.videos or key in self._encoders:
+            known = self._schema.videos.keys() - self._encoders.keys()
+            raise FrameError(unknown_name("camera without images", key, known))
+        path = self.folder / f"{key}.mp4"
+        with write_errors("store video", self.folder.parents[1], "Episodes saved before are intact."):
+            self._disk.make_folder(self.folder)
+            self._disk.write(path, content)
+        self._encoders[key] = EncodedVideo(path, histograms)
 
     def discard(self) -> None:
         """Throw the episode away; a second call, or a call after saving, does nothing."""

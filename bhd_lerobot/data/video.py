@@ -182,6 +182,32 @@ class CameraEncoder:
             container.mux(stream.encode())
 
 
+class EncodedVideo:
+    """Images of one camera and one episode that were encoded elsewhere; in the place of a `CameraEncoder`.
+
+    Args:
+        path: the file.
+        histograms: of its images, shape (T, 3, 256).
+    """
+
+    def __init__(self, path: Path, histograms: np.ndarray) -> None:
+        self.path, self.frames = path, len(histograms)
+        self._histograms = histograms
+
+    def finish(self) -> np.ndarray:
+        """Check the file and return the histograms.
+
+        Raises:
+            OSError: the file holds another number of images.
+        """
+        if count_frames(self.path) != self.frames:
+            raise OSError(f"{self.path.name} holds another number of frames than the {self.frames} that belong to it")
+        return self._histograms
+
+    def cancel(self) -> None:
+        """There is nothing to stop."""
+
+
 def count_frames(path: Path) -> int:
     """Return how many frames a video file holds, by reading all of it but decoding nothing.
 

@@ -7,6 +7,7 @@ from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.runs.cluster_config import RayConfig, check_engine
 from bhd_lerobot.runs.registry import SIMULATED_ROBOTS, robot_of_brain, robot_of_task
 from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import SPLITS
@@ -47,6 +48,8 @@ class EvalConfig:
         baseline: name of the brain that the others are compared with; the first one if nothing.
         n_envs: simulations that run side by side; changes the speed and nothing else.
         threads: threads that step the physics; all processors if nothing.
+        engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes the speed, nothing else.
+        ray: which cluster, and how much of it.
         videos: how many failures of each brain are filmed, the first ones; of a brain without failures its first
             episode. If nothing, 2 where images can be rendered, and none elsewhere.
         record: where the runs are recorded, if they are.
@@ -67,6 +70,8 @@ class EvalConfig:
     baseline: str | None = None
     n_envs: int = 16
     threads: int | None = None
+    engine: str = "local"
+    ray: RayConfig = field(default_factory=RayConfig)
     videos: int | None = None
     record: EvalDatasetConfig = field(default_factory=EvalDatasetConfig)
     fail_below: float | None = None
@@ -104,6 +109,7 @@ class EvalConfig:
                     raise ConfigError(unknown_name(f"brain in {key}", label, self.brains))
         if self.only is not None and not self.only:
             raise ConfigError("only is empty; name at least one brain, or leave it out.")
+        check_engine(self)
         self._check_numbers()
 
     @property

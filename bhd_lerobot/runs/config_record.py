@@ -9,6 +9,7 @@ from bhd_lerobot.control.estop import estop_signal
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.runs.cluster_config import RayConfig, check_engine
 from bhd_lerobot.runs.live_view import check_options
 from bhd_lerobot.runs.registry import SIMULATED_ROBOTS, brains_for, robot_of_brain, robot_of_task
 from bhd_lerobot.tasks.config_task import TaskConfig
@@ -58,6 +59,8 @@ class RecordConfig:
         split: `train` or `held_out`: which of two sets of seeds, disjoint by construction.
         n_envs: simulations that run side by side; changes the speed and nothing else.
         threads: threads that step the physics; all processors if nothing.
+        engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes the speed, nothing else.
+        ray: which cluster, and how much of it.
         resume: continue the dataset at `dataset.root`, or start it if there is none.
         output_dir: run folder, for the resolved configuration and pictures; a new one in `outputs/record` if nothing.
         preview_video: make an MP4 of the first episode; if nothing, where images can be rendered.
@@ -83,6 +86,8 @@ class RecordConfig:
     split: str = "train"
     n_envs: int = 1
     threads: int | None = None
+    engine: str = "local"
+    ray: RayConfig = field(default_factory=RayConfig)
     resume: bool = False
     output_dir: str | None = None
     preview_video: bool | None = None
@@ -129,6 +134,7 @@ class RecordConfig:
         if self.seed < 0:
             raise ConfigError(f"seed is {self.seed}; seeds start at 0.")
         check_options(self)
+        check_engine(self)
         estop_signal(self.estop_signal)
         if self.split not in SPLITS:
             raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")

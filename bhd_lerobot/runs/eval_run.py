@@ -12,6 +12,8 @@ from bhd_lerobot.data.features import PHYSICS_STATE
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.runs.cluster_crew import Crew
+from bhd_lerobot.runs.cluster_loop import ClusterLoop
 from bhd_lerobot.runs.config_eval import EvalConfig
 from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
@@ -87,8 +89,14 @@ class BrainRun:
         }
 
 
-def prepare(config: EvalConfig, label: str, simulation: Simulation) -> BrainRun:
+def prepare(config: EvalConfig, label: str, simulation: Simulation, crew: Crew | None = None) -> BrainRun:
     """Make a brain and what runs it: one that does not fit fails here, before any episode.
+
+    Args:
+        config: the evaluation.
+        label: the brain's name in it.
+        simulation: the robots.
+        crew: who runs the episodes, if not this process.
 
     Raises:
         BhdError: the message names the brain.
@@ -97,7 +105,11 @@ def prepare(config: EvalConfig, label: str, simulation: Simulation) -> BrainRun:
     try:
         timed = TimedBrain(make_brain(config.brains[label]))
         task = make_task(config.task, simulation.n, robot.fps)
-        return BrainRun(label, EpisodeLoop(simulation, task, cast(Brain, timed)), timed)
+        brain = cast(Brain, timed)
+        if crew is None:
+            return BrainRun(label, EpisodeLoop(simulation, task, brain), timed)
+        loop = ClusterLoop(simulation, task, brain, crew=crew, config=config, brain_config=config.brains[label])
+        return BrainRun(label, loop, timed)
     except BhdError as error:
         raise type(error)(f"brains.{label}: {error}") from error
 

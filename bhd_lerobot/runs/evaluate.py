@@ -4,7 +4,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import metadata
@@ -20,6 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
 from bhd_lerobot.robots.simulation import Simulation, describe
+from bhd_lerobot.runs.cluster_loop import open_crew
 from bhd_lerobot.runs.config_eval import YARDSTICKS, EvalConfig
 from bhd_lerobot.runs.configuration import encode, run
 from bhd_lerobot.runs.eval_console import tell_summary
@@ -85,10 +86,15 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     n = 1 if is_live else min(config.n_envs, len(config.indices))
     simulation = make_robot(config.robot, n, config.threads)
     pressed = EstopInputs(simulation.bridge.estop)
-    with closing(simulation), stop_on_signals() as stop, pressed:
-        runs = [prepare(config, label, simulation) for label in config.chosen]
+    with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
+        crew = None if config.engine == "local" else cluster.enter_context(open_crew(config.ray, console))
+        runs = [prepare(config, label, simulation, crew) for label in config.chosen]
         tell_refusals(simulation, console)
-        if simulation.camera_names and (config.record.repo_id or any(one.timed.uses_images for one in runs)):
+        if (
+            crew is None
+            and simulation.camera_names
+            and (config.record.repo_id or any(one.timed.uses_images for one in runs))
+        ):
             simulation.start_rendering()  # a machine without OpenGL fails here, before the first episode
         if is_live:
             number = estop_signal("SIGUSR1")

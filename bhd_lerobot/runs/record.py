@@ -4,7 +4,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, RealtimeError, RenderingError
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.robots.simulation import Simulation, describe
+from bhd_lerobot.runs.cluster_loop import ClusterLoop, open_crew
 from bhd_lerobot.runs.config_record import RecordConfig
 from bhd_lerobot.runs.configuration import encode, run
 from bhd_lerobot.runs.data_push import check_pushable, left_by_interrupt, push_command, push_dataset, tell
@@ -56,19 +57,26 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         check_pushable(config.dataset.repo_id)  # before hours of recording, not after
     console = console or Console(stderr=True)
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
-    n = 1 if config.robot.clock == "realtime" else min(config.n_envs, config.dataset.num_episodes)
+    is_here = config.engine == "local"  # otherwise one simulation, which only says what is recorded
+    n = 1 if config.robot.clock == "realtime" or not is_here else min(config.n_envs, config.dataset.num_episodes)
     simulation = make_robot(config.robot, n, config.threads)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
     pressed = EstopInputs(simulation.bridge.estop)
-    with closing(simulation), stop_on_signals() as stop, pressed:
+    with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)
         task = make_task(config.task, simulation.n, config.dataset.fps)
         brain = make_brain(config.brain)
         # A brain that does not fit the robot fails here, before a dataset exists.
-        loop = EpisodeLoop(simulation, task, brain, config.timing)
+        if is_here:
+            loop = EpisodeLoop(simulation, task, brain, config.timing)
+        else:
+            crew = cluster.enter_context(open_crew(config.ray, console))
+            loop = ClusterLoop(
+                simulation, task, brain, config.timing, crew=crew, config=config, brain_config=config.brain
+            )
         tell_refusals(simulation, console)
         preview = _make_preview(config, simulation, console)
-        if simulation.camera_names:
+        if simulation.camera_names and is_here:
             simulation.start_rendering()  # a machine without OpenGL fails here, before a dataset exists
         output_dir = _make_output_dir(config)
         result = RecordResult(root, output_dir, stopped_by=stop)

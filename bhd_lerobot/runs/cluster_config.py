@@ -1,0 +1,102 @@
+"""Where episodes are run: in this process, or on a cluster of machines."""
+
+import importlib.util
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from bhd_lerobot.errors import ConfigError, unknown_name
+
+ENGINES = ("local", "ray")
+
+
+@dataclass
+class RayConfig:
+    """Which cluster, and how much of it. The names are those of Ray.
+
+    Attributes:
+        address: `local` starts a cluster of one machine, this one, for the time of the run; `auto` is the cluster that
+            this machine is part of; or `host:port` of its head. If nothing, what `RAY_ADDRESS` says, otherwise `local`.
+        num_workers: processes that run episodes; as many as the cluster's machines have room for if nothing.
+        cpus_per_worker: processors of each, and the threads that step its physics, unless `threads` says otherwise.
+        gpus_per_worker: GPUs of each; a share such as 0.25 if several use one.
+        episodes_per_task: episodes that a worker gets at a time, and that are lost with it; if nothing, one, or twice
+            `n_envs` if more than one runs side by side.
+        timeout_s: how long the cluster may take to answer, and to start a first worker [s].
+        include_dashboard: start Ray's dashboard with a cluster of this machine; it needs Ray's extra `default`.
+    """
+
+    address: str | None = None
+    num_workers: int | None = None
+    cpus_per_worker: int = 1
+    gpus_per_worker: float = 0.0
+    episodes_per_task: int | None = None
+    timeout_s: float = 60.0
+    include_dashboard: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        for name in ("num_workers", "cpus_per_worker", "episodes_per_task"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(f"ray.{name} is {value}; it must be at least 1.")
+        if not 0 <= self.gpus_per_worker < math.inf or (self.gpus_per_worker > 1 and self.gpus_per_worker % 1):
+            raise ConfigError(
+                f"ray.gpus_per_worker is {self.gpus_per_worker}; it is a share up to 1, or a whole number."
+            )
+        if not 0 < self.timeout_s < math.inf:
+            raise ConfigError(f"ray.timeout_s is {self.timeout_s}; it must be positive.")
+        if self.address is not None:
+            _check_address(self.address)
+
+
+def check_engine(config: Any) -> None:
+    """Refuse what a cluster cannot do. Imports nothing.
+
+    Args:
+        config: of a recording or an evaluation.
+
+    Raises:
+        ConfigError: names the option and the remedy.
+    """
+    if config.engine not in ENGINES:
+        raise ConfigError(unknown_name("engine", config.engine, ENGINES))
+    if config.engine == "local":
+        if config.ray != RayConfig():
+            raise ConfigError("Options of ray are set, but engine is 'local'; add --engine=ray, or leave them out.")
+        return
+    if config.robot.clock == "realtime":
+        raise ConfigError(
+            "robot.clock is 'realtime' and engine is 'ray': a robot on the wall clock runs where its real-time process "
+            "was set up, not wherever a cluster has room. Use --engine=local, or --robot.clock=lockstep."
+        )
+    if getattr(config, "display_data", False):
+        raise ConfigError(
+            "display_data is true and engine is 'ray': frames stay where they are made. Leave one of them out."
+        )
+    if getattr(config, "estop_key", None):
+        raise ConfigError(
+            "estop_key is true and engine is 'ray': simulations on other machines have no key. Ctrl-C ends the run."
+        )
+    if importlib.util.find_spec("ray") is None:
+        raise ConfigError(
+            "engine is 'ray', but Ray is not installed. Install it here and on every machine of the cluster: "
+            "pip install 'lerobot_robot_bhd[ray]'"
+        )
+
+
+def _check_address(address: str) -> None:
+    if address.startswith("ray://"):
+        raise ConfigError(
+            f"ray.address is {address!r}, which is for Ray's client. Start this command on a machine of the cluster "
+            "with --ray.address=auto, or send it there: ray job submit --address=http://HEAD:8265 -- bhd-record …"
+        )
+    if address in ("local", "auto"):
+        return
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ConfigError(f"ray.address is {address!r}. Valid: local, auto, or host:port such as 10.0.0.1:6379.")
