@@ -64,9 +64,14 @@ def packed_episode(state: DatasetState, row: Row, table: pa.Table) -> bytes:
 
 def _numbers(column: pa.ChunkedArray, frames: int) -> NDArray | None:
     """Return a column of numbers, of shape (frames, numbers); None if it holds something else."""
-    array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
-    while pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type) or pa.types.is_large_list(array.type):
-        array = array.flatten()
+    array: Any = column.combine_chunks()
+    while True:
+        if isinstance(array.type, pa.BaseExtensionType):  # LeRobot's matrices
+            array = array.storage
+        elif pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type):
+            array = array.flatten()
+        else:
+            break
     kind = array.type
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
         return None
