@@ -181,6 +181,7 @@ class EpisodeTopics:
             "task": row["tasks"][0] if row["tasks"] else "",
             "features": json.dumps(self._features),
             "metadata": json.dumps(metadata),
+            "metadata_types": json.dumps({name: str(kind) for name, kind in self._state.metadata_types.items()}),
             "recording": json.dumps(identity.get("recording", {})),
             "video": json.dumps(identity.get("video", {})),
             "topics": json.dumps(topics),

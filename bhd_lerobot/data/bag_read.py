@@ -4,7 +4,7 @@ import contextlib
 import re
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -36,10 +36,12 @@ class Messages:
 
     Attributes:
         received: when [ns], shape (n,).
+        order: each one's place among all messages of the bag, shape (n,).
         data: each one's bytes, or their beginning.
     """
 
     received: NDArray[np.int64]
+    order: NDArray[np.int64]
     data: list[bytes]
 
 
@@ -99,19 +101,21 @@ class Bag:
             DatasetError: a file cannot be read at all.
         """
         times: dict[str, list[int]] = {name: [] for name in (*topics, *heads)}
+        order: dict[str, list[int]] = {name: [] for name in (*topics, *heads)}
         data: dict[str, list[bytes]] = {name: [] for name in (*topics, *heads)}
         problems, total = [], 0
         for file in self._open():
-            wanted: dict[int, tuple[list[int], list[bytes], int | None]] = {}
+            wanted: dict[int, tuple[list[int], list[int], list[bytes], int | None]] = {}
             for channel, received, buffer, first, last in file.messages():
                 total += 1
                 if channel not in wanted:
                     name = file.channels.get(channel, ("", "", ""))[0]
-                    ours = (times.get(name, []), data.get(name, []))
+                    ours = (times.get(name, []), order.get(name, []), data.get(name, []))
                     wanted[channel] = (*ours, _HEAD_BYTES if name in heads else None if name in topics else 0)
-                stamps, payloads, size = wanted[channel]
+                stamps, places, payloads, size = wanted[channel]
                 if size == 0:
                     continue
+                places.append(total)
                 payload = bytes(buffer[first:last])
                 if self.per_message:
                     payload = zstd().decompress(payload)
@@ -121,28 +125,46 @@ class Bag:
         if self.expected is not None and total < self.expected and not problems:
             problems.append(f"{self.path.name}: its metadata count {self.expected} messages; it has {total}")
         self.problems = [*self.problems, *(problem for problem in problems if problem not in self.problems)]
-        return {name: Messages(np.array(times[name], np.int64), data[name]) for name in times}
+        return {
+            name: Messages(np.array(times[name], np.int64), np.array(order[name], np.int64), data[name])
+            for name in times
+        }
 
-    def pick(self, topic: str, places: Sequence[int]) -> Iterator[bytes]:
-        """Yield some messages of a topic, by their places in what `read` returns; `places` rise."""
-        place, wanted = -1, iter(places)
-        due = next(wanted, None)
+    def payloads(self, topic: str) -> Iterator[bytes]:
+        """Yield the whole messages of a topic, in the order in which `read` has them."""
         for file in self._open():
             for channel, _, buffer, first, last in file.messages():
-                if file.channels.get(channel, ("",))[0] != topic:
-                    continue
-                place += 1
-                while due == place:
+                if file.channels.get(channel, ("",))[0] == topic:
                     payload = bytes(buffer[first:last])
                     yield zstd().decompress(payload) if self.per_message else payload
-                    due = next(wanted, None)
-                if due is None:
-                    return
 
     def _open(self) -> Iterator[Any]:
         for path in self.files:
             with _plain(path) as plain, contextlib.closing(_KINDS[plain.suffix](plain)) as file:
                 yield file
+
+
+class Picker:
+    """Gives large messages of a topic one by one, reading on in the bag; best asked for in their order.
+
+    Args:
+        bag: the bag.
+        topic: the topic.
+    """
+
+    def __init__(self, bag: Bag, topic: str) -> None:
+        self._bag, self._topic = bag, topic
+        self._place, self._payload = -1, b""
+        self._payloads = bag.payloads(topic)
+
+    def get(self, place: int) -> bytes:
+        """Return a message, by its place in what `Bag.read` returns."""
+        if place < self._place:
+            self._place, self._payloads = -1, self._bag.payloads(self._topic)
+        while self._place < place:
+            self._payload = next(self._payloads)
+            self._place += 1
+        return self._payload
 
 
 def find_bags(path: Path) -> list[Bag]:

@@ -20,7 +20,7 @@ from bhd_lerobot.data.bag_episode import (
     image_topic,
 )
 from bhd_lerobot.data.bag_images import COMPRESSED, IMAGE, decode_image
-from bhd_lerobot.data.bag_read import Bag, Topic
+from bhd_lerobot.data.bag_read import Bag, Picker, Topic
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.data.ros2_base import BareTwistPart, ScanPart
@@ -111,6 +111,7 @@ class _BagEpisodes:
         self._messages = bag.read(wanted, images)
         self._stamps: dict[str, NDArray[np.int64]] = {}
         self._values: dict[str, NDArray[Any]] = {}
+        self._pictures: dict[str, Picker] = {}
         self._state = self._table(STATE_TOPIC, types.STATE, STATE_COLUMNS, "control.")
         self._outcome = self._table(OUTCOME_TOPIC, types.OUTCOME, OUTCOME_COLUMNS, "next.", "subtask")
 
@@ -146,8 +147,10 @@ class _BagEpisodes:
                 if feature["dtype"] == "video":
                     topic = self._image_topic(key)
                     places = self._places(topic, head_stamps(topic, self._messages[topic].data), observed)
-                    for message in self._bag.pick(topic, places.tolist()):
-                        writer.add_image(key, decode_image(topic, self._topics[topic].msgtype, message))
+                    pictures = self._pictures.setdefault(topic, Picker(self._bag, topic))
+                    for place in places.tolist():
+                        image = decode_image(topic, self._topics[topic].msgtype, pictures.get(place))
+                        writer.add_image(key, image)
             recorder.save(writer, task=episode["task"], metadata=episode["metadata"])
         except BaseException:
             writer.discard()
@@ -248,7 +251,7 @@ def _headers(bag: Bag) -> list[dict[str, Any]]:
     """Return what is said of each episode of a bag, in the order of time."""
     messages = bag.read([EPISODE_TOPIC])[EPISODE_TOPIC].data
     plain = ("robot_type", "fps", "episode_index", "frames", "task", "format", "stamp.sec", "stamp.nanosec")
-    structured = ("features", "metadata", "recording", "video", "topics")
+    structured = ("features", "metadata", "metadata_types", "recording", "video", "topics")
     episodes = []
     for message in messages:
         found = {path: values[0] for path, values in decode(types.EPISODE, [message], (*plain, *structured)).items()}
@@ -262,10 +265,20 @@ def _headers(bag: Bag) -> list[dict[str, Any]]:
         except ValueError as error:
             raise DatasetError(f"{bag.path}: what {EPISODE_TOPIC} says is no JSON: {error}.") from error
         found |= {key: int(found[key]) for key in ("fps", "episode_index", "frames")}
+        found["metadata"] = _complete(found["metadata"], found["metadata_types"])
         episodes.append({**found, "start": int(found["stamp.sec"]) * NANO + int(found["stamp.nanosec"])})
     episodes.sort(key=lambda episode: episode["start"])
     starts = [episode["start"] for episode in episodes[1:]] + [np.iinfo(np.int64).max]
     return [{**episode, "next_start": start} for episode, start in zip(episodes, starts, strict=True)]
+
+
+def _complete(metadata: Mapping[str, Any], kinds: Mapping[str, str]) -> dict[str, Any]:
+    """Return metadata in which no value is missing: an edit may leave some out, the recorder wants them all."""
+    nothing = {"string": "", "bool": False, "int64": 0, "double": float("nan")}
+    return {
+        key: nothing.get(kinds.get(key, ""), []) if value is None else value
+        for key, value in {**dict.fromkeys(kinds), **metadata}.items()
+    }
 
 
 def _time(table: Mapping[str, Any], path: str) -> NDArray[np.int64]:

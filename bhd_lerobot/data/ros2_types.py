@@ -32,6 +32,7 @@ int64 frames
 string task                     # the instruction
 string features                 # LeRobot's feature dictionaries, JSON
 string metadata                 # what is recorded of the episode, without the prefix bhd/, JSON
+string metadata_types           # type of each of these values, JSON
 string recording                # identity of the recording, JSON
 string video                    # settings of the video encoder, JSON
 string topics                   # which topic carries which numbers of which feature, JSON
@@ -86,6 +87,7 @@ int64 WRONG_OBJECT=7
 int64 DROPPED=8
 int64 UNREACHABLE=9
 int64 FAULT=10
+int64 FAILURE=11                # without a cause
 std_msgs/Header header
 int64 episode_index
 int64 frame_index

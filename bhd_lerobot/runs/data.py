@@ -8,6 +8,8 @@ from bhd_lerobot.errors import BhdError
 from bhd_lerobot.runs import (
     data_check,
     data_edit,
+    data_export,
+    data_import,
     data_info,
     data_mark,
     data_pull,
@@ -28,6 +30,8 @@ COMMANDS = (
     data_view,
     data_push,
     data_pull,
+    data_export,
+    data_import,
 )
 
 

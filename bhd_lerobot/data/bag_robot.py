@@ -1,0 +1,299 @@
+"""From the bag of a real robot on wheels to episodes with the columns that our recordings of that robot have."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.data import features as keys
+from bhd_lerobot.data.bag_dataset import ImportReport, all_or_nothing
+from bhd_lerobot.data.bag_images import decode_image
+from bhd_lerobot.data.bag_read import Bag, Picker
+from bhd_lerobot.data.bag_tracks import Track, TrackOptions, read_tracks, seconds
+from bhd_lerobot.data.identity import default_root
+from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.data.resample import NANO, Grid, clock_jumps, grids, newest
+from bhd_lerobot.data.ros2_base import GYRO, ODOMETRY, TWIST
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.tasks.task import Event
+
+
+@dataclass(frozen=True)
+class RobotImport:
+    """What becomes of a bag.
+
+    Attributes:
+        robot_type: of the dataset.
+        task: the instruction.
+        fps: frames a second.
+        observation_names, action_names: of the dataset's numbers, in order.
+        tracks: how the bag is read.
+        max_speed: largest of each action [m/s, rad/s]; what is applied keeps to it.
+        max_age_s: age of the oldest reading beyond which a frame is late.
+        max_gap_s: silence of a sensor that ends an episode.
+        command_timeout_s: silence after which a command is no longer in force and the robot stands.
+        min_episode_s: shorter episodes are left out.
+        outcome: what the episodes ended with; None if nobody said.
+    """
+
+    robot_type: str
+    task: str
+    fps: int
+    observation_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+    tracks: TrackOptions
+    max_speed: tuple[float, ...]
+    max_age_s: float
+    max_gap_s: float
+    command_timeout_s: float
+    min_episode_s: float
+    outcome: str | None = None
+
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the episodes, JSON values."""
+        tracks = self.tracks
+        return {
+            "source": "rosbag2",
+            "robot": self.robot_type,
+            "fps": self.fps,
+            "stamps": tracks.stamps,
+            "topics": {**tracks.topics, **{f"camera/{name}": topic for name, topic in tracks.cameras.items()}},
+            "max_age_s": self.max_age_s,
+            "max_gap_s": self.max_gap_s,
+            "command_timeout_s": None if np.isinf(self.command_timeout_s) else self.command_timeout_s,
+        }
+
+
+def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wanted: RobotImport) -> ImportReport:
+    """Make a dataset of bags of a robot; the whole of it, or nothing.
+
+    Args:
+        bags: in order; each gives one episode, or several where it has gaps.
+        root: where to put it; LeRobot's default place if None.
+        repo_id: its name.
+        wanted: what becomes of them.
+
+    Raises:
+        DatasetError: a bag does not have what is needed.
+        DatasetExistsError: `root` exists.
+    """
+    report = ImportReport(Path(root) if root is not None else default_root(repo_id))
+    recorder: DatasetRecorder | None = None
+    with all_or_nothing(report.root) as made:
+        for bag in bags:
+            robot_bag = _RobotBag(bag, wanted)
+            for episode in robot_bag.episodes():
+                if recorder is None:
+                    features = _features(wanted, robot_bag.image_shapes())
+                    recorder = made(
+                        DatasetRecorder.create(
+                            repo_id,
+                            wanted.fps,
+                            features,
+                            robot_type=wanted.robot_type,
+                            root=report.root,
+                            recording=wanted.identity(),
+                        )
+                    )
+                report.frames += robot_bag.save(episode, recorder)
+                report.episodes += 1
+            report.problems += bag.problems
+            report.notes += [f"{bag.path.name}: {note}" for note in robot_bag.notes]
+        if recorder is None:
+            told = "; ".join([*report.notes, *report.problems])
+            raise DatasetError(
+                f"No episode of {wanted.min_episode_s:g} s or more came out of {', '.join(str(b.path) for b in bags)}: "
+                f"there is no such time in which all of {', '.join(wanted.identity()['topics'].values())} but the "
+                f"commands were heard at least every {wanted.max_gap_s:g} s. {told}"
+            )
+    return report
+
+
+def _features(wanted: RobotImport, images: Mapping[str, tuple[int, int, int]]) -> dict[str, dict[str, Any]]:
+    features = keys.dataset_features(wanted.observation_names, wanted.action_names, images, ("none",))
+    del features[keys.PHYSICS_STATE]  # nobody knows it of a real robot
+    return features
+
+
+@dataclass(frozen=True)
+class _Episode:
+    """Frames, and the tracks of the stretch of the bag in which they lie, sorted by time."""
+
+    grid: Grid
+    tracks: Mapping[str, Track]
+
+
+class _RobotBag:
+    """One bag, all of it but pictures in memory."""
+
+    def __init__(self, bag: Bag, wanted: RobotImport) -> None:
+        self.notes: list[str] = []
+        self._bag, self._wanted = bag, wanted
+        self._tracks = read_tracks(bag, wanted.tracks, self.notes)
+        self._pictures = {role: Picker(bag, one.topic) for role, one in self._tracks.items() if _is_camera(role)}
+        self._begin = min(int(track.times.min()) for track in self._tracks.values())
+
+    def episodes(self) -> Iterator[_Episode]:
+        """Yield the episodes in order."""
+        wanted = self._wanted
+        every = list(self._tracks.values())
+        jumps = clock_jumps([track.times for track in every], [track.order for track in every])
+        bounds = [0, *jumps.tolist(), np.iinfo(np.int64).max]
+        if len(jumps):
+            self.notes.append(f"the clock jumped back {len(jumps)} times; each time a new episode begins")
+        for number, (first, end) in enumerate(pairwise(bounds)):
+            tracks = {
+                role: track.part((track.order >= first) & (track.order < end)) for role, track in self._tracks.items()
+            }
+            sensors = {role: track for role, track in tracks.items() if role != "cmd"}
+            self._tell_gaps(sensors)
+            for grid in grids(
+                [track.times for track in sensors.values()],
+                wanted.fps,
+                max_age_ns=round(wanted.max_age_s * NANO),
+                max_gap_ns=round(wanted.max_gap_s * NANO),
+                why="clock" if number else "start",
+            ):
+                lasts = (len(grid.times) - 1) / wanted.fps
+                if lasts >= wanted.min_episode_s:
+                    yield _Episode(grid, tracks)
+                else:
+                    self.notes.append(
+                        f"a stretch of {lasts:.2f} s, {seconds(int(grid.times[0]) - self._begin)} after the start, is "
+                        "shorter than --min_episode_s and was left out"
+                    )
+
+    def _tell_gaps(self, sensors: Mapping[str, Track]) -> None:
+        limit = round(self._wanted.max_gap_s * NANO)
+        for track in sensors.values():
+            steps = np.diff(track.times)
+            for place in np.flatnonzero(steps > limit)[:5].tolist():
+                after = seconds(int(track.times[place]) - self._begin)
+                self.notes.append(
+                    f"{track.topic} was silent for {seconds(int(steps[place]))} ({after} after the start), or the "
+                    "clock jumped ahead; a new episode begins"
+                )
+
+    def image_shapes(self) -> dict[str, tuple[int, int, int]]:
+        """Return the shapes of the cameras' pictures by name."""
+        return {
+            role.removeprefix("camera/"): self._picture(role, 0).shape  # type: ignore[misc]
+            for role in self._pictures
+        }
+
+    def save(self, episode: _Episode, recorder: DatasetRecorder) -> int:
+        """Save an episode and return its number of frames."""
+        columns = self._columns(episode)
+        times = episode.grid.times
+        writer = recorder.begin_episode()
+        try:
+            writer.set_columns(columns)
+            for role in self._pictures:
+                track = episode.tracks[role]
+                for place in track.values[newest(track.times, times), 0].astype(np.intp).tolist():
+                    key = f"{keys.OBSERVATION_IMAGES}.{role.removeprefix('camera/')}"
+                    writer.add_image(key, self._picture(role, place))
+            recorder.save(writer, task=self._wanted.task, metadata=self._metadata(episode, columns))
+        except BaseException:
+            writer.discard()
+            raise
+        late = int(columns[keys.LATE].sum())
+        if late:
+            self.notes.append(
+                f"{late} of {len(times)} frames of the episode {seconds(int(times[0]) - self._begin)} after the start "
+                f"have a reading older than {self._wanted.max_age_s:g} s; control.late is true in them"
+            )
+        return len(times)
+
+    # --- what is in a frame ------------------------------------------------------------------------------------------
+
+    def _columns(self, episode: _Episode) -> dict[str, NDArray[Any]]:
+        wanted, times = self._wanted, episode.grid.times
+        n = len(times)
+        age = episode.grid.ages.max(axis=0)
+        asked, command_age = self._commands(episode.tracks["cmd"], times)
+        heard = command_age >= 0
+        applied = np.clip(asked, -np.array(wanted.max_speed), wanted.max_speed)
+        over = (applied != asked).any(axis=1)
+        done = np.arange(n) == n - 1
+        ended = Event.NOTHING if wanted.outcome is None else Event[wanted.outcome.upper()]
+        return {
+            keys.OBSERVATION_STATE: self._state(episode),
+            keys.ACTION: asked.astype(np.float32),
+            keys.APPLIED_ACTION: applied.astype(np.float32),
+            keys.TIME: (times - times[0]) / NANO,
+            keys.AGE: (age / NANO).astype(np.float32),
+            keys.COMMAND_AGE: (np.where(heard, command_age, 0) / NANO).astype(np.float32),
+            keys.LATENESS: np.zeros(n, np.float32),
+            keys.OVERRUNS: np.zeros(n, np.int64),
+            keys.SKIPPED: np.zeros(n, np.int64),
+            keys.INFERENCE_TIME: np.zeros(n, np.float32),
+            keys.LATE: age > round(wanted.max_age_s * NANO),
+            keys.LIMITS: np.where(over, int(Limit.VELOCITY), 0),
+            keys.WATCHDOG: np.where(heard, 0, int(Watchdog.COMMAND_AGE)),
+            keys.MODE: np.where(heard, int(Mode.TRACKING), int(Mode.HOLD)),
+            keys.REWARD: np.zeros(n, np.float32),
+            keys.SUCCESS: done & (ended == Event.SUCCESS),
+            keys.DONE: done,
+            keys.EVENT: np.where(done, int(ended), 0),
+        }
+
+    def _commands(self, track: Track, times: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the command in force at each frame, shape (n, 2), and its age [ns]; 0 and -1 where there is none."""
+        place = newest(track.times, times)
+        known = np.maximum(place, 0)
+        if not len(track.times):
+            return np.zeros((len(times), len(TWIST))), np.full(len(times), -1, np.int64)
+        age = np.where(place < 0, -1, times - track.times[known])
+        timeout = self._wanted.command_timeout_s
+        if np.isfinite(timeout):
+            age = np.where(age > round(timeout * NANO), -1, age)
+        order = [TWIST.index(name) for name in self._wanted.action_names]
+        return np.where(age[:, None] >= 0, track.values[known], 0.0)[:, order], age
+
+    def _state(self, episode: _Episode) -> NDArray[np.float32]:
+        times, tracks = episode.grid.times, episode.tracks
+
+        def at(role: str) -> NDArray[np.float64]:
+            return tracks[role].values[newest(tracks[role].times, times)]
+
+        scan, odom = at("scan"), at("odom")
+        columns = dict(zip(TWIST, odom[:, :2].T, strict=True))
+        columns |= dict(zip(ODOMETRY, _since_start(odom[:, 2:]).T, strict=True))
+        columns |= {f"scan_{beam:03d}.pos": scan[:, beam] for beam in range(scan.shape[1])}
+        if "imu" in tracks:
+            columns |= dict(zip(GYRO, at("imu").T, strict=True))
+        return np.stack([columns[name] for name in self._wanted.observation_names], axis=1).astype(np.float32)
+
+    def _metadata(self, episode: _Episode, columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+        outcome = self._wanted.outcome
+        source = {
+            "bag": self._bag.path.name,
+            "start_ns": int(episode.grid.times[0]),
+            "why": episode.grid.why,
+            "late_frames": int(columns[keys.LATE].sum()),
+            "problems": self._bag.problems,
+        }
+        told = {} if outcome is None else {"outcome": outcome, "success": outcome == Event.SUCCESS.cause}
+        return {"source": json.dumps(source), **told}
+
+    def _picture(self, role: str, place: int) -> NDArray[np.uint8]:
+        track = self._tracks[role]
+        return decode_image(track.topic, track.msgtype, self._pictures[role].get(place))
+
+
+def _is_camera(role: str) -> bool:
+    return role.startswith("camera/")
+
+
+def _since_start(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return poses x, y, yaw in the frame of the first one, shape (n, 3)."""
+    x, y, yaw = (pose - pose[0]).T
+    cos, sin = np.cos(pose[0, 2]), np.sin(pose[0, 2])
+    return np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1)

@@ -1,0 +1,135 @@
+"""From messages, which come when they come, to frames, which come at a fixed rate: never looking into the future.
+
+A frame at time T has of each topic the newest message at or before T. Where frames lie depends on earlier messages
+only, too: an episode begins when every sensor has been heard, and its frames follow at 1 / fps. So nothing that happens
+after T changes the frame at T; only that a frame was the last one shows later.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Times = NDArray[np.int64]
+NANO = 1_000_000_000
+STEP_BACK_NS = NANO // 2  # a clock that goes back further has jumped; what is less is sorted
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The frames of an episode.
+
+    Attributes:
+        times: of the frames [ns], shape (frames,).
+        ages: of the newest message of each sensor, shape (sensors, frames) [ns].
+        why: what began it: ``"start"``, ``"gap"`` or ``"clock"``.
+    """
+
+    times: Times
+    ages: Times
+    why: str
+
+
+def message_times(received: Times, stamps: Times | None, policy: str, tolerance_ns: int = NANO // 2) -> Times:
+    """Return when messages happened [ns], shape (n,).
+
+    Args:
+        received: when the recorder got them.
+        stamps: of their headers; None if they have none.
+        policy: ``"header"`` or ``"receive"`` take one of them; ``"auto"`` takes the header's if it is sane: before
+            the message was received, and not by more than the tolerance. Each message is judged by itself, so that no
+            later one decides about it.
+        tolerance_ns: on both sides, for two clocks that differ a little; a tenth of it after the reception.
+    """
+    if stamps is None or policy == "receive":
+        return received
+    if policy == "header":
+        return stamps
+    return np.where(sane(received, stamps, tolerance_ns), stamps, received)
+
+
+def sane(received: Times, stamps: Times, tolerance_ns: int = NANO // 2) -> NDArray[np.bool_]:
+    """Return which headers' stamps can be true, shape (n,)."""
+    delay = received - stamps
+    return (stamps > 0) & (delay <= tolerance_ns) & (delay >= -tolerance_ns // 10)
+
+
+def clock_jumps(times: Sequence[Times], order: Sequence[Times]) -> Times:
+    """Return where the clock jumped back: places in the bag's order, of the first message after each jump.
+
+    Args:
+        times: of each topic's messages, in the order in which they were written.
+        order: their places among all messages of the bag.
+    """
+    if not any((np.diff(one) < -STEP_BACK_NS).any() for one in times):
+        return np.zeros(0, np.int64)  # a bag may also have been written topic by topic
+    places = np.concatenate(list(order))
+    by_place = np.argsort(places, kind="stable")
+    clock, places = np.concatenate(list(times))[by_place], places[by_place]
+    jumps, begin = [], 0
+    while len(clock) > begin:
+        behind = np.maximum.accumulate(clock[begin:]) - clock[begin:] > STEP_BACK_NS
+        if not behind.any():
+            break
+        begin += int(behind.argmax())
+        jumps.append(int(places[begin]))
+    return np.array(jumps, np.int64)
+
+
+def newest(times: Times, at: Times) -> NDArray[np.intp]:
+    """Return the place of the newest message at or before each time, shape (frames,); -1 where there is none.
+
+    Args:
+        times: of the messages, ascending.
+        at: of the frames.
+    """
+    return np.searchsorted(times, at, side="right") - 1
+
+
+def grids(sensors: Sequence[Times], fps: float, *, max_age_ns: int, max_gap_ns: int, why: str = "start") -> list[Grid]:
+    """Return the frames of the episodes that some sensors allow.
+
+    An episode goes on as long as every sensor was heard within the last `max_gap_ns`. At its end, frames that only have
+    readings older than `max_age_ns` are left out: they tell what was, not what is.
+
+    Args:
+        sensors: times of each sensor's messages, ascending.
+        fps: frames a second.
+        max_age_ns: age at which a reading is too old.
+        max_gap_ns: silence that ends an episode, at least `max_age_ns`.
+        why: what began the first one.
+    """
+    if not sensors or any(not len(times) for times in sensors):
+        return []
+    last = max(int(times[-1]) for times in sensors)
+    result = []
+    for first, until in _common([_covered(times, max_gap_ns) for times in sensors]):
+        end = min(until, last)
+        count = int((end - first) * fps / NANO) + 1
+        at = first + np.round(np.arange(count) * (NANO / fps)).astype(np.int64)
+        at = at[at <= end]
+        ages = np.stack([at - times[newest(times, at)] for times in sensors])
+        fresh = np.flatnonzero(ages.max(axis=0) <= max_age_ns)
+        if len(fresh):
+            stop = int(fresh[-1]) + 1
+            result.append(Grid(at[:stop], ages[:, :stop], why))
+        why = "gap"
+    return result
+
+
+def _covered(times: Times, gap: int) -> list[tuple[int, int]]:
+    """Return the spans in which the newest message is not older than a gap."""
+    breaks = np.flatnonzero(np.diff(times) > gap)
+    begin, end = np.append(0, breaks + 1), np.append(breaks, len(times) - 1)
+    return [(int(times[a]), int(times[b]) + gap) for a, b in zip(begin, end, strict=True)]
+
+
+def _common(spans: Sequence[list[tuple[int, int]]]) -> list[tuple[int, int]]:
+    """Return the spans that lie in one of each list."""
+    common = spans[0]
+    for other in spans[1:]:
+        common = [
+            (max(a, c), min(b, d)) for a, b in common for c, d in other if max(a, c) <= min(b, d)
+        ]  # a handful: one for each gap
+    return common

@@ -1,0 +1,113 @@
+"""From the beams of some scanner to ours: evenly spaced, the first straight ahead, counter-clockwise."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import LidarSpec
+from bhd_lerobot.errors import DatasetError
+
+Array = NDArray[np.float64]
+
+
+def clean_ranges(ranges: NDArray[np.floating], lidar: LidarSpec, range_min: float) -> Array:
+    """Return ranges as the dataset has them.
+
+    No return is 0, infinity, not a number or a negative value in drivers of real scanners; it becomes the maximum
+    range. Minus infinity is ROS's word for something too near. What is nearer than the scanner can see, or farther,
+    reads its nearest or farthest range.
+
+    Args:
+        ranges: as they came [m].
+        lidar: the scanner that the dataset is of.
+        range_min: of the scanner that measured [m].
+    """
+    values = np.asarray(ranges, np.float64)
+    near = np.isneginf(values) | ((values > 0) & (values < max(range_min, lidar.range_min)))
+    nothing = ~np.isfinite(values) | (values <= 0)
+    return np.where(near, lidar.range_min, np.where(nothing, lidar.range_max, np.minimum(values, lidar.range_max)))
+
+
+class Sweep(NamedTuple):
+    """How a scan was taken: how many beams, the first one's angle, and the angle between two [rad].
+
+    The angle between two is negative where they run clockwise.
+    """
+
+    beams: int
+    angle_min: float
+    angle_increment: float
+
+
+@lru_cache(maxsize=4096)
+def nearest_beams(sweep: Sweep, beams: int, rotation: tuple[float, ...], topic: str) -> NDArray[np.intp]:
+    """Return which measured beam is nearest to each of ours, shape (beams,).
+
+    Args:
+        sweep: what was measured.
+        beams: how many are wanted.
+        rotation: of the scanner in the robot, a rotation matrix, row by row.
+        topic: for messages.
+
+    Raises:
+        DatasetError: one of ours has none nearby: the scanner does not see all around.
+    """
+    count, angle_min, angle_increment = sweep
+    angle = angle_min + angle_increment * np.arange(count)
+    matrix = np.reshape(rotation, (3, 3))
+    ahead, left, _ = matrix @ np.stack([np.cos(angle), np.sin(angle), np.zeros(count)])
+    measured = np.arctan2(left, ahead)
+    wanted = 2 * np.pi * np.arange(beams) / beams
+    away = np.abs((measured[None] - wanted[:, None] + np.pi) % (2 * np.pi) - np.pi)
+    nearest = away.argmin(axis=1)
+    far = away.min(axis=1) > max(2 * np.pi / beams, 1.5 * abs(angle_increment)) + 1e-9
+    if far.any():
+        seen = np.degrees(abs(angle_increment) * (count - 1))
+        raise DatasetError(
+            f"The scans of {topic} cover {seen:.0f} degrees and have no beam within reach of {int(far.sum())} of the "
+            f"{beams} that the dataset has. Where nothing was measured, a policy must not read free space: a scanner "
+            "that sees all around is needed, or fewer --beams."
+        )
+    return nearest
+
+
+def resampled_scans(
+    ranges: NDArray[np.object_] | Array,
+    geometry: Mapping[str, Array],
+    *,
+    lidar: LidarSpec,
+    beams: int,
+    rotation: Array,
+    topic: str,
+) -> Array:
+    """Return scans with our beams, shape (n, beams) [m]; not a number where a scan is none: without beams or angles.
+
+    Args:
+        ranges: of n scans, shape (n, m), or n arrays of different lengths.
+        geometry: ``angle_min``, ``angle_increment`` [rad] and ``range_min`` [m] of each, shape (n,).
+        lidar: the scanner that the dataset is of.
+        beams: how many are wanted.
+        rotation: of the scanner in the robot, a rotation matrix, shape (3, 3).
+        topic: for messages.
+
+    Raises:
+        DatasetError: a scan does not see all around.
+    """
+    n = len(ranges)
+    result = np.empty((n, beams))
+    lengths = np.array([len(one) for one in ranges], np.int64)
+    keys = np.stack([lengths, geometry["angle_min"], geometry["angle_increment"], geometry["range_min"]], axis=1)
+    turn = tuple(rotation.reshape(-1).tolist())
+    kinds, which = np.unique(keys, axis=0, return_inverse=True)
+    for kind, (count, angle_min, increment, range_min) in enumerate(kinds):
+        rows = np.flatnonzero(which.reshape(-1) == kind)
+        if count < 1 or not np.isfinite([angle_min, increment]).all() or (increment == 0 and beams > 1):
+            result[rows] = np.nan
+            continue
+        beam = nearest_beams(Sweep(int(count), float(angle_min), float(increment)), beams, turn, topic)
+        block = np.stack([np.asarray(ranges[row], np.float64) for row in rows])
+        result[rows] = clean_ranges(block[:, beam], lidar, float(range_min))
+    return result
