@@ -17,11 +17,35 @@ import pandas as pd  # noqa: F401
 import pyarrow.dataset  # noqa: F401
 import support  # run as a script, so this folder is on the path
 
-from bhd_lerobot.data import disk
+from bhd_lerobot.data import disk, edits, mark, repair
+
+
+def edit(job: dict[str, Any]) -> None:
+    """Edit a dataset and die at a given step."""
+    steps = itertools.count()
+
+    def before_step(action: str, path: Path) -> None:
+        if next(steps) == job["die_at"]:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    disk._before_step = before_step
+    roots = [Path(root) for root in job["roots"]]
+    if job["edit"] == "delete":
+        edits.delete(roots[0], job["episodes"])
+    elif job["edit"] == "merge":
+        edits.merge(roots[1:], roots[0])
+    elif job["edit"] == "mark":
+        mark.mark(roots[0], job["episodes"], outcome=job["outcome"])
+    else:
+        assert job["edit"] == "repair"
+        repair.repair(roots[0])
 
 
 def run(job: dict[str, Any]) -> None:
     """Do one job: save some episodes, perhaps finalise, perhaps again and again; die at a given step."""
+    if "edit" in job:
+        edit(job)
+        return
     root, video = Path(job["root"]), job.get("video", False)
     progress = os.open(job["progress"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     steps = itertools.count()
