@@ -18,7 +18,7 @@ from bhd_lerobot.data.disk import RootLock, to_json, write_errors
 from bhd_lerobot.data.remote import SUBSET, Remote, RemoteFile, digest, in_order, is_recorded, listed, megabytes, total
 from bhd_lerobot.data.remote_subset import Subset, files_of, read_subset
 from bhd_lerobot.data.state import load_state
-from bhd_lerobot.errors import DatasetError, DatasetExistsError, TransferError
+from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError
 
 type Select = Callable[[Path], Sequence[int]]
 """Chooses episodes, given a folder that holds the metadata of the dataset."""
@@ -33,7 +33,8 @@ class PullReport:
 
     Attributes:
         root: the dataset on this machine.
-        episodes: the episodes whose files it holds, by number; None if it is whole.
+        episodes: the episodes that were chosen, now and before, by number; None if none were.
+        is_whole: whether it holds all files.
         total_episodes: episodes of the whole dataset.
         fetched: files that were fetched.
         fetched_bytes: their bytes.
@@ -42,6 +43,7 @@ class PullReport:
 
     root: Path
     episodes: list[int] | None
+    is_whole: bool
     total_episodes: int
     fetched: list[str]
     fetched_bytes: int
@@ -86,6 +88,7 @@ class _Pull:
             raise DatasetError(f"{self._root} is a mount point, which cannot be exchanged. Name a folder in it.")
         if self._old.is_dir() and not self._root.exists():
             self._old.rename(self._root)  # a kill between the two renames
+        is_new = not self._staging.exists()
         self._staging.mkdir(parents=True, exist_ok=True)
         locks = [RootLock(self._staging, self._root)]
         try:
@@ -105,12 +108,17 @@ class _Pull:
             info = json.loads((self._root / layout.INFO).read_bytes())
             return PullReport(
                 root=self._root,
-                episodes=None if whole or subset is None else subset.episodes,
+                episodes=None if subset is None else subset.episodes,
+                is_whole=whole,
                 total_episodes=info["total_episodes"],
                 fetched=in_order(self._fetched),
                 fetched_bytes=total(there[path] for path in self._fetched),
                 kept=len(wanted) - len(self._fetched),
             )
+        except (ConfigError, DatasetError):
+            if is_new:  # refused: there is nothing to go on with
+                shutil.rmtree(self._staging, ignore_errors=True)
+            raise
         finally:
             for lock in locks:
                 lock.release()

@@ -4,7 +4,6 @@ Beside the dataset lies a list of its files with their checksums, because object
 the same by. `meta/info.json` is written last and removed first, so that there is either all of a dataset or none.
 """
 
-import contextlib
 import errno
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +20,9 @@ MANIFEST = "bhd_files.json"
 
 _EXTRAS = {"s3": "lerobot_robot_bhd[s3]", "s3a": "lerobot_robot_bhd[s3]", "gs": "gcsfs", "gcs": "gcsfs"}
 _EXTRAS |= {"az": "adlfs", "abfs": "adlfs", "abfss": "adlfs", "sftp": "paramiko", "ssh": "paramiko"}
+
+_FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", "webhdfs", "webdav", "dbfs"}
+"""Where folders must be made first. To make the folder of an object store's object may mean to make a bucket."""
 
 _BATCH_BYTES = 64e6
 """Bytes that are sent at once, after which the list is written: as much is sent again at most after a kill."""
@@ -67,6 +69,8 @@ class StoreDataset:
         except ValueError as error:
             known = ", ".join(sorted(str(one) for one in fsspec.available_protocols()))
             raise ConfigError(f"{url} cannot be used: {error}. Known protocols: {known}.") from error
+        kinds = self._fs.protocol if isinstance(self._fs.protocol, tuple) else (self._fs.protocol,)
+        self._has_folders = not _FOLDERS.isdisjoint(kinds)
         self._known: dict[str, RemoteFile] = {}
         self._there: dict[str, RemoteFile] = {}
 
@@ -153,8 +157,8 @@ class StoreDataset:
     def _put(self, items: Sequence[Item], note: bool = True) -> None:
         files = [item for item in items if isinstance(item.content, Path)]
         sums = {item.path: RemoteFile(item.size, digest(item.content, "sha256")) for item in items} if note else {}
-        for folder in {str(Path(self._at(item.path)).parent) for item in items}:
-            with contextlib.suppress(FileExistsError):
+        if self._has_folders:
+            for folder in {self._at(item.path).rpartition("/")[0] for item in items}:
                 self._fs.makedirs(folder, exist_ok=True)
         if files:
             self._fs.put([str(item.content) for item in files], [self._at(item.path) for item in files])

@@ -111,6 +111,8 @@ def tell(report: "PullReport", source: str) -> str:
         chosen = _ranges(report.episodes)
         name = "me/some" if is_url(source) else source
         lines[0] = f"{report.root}: {len(report.episodes)} of {report.total_episodes} episodes: {chosen}"
+        if report.is_whole:
+            lines.append("  the files that hold them hold all the others, too")
         lines += [
             "  Name them where you load it:",
             f"    bhd-train --dataset.repo_id={name} --dataset.root={report.root} --dataset.episodes="

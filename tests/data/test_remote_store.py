@@ -1,0 +1,291 @@
+"""Datasets below a URL: in memory, in a folder, and in an S3-compatible store on this machine."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from bhd_lerobot.data import layout, remote_store
+from bhd_lerobot.data.remote_pull import pull
+from bhd_lerobot.data.remote_push import push
+from bhd_lerobot.data.remote_store import MANIFEST, StoreDataset
+from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError
+from tests.data import support
+
+EPISODES = 3
+KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("recorded") / "d"
+    with support.create(root, video=True) as recorder:
+        for _ in range(EPISODES):
+            support.record(recorder, video=True)
+    return root
+
+
+@pytest.fixture
+def root(recorded: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recorded, tmp_path / "d"))
+
+
+@pytest.fixture(scope="module")
+def s3_url() -> Iterator[str]:
+    """An S3-compatible store with one bucket; yields its address."""
+    from moto.server import ThreadedMotoServer
+
+    server = ThreadedMotoServer(port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"
+    server.stop()
+
+
+@pytest.fixture(params=["memory", "file", "s3"])
+def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    if request.param == "file":
+        return f"file://{tmp_path}/there/d"
+    if request.param == "memory":
+        fsspec.filesystem("memory").store.clear()
+        return "memory://bucket/there/d"
+    use_s3(request.getfixturevalue("s3_url"), monkeypatch)
+    s3 = fsspec.filesystem("s3")
+    if s3.exists("bucket"):
+        s3.rm("bucket", recursive=True)
+    s3.mkdir("bucket")
+    return "s3://bucket/there/d"
+
+
+def use_s3(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {**KEYS, "AWS_ENDPOINT_URL": address}.items():
+        monkeypatch.setenv(name, value)
+    fsspec.filesystem("s3").clear_instance_cache()
+
+
+def content(root: Path) -> dict[str, bytes]:
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def stored(url: str) -> dict[str, bytes]:
+    store = StoreDataset(url)
+    return {path: store.read(path) or b"" for path in store.files()}
+
+
+def test_what_comes_back_is_what_was_recorded(root: Path, url: str, tmp_path: Path) -> None:
+    report = push(root, StoreDataset(url))
+    assert stored(url) == content(root)
+    assert len(report.sent) == len(content(root))
+    pull(StoreDataset(url), tmp_path / "e")
+    assert content(tmp_path / "e") == content(root)
+    assert (push(root, StoreDataset(url)).sent, pull(StoreDataset(url), tmp_path / "e").fetched) == ([], [])
+
+
+def test_a_longer_dataset_replaces_what_differs(root: Path, url: str, tmp_path: Path) -> None:
+    push(root, StoreDataset(url))
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+    report = push(root, StoreDataset(url))
+    assert stored(url) == content(root)
+    assert report.kept > 0
+    with support.create(tmp_path / "small") as recorder:
+        support.record(recorder)
+    assert push(tmp_path / "small", StoreDataset(url)).deleted
+    assert stored(url) == content(tmp_path / "small")
+
+
+class Dying:
+    """Lets a file system's calls through, until one fails."""
+
+    def __init__(self, calls: int) -> None:
+        self.left = calls
+
+    def wrap(self, original):
+        def call(*args: object, **kwargs: object) -> object:
+            if self.left == 0:
+                raise ConnectionResetError("gone")
+            self.left -= 1
+            return original(*args, **kwargs)
+
+        return call
+
+
+@pytest.mark.parametrize("step", range(25))
+def test_an_upload_that_dies_anywhere_shows_nothing_and_goes_on(root: Path, tmp_path: Path, monkeypatch, step) -> None:
+    """At every write: no reader finds a dataset that is not whole, and the repetition sends what is missing."""
+    monkeypatch.setattr(remote_store, "_BATCH_FILES", 1)
+    memory = fsspec.filesystem("memory")
+    memory.store.clear()
+    old, target, url = tmp_path / "old", tmp_path / "e", "memory://b/d"
+    with support.create(old) as recorder:
+        support.record(recorder)
+    push(old, StoreDataset(url))
+    dying = Dying(step)
+    with monkeypatch.context() as patch:
+        for name in ("put_file", "pipe_file", "rm_file"):
+            patch.setattr(type(memory), name, dying.wrap(getattr(type(memory), name)))
+        with pytest.raises(TransferError, match="cannot be reached"):
+            push(root, StoreDataset(url))
+    if step == 0:  # nothing was changed yet
+        pull(StoreDataset(url), target)
+        assert content(target) == content(old)
+    else:
+        with pytest.raises(TransferError, match=r"no meta/info\.json"):
+            pull(StoreDataset(url), target)
+        assert not target.exists()
+    push(root, StoreDataset(url))
+    assert stored(url) == content(root)
+
+
+def test_what_arrived_is_not_sent_again(root: Path, url: str, monkeypatch) -> None:
+    monkeypatch.setattr(remote_store, "_BATCH_FILES", 1)
+    first = StoreDataset(url)
+    put, sent = first._fs.put, []
+
+    def three(local: list[str], *args: object, **kwargs: object) -> object:
+        if len(sent) == 3:
+            raise ConnectionResetError("gone")
+        sent.extend(local)
+        return put(local, *args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(first._fs, "put", three)
+        with pytest.raises(TransferError):
+            push(root, first)
+    report = push(root, StoreDataset(url))
+    assert report.kept == 3
+    assert stored(url) == content(root)
+
+
+def test_a_download_that_dies_leaves_no_dataset_and_goes_on(root: Path, url: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(remote_store, "_BATCH_FILES", 1)
+    push(root, StoreDataset(url))
+    source = StoreDataset(url)
+    get, fetched = source._fs.get, []
+
+    def some(remote: list[str], *args: object, **kwargs: object) -> object:
+        if len(fetched) == 4:
+            raise ConnectionResetError("gone")
+        fetched.extend(remote)
+        return get(remote, *args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(source._fs, "get", some)
+        with pytest.raises(TransferError, match="cannot be reached"):
+            pull(source, tmp_path / "e")
+    assert not (tmp_path / "e").exists()
+    assert len(pull(StoreDataset(url), tmp_path / "e").fetched) == len(content(root)) - 4
+    assert content(tmp_path / "e") == content(root)
+
+
+def test_a_changed_object_is_noticed(root: Path, url: str, tmp_path: Path) -> None:
+    push(root, StoreDataset(url))
+    store = StoreDataset(url)
+    path = next(path for path in store.files() if path.startswith("data/"))
+    broken = bytearray(store.read(path) or b"")
+    broken[20] ^= 1
+    store._fs.pipe_file(store._at(path), bytes(broken))
+    with pytest.raises(TransferError, match=r"file-000\.parquet came otherwise"):
+        pull(StoreDataset(url), tmp_path / "e")
+    assert not (tmp_path / "e").exists()
+
+
+def test_a_dataset_that_another_program_put_there(root: Path, tmp_path: Path) -> None:
+    """Without our list of checksums sizes decide, and a push sends everything once."""
+    there = tmp_path / "there"
+    shutil.copytree(root, there)
+    url = f"file://{there}"
+    pull(StoreDataset(url), tmp_path / "e")
+    assert content(tmp_path / "e") == content(root)
+    assert len(push(root, StoreDataset(url)).sent) == len(content(root))
+    assert push(root, StoreDataset(url)).sent == []
+
+
+def test_a_list_that_is_damaged_is_not_trusted(root: Path, tmp_path: Path) -> None:
+    url = f"file://{tmp_path}/there"
+    push(root, StoreDataset(url))
+    for text in ("{", "[]", '{"files": {"meta/info.json": 3}}'):
+        (tmp_path / "there" / MANIFEST).write_text(text)
+        assert len(push(root, StoreDataset(url)).sent) == len(content(root))
+    listed = json.loads((tmp_path / "there" / MANIFEST).read_text())["files"]
+    assert set(listed) == set(content(root))
+
+
+def test_a_file_that_would_lie_outside_is_refused(root: Path, tmp_path: Path, monkeypatch) -> None:
+    push(root, StoreDataset("memory://b/d"))
+    source = StoreDataset("memory://b/d")
+    files = source.files()
+    monkeypatch.setattr(source, "files", lambda: {**files, "../../evil": files[layout.INFO]})
+    with pytest.raises(TransferError, match="outside of the dataset"):
+        pull(source, tmp_path / "e")
+
+
+def test_some_episodes(root: Path, url: str, tmp_path: Path) -> None:
+    push(root, StoreDataset(url))
+    report = pull(StoreDataset(url), tmp_path / "e", select=lambda folder: [1])
+    assert (report.episodes, report.is_whole) == ([1], True)  # one file holds them all
+    (tmp_path / "e" / layout.STATS).write_text("{}")
+    with pytest.raises(DatasetExistsError):
+        pull(StoreDataset(url), tmp_path / "e")
+
+
+def test_a_change_during_the_upload_is_not_shown(root: Path, monkeypatch) -> None:
+    store = StoreDataset("memory://b/changed")
+    put = store._fs.put
+
+    def put_and_change(*args: object, **kwargs: object) -> object:
+        (root / layout.STATS).write_text("{}")
+        return put(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store._fs, "put", put_and_change)
+        with pytest.raises(DatasetError, match="changed by another program"):
+            push(root, store)
+    assert layout.INFO not in StoreDataset("memory://b/changed").files()
+
+
+def test_places_that_do_not_exist(root: Path, s3_url: str, tmp_path: Path, monkeypatch) -> None:
+    use_s3(s3_url, monkeypatch)
+    with pytest.raises(TransferError, match="bucket must be made first"):
+        push(root, StoreDataset("s3://nobucket/d"))
+    for url in ("s3://nobucket/d", f"file://{tmp_path}/nowhere", "memory://nowhere/d"):
+        with pytest.raises(TransferError, match="no LeRobot dataset"):
+            pull(StoreDataset(url), tmp_path / "e")
+    for wrong, words in (
+        ("foo://b/d", "Protocol not known"),
+        ("s3://", "names no folder"),
+        ("http://127.0.0.1/d", "cannot be written"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            StoreDataset(wrong)
+
+
+def test_no_store_and_no_credentials(root: Path, monkeypatch) -> None:
+    use_s3("http://127.0.0.1:9", monkeypatch)
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
+    monkeypatch.setattr("asyncio.sleep", _no_sleep)
+    with pytest.raises(TransferError, match="cannot be reached"):
+        push(root, StoreDataset("s3://bucket/d"))
+    for name in KEYS:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_CONFIG_FILE", "/dev/null")
+    fsspec.filesystem("s3").clear_instance_cache()
+    with pytest.raises(TransferError, match="no credentials were found"):
+        push(root, StoreDataset("s3://bucket/d"))
+
+
+def test_what_is_not_installed_is_named(monkeypatch) -> None:
+    def missing(*_: object, **__: object) -> None:
+        raise ImportError("Install s3fs to access S3")
+
+    monkeypatch.setattr("fsspec.core.url_to_fs", missing)
+    with pytest.raises(TransferError, match=r"pip install 'lerobot_robot_bhd\[s3\]'"):
+        StoreDataset("s3://bucket/d")
+
+
+async def _no_sleep(*_: object) -> None:
+    return None
