@@ -113,7 +113,7 @@ class Dying:
         return call
 
 
-@pytest.mark.parametrize("step", range(25))
+@pytest.mark.parametrize("step", range(14))
 def test_an_upload_that_dies_anywhere_shows_nothing_and_goes_on(root: Path, tmp_path: Path, monkeypatch, step) -> None:
     """At every write: no reader finds a dataset that is not whole, and the repetition sends what is missing."""
     monkeypatch.setattr(remote_store, "_BATCH_FILES", 1)
