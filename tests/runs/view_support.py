@@ -62,9 +62,9 @@ def served(root: Path) -> Iterator[Served]:
         await web.TCPSite(runner, HOST, 0).start()
         return int(runner.addresses[0][1])
 
-    port = loop.run_until_complete(start())
     thread = threading.Thread(target=loop.run_forever)
     thread.start()
+    port = asyncio.run_coroutine_threadsafe(start(), loop).result(20)
     try:
         yield Served(root, port)
     finally:
