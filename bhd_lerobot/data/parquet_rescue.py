@@ -5,7 +5,7 @@ footer no reader opens it, though every row group that was written is there. Eac
 its size and number of values. So the row groups can be walked through, given the columns, and a footer can be written.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,15 +62,17 @@ class _Page:
     uncompressed: int
 
 
-def rescue(path: Path, schema: pa.Schema) -> Rescued:
+def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | None = None) -> Rescued:
     """Return the row groups of a file, with its footer or without.
 
     Args:
         path: the file.
-        schema: its columns, in order; used only if there is no footer. Lists must have a fixed length.
+        schema: its columns, in order; used only if there is no footer.
+        shapes: the shape of a row's value in columns of nested lists, whose type does not tell it.
 
     Raises:
         OSError: the file cannot be read at all.
+        ValueError: rows of a column may have any length, so that the ends of its pages cannot be known.
     """
     try:
         whole = pq.ParquetFile(path)
@@ -80,7 +82,7 @@ def rescue(path: Path, schema: pa.Schema) -> Rescued:
     data = path.read_bytes()
     if not data.startswith(MAGIC):
         return Rescued([], "it does not begin like a Parquet file", len(data))
-    footer, factors = _template(schema)
+    footer, factors = _template(schema, shapes or {})
     groups = _walk(memoryview(data), factors)
     if not groups:
         return Rescued([], f"it has no footer and no whole row group ({problem[:120]})", len(data) - len(MAGIC))
@@ -97,12 +99,12 @@ def rescue(path: Path, schema: pa.Schema) -> Rescued:
     return Rescued(tables, "it has no footer", len(data) - groups[-1][-1].end)
 
 
-def _template(schema: pa.Schema) -> tuple[Struct, list[int]]:
+def _template(schema: pa.Schema, shapes: Mapping[str, Sequence[int]]) -> tuple[Struct, list[int]]:
     """Return the footer of a file with these columns and one row, and how many values a row has in each leaf column."""
-    arrays = [pa.array([_example(column.type)], type=column.type) for column in schema]
+    arrays = [pa.array([_example(column.type, column.name, shapes)], type=_storage(column.type)) for column in schema]
     sink = pa.BufferOutputStream()
     # As LeRobot writes; the codec and the encodings go into the footer.
-    pq.write_table(pa.Table.from_arrays(arrays, schema=schema), sink, compression="snappy", use_dictionary=True)
+    pq.write_table(pa.Table.from_arrays(arrays, names=schema.names), sink, compression="snappy", use_dictionary=True)
     data = sink.getvalue().to_pybytes()
     length = int.from_bytes(data[-8:-4], "little")
     footer = Reader(data, len(data) - 8 - length).struct()
@@ -110,20 +112,27 @@ def _template(schema: pa.Schema) -> tuple[Struct, list[int]]:
     return footer, [column[_COLUMN_META].value[_META_VALUES].value for column in columns]
 
 
-def _example(kind: pa.DataType) -> object:
-    if isinstance(kind, pa.BaseExtensionType):
-        kind = kind.storage_type
+def _storage(kind: pa.DataType) -> pa.DataType:
+    return kind.storage_type if isinstance(kind, pa.BaseExtensionType) else kind
+
+
+def _example(kind: pa.DataType, name: str, shapes: Mapping[str, Sequence[int]]) -> object:
+    """Return a value of a column, with as many elements as every row has."""
+    kind = _storage(kind)
     if pa.types.is_fixed_size_list(kind):
-        return [_example(kind.value_type)] * kind.list_size
+        return [_example(kind.value_type, name, shapes)] * kind.list_size
     if pa.types.is_struct(kind):
-        return {kind.field(i).name: _example(kind.field(i).type) for i in range(kind.num_fields)}
+        return {kind.field(i).name: _example(kind.field(i).type, name, shapes) for i in range(kind.num_fields)}
     if pa.types.is_list(kind) or pa.types.is_large_list(kind):
-        raise ValueError(f"a column of type {kind} has rows of any length, so its pages cannot be told apart")
+        if name not in shapes:
+            raise ValueError(f"rows of {name!r} ({kind}) may have any length, so the ends of its pages are unknown")
+        size, *rest = shapes[name]
+        return [_example(kind.value_type, name, {name: rest} if rest else {})] * size
     if pa.types.is_binary(kind):
         return b""
     if pa.types.is_string(kind):
         return ""
-    return bool(0) if pa.types.is_boolean(kind) else 0
+    return False if pa.types.is_boolean(kind) else 0
 
 
 def _walk(data: memoryview, factors: Sequence[int]) -> list[list[_Chunk]]:

@@ -26,7 +26,7 @@ from bhd_lerobot.data.parquet_rescue import rescue
 from bhd_lerobot.data.salvage_films import Films
 from bhd_lerobot.data.salvage_stats import stats_of
 from bhd_lerobot.data.state import Row, corrupt, read_json, read_tasks, slot_columns
-from bhd_lerobot.errors import DatasetCorruptError, DatasetLockedError
+from bhd_lerobot.errors import DatasetCorruptError, DatasetLockedError, UnsupportedDatasetError
 
 _LOST_TASK = "(the instruction was lost)"
 
@@ -136,13 +136,20 @@ def _frames(root: Path, info: dict[str, Any]) -> tuple[list[Found], list[str]]:
     found: list[Found] = []
     lost: list[str] = []
     schema = _schema(root, info)
+    shapes = {
+        key: feature["shape"]
+        for key, feature in info["features"].items()
+        if len(feature["shape"]) > 1 and feature["dtype"] not in ("image", "video")
+    }
     for path in sorted((root / "data").glob("chunk-*/file-*.parquet")):
         name = path.relative_to(root).as_posix()
         try:
-            rescued = rescue(path, schema)
+            rescued = rescue(path, schema, shapes)
         except OSError as error:
             lost.append(f"{name}: {error.strerror or error}")
             continue
+        except ValueError as error:
+            raise UnsupportedDatasetError(f"{path} has no footer and cannot be read without: {error}.") from error
         if rescued.lost_bytes:
             lost.append(f"{name}: {rescued.lost_bytes} bytes at its end, an episode that was being saved")
         elif rescued.problem and not rescued.groups:

@@ -45,7 +45,9 @@ def stats_of(
             own[key] = statistics.image_stats(np.stack([statistics.image_histogram(one) for one in pictures]))
         for key, stat in own.items():
             for name, values in stat.items():
-                stacked.setdefault(key, {}).setdefault(name, []).append(np.asarray(values))
+                stacked.setdefault(key, {}).setdefault(name, []).append(
+                    np.asarray(values, None if name == "count" else np.float64)
+                )
     return {key: {name: np.stack(values) for name, values in stat.items()} for key, stat in stacked.items()}
 
 

@@ -44,8 +44,9 @@ def pictures(path: Path) -> list[bytes]:
 
 def content(root: Path) -> list[Episode]:
     """Return the episodes of a dataset, after checking that its numbers count up."""
-    rows = pa.concat_tables([pq.read_table(p) for p in sorted((root / "meta/episodes").glob("*/*.parquet"))])
-    light = rows.select([n for n in rows.column_names if not n.startswith("stats/")]).to_pylist()
+    tables = [pq.read_table(path) for path in sorted((root / "meta/episodes").glob("*/*.parquet"))]
+    names = [name for name in tables[0].column_names if not name.startswith("stats/")]
+    light = pa.concat_tables([table.select(names) for table in tables]).to_pylist()
     frames = pa.concat_tables([pq.read_table(p) for p in sorted((root / "data").glob("*/*.parquet"))])
     tasks = pq.read_table(root / "meta/tasks.parquet").to_pydict()
     sentences = dict(zip(tasks["task_index"], tasks["task"], strict=True))

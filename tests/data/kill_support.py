@@ -12,9 +12,9 @@ from typing import Any
 class KillServer:
     """The process that forks the victims."""
 
-    def __init__(self) -> None:
+    def __init__(self, script: str = "kill_server.py") -> None:
         self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("kill_server.py"))],
+            [sys.executable, str(Path(__file__).with_name(script))],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

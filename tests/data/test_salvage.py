@@ -1,0 +1,250 @@
+"""What stock LeRobot leaves behind SIGKILL is recovered: every whole episode, as it would have been."""
+
+import os
+import random
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from bhd_lerobot.data.disk import Disk
+from bhd_lerobot.data.repair import repair
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError, DatasetWriteError
+from tests.data.edit_support import Episode, assert_sound, content
+from tests.data.kill_support import KillServer
+
+CAMERA = "observation.images.top"
+
+
+@pytest.fixture(scope="module")
+def lerobot() -> Iterator[KillServer]:
+    server = KillServer("wreck_server.py")
+    yield server
+    server.close()
+
+
+def recorded(server: KillServer, root: Path, video: str, episodes: int, die: str = "never", **job: Any) -> Path:
+    server.start({"root": str(root), "video": video, "episodes": episodes, "die": die, **job})
+    status = server.end()
+    assert (status == 0) == (die == "never"), status
+    return root
+
+
+@pytest.fixture(scope="module")
+def truth(lerobot: KillServer, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Episode]]:
+    """What a recording that nobody kills is like."""
+    folder = tmp_path_factory.mktemp("truth")
+    episodes = {"none": 8, "film": 4, "image": 3}
+    return {video: content(recorded(lerobot, folder / video, video, count)) for video, count in episodes.items()}
+
+
+def loaded(root: Path, frames: int) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("t/t", root=root, video_backend="pyav")
+    assert len(dataset) == frames
+    assert dataset[frames - 1]["task"]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        ("none", 1, "saved", 1),
+        ("none", 8, "saved", 8),
+        ("none", 4, "frames", 4),
+        ("none", 5, "counting", 5),  # its frames are on the disk, though info.json does not count it
+        ("film", 3, "saved", 3),
+        ("film", 3, "encoding", 3),  # its pictures are still there
+        ("film", 2, "frames", 2),
+        ("film", 3, "counting", 3),
+        ("stream", 3, "frames", 3),
+        ("stream", 3, "encoding", 2),  # its film lies in a temporary folder under no name
+        ("image", 3, "saved", 3),
+    ],
+)
+def test_every_whole_episode_is_recovered(
+    lerobot: KillServer, truth: dict, tmp_path: Path, case: tuple[str, int, str, int]
+) -> None:
+    video, episodes, die, recovered = case
+    root = recorded(lerobot, tmp_path / "d", video, episodes, die)
+    report = repair(root)
+    assert report.episodes == recovered
+    assert bool(report.lost) == (recovered < episodes)
+    found = content(root)
+    expected = truth["film" if video == "stream" else video][:recovered]
+    for one, wanted in zip(found, expected, strict=True):
+        assert (one.task, one.columns) == (wanted.task, wanted.columns)
+        assert one.films.keys() == wanted.films.keys()
+        for key in one.films:
+            for a, b in zip(one.films[key], wanted.films[key], strict=True):
+                # A film that had to be encoded anew, or by the streaming encoder, may round otherwise.
+                assert abs(np.frombuffer(a, np.uint8).astype(int) - np.frombuffer(b, np.uint8)).max() <= 3
+    assert_sound(root)
+    loaded(root, report.frames)
+    assert report.aside is not None
+    assert (report.aside / "images").exists() == ((video, die) == ("film", "encoding"))
+    assert not repair(root)  # and now there is nothing to do
+
+
+def test_what_was_lost_is_told(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "stream", 3, "encoding")
+    report = repair(root)
+    assert report.lost == (f"episode 2: no whole film of {CAMERA}",)
+    text = str(report)
+    assert "meta/episodes is corrupt" in text
+    assert f"lost: episode 2: no whole film of {CAMERA}" in text
+    assert str(report.aside) in text
+
+
+def test_the_damaged_files_are_kept(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "film", 2, "encoding")
+    before = {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    for number in (1, 2):
+        report = repair(root)
+        aside = tmp_path / f"d.damaged-{number}"
+        assert report.aside == aside
+        assert {p.relative_to(aside): p.read_bytes() for p in aside.rglob("*") if p.is_file()} == before
+        shutil.rmtree(root)
+        shutil.copytree(aside, root)
+
+
+def test_a_session_that_went_on_and_was_killed(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 3)
+    recorded(lerobot, root, "none", 4, "frames")
+    assert repair(root).episodes == 7
+    assert [(e.task, e.columns) for e in content(root)] == [(e.task, e.columns) for e in truth["none"][:7]]
+    recorded(lerobot, root, "none", 1)  # LeRobot itself goes on with it
+    assert [e.columns for e in content(root)] == [e.columns for e in truth["none"]]
+
+
+def test_random_kills_lose_no_saved_episode(lerobot: KillServer, tmp_path: Path) -> None:
+    rng = random.Random(11)
+    for kill in range(4):
+        root, progress = tmp_path / f"d{kill}", tmp_path / f"progress{kill}"
+        job = {"video": "none", "episodes": 10_000, "die": "never", "progress": str(progress)}
+        pid = lerobot.start({"root": str(root), **job})
+        wanted = rng.randrange(2, 16)
+        while not progress.exists() or progress.read_text().count("\n") < wanted:
+            time.sleep(0.002)
+        time.sleep(rng.random() * 0.03)
+        os.kill(pid, 9)
+        lerobot.end()
+        saved = progress.read_text().count("\n")
+        report = repair(root)
+        assert saved <= report.episodes <= saved + 1
+        assert_sound(root)
+
+
+def test_a_torn_film_costs_the_episodes_behind_the_tear(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
+    origin = recorded(lerobot, tmp_path / "origin", "film", 3, "saved")
+    size = next(origin.glob("videos/*/*/*.mp4")).stat().st_size
+    seen = set()
+    for missing in (1, 60, 120, 180, 240, 300):
+        root = shutil.copytree(origin, tmp_path / f"d{missing}")
+        film = next(root.glob("videos/*/*/*.mp4"))
+        os.truncate(film, size - missing)
+        try:
+            report = repair(root)
+        except DatasetCorruptError as error:
+            assert "No whole episode" in str(error)  # noqa: PT017
+            seen.add(0)
+            continue
+        assert report.lost
+        seen.add(report.episodes)
+        assert [e.films for e in content(root)] == [e.films for e in truth["film"][: report.episodes]]
+        assert_sound(root)
+    assert {2, 1} <= seen
+
+
+def test_torn_data_cost_the_episodes_behind_the_tear(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
+    origin = recorded(lerobot, tmp_path / "origin", "none", 4, "saved")
+    size = next(origin.glob("data/*/*.parquet")).stat().st_size
+    for keep in (0.3, 0.6, 0.9):
+        root = shutil.copytree(origin, tmp_path / f"d{keep}")
+        os.truncate(next(root.glob("data/*/*.parquet")), int(size * keep))
+        report = repair(root)
+        assert 1 <= report.episodes <= 3
+        assert "bytes at its end" in report.lost[0]
+        assert [e.columns for e in content(root)] == [e.columns for e in truth["none"][: report.episodes]]
+
+
+def test_lost_instructions_are_told_and_told_apart(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 4, "saved")
+    (root / "meta/tasks.parquet").write_bytes(b"PAR1")
+    report = repair(root)
+    assert any("meta/tasks.parquet" in line for line in report.lost)
+    texts = [episode.task[0] for episode in content(root)]
+    assert texts[0] == texts[3] != texts[1]
+    assert all("lost" in text for text in texts)
+
+
+def test_nothing_left_changes_nothing(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+    os.truncate(next(root.glob("data/*/*.parquet")), 40)
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    with pytest.raises(DatasetCorruptError, match=r"No whole episode of .* can be recovered; nothing was changed"):
+        repair(root)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    (root / "meta/info.json").write_text("{")
+    with pytest.raises(DatasetError, match=r"info\.json"):
+        repair(root)
+
+
+def test_a_full_disk_leaves_the_wreck_as_it_was(
+    lerobot: KillServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+    before = {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+    def full(self: Disk, path: Path, data: bytes) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Disk, "write", full)
+        with pytest.raises(DatasetWriteError, match="No space left"):
+            repair(root)
+    assert {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()} == before
+    assert repair(root).episodes == 2
+
+
+def test_a_recording_that_goes_on_is_left_alone(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+    path = next(root.glob("data/*/*.parquet"))
+    code = "import sys; f = open(sys.argv[1], 'ab'); print('open', flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "open\n"
+        with pytest.raises(DatasetLockedError, match=f"Process {process.pid} has"):
+            repair(root)
+        process.communicate("")
+    assert repair(root).episodes == 2
+
+
+def test_a_sound_dataset_of_lerobot_is_left_alone(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "film", 2)
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    assert not repair(root)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    assert not (tmp_path / "d.damaged-1").exists()
+
+
+def test_numbers_are_counted_anew(lerobot: KillServer, tmp_path: Path) -> None:
+    """An episode that is lost in the middle leaves no hole."""
+    root = recorded(lerobot, tmp_path / "d", "none", 3)
+    recorded(lerobot, root, "none", 3, "saved")
+    (root / "data/chunk-000/file-000.parquet").write_bytes(b"")
+    report = repair(root)
+    assert report.episodes == 3
+    table = pq.read_table(next(root.glob("data/*/*.parquet")))
+    assert sorted(set(table["episode_index"].to_pylist())) == [0, 1, 2]
+    assert table["note"].to_pylist()[0] == "3/0"
+    assert_sound(root)

@@ -1,0 +1,109 @@
+"""Records with stock LeRobot in forked processes that kill themselves. Started once, so that a wreck costs no import.
+
+Reads one JSON job per line and answers with how the child ended.
+"""
+
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.datasets import dataset_writer
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+CAMERA = "observation.images.top"
+FEATURES: dict[str, dict[str, Any]] = {
+    "observation.state": {"dtype": "float32", "shape": (3,), "names": ["a.pos", "b.pos", "c.pos"]},
+    "action": {"dtype": "float32", "shape": (2,), "names": ["a.pos", "b.pos"]},
+    "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+    "note": {"dtype": "string", "shape": (1,), "names": None},
+    "matrix": {"dtype": "float64", "shape": (2, 2), "names": None},
+}
+
+
+def length(episode: int) -> int:
+    """Return how many frames an episode has."""
+    return 5 + episode % 3
+
+
+def frame(episode: int, index: int, video: str) -> dict[str, Any]:
+    """Return a frame."""
+    seed = 100 * episode + index
+    values: dict[str, Any] = {
+        "observation.state": np.array([seed, np.sin(seed), episode], np.float32),
+        "action": np.array([-seed, index], np.float32),
+        "next.done": np.array([index == length(episode) - 1]),
+        "note": f"{episode}/{index}",
+        "matrix": np.array([[seed, 1.0], [0.5, -seed]]),
+        "task": f"task {episode % 3}",
+    }
+    if video != "none":
+        values[CAMERA] = np.full((32, 48, 3), 20 + (37 * episode + 11 * index) % 200, np.uint8)
+    return values
+
+
+def run(job: dict[str, Any]) -> None:
+    """Record; `die` says when to go: `never`, `saved`, `frames`, `encoding`, or `counting`."""
+    root, video = Path(job["root"]), job["video"]
+    progress = os.open(job["progress"], os.O_WRONLY | os.O_CREAT | os.O_APPEND) if "progress" in job else None
+    streaming = {"streaming_encoding": video == "stream"}
+    if root.exists():
+        dataset = LeRobotDataset.resume("t/t", root=root, **streaming)
+    else:
+        features = dict(FEATURES)
+        if video != "none":
+            kind = "image" if video == "image" else "video"
+            features[CAMERA] = {"dtype": kind, "shape": (32, 48, 3), "names": ["height", "width", "channels"]}
+        dataset = LeRobotDataset.create(
+            "t/t", fps=10, features=features, root=root, robot_type="toy",
+            use_videos=video in ("film", "stream"), **streaming,
+        )  # fmt: skip
+
+    def die(*args: object, **kwargs: object) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    first = dataset.meta.total_episodes
+    for episode in range(first, first + job["episodes"]):
+        for index in range(length(episode)):
+            dataset.add_frame(frame(episode, index, video))
+        if episode == first + job["episodes"] - 1:
+            if job["die"] == "encoding":
+                dataset_writer.DatasetWriter._save_episode_video = die
+            if job["die"] == "counting":
+                dataset.meta.save_episode = die
+        dataset.save_episode()
+        if progress is not None:
+            os.write(progress, f"saved {episode}\n".encode())
+    if job["die"] == "saved":
+        die()
+    if job["die"] == "frames":
+        for index in range(3):
+            dataset.add_frame(frame(first + job["episodes"], index, video))
+        die()
+    dataset.finalize()
+
+
+def main() -> None:
+    """Serve jobs until the input ends."""
+    for line in sys.stdin:
+        child = os.fork()
+        if child == 0:
+            quiet = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(quiet, 1)
+            if os.environ.get("BHD_WRECK_ERRORS") is None:
+                os.dup2(quiet, 2)
+            try:
+                run(json.loads(line))
+            except BaseException:
+                os._exit(1)
+            os._exit(0)
+        print(child, flush=True)
+        _, status = os.waitpid(child, 0)
+        print(os.waitstatus_to_exitcode(status), flush=True)
+
+
+if __name__ == "__main__":
+    main()
