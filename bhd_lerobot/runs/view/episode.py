@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.messages import Limit, Watchdog
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.episode_table import PREFIX
 from bhd_lerobot.data.state import DatasetState, Row
@@ -47,7 +47,7 @@ def packed_episode(state: DatasetState, row: Row, table: pa.Table) -> bytes:
         "marks": marks_of(state.root, row["episode_index"]),
         "names": {key: names_of(features[key], width) for key, width in widths.items()},
         "sections": sections(features, widths, robot),
-        "bands": _bands(table, state.info["fps"]),
+        "bands": [*_bands(table, state.info["fps"]), *_modes(columns.get(keys.MODE))],
         "events": _events(columns.get(keys.EVENT)),
         "interventions": _interventions(row, columns.get(keys.EVENT)),
         "flags": {
@@ -106,6 +106,16 @@ def _said(rows: Any, frames: int, fps: float) -> list[list[Any]]:
         return []
     ends = [frame for frame, _ in told[1:]] + [frames]
     return [[frame, end, text] for (frame, text), end in zip(told, ends, strict=True) if text and frame < end]
+
+
+def _modes(modes: NDArray | None) -> list[dict[str, Any]]:
+    """Return the cerebellum's modes as a band, if it was not in the same one all the time."""
+    runs = _runs(modes[:, 0].tolist()) if modes is not None else []
+    if len(runs) < 2:
+        return []
+    known = Mode._value2member_map_
+    named = [[first, end, _words(Mode(value).name) if value in known else f"{value}"] for first, end, value in runs]
+    return [{"name": "mode", "runs": named}]
 
 
 def _runs(values: Iterable[Any]) -> list[list[Any]]:

@@ -10,7 +10,8 @@ MAX_LINES = 8  # in one plot; more cannot be told apart
 _SCAN = re.compile(r"scan_\d+\.pos")
 _OURS = ("turtlebot3", "ur5")
 _METRES = ("x", "y", "z", "gripper", "tool_x", "tool_y", "tool_z")
-_TIMES = {keys.LATENESS: "lateness", keys.AGE: "age", keys.COMMAND_AGE: "command age", keys.INFERENCE_TIME: "inference"}
+_DELAYS = {keys.LATENESS: "lateness", keys.INFERENCE_TIME: "inference"}
+_AGES = {keys.AGE: "observation", keys.COMMAND_AGE: "command"}
 _COUNTS = {keys.SKIPPED: "skipped", keys.OVERRUNS: "overruns"}
 _PLACED = (  # what has a place of its own on the page
     *(keys.TIME, keys.LATE, keys.LIMITS, keys.WATCHDOG, keys.MODE, keys.EVENT, keys.SUCCESS, keys.DONE),
@@ -77,7 +78,7 @@ def sections(features: Mapping[str, Any], widths: Mapping[str, int], robot: str 
         if key in widths:
             add(title, list(_chunks(key, names(key), "")), is_open=False)
     for key in widths:
-        if key not in (*_PLACED, *_TIMES, *_COUNTS):
+        if key not in (*_PLACED, *_DELAYS, *_AGES, *_COUNTS):
             add(key, list(_chunks(key, names(key), "")), is_open=False)
     return result
 
@@ -126,9 +127,10 @@ def _chunks(
 
 
 def _timing(widths: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    times = [{**_line(key, 0, label), "scale": 1000.0} for key, label in _TIMES.items() if key in widths]
-    if times:
-        yield _plot("lateness and ages", "ms", times)
+    for title, labels in (("lateness and inference", _DELAYS), ("age", _AGES)):
+        times = [{**_line(key, 0, label), "scale": 1000.0} for key, label in labels.items() if key in widths]
+        if times:
+            yield _plot(title, "ms", times)
     counts = [_line(key, 0, label) for key, label in _COUNTS.items() if key in widths]
     if counts:
         yield _plot("control ticks", "", counts)

@@ -45,15 +45,17 @@ function stored(episode) {
 
 function showAll(episode) {
   const dialog = byId("dialog");
-  const rows = [...Object.entries(episode.metadata), ...Object.entries(episode.timing ?? {}).map(([key, value]) => [`timing: ${key}`, value])];
-  for (const [frame, name, code, message] of episode.goals) rows.push([`goal ${name}`, `${code} in frame ${frame}: ${message}`]);
+  const rows = [];
   for (const { when, note, outcome, interventions } of episode.marks) {
     const what = outcome ? `${outcome[0] ?? "nothing"} → ${outcome[1]}` : `interventions ${JSON.stringify(interventions?.[1])}`;
     rows.push([`marked ${when}`, note ? `${what}: ${note}` : what]);
   }
+  rows.push(...Object.entries(episode.metadata));
+  for (const [frame, name, code, message] of episode.goals) rows.push([`goal ${name}`, `${code} in frame ${frame}: ${message}`]);
+  for (const [key, value] of Object.entries(episode.timing ?? {})) rows.push([`timing: ${key}`, value]);
   const text = (value) => (typeof value === "object" ? JSON.stringify(value) : `${value}`);
   dialog.replaceChildren(
-    make("h2", {}, `Episode ${episode.index}`),
+    make("h2", { tabindex: "-1", autofocus: true }, `Episode ${episode.index}`),
     rows.length ? make("table", {}, ...rows.map(([key, value]) => make("tr", {}, make("td", {}, key), make("td", { style: { "word-break": "break-word" } }, text(value)))))
       : make("p", {}, "Nothing but its frames was stored."),
     make("div", { class: "end" }, make("button", { onclick: () => dialog.close() }, "Close")));

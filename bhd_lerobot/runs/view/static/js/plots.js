@@ -141,13 +141,13 @@ function options(about, one, width) {
 // Three digits, as short as they can be written.
 function short(value) {
   const text = Number(value.toPrecision(3)).toString();
-  return text.length > 7 ? value.toExponential(0) : text;
+  return text.length > 7 ? value.toExponential(1).replace(".0e", "e") : text;
 }
 
 // Some room above and below, and a range for lines that never move.
 function padded(_, min, max) {
   if (min === null || min === undefined) return [0, 1];
-  const room = max > min ? 0.06 * (max - min) : Math.max(0.05 * Math.abs(max), 1e-3);
+  const room = max > min ? 0.06 * (max - min) : 0.05 * Math.abs(max) || 1;
   return [min - room, max + room];
 }
 
