@@ -4,21 +4,19 @@ import contextlib
 import heapq
 import pickle
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 
-from bhd_lerobot.errors import BhdError, ClusterError
+from bhd_lerobot.errors import ClusterError
 from bhd_lerobot.runs import cluster_remote
 from bhd_lerobot.runs.cluster import free_places, tell_machines
 from bhd_lerobot.runs.cluster_config import RayConfig
 from bhd_lerobot.runs.cluster_job import Job
-
-Spec = tuple[int, int]  # an episode's number and seed
+from bhd_lerobot.runs.cluster_task import Call, Task, Worker, cause_of, error_of
 
 _QUEUED = 2  # tasks that a worker has at a time: it goes on with the next while a result travels
 _WINDOW = 4  # tasks for each worker, finished or not, by which the run may be ahead of the oldest that is missing
@@ -30,48 +28,6 @@ _PRINTED = 200  # lines of workers in a run
 _DISTRIBUTIONS = ("ray", "lerobot_robot_bhd", "lerobot", "mujoco", "numpy", "scipy", "pin", "ruckig")
 
 
-@dataclass(order=True)
-class Task:
-    """Some episodes for one worker.
-
-    Attributes:
-        number: its place in the run.
-        specs: the episodes.
-        deaths: how many workers were lost while they ran it.
-    """
-
-    number: int
-    specs: list[Spec] = field(compare=False)
-    deaths: int = field(default=0, compare=False)
-
-    def __str__(self) -> str:
-        """The episodes in words."""
-        first, last = self.specs[0][0], self.specs[-1][0]
-        return f"episode {first}" if first == last else f"episodes {first} to {last}"
-
-
-@dataclass(eq=False)
-class _Worker:
-    actor: Any
-    host: str = "a machine that had not answered yet"
-    is_there: bool = False  # it has been given a machine, and answered
-    job: Any = None  # reference of the job that it is ready for
-    tasks: deque[Task] = field(default_factory=deque)
-
-    @property
-    def is_ready(self) -> bool:
-        return self.job is not None
-
-
-@dataclass(frozen=True)
-class _Call:
-    """A call that a worker has not answered yet."""
-
-    worker: _Worker
-    kind: str  # describe, prepare or run
-    task: Task | None = None
-
-
 class Crew:
     """Runs tasks on workers and gives their results in order. Use it as a context manager.
 
@@ -81,12 +37,13 @@ class Crew:
     Args:
         config: how many workers, and of what size.
         console: where losses, and what workers print, are told.
+        server: module of the workers' `EpisodeServer`.
     """
 
-    def __init__(self, config: RayConfig, console: Console) -> None:
-        self._config, self._console = config, console
-        self._workers: list[_Worker] = []
-        self._calls: dict[Any, _Call] = {}
+    def __init__(self, config: RayConfig, console: Console, server: str = "bhd_lerobot.runs.cluster_worker") -> None:
+        self._config, self._console, self._server = config, console, server
+        self._workers: list[Worker] = []
+        self._calls: dict[Any, Call] = {}
         self._lost_early = 0
         self._failed: tuple[int, BaseException] | None = None  # from this task on there are no results, and why
         self._told: Counter[str] = Counter()
@@ -131,6 +88,7 @@ class Crew:
                 if stop():
                     return
                 self._step(limit)
+            self._raise_failure(number)  # others may have run what comes after it
             yield self._done.pop(number)
         self._raise_failure(numbers[-1] + 1)
 
@@ -205,33 +163,33 @@ class Crew:
                 max_restarts=0,
                 scheduling_strategy="SPREAD",
             )
-            worker = _Worker(remote.remote())
+            worker = Worker(remote.remote())
             self._workers.append(worker)
             self._call(worker, "describe", worker.actor.describe.remote(self._distributions))
         finally:
             ray.cloudpickle.unregister_pickle_by_value(cluster_remote)
 
-    def _call(self, worker: _Worker, kind: str, reference: Any, task: Task | None = None) -> None:
-        self._calls[reference] = _Call(worker, kind, task)
+    def _call(self, worker: Worker, kind: str, reference: Any, task: Task | None = None) -> None:
+        self._calls[reference] = Call(worker, kind, task)
 
-    def _hand_out(self, worker: _Worker, limit: int) -> None:
+    def _hand_out(self, worker: Worker, limit: int) -> None:
         last = limit if self._failed is None else min(limit, self._failed[0] - 1)
         while worker.is_ready and len(worker.tasks) < _QUEUED and self._waiting and self._waiting[0].number <= last:
             task = heapq.heappop(self._waiting)
             worker.tasks.append(task)
             self._call(worker, "run", worker.actor.run.remote(task.specs), task)
 
-    def _take(self, call: _Call, answer: dict[str, Any]) -> None:
+    def _take(self, call: Call, answer: dict[str, Any]) -> None:
         worker = call.worker
         if call.kind == "describe":
             worker.host, worker.is_there = f"{answer['host']}, process {answer['pid']}", True
             self._check_facts(worker, answer["facts"])
-            self._call(worker, "prepare", worker.actor.prepare.remote(self._job))
+            self._call(worker, "prepare", worker.actor.prepare.remote(self._job, self._server))
             return
         self._tell(worker, answer["printed"])
         if call.kind == "prepare":
             if "error" in answer:
-                raise _error_of(answer, f"A worker on {worker.host} could not get ready.")
+                raise error_of(answer, f"A worker on {worker.host} could not get ready.")
             self._check_fingerprint(worker, answer["value"])
             worker.job, self._lost_early = self._job, 0
             return
@@ -245,16 +203,16 @@ class Crew:
         self.busy_s += value["busy_s"]
         if "error" in failure and (self._failed is None or task.number < self._failed[0]):
             # What comes before it is still run: as on one machine, it is in the dataset.
-            self._failed = (task.number + 1, _error_of(failure, f"It came up in {task} on {worker.host}."))
+            self._failed = (task.number + 1, error_of(failure, f"It came up in {task} on {worker.host}."))
 
-    def _lost(self, worker: _Worker, error: BaseException) -> None:
+    def _lost(self, worker: Worker, error: BaseException) -> None:
         """Give a worker up and its tasks to others."""
         import ray
 
         self._workers.remove(worker)
         self._calls = {reference: call for reference, call in self._calls.items() if call.worker is not worker}
         ray.kill(worker.actor)  # if it lives after all, nobody listens to it any more
-        cause = _cause(error)
+        cause = cause_of(error)
         if not worker.is_ready:
             self._lost_early += 1
             if self._lost_early >= _STARTS:
@@ -289,7 +247,7 @@ class Crew:
                 "saved is there, go on with --resume=true."
             )
 
-    def _check_facts(self, worker: _Worker, facts: dict[str, str]) -> None:
+    def _check_facts(self, worker: Worker, facts: dict[str, str]) -> None:
         wrong = [
             f"{name} {theirs} there, {self._facts[name]} here"
             for name, theirs in facts.items()
@@ -301,7 +259,7 @@ class Crew:
                 "all machines, and start Ray there again."
             )
 
-    def _check_fingerprint(self, worker: _Worker, fingerprint: str) -> None:
+    def _check_fingerprint(self, worker: Worker, fingerprint: str) -> None:
         if fingerprint != self._fingerprint:
             raise ClusterError(
                 f"A worker on {worker.host} would not record the same bytes: it has the same packages, but computes "
@@ -309,26 +267,10 @@ class Crew:
                 "library differs. Use machines of one kind, this one among them."
             )
 
-    def _tell(self, worker: _Worker, lines: list[str]) -> None:
+    def _tell(self, worker: Worker, lines: list[str]) -> None:
         """Print what a worker printed: each line once, however many workers print it."""
         for line in lines:
             self._told[line] += 1
             if self._told[line] == 1 and len(self._told) <= _PRINTED:
                 more = " (no more of this)" if len(self._told) == _PRINTED else ""
                 self._console.print(f"[dim]{escape(f'[{worker.host}]')}[/dim] {escape(line)}{more}", highlight=False)
-
-
-def _error_of(failure: dict[str, Any], where: str) -> BaseException:
-    """Return what a worker raised, with where that was."""
-    error: BaseException = pickle.loads(failure["error"])
-    error.add_note(where)
-    if not isinstance(error, BhdError):
-        error.add_note(f"There:\n{failure['traceback']}")
-    return error
-
-
-def _cause(error: BaseException) -> str:
-    """Return the first sentence or two of what Ray says."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip() and "class_name" not in line]
-    text = " ".join(lines)
-    return text if len(text) <= 300 else text[:300] + "…"

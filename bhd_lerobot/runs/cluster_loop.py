@@ -15,8 +15,8 @@ from bhd_lerobot.robots.simulation import Simulation
 from bhd_lerobot.runs.cluster import connected
 from bhd_lerobot.runs.cluster_config import RayConfig
 from bhd_lerobot.runs.cluster_crew import Crew
-from bhd_lerobot.runs.cluster_crew import Task as ClusterTask
 from bhd_lerobot.runs.cluster_job import Job, fingerprint, histograms_of, read_checkpoints, unpack
+from bhd_lerobot.runs.cluster_task import Task as ClusterTask
 from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Task

@@ -53,13 +53,17 @@ class RemoteWorker:
         """Return where it runs, and what decides the bytes of its episodes."""
         return {"host": socket.gethostname(), "pid": os.getpid(), "facts": facts_of_machine(distributions)}
 
-    def prepare(self, job: bytes) -> dict[str, Any]:
-        """Get ready for a job; the value is the fingerprint of what this machine computes."""
+    def prepare(self, job: bytes, server: str) -> dict[str, Any]:
+        """Get ready for a job; the value is the fingerprint of what this machine computes.
+
+        Args:
+            job: what the server is made of.
+            server: the module that has it.
+        """
 
         def start() -> str:
             self._server = None
-            server = importlib.import_module("bhd_lerobot.runs.cluster_worker")
-            self._server = server.EpisodeServer(job)
+            self._server = importlib.import_module(server).EpisodeServer(job)
             return str(self._server.fingerprint)
 
         return self._answer(start)
