@@ -344,11 +344,12 @@ class _Handler(BaseHTTPRequestHandler):
             answer.append({"path": one["path"], "uploadMode": mode, "shouldIgnore": False, "oid": oid})
         self._answer({"files": answer})
 
-    def _batch(self, body: bytes, name: str, kind: str = "models") -> None:
-        repository = self._repository(kind.rstrip("/") or "models", name, write=True)
+    def _batch(self, body: bytes, name: str, kind: str | None = None) -> None:
+        kind = (kind or "models/").rstrip("/")
+        repository = self._repository(kind, name, write=True)
         objects = []
         for one in json.loads(body)["objects"]:
-            href = f"{self.hub.url}/lfs/{kind.rstrip('/') or 'models'}/{name}/{one['oid']}"
+            href = f"{self.hub.url}/lfs/{kind}/{name}/{one['oid']}"
             actions = {} if one["oid"] in repository.objects else {"actions": {"upload": {"href": href, "header": {}}}}
             objects.append({"oid": one["oid"], "size": one["size"], **actions})
         self._answer({"transfer": "basic", "objects": objects})
@@ -478,7 +479,7 @@ def real_client(hub: HubServer, token: str | None = "hf_me") -> Iterator[Any]:
     The client reads its environment when it is imported, so its constants are changed.
     """
     import pytest
-    from huggingface_hub import constants
+    from huggingface_hub import RepoCard, constants
     from huggingface_hub.utils import _http
 
     with pytest.MonkeyPatch.context() as patch:
@@ -489,6 +490,8 @@ def real_client(hub: HubServer, token: str | None = "hf_me") -> Iterator[Any]:
         patch.setattr(constants, "HF_HUB_OFFLINE", False)
         patch.setattr(constants, "HF_HUB_DISABLE_XET", True)
         patch.setattr(constants, "HF_HUB_DISABLE_PROGRESS_BARS", True)
+        # To check a model's card it asks the Hub on the internet, whatever HF_ENDPOINT is.
+        patch.setattr(RepoCard, "validate", lambda card, repo_type=None: None)
         patch.setenv("HF_ENDPOINT", hub.url)
         patch.setenv("HF_HUB_OFFLINE", "0")
         patch.delenv("HF_TOKEN", raising=False)
