@@ -1,6 +1,9 @@
 """SQLite files of rosbag2, read in the order in which messages were written, also damaged ones."""
 
+import os
+import shutil
 import sqlite3
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,11 +28,15 @@ class SqliteFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.problems: list[str] = []
+        self._copy: tempfile.TemporaryDirectory[str] | None = None
+        whole = self._whole_pages(path)
         try:
             # With a write-ahead log beside it, which a killed recorder leaves, the log is read, too.
             has_log = path.with_name(f"{path.name}-wal").exists()
             options = "mode=ro" if has_log else "mode=ro&immutable=1"
-            self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?{options}", uri=True)
+            self._connection = sqlite3.connect(f"{whole.resolve().as_uri()}?{options}", uri=True)
+            # Without it SQLite does not open a file that has fewer pages than its header says. Nothing is written.
+            self._connection.execute("PRAGMA writable_schema = ON")
             rows = self._connection.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         except sqlite3.Error as error:
             raise DatasetError(
@@ -41,10 +48,29 @@ class SqliteFile:
     def close(self) -> None:
         """Give the file back."""
         self._connection.close()
+        if self._copy is not None:
+            self._copy.cleanup()
+
+    def _whole_pages(self, path: Path) -> Path:
+        """Return the file, or, if it ends within a page, a copy without that: SQLite would read zeros for the rest."""
+        with path.open("rb") as file:
+            head = file.read(18)
+        page = (int.from_bytes(head[16:18]) or 4096) if len(head) == 18 else 4096
+        page = 65536 if page == 1 else page  # so the format says it
+        size = path.stat().st_size
+        if size < page or not size % page:
+            return path
+        self._copy = tempfile.TemporaryDirectory(prefix="bhd-bag-")
+        copy = Path(self._copy.name) / path.name
+        shutil.copyfile(path, copy)
+        os.truncate(copy, size - size % page)
+        return copy
 
     def summary(self) -> dict[int, int] | None:
         """Return how many messages each topic has; None if that cannot be counted."""
         try:
+            # Without it SQLite does not open a file that has fewer pages than its header says. Nothing is written.
+            self._connection.execute("PRAGMA writable_schema = ON")
             rows = self._connection.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id").fetchall()
         except sqlite3.Error:
             return None
@@ -58,6 +84,8 @@ class SqliteFile:
             for channel, received, data in self._connection.execute(
                 "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
             ):
+                if not isinstance(data, bytes):
+                    raise sqlite3.DatabaseError("a message is no bytes")
                 count += 1
                 yield channel, received, data, 0, len(data)
         except sqlite3.Error as error:

@@ -69,7 +69,7 @@ def nearest_beams(sweep: Sweep, beams: int, rotation: tuple[float, ...], topic: 
         raise DatasetError(
             f"The scans of {topic} cover {seen:.0f} degrees and have no beam within reach of {int(far.sum())} of the "
             f"{beams} that the dataset has. Where nothing was measured, a policy must not read free space: a scanner "
-            "that sees all around is needed, or fewer --beams."
+            "that sees all around is needed."
         )
     return nearest
 

@@ -1,0 +1,315 @@
+"""Export: read by readers that are not ours, and back into the same dataset."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability
+
+from bhd_lerobot.control.forward_kinematics import ForwardKinematics
+from bhd_lerobot.data import bag_write
+from bhd_lerobot.data.inspect import dataset_info
+from bhd_lerobot.data.read import read_episode
+from bhd_lerobot.data.state import load_state
+from bhd_lerobot.runs import data
+from bhd_lerobot.runs.data_export import parse_episodes, robot_view
+from tests.data import support
+from tests.runs.support import run_record
+
+NANO = 10**9
+
+
+@pytest.fixture(scope="module")
+def turtlebot3(tmp_path_factory):
+    root = tmp_path_factory.mktemp("export") / "tb3"
+    run_record(root, n_envs=2, seed=4, robot__beams=360, robot__odometry="true", robot__imu="true",
+               dataset__num_episodes=2)  # fmt: skip
+    return root
+
+
+@pytest.fixture(scope="module")
+def ur5(tmp_path_factory):
+    root = tmp_path_factory.mktemp("export") / "ur5"
+    run_record(root, seed=4, robot__type="ur5", brain__type="reach", task__type="reach", robot__beams=None,
+               dataset__repo_id="test/reach", dataset__num_episodes=2, n_envs=2)  # fmt: skip
+    return root
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory):
+    root = tmp_path_factory.mktemp("export") / "toy"
+    with support.create(root, video=True) as recorder:
+        for _ in range(2):
+            support.record(recorder, video=True)
+    return root
+
+
+def export(root, output, *arguments):
+    assert data.main(["export", str(root), f"--output={output}", *arguments]) == 0
+    return output
+
+
+def decoded(path):
+    """Return topic -> its messages as an independent reader has them: (time of reception, message)."""
+    found = defaultdict(list)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        for _, channel, message, content in reader.iter_decoded_messages():
+            found[channel.topic].append((message.log_time, content))
+    return found
+
+
+def stamp(message):
+    return message.header.stamp.sec * NANO + message.header.stamp.nanosec
+
+
+def same_dataset(old, new, *, lossy=()):
+    """Compare everything: frames to the bit, what is said of episodes, features, identity."""
+    first, second = dataset_info(old), dataset_info(new)
+    assert json.dumps(first.features) == json.dumps(second.features)
+    assert (first.fps, first.robot_type, first.recording) == (second.fps, second.robot_type, second.recording)
+    assert first.episodes == second.episodes
+    for episode in first.episodes:
+        ours, theirs = read_episode(old, episode.index), read_episode(new, episode.index)
+        assert list(ours) == list(theirs)
+        for key, values in ours.items():
+            assert values.dtype == theirs[key].dtype
+            assert np.array_equal(values, theirs[key]), key
+    assert (old / "meta/bhd.json").read_bytes() == (new / "meta/bhd.json").read_bytes()
+
+
+@pytest.mark.parametrize("robot", ["turtlebot3", "ur5"])
+@pytest.mark.parametrize("layout", [[], ["--one_bag", "--format=sqlite3", "--twist"]])
+def test_a_dataset_comes_back_to_the_bit_and_is_sound(request, tmp_path, robot, layout):
+    root = request.getfixturevalue(robot)
+    bags = export(root, tmp_path / "bags", *layout)
+    assert (bags / "metadata.yaml").exists() == bool(layout)
+    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
+    same_dataset(root, tmp_path / "back")
+    assert data.main(["check", str(tmp_path / "back")]) == 0
+
+
+@pytest.mark.parametrize("compressed", [[], ["--compressed_images"]])
+def test_texts_integers_and_pictures_of_an_unknown_robot_come_back(toy, tmp_path, compressed):
+    bags = export(toy, tmp_path / "bags", *compressed)
+    topics = decoded(bags / "episode_000001/episode_000001.mcap")
+    assert "/bhd/observation_state" in topics
+    assert [message.text for _, message in topics["/bhd/note"]] == [f"1/{k}" for k in range(support.length(1))]
+    image = "/front/image_raw" + "/compressed" * bool(compressed)
+    if not compressed:
+        for frame, (_, message) in enumerate(topics[image]):
+            assert (message.height, message.width, message.step, message.encoding) == (32, 48, 144, "rgb8")
+            assert abs(np.frombuffer(message.data, np.uint8).mean() - support.grey(1, frame)) < 3
+    assert len(topics[image]) == support.length(1)
+    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
+    assert support.verify(tmp_path / "back", 2, video=True, stats=True) == 2
+    same_dataset(toy, tmp_path / "back")
+
+
+def test_an_independent_reader_sees_what_was_recorded_of_a_base(turtlebot3, tmp_path):
+    bags = export(turtlebot3, tmp_path / "bags", "--start_time=1000")
+    columns = read_episode(turtlebot3, 0)
+    names = dataset_info(turtlebot3).features["observation.state"]["names"]
+    state = {name: columns["observation.state"][:, column] for column, name in enumerate(names)}
+    topics = decoded(bags / "episode_000000/episode_000000.mcap")
+    times = 1000 * NANO + np.round(columns["control.time"] * NANO).astype(np.int64)
+    n = len(times)
+    for topic in ("/odom", "/imu", "/cmd_vel", "/tf", "/joint_states", "/cmd_vel_applied", "/bhd/outcome"):
+        assert len(topics[topic]) == n, topic
+    odom = [message for _, message in topics["/odom"]]
+    assert [stamp(one) for one in odom] == times.tolist()
+    assert [one.twist.twist.linear.x for one in odom] == state["x.vel"].tolist()
+    assert [one.twist.twist.angular.z for one in odom] == state["theta.vel"].tolist()
+    assert [one.pose.pose.position.x for one in odom] == state["x.pos"].tolist()
+    yaw = [2 * np.arctan2(one.pose.pose.orientation.z, one.pose.pose.orientation.w) for one in odom]
+    assert yaw == pytest.approx(state["theta.pos"], abs=1e-12)
+    assert {(one.header.frame_id, one.child_frame_id) for one in odom} == {("odom", "base_footprint")}
+    asked = [(m.twist.linear.x, m.twist.angular.z) for _, m in topics["/cmd_vel"]]
+    assert asked == [tuple(row) for row in columns["action"].tolist()]
+    applied = [(stamp(m), m.twist.linear.x, m.twist.angular.z) for _, m in topics["/cmd_vel_applied"]]
+    ends = [*times[1:].tolist(), int(times[-1]) + NANO // 10]
+    assert applied == [(end, *row) for end, row in zip(ends, columns["control.applied_action"].tolist(), strict=True)]
+    assert [m.angular_velocity.z for _, m in topics["/imu"]] == state["imu_z.vel"].tolist()
+    assert {m.orientation_covariance[0] for _, m in topics["/imu"]} == {-1.0}
+    assert [m.event for _, m in topics["/bhd/outcome"]] == columns["event"].tolist()
+    assert [m.mode for _, m in topics["/bhd/cerebellum"]] == columns["control.mode"].tolist()
+    assert [m.time for _, m in topics["/bhd/cerebellum"]] == columns["control.time"].tolist()
+    wheels = topics["/joint_states"][-1][1]
+    assert list(wheels.name) == ["wheel_left_joint", "wheel_right_joint"]
+    assert list(wheels.position) == columns["simulation.state"][-1, 7:9].tolist()
+    frames = {one.child_frame_id: one for one in topics["/tf_static"][0][1].transforms}
+    assert frames["base_scan"].transform.translation.z + frames["base_link"].transform.translation.z == 0.182
+    told = topics["/bhd/episode"][0][1]
+    assert (told.task, told.frames, told.episode_index) == (dataset_info(turtlebot3).episodes[0].task, n, 0)
+
+
+def test_scans_are_there_once_with_infinity_for_no_return(turtlebot3, tmp_path):
+    bags = export(turtlebot3, tmp_path / "bags", "--start_time=1000")
+    for episode in (0, 1):
+        columns = read_episode(turtlebot3, episode)
+        name = f"episode_{episode:06d}"
+        topics = decoded(bags / name / f"{name}.mcap")
+        start = topics["/bhd/episode"][0][0]
+        scans = [message for _, message in topics["/scan"]]
+        measured = np.array([stamp(one) for one in scans])
+        # 5 Hz at 10 frames a second, and stamped when it was measured
+        assert np.diff(measured).tolist() == [NANO // 5] * (len(scans) - 1)
+        assert measured[0] == start
+        assert all(time >= stamp(message) for time, message in topics["/scan"])
+        times = start + np.round(columns["control.time"] * NANO).astype(np.int64)
+        seen = np.array([scans[np.searchsorted(measured, time, side="right") - 1].ranges for time in times])
+        recorded = columns["observation.state"][:, 2:362]
+        assert np.array_equal(np.isinf(seen), recorded == np.float32(3.5))
+        assert np.array_equal(np.where(np.isinf(seen), np.float32(3.5), seen.astype(np.float32)), recorded)
+        one = scans[0]
+        assert (one.angle_min, one.header.frame_id, len(one.ranges)) == (0.0, "base_scan", 360)
+        assert one.angle_increment == pytest.approx(2 * np.pi / 360)
+        assert (one.range_min, one.range_max, one.scan_time) == pytest.approx((0.12, 3.5, 0.2))
+
+
+def test_an_independent_reader_sees_what_was_recorded_of_an_arm(ur5, tmp_path):
+    bags = export(ur5, tmp_path / "bags", "--episodes=1")
+    assert [one.name for one in bags.iterdir()] == ["episode_000001"]
+    topics = decoded(bags / "episode_000001/episode_000001.mcap")
+    columns = read_episode(ur5, 1)
+    state = columns["observation.state"].astype(np.float64)
+    joints = [message for _, message in topics["/joint_states"]]
+    assert np.array_equal([one.position for one in joints], state[:, :7])
+    assert np.array_equal([one.velocity for one in joints], state[:, 7:])
+    assert list(joints[0].name)[:2] == ["shoulder_pan_joint", "shoulder_lift_joint"]
+    assert np.array_equal([m.position for _, m in topics["/joint_command"]], columns["action"].astype(np.float64))
+    poses = [message.transforms[0] for _, message in topics["/tf"]]
+    assert {(one.header.frame_id, one.child_frame_id) for one in poses} == {("base", "tool")}
+    from bhd_lerobot.bodies.ur5 import ur5 as body
+
+    tool = ForwardKinematics(body().chain).tool(state[:, :6])
+    place = [(one.transform.translation.x, one.transform.translation.y, one.transform.translation.z) for one in poses]
+    assert np.allclose(place, tool[:, :3, 3])
+    texts = [message.subtask for _, message in topics["/bhd/outcome"]]
+    assert texts == columns["subtask"].tolist()
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_rosbags_reads_it_with_the_embedded_definitions(turtlebot3, tmp_path, storage):
+    bags = export(turtlebot3, tmp_path / "bags", f"--format={storage}")
+    for bag in bags.iterdir():
+        with AnyReader([bag]) as reader:
+            count, before = 0, {}
+            for connection, time, raw in reader.messages():
+                message = reader.deserialize(raw, connection.msgtype)
+                count += 1
+                assert time >= before.get("", 0)
+                before[""] = time
+                if hasattr(message, "header"):
+                    assert stamp(message) > before.get(connection.topic, 0)
+                    before[connection.topic] = stamp(message)
+            assert count == reader.message_count
+            latched = {
+                one.topic
+                for one in reader.connections
+                if one.ext.offered_qos_profiles[0].durability == QosDurability.TRANSIENT_LOCAL
+            }
+            assert latched == {"/tf_static", "/bhd/episode"}
+
+
+def test_the_same_dataset_gives_the_same_bytes(turtlebot3, tmp_path):
+    first, second = (export(turtlebot3, tmp_path / name / "b", "--one_bag") for name in ("x", "y"))
+    assert (first / "b.mcap").read_bytes() == (second / "b.mcap").read_bytes()
+
+
+def test_a_film_has_its_cameras_geometry():
+    view = robot_view("turtlebot3")
+    assert np.degrees(view.fovy["front"]) == pytest.approx(48.8)
+    optical = next(one for one in view.frames if one.child == "front_optical_frame")
+    w, x, y, z = optical.rotation
+    ahead = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+    assert ahead == pytest.approx((np.cos(np.radians(10)), 0, -np.sin(np.radians(10))), abs=1e-4)
+    assert robot_view("so100").frames == ()
+
+
+def test_nothing_is_left_when_the_disk_refuses(turtlebot3, tmp_path, monkeypatch, capsys):
+    def refuse(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(bag_write.BagWriter, "write", refuse)
+    assert data.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}"]) == 2
+    assert "No space left" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--episodes=7"], "no episode 7 in"),
+        (["--episodes=3-1"], "such as 0,3,5-9"),
+        (["--episodes=a"], "such as 0,3,5-9"),
+        (["--start_time=-1"], "--start_time is -1"),
+        (["--start_time=nan"], "--start_time is nan"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(turtlebot3, tmp_path, capsys, arguments, told):
+    assert data.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}", *arguments]) == 2
+    assert told in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_there_is_not_overwritten(turtlebot3, tmp_path, capsys):
+    (tmp_path / "bags").mkdir()
+    (tmp_path / "bags" / "note").write_text("mine")
+    assert data.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}"]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert os.listdir(tmp_path / "bags") == ["note"]
+    assert data.main(["export", str(tmp_path / "none"), f"--output={tmp_path / 'b'}"]) == 2
+
+
+def test_bags_of_ours_that_lost_messages_are_refused_not_shortened(turtlebot3, tmp_path, capsys):
+    bags = export(turtlebot3, tmp_path / "bags", "--episodes=0")
+    path = bags / "episode_000000" / "episode_000000.mcap"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 2
+    error = capsys.readouterr().err
+    for part in ("lacks", "messages of an episode", "ends at byte", "--resample"):
+        assert part in error
+    assert not (tmp_path / "back").exists()
+
+
+def test_bags_of_two_datasets_do_not_become_one(turtlebot3, ur5, tmp_path, capsys):
+    one, other = export(turtlebot3, tmp_path / "a"), export(ur5, tmp_path / "b")
+    arguments = ["import", str(one), str(other), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]
+    assert data.main(arguments) == 2
+    assert "differs" in capsys.readouterr().err
+    assert not (tmp_path / "back").exists()
+    assert data.main(["import", str(one), "--repo_id=t/t", f"--root={tmp_path / 'back'}", "--fps=5"]) == 2
+    assert "--fps is for bags of a real robot" in capsys.readouterr().err
+
+
+def test_an_episode_that_was_marked_later_comes_back(turtlebot3, tmp_path):
+    root = tmp_path / "d"
+    shutil.copytree(turtlebot3, root)
+    assert data.main(["mark", str(root), "--episodes=1", "--outcome=failure"]) == 0
+    bags = export(root, tmp_path / "bags")
+    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
+    assert load_state(tmp_path / "back").rows[1]["bhd/outcome"] == "failure"
+    assert read_episode(tmp_path / "back", 1)["event"][-1] == 11
+
+
+def test_lists_of_episodes():
+    assert parse_episodes("0, 3,5-7") == [0, 3, 5, 6, 7]
+
+
+def test_nothing_heavy_is_imported_before_it_is_needed():
+    code = (
+        "import sys\n"
+        "from bhd_lerobot.runs import data_export, data_import\n"
+        "print(*(name for name in ('rosbags', 'torch', 'lerobot', 'mujoco', 'av', 'PIL') if name in sys.modules))"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == []
