@@ -58,8 +58,10 @@ def guard(token: str) -> Middleware:
 
 
 async def add_headers(request: web.Request, response: web.StreamResponse) -> None:
-    """Add the headers that keep strangers out; for `Application.on_response_prepare`."""
+    """Add the headers of every answer; for `Application.on_response_prepare`."""
     response.headers.update(_HEADERS)
+    # A browser must not show scripts of an older version, or a dataset that was here before. Asking costs nothing.
+    response.headers.setdefault("Cache-Control", "no-cache")
 
 
 def is_loopback(host: str) -> bool:

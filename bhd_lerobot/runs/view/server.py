@@ -18,8 +18,6 @@ HOST = "127.0.0.1"
 STATIC = Path(__file__).parent / "static"
 _DATASET: web.AppKey[ViewedDataset] = web.AppKey("dataset", ViewedDataset)
 _TOKEN: web.AppKey[str] = web.AppKey("token", str)
-# The page of a new version must not meet scripts of an old one; both come from this machine, so asking costs nothing.
-_FRESH = {"Cache-Control": "no-cache"}
 _NUMBER = re.compile(r"[0-9]{1,9}")
 
 
@@ -97,7 +95,7 @@ async def _dataset(request: web.Request) -> web.Response:
     dataset = request.app[_DATASET]
     await asyncio.to_thread(dataset.reload)
     text = await asyncio.to_thread(lambda: to_json(dataset.summary()))
-    response = web.Response(text=text, content_type="application/json", headers=_FRESH)
+    response = web.Response(text=text, content_type="application/json")
     response.enable_compression()
     return response
 
@@ -105,16 +103,16 @@ async def _dataset(request: web.Request) -> web.Response:
 async def _stamp(request: web.Request) -> web.Response:
     dataset = request.app[_DATASET]
     now = await asyncio.to_thread(stamp_of, dataset.root)
-    return web.json_response({"shown": dataset.stamp, "now": now}, headers=_FRESH)
+    return web.json_response({"shown": dataset.stamp, "now": now})
 
 
 async def _episode(request: web.Request) -> web.Response:
     dataset = request.app[_DATASET]
-    etag = f'"{dataset.stamp}"'
+    etag = f'"{dataset.stamp}-{request.app[_TOKEN][:8]}"'  # another server's packing may be another one
     if request.headers.get("If-None-Match") == etag:
-        return web.Response(status=304, headers={"ETag": etag, **_FRESH})
+        return web.Response(status=304, headers={"ETag": etag})
     packed = await asyncio.to_thread(dataset.packed, _number(request, "index"))
-    return web.Response(body=packed, content_type="application/octet-stream", headers={"ETag": etag, **_FRESH})
+    return web.Response(body=packed, content_type="application/octet-stream", headers={"ETag": etag})
 
 
 async def _film(request: web.Request) -> web.StreamResponse:
@@ -122,7 +120,7 @@ async def _film(request: web.Request) -> web.StreamResponse:
     path = request.app[_DATASET].film(request.match_info["key"], slot)
     if path is None:
         raise web.HTTPNotFound(text="There is no such film.\n")
-    return web.FileResponse(path, headers={"Content-Type": "video/mp4", **_FRESH})  # it knows ranges and conditions
+    return web.FileResponse(path, headers={"Content-Type": "video/mp4"})  # it knows ranges and conditions
 
 
 async def _image(request: web.Request) -> web.Response:
@@ -131,7 +129,7 @@ async def _image(request: web.Request) -> web.Response:
     if content is None:
         raise web.HTTPNotFound(text="There is no such picture.\n")
     kind = "image/png" if content.startswith(b"\x89PNG") else "image/jpeg"
-    return web.Response(body=content, content_type=kind, headers={"Cache-Control": "max-age=60"})
+    return web.Response(body=content, content_type=kind)
 
 
 async def _mark(request: web.Request) -> web.Response:

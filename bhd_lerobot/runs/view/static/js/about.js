@@ -50,6 +50,9 @@ function showAll(episode) {
     const what = outcome ? `${outcome[0] ?? "nothing"} → ${outcome[1]}` : `interventions ${JSON.stringify(interventions?.[1])}`;
     rows.push([`marked ${when}`, note ? `${what}: ${note}` : what]);
   }
+  const { steps = [], done = 0, attempts } = episode.plan ?? {};
+  steps.forEach((one, number) => rows.push([`step ${number + 1}`, `${number < done ? "✓ " : ""}${one[1] ?? one}`]));
+  if (attempts > 1) rows.push(["attempts", attempts]);
   rows.push(...Object.entries(episode.metadata));
   for (const [frame, name, code, message] of episode.goals) rows.push([`goal ${name}`, `${code} in frame ${frame}: ${message}`]);
   for (const [key, value] of Object.entries(episode.timing ?? {})) rows.push([`timing: ${key}`, value]);

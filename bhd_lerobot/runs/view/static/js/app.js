@@ -14,6 +14,7 @@ import { startViews } from "./views.js";
 
 const LOOK_MS = 2000; // between two looks at whether the dataset has changed
 let before = null; // the episode that was selected before this one
+let refusal = null; // why the changed dataset could not be read
 let wanted = 0; // number of the newest request, so that a slow answer does not replace a newer one
 
 async function select(index, { compare = undefined, time = 0 } = {}) {
@@ -79,6 +80,7 @@ function told() {
 
 async function load() {
   state.dataset = await loadDataset();
+  refusal = null;
   const { name, root, robot, fps, frames, episodes, unfinished } = state.dataset;
   document.title = `${name} – bhd-data view`;
   byId("dataset-name").textContent = name;
@@ -100,11 +102,13 @@ async function reload() {
     if (!a) return count ? select(0) : undefined;
     await select(Math.min(a.index, count - 1), { compare: b && b.index < count ? b.index : null, time });
   } catch (error) {
-    banner(error.message, true);
+    refusal = error.message;
+    banner(refusal, true);
   }
 }
 
 function banner(text, canReload = false) {
+  if (text !== null && text === byId("banner").querySelector("span").textContent) return; // said once is enough
   byId("banner").hidden = text === null;
   byId("banner").querySelector("span").textContent = text ?? "";
   byId("banner").querySelector("button").hidden = !canReload;
@@ -113,7 +117,7 @@ function banner(text, canReload = false) {
 async function look() {
   try {
     const { now } = await loadStamp();
-    if (now !== state.dataset.stamp) banner("The dataset has changed on disk.", true);
+    if (now !== state.dataset.stamp) banner(refusal ?? "The dataset has changed on disk.", true);
     else if (byId("banner").querySelector("span").textContent.startsWith("The server does not")) banner(null);
   } catch (error) {
     banner(error.message);

@@ -157,13 +157,15 @@ function moved([x, y, z], [px, py, pz, w, i, j, k]) {
 
 function drawTool(context, episode, now, name, at) {
   const { values } = episode.arrays["view.tool"];
-  const way = (last) => Array.from({ length: last + 1 }, (_, frame) => at(values.subarray(3 * frame, 3 * frame + 3)));
+  const step = Math.ceil(episode.frames / 3000); // more points than pixels only take time
+  const place = (frame) => at(values.subarray(3 * frame, 3 * frame + 3));
+  const way = (last) => [...Array.from({ length: Math.ceil(last / step) }, (_, i) => place(i * step)), place(last)];
   context.strokeStyle = context.fillStyle = colour(`--${name}`);
   context.lineWidth = 1;
   polyline(context, way(episode.frames - 1));
   context.lineWidth = 2.2;
   polyline(context, way(now));
-  disc(context, at(values.subarray(3 * now, 3 * now + 3)), 3.5);
+  disc(context, place(now), 3.5);
   context.fill();
 }
 

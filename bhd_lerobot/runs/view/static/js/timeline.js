@@ -7,6 +7,7 @@ import { outcomeColour } from "./outcomes.js";
 import { duration, emit, frameAt, on, shown, state, stretches } from "./store.js";
 
 const RATES = [0.5, 1, 2];
+const MOST_RUNS = 400; // of a band as elements of the page
 const HUES = ["--line-0", "--line-2", "--line-1", "--line-3", "--line-6", "--line-5", "--line-4"];
 let painters = []; // draw the lanes that are canvases
 
@@ -129,6 +130,7 @@ const laneClass = (name) => `lane${name === "b" ? " of-b" : ""}`;
 
 function bandLane(title, name, episode, runs, fixed = null) {
   const words = [...new Set(runs.map((run) => run[2]))];
+  if (runs.length > MOST_RUNS) return dense(title, name, episode, runs, words);
   const parts = runs.map(([first, end, text]) => make("div", {
     class: "run", title: `${text}: ${seconds(first / episode.fps)} to ${seconds(end / episode.fps)}`,
     "data-end": `${end}`, "data-of": name,
@@ -136,8 +138,19 @@ function bandLane(title, name, episode, runs, fixed = null) {
       left: `${share(first, episode)}%`, width: `${share(end - first, episode)}%`,
       "--colour": `var(${fixed ?? HUES[words.indexOf(text) % HUES.length]})`,
     },
-  }, `${text}`));
+  }, share(end - first, episode) < 2 ? null : `${text}`)); // half a letter says nothing; the title says all
   return { name: title, element: make("div", { class: laneClass(name), "data-lane": title }, ...parts) };
+}
+
+// A band whose text changes so often that nobody could read it: colours only; what holds now is said above.
+function dense(title, name, episode, runs, words) {
+  const numbers = new Map(words.map((word, number) => [word, number]));
+  return painted(title, name, (context, height, each) => {
+    for (const [first, end, text] of runs) {
+      context.fillStyle = colour(HUES[numbers.get(text) % HUES.length]);
+      context.fillRect(first * each, 0, Math.max(1, (end - first) * each), height);
+    }
+  }, episode);
 }
 
 function eventLane(title, name, episode) {
@@ -155,13 +168,18 @@ function eventLane(title, name, episode) {
 }
 
 function flagLane(title, name, episode, values, hue) {
+  return painted(title, name, (context, height, each) => {
+    context.fillStyle = colour(hue);
+    for (const [first, end] of stretches(values)) context.fillRect(first * each, 0, Math.max(1, (end - first) * each), height);
+  }, episode);
+}
+
+function painted(title, name, paint, episode) {
   const canvas = make("canvas", { role: "img", "aria-label": `${title}: in which frames` });
   painters.push(() => {
     if (!canvas.clientWidth) return;
     const { context, width, height } = prepare(canvas);
-    context.fillStyle = colour(hue);
-    const each = (width * share(1, episode)) / 100;
-    for (const [first, end] of stretches(values)) context.fillRect(first * each, 0, Math.max(1, (end - first) * each), height);
+    paint(context, height, (width * share(1, episode)) / 100);
   });
   return { name: title, thin: true, element: make("div", { class: `${laneClass(name)} thin`, "data-lane": title }, canvas) };
 }

@@ -85,10 +85,12 @@ function drawGrid(context, width, height, scale, point) {
 
 function drawRobot(context, name, episode, scale, point) {
   const now = frameAt(episode), hue = colour(`--${name}`);
+  const step = Math.ceil(episode.frames / 3000); // more points than pixels only take time
   const way = (first, last) => {
     const points = [];
-    for (let frame = Math.max(0, first); frame <= Math.min(last, episode.frames - 1); frame++) points.push(point(...pose(episode, frame)));
-    return points;
+    const end = Math.min(last, episode.frames - 1);
+    for (let frame = Math.max(0, first); frame < end; frame += step) points.push(point(...pose(episode, frame)));
+    return [...points, point(...pose(episode, end))];
   };
   context.strokeStyle = hue;
   context.lineWidth = 1.2;
