@@ -115,7 +115,7 @@ def _judge_outcomes(files: Files, findings: Findings) -> None:
     outcomes = files.episodes.get(f"{PREFIX}outcome")
     if not outcomes:
         return
-    counts = Counter(outcomes)
+    counts = Counter("not said" if outcome is None else outcome for outcome in outcomes)
     told = ", ".join(f"{name} {count}" for name, count in counts.most_common())
     if counts.get("success"):
         findings.note("outcome", f"{len(outcomes)} episodes", told)

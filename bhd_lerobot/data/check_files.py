@@ -217,7 +217,7 @@ def _check_counts(files: Files, findings: Findings) -> None:
         findings.error("counts", "meta/episodes", what, _COPY)
     if length.sum() != files.info["total_frames"]:
         what = f"it counts {files.info['total_frames']} frames; the episodes have {length.sum()}"
-        findings.error("counts", layout.INFO, what, _COPY)
+        findings.error("counts", layout.INFO, what, "bhd-data check --fix counts them.")
 
 
 def _check_names(files: Files, findings: Findings) -> None:
@@ -237,11 +237,17 @@ def _check_names(files: Files, findings: Findings) -> None:
         findings.warning("files", layout.STAGING, what, "bhd-data repair finishes it.")
 
 
+def stats_remedy(files: Files) -> str:
+    """Return what computes missing or wrong statistics."""
+    unfinished = (files.root / layout.STAGING).exists()
+    return "bhd-data repair computes them." if unfinished else "bhd-data check --fix computes them."
+
+
 def _read_stats(files: Files, findings: Findings) -> None:
     path, name = files.root / layout.STATS, layout.STATS
     if not files.episodes:
         return
-    remedy = "bhd-data repair computes them." if files.is_ours else "LeRobot's recompute_stats computes them."
+    remedy = stats_remedy(files)
     if not path.is_file():
         findings.error("stats", name, "it is missing, so no policy can be normalised", remedy)
         return

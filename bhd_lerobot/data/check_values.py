@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data import layout
-from bhd_lerobot.data.check_files import Files
+from bhd_lerobot.data.check_files import Files, stats_remedy
 from bhd_lerobot.data.check_frozen import FrozenCheck
 from bhd_lerobot.data.check_steps import StepCheck
 from bhd_lerobot.data.findings import Findings, few, name_of, one_line
@@ -255,7 +255,7 @@ class ValueCheck:
         """Compare `meta/stats.json` with what was read."""
         if not self.frames or self.frames != self._files.info["total_frames"]:
             return
-        remedy = "bhd-data repair computes them." if self._files.is_ours else "LeRobot's recompute_stats computes them."
+        remedy = stats_remedy(self._files)
         for key, column in self._columns.items():
             known = self._files.stats.get(key, {})
             if key in self._broken or not {"min", "max", "mean"} <= set(known):

@@ -65,7 +65,7 @@ def mark(
         changes = _Changes(state, outcome, intervention, clear_interventions)
         picks = [changes.pick(row) if row["episode_index"] in set(episodes) else Pick(state, row) for row in state.rows]
         edit = {"edit": "mark", "episodes": changes.log, **({"note": note} if note else {})}
-        types = {name: kind for name, kind in _COLUMNS.items() if outcome is not None}
+        types = _COLUMNS if outcome is not None and "outcome" not in state.metadata_types else {}
         return rewrite(state, picks, edit, state.identity, types)
 
 
@@ -95,12 +95,15 @@ class _Changes:
             told |= self._intervene(events, row, metadata)
         if self._outcome is not None:
             told["outcome"] = [row.get("bhd/outcome"), self._outcome]
-            metadata |= {"outcome": self._outcome, "success": self._outcome == Event.SUCCESS.cause}
+            is_success = self._outcome == Event.SUCCESS.cause
+            metadata["outcome"] = self._outcome
+            if "success" in self._state.metadata_types or "outcome" not in self._state.metadata_types:
+                metadata["success"] = is_success
             if keys.EVENT in self._features:
                 columns[keys.EVENT][-1] = Event[self._outcome.upper()]
             if keys.SUCCESS in self._features:
                 columns[keys.SUCCESS] = np.zeros(length, np.bool_)
-                columns[keys.SUCCESS][-1] = metadata["success"]
+                columns[keys.SUCCESS][-1] = is_success
         self.log.append(told)
         return Pick(self._state, row, metadata, columns)
 

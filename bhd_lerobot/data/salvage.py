@@ -95,8 +95,7 @@ def salvage(root: Path, disk: Disk) -> Salvage:
         described = _info(info, kept, len(tasks))
         _write_data(kept, rows, described, new, disk)
         films.write(kept, rows, described, new, disk)
-        pairs = [(one.table, one.films) for one in kept]
-        stats = stats_of(pairs, described["features"], new, rows)
+        stats = stats_of((one.table for one in kept), described["features"], new, rows)
         disk.make_folder(new / "meta")
         sink = pa.BufferOutputStream()
         pq.write_table(tasks_table(tasks), sink)

@@ -1,7 +1,7 @@
-"""Statistics of recovered episodes: those of columns by LeRobot's function, those of pictures from the pictures."""
+"""Statistics of what another program recorded: of columns by LeRobot's function, of pictures from the pictures."""
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from bhd_lerobot.data.state import Row, slot_of
 
 
 def stats_of(
-    episodes: Sequence[tuple[pa.Table, Mapping[str, Any]]],
+    episodes: Iterable[pa.Table],
     features: Mapping[str, Mapping[str, Any]],
     new: Path,
     rows: Sequence[Row],
@@ -22,9 +22,9 @@ def stats_of(
     """Return feature -> statistic -> values of all episodes, shape (E, ...).
 
     Args:
-        episodes: frames of each episode, and its films.
+        episodes: frames of each episode.
         features: LeRobot feature dictionaries.
-        new: root of the dataset that is being built, with its films.
+        new: root of the dataset, with its films.
         rows: of the episodes, with the places of their films.
     """
     from lerobot.datasets.compute_stats import compute_episode_stats
@@ -35,7 +35,7 @@ def stats_of(
         if feature["dtype"] not in ("video", "image", "string", "language")
     }
     stacked: dict[str, dict[str, list[np.ndarray]]] = {}
-    for (table, _), row in zip(episodes, rows, strict=True):
+    for table, row in zip(episodes, rows, strict=True):
         columns = {key: _array(table, key, feature["shape"]) for key, feature in plain.items()}
         own = dict(compute_episode_stats(columns, plain))
         for key, feature in features.items():

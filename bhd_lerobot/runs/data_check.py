@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.check_dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.data.check_values import Limits
+from bhd_lerobot.data.fix import fix
 from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS
 from bhd_lerobot.runs.data_command import Commands, add_command, root_of
 
@@ -22,17 +24,22 @@ _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "d
 
 def add_to(commands: Commands) -> None:
     """Add `check`."""
-    help_text = "is a dataset sound? Exit status 0 if it is, 1 if not; changes nothing"
+    help_text = "is a dataset sound? Exit status 0 if it is, 1 if not; changes nothing without --fix"
     command = add_command(commands, "check", help_text, _run)
     command.add_argument("--json", action="store_true", help="print everything as JSON")
     command.add_argument("--strict", action="store_true", help="a warning is enough for exit status 1")
     command.add_argument("--no-videos", action="store_true", help="leave the films out, which take longest")
+    command.add_argument(
+        "--fix", action="store_true", help="compute statistics and counts anew where they are wrong, and check again"
+    )
 
 
 def _run(options: argparse.Namespace) -> int:
-    return check(
-        root_of(options), Console(), as_json=options.json, is_strict=options.strict, videos=not options.no_videos
-    )
+    root, videos = root_of(options), not options.no_videos
+    if options.fix:
+        for line in fix(root, check_dataset(root, limits_of, videos=videos).findings):
+            print(f"fixed {line}", file=sys.stderr if options.json else sys.stdout)
+    return check(root, Console(), as_json=options.json, is_strict=options.strict, videos=videos)
 
 
 def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, videos: bool) -> int:

@@ -1,0 +1,105 @@
+"""`bhd-data check --fix`: mend what follows from the rest of a dataset, and nothing else.
+
+Statistics follow from the frames, and the number of frames from the episodes. What is damaged is for `repair`, and what
+is doubtful, such as a value that is out of range, is for a person.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.data import exchange, layout
+from bhd_lerobot.data.compact import compact
+from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.data.findings import Finding, Severity
+from bhd_lerobot.data.meta_files import write_meta
+from bhd_lerobot.data.salvage_stats import stats_of
+from bhd_lerobot.data.schema import Schema
+from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots, read_json
+
+
+def is_fixable(finding: Finding) -> bool:
+    """Tell whether `fix` mends what was found."""
+    if finding.severity is Severity.NOTE:
+        return False
+    return finding.check == "stats" or (finding.check == "counts" and finding.where == layout.INFO)
+
+
+def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
+    """Mend what can be mended, if everything that it follows from is sound; return a line for each thing.
+
+    Args:
+        root: the dataset.
+        findings: what `check_dataset` found there.
+
+    Raises:
+        DatasetLockedError: it is being recorded.
+        DatasetCorruptError: a file cannot be read; nothing was changed.
+        DatasetWriteError: the disk refuses; the dataset is as it was.
+    """
+    root = Path(root)
+    wanted = [one for one in findings if is_fixable(one)]
+    if (root / layout.STAGING).exists():
+        return []  # an interrupted recording, which is for `repair`
+    if not wanted or any(one.severity is Severity.ERROR and not is_fixable(one) for one in findings):
+        return []
+    disk = Disk()
+    lock = RootLock(root)
+    done: list[str] = []
+    try:
+        with write_errors("mend the dataset", root, "It is as it was."):
+            if any(one.check == "counts" for one in wanted):
+                done.append(_count_frames(root, disk))
+            if any(one.check == "stats" for one in wanted):
+                done.append(_compute_stats(load_state(root), disk))
+            disk.remove_tree(root / layout.STAGING)
+    finally:
+        lock.release()
+    return done
+
+
+def _count_frames(root: Path, disk: Disk) -> str:
+    info = read_json(root / layout.INFO)
+    frames = 0
+    for path in sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet")):
+        try:
+            table = pq.ParquetFile(path).read(columns=["episode_index", "length"], use_threads=False)
+        except (OSError, pa.ArrowException) as error:
+            raise corrupt(path, error) from error
+        rows = zip(table["episode_index"].to_pylist(), table["length"].to_pylist(), strict=True)
+        frames += sum(length for index, length in rows if index < info["total_episodes"])
+    before = info["total_frames"]
+    disk.make_folder(root / layout.STAGING)
+    disk.write(root / layout.STAGING / "info.json", to_json({**info, "total_frames": frames}))
+    disk.move(root / layout.STAGING / "info.json", root / layout.INFO)
+    return f"{layout.INFO}: total_frames is {frames}, as the episodes say; it was {before}"
+
+
+def _compute_stats(state: DatasetState, disk: Disk) -> str:
+    if state.identity is not None:
+        state.without_stats = set(range(state.num_episodes))
+        compact(state, Schema(state.info["features"]), disk, {})
+    else:
+        rows = [dict(row) for row in state.rows]
+        stats = stats_of(_tables(state), state.info["features"], state.root, rows)
+        new = exchange.begin(state.root, disk)
+        skipped = ("episodes/chunk-*/file-*.parquet", "stats.json")
+        exchange.link_others(state.root / "meta", new / "meta", disk, *skipped)
+        write_meta(new, state.info, rows, state.metadata_types, stats, disk=disk)
+        exchange.complete(state.root, disk)
+    return f"{layout.STATS} and meta/episodes: statistics of {state.num_episodes} episodes, computed from their frames"
+
+
+def _tables(state: DatasetState) -> Iterator[pa.Table]:
+    """Yield the frames of every episode."""
+    for slot, rows in ordered_slots(state.rows, "data").items():
+        path = state.root / layout.data_file(slot)
+        try:
+            table = pq.ParquetFile(path, page_checksum_verification=True).read(use_threads=False)
+        except (OSError, pa.ArrowException) as error:
+            raise corrupt(path, error) from error
+        first = rows[0]["dataset_from_index"]
+        for row in rows:
+            yield table.slice(row["dataset_from_index"] - first, row["length"])
