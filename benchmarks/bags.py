@@ -1,0 +1,149 @@
+"""Messages a second of `bhd-data export` and `bhd-data import`: `python -m benchmarks.bags`.
+
+A dataset of TurtleBot3 episodes as `bhd-record` writes it (360 beams, no camera) becomes a bag, and the bag a dataset
+again, once bit by bit and once resampled as if it were a real robot's. Beside it the `mcap` library writes the same
+messages, serialised already, into a file, and reads them without decoding them: what a bag costs at the least in that
+library. They run in turns; the first of each is not counted.
+"""
+
+import argparse
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from benchmarks._spread import ratios, spread, write
+from bhd_lerobot.data import features as keys
+from bhd_lerobot.data.bag_export import ExportOptions, export_bags
+from bhd_lerobot.data.bag_read import find_bags
+from bhd_lerobot.data.bag_restore import restore
+from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.runs import data
+from bhd_lerobot.runs.data_export import robot_view
+
+FPS = 10
+
+
+def record(root: Path, episodes: int, frames: int) -> None:
+    """Record drives past walls that are somewhere."""
+    state = ["x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(360))]
+    physics = [f"qpos_{i}" for i in range(9)] + [f"qvel_{i}" for i in range(8)]
+    features = keys.dataset_features(state, ["x.vel", "theta.vel"], {}, physics)
+    recorder = DatasetRecorder.create("bench/bags", FPS, features, robot_type="turtlebot3", root=root)
+    rng, index = np.random.default_rng(0), np.arange(frames)
+    for _ in range(episodes):
+        columns: dict[str, Any] = {
+            key: np.zeros((frames, *one["shape"]) if one["shape"] != (1,) else frames, one["dtype"])
+            for key, one in features.items()
+        }
+        # The lidar is half as fast as the frames.
+        scans = rng.uniform(0.12, 3.5, (frames // 2 + 1, 360))[index // 2]
+        speeds = 0.2 * np.sin(index / 7)[:, None] * [1, 2]
+        columns[keys.OBSERVATION_STATE] = np.concatenate([speeds, scans], axis=1).astype(np.float32)
+        columns[keys.ACTION] = columns[keys.APPLIED_ACTION] = (1.1 * speeds).astype(np.float32)
+        columns[keys.TIME], columns[keys.AGE] = index / FPS, (index % 2 / FPS).astype(np.float32)
+        columns[keys.MODE][:] = 3
+        writer = recorder.begin_episode()
+        writer.set_columns(columns)
+        recorder.save(writer, task="drive", metadata={"outcome": "success"})
+    recorder.finalize()
+
+
+def timed(action: Callable[[], object]) -> float:
+    """Return how long something takes [s]."""
+    started = time.perf_counter()
+    action()
+    return time.perf_counter() - started
+
+
+def bare_write(path: Path, schemas: dict[str, bytes], messages: list[tuple[str, str, int, bytes]]) -> None:
+    """Write messages with the mcap library, in the way that rosbag2 does by default: chunks without compression."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start("ros2")
+        kinds = {kind: writer.register_schema(kind, "ros2msg", text) for kind, text in schemas.items()}
+        channels: dict[str, int] = {}
+        for topic, kind, log_time, payload in messages:
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "cdr", kinds[kind])
+            writer.add_message(channels[topic], log_time, payload, log_time)
+        writer.finish()
+
+
+def bare_read(path: Path) -> tuple[dict[str, bytes], list[tuple[str, str, int, bytes]]]:
+    """Read all messages with the mcap library, without decoding them."""
+    schemas: dict[str, bytes] = {}
+    messages = []
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None
+            schemas[schema.name] = schema.data
+            messages.append((channel.topic, schema.name, message.log_time, message.data))
+    return schemas, messages
+
+
+def resample(bag: Path, root: Path) -> None:
+    """Import a bag as if it were a real robot's."""
+    arguments = ["import", str(bag), "--resample", "--repo_id=bench/bags", f"--root={root}", "--task=drive"]
+    if data.main(arguments):
+        raise AssertionError("The import failed.")
+
+
+def main() -> int:
+    """Print what was measured."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--frames", type=int, default=600, help="of an episode")
+    parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
+    options = parser.parse_args()
+    view, how = robot_view("turtlebot3"), ExportOptions(one_bag=True)
+    turns: dict[str, list[float]] = {name: [] for name in ("export", "restore", "resample", "bare_write", "bare_read")}
+    with tempfile.TemporaryDirectory() as folder:
+        root, bag, back, file = (Path(folder) / name for name in ("data", "bag", "back", "bare.mcap"))
+        record(root, options.episodes, options.frames)
+        for _ in range(options.turns + 1):
+            for path in (bag, back):
+                shutil.rmtree(path, ignore_errors=True)
+            turns["export"].append(timed(lambda: export_bags(root, bag, view=view, options=how)))
+            schemas, messages = bare_read(bag / "bag.mcap")
+            turns["bare_write"].append(timed(lambda s=schemas, m=messages: bare_write(file, s, m)))
+            turns["bare_read"].append(timed(lambda: bare_read(file)))
+            turns["restore"].append(timed(lambda: restore(find_bags(bag), back, "bench/bags")))
+            shutil.rmtree(back)
+            turns["resample"].append(timed(lambda: resample(bag, back)))
+        size = (bag / "bag.mcap").stat().st_size
+    count = len(messages)
+    speeds = {name: [count / took for took in values[1:]] for name, values in turns.items()}
+    results: dict[str, Any] = {
+        "messages": count,
+        "megabytes": size / 1e6,
+        "messages_per_s": {name: spread(values) for name, values in speeds.items()},
+        "of_the_bare_library": {
+            "export": spread(ratios(speeds["export"], speeds["bare_write"])),
+            "restore": spread(ratios(speeds["restore"], speeds["bare_read"])),
+            "resample": spread(ratios(speeds["resample"], speeds["bare_read"])),
+        },
+    }
+    write(options.json, results)
+    print(f"{count:,} messages, {size / 1e6:.1f} MB")
+    for name, beside in (("export", "bare_write"), ("restore", "bare_read"), ("resample", "bare_read")):
+        ours, theirs = results["messages_per_s"][name], results["messages_per_s"][beside]
+        share = results["of_the_bare_library"][name]
+        print(
+            f"{name:8s} {ours['median']:>9,.0f} messages/s ({ours['low']:,.0f} to {ours['high']:,.0f}); {beside} of "
+            f"the mcap library {theirs['median']:,.0f}: ratio {share['median']:.2f} ({share['low']:.2f} to "
+            f"{share['high']:.2f})"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
