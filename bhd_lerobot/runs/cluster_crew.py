@@ -77,6 +77,7 @@ class Crew:
         self._failed = None
         self._wanted = self.workers_for(len(tasks))
         self._idle_since = time.monotonic()
+        self._dismiss(lambda worker: bool(worker.tasks))  # what a run before left undone is not wanted any more
         for worker in self._workers:
             worker.job = None
             self._call(worker, "describe", worker.actor.describe.remote(self._distributions))
@@ -112,13 +113,17 @@ class Crew:
 
     def __exit__(self, *_: object) -> None:
         """End all workers, in whatever they are doing."""
+        self._dismiss(lambda worker: True)
+
+    def _dismiss(self, which: Callable[[Worker], bool]) -> None:
+        """End some workers, and forget all calls."""
         import ray
 
         self._calls.clear()
-        for worker in self._workers:
+        for worker in filter(which, list(self._workers)):
+            self._workers.remove(worker)
             with contextlib.suppress(ray.exceptions.RayError):
                 ray.kill(worker.actor)
-        self._workers.clear()
 
     def _raise_failure(self, number: int) -> None:
         """Raise what a worker raised, if it was before this task."""

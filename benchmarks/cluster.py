@@ -1,0 +1,137 @@
+"""Episodes a second of `bhd-record --engine=ray`: `python -m benchmarks.cluster`.
+
+Two workers of this machine against one, each one process with one thread, and one worker against the same episodes in
+one process without Ray. TurtleBot3, `gap_follower`, episodes of full length. The cluster is started once and its
+workers are kept: what is measured is recording, from handing out the first episode to having saved the last. What a
+start costs is told beside it. They run in turns; the first turn is not counted.
+"""
+
+import argparse
+import os
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+# Before anything imports numpy or torch: one worker is one processor.
+os.environ["OMP_NUM_THREADS"] = "1"
+
+from rich.console import Console
+
+from benchmarks._spread import ratios, spread, write
+from bhd_lerobot.control.tolerance import TimingTolerance
+from bhd_lerobot.runs.cluster_config import RayConfig
+from bhd_lerobot.runs.cluster_crew import Crew
+from bhd_lerobot.runs.cluster_loop import ClusterLoop, open_crew
+from bhd_lerobot.runs.config_record import RecordConfig
+from bhd_lerobot.runs.configuration import parse
+from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.runs.episode_types import EpisodeSpec
+from bhd_lerobot.runs.provenance import episode_metadata
+from bhd_lerobot.runs.record import open_recorder, save_episode
+from bhd_lerobot.runs.registry import make_brain, make_robot, make_task
+from bhd_lerobot.tasks.task import episode_seed
+
+GOAL = 1.7  # two workers against one
+
+
+def configuration(root: Path, episode_s: float) -> RecordConfig:
+    """Return what is recorded."""
+    return parse(
+        RecordConfig,
+        [
+            "--robot.type=turtlebot3",
+            "--task.type=avoid",
+            "--brain.type=gap_follower",
+            "--dataset.repo_id=bench/cluster",
+            f"--dataset.root={root}",
+            f"--dataset.episode_time_s={episode_s}",
+            "--engine=ray",
+        ],
+    )
+
+
+def record(config: RecordConfig, crew: Crew | None, episodes: int) -> float:
+    """Record into a new dataset; return how long it took to run and save all episodes [s]."""
+    simulation = make_robot(config.robot, 1, 1)
+    task, brain = make_task(config.task, 1, config.dataset.fps), make_brain(config.brain)
+    loop = EpisodeLoop(simulation, task, brain)
+    if crew is not None:
+        loop = ClusterLoop(
+            simulation, task, brain, TimingTolerance(), crew=crew, config=config, brain_config=config.brain
+        )
+    specs = [EpisodeSpec(index, episode_seed(0, index, "train")) for index in range(episodes)]
+    with tempfile.TemporaryDirectory() as folder:
+        recorder = open_recorder(config, Path(folder) / "data", simulation, task, brain)
+        started = time.perf_counter()
+        for episode in loop.run(specs, open_images=recorder.begin_episode):
+            save_episode(
+                recorder,
+                episode,
+                episode_metadata(episode, split="train", task=task.parameters(), brain=brain.parameters()),
+            )
+        took = time.perf_counter() - started
+        if recorder.num_episodes != episodes:
+            raise AssertionError(f"{recorder.num_episodes} of {episodes} episodes were saved.")
+        recorder.finalize()
+    simulation.close()
+    return took
+
+
+def main() -> int:
+    """Print what was measured; return 1 if the goal was missed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=60)
+    parser.add_argument("--episode_s", type=float, default=30.0, help="simulated duration of an episode [s]")
+    parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
+    options = parser.parse_args()
+    config = configuration(Path("unused"), options.episode_s)
+    quiet = Console(quiet=True)
+    started = time.perf_counter()
+    times: dict[str, list[float]] = {"alone": [], "one": [], "two": []}
+    shared = {"num_workers": 2, "address": "local"}
+    with open_crew(RayConfig(**shared), quiet) as two, Crew(RayConfig(num_workers=1), quiet) as one:
+        crews = {"alone": None, "one": one, "two": two}
+        record(config, two, 2)
+        start_s = time.perf_counter() - started
+        two.__exit__()
+        for turn in range(options.turns + 1):
+            for name, crew in crews.items():
+                if crew is not None:
+                    record(config, crew, 4)  # its workers are there, and have imported everything
+                took = record(config, crew, options.episodes)
+                if crew is not None:
+                    crew.__exit__()  # the other's workers need the processors
+                if turn:
+                    times[name].append(took)
+    speeds = {name: [options.episodes / took for took in values] for name, values in times.items()}
+    gain = ratios(speeds["two"], speeds["one"])
+    overhead_ms = [
+        1000 * (one - alone) / options.episodes for one, alone in zip(times["one"], times["alone"], strict=True)
+    ]
+    results = {
+        "episodes": options.episodes,
+        "episode_s": options.episode_s,
+        "processors": os.cpu_count(),
+        "start_s": start_s,
+        "episodes_per_s": {name: spread(values) for name, values in speeds.items()},
+        "two_against_one": spread(gain),
+        "overhead_ms_per_episode": spread(overhead_ms),
+        "goal": GOAL,
+        "met": statistics.median(gain) >= GOAL,
+    }
+    write(options.json, results)
+    for name, said in (("alone", "in one process"), ("one", "one worker"), ("two", "two workers")):
+        print(f"{said}: {statistics.median(speeds[name]):.1f} episodes/s of {options.episode_s:g} s")
+    print(
+        f"two workers against one: {statistics.median(gain):.2f} ({min(gain):.2f} to {max(gain):.2f}), goal {GOAL}; "
+        f"one worker against one process: {statistics.median(overhead_ms):+.1f} ms an episode "
+        f"({min(overhead_ms):+.1f} to {max(overhead_ms):+.1f}); start {start_s:.1f} s"
+    )
+    return int(not results["met"])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
