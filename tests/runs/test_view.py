@@ -6,7 +6,9 @@ import re
 import shutil
 import signal
 import socket
+import subprocess
 import threading
+import tomllib
 import urllib.request
 import webbrowser
 from pathlib import Path
@@ -301,6 +303,19 @@ def test_no_file_of_the_page_names_another_host() -> None:
         assert (STATIC / name).is_file()
 
 
+def test_no_file_of_the_page_is_left_out_of_the_package() -> None:
+    """Hatch packs all of `bhd_lerobot` but what git ignores."""
+    root = Path(__file__).resolve().parents[2]
+    settings = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
+    assert "/bhd_lerobot" in settings["tool"]["hatch"]["build"]["targets"]["wheel"]["include"]
+    if not (root / ".git").exists():
+        pytest.skip("not a git checkout, so nothing is ignored")
+    files = [path for path in STATIC.rglob("*") if path.is_file()]
+    command = ["git", "-c", f"safe.directory={root}", "check-ignore", *map(str, files)]
+    found = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
+    assert (found.returncode, found.stdout) == (1, ""), found.stderr
+
+
 def test_every_file_of_the_page_is_served_as_what_it_is(base_server) -> None:
     kinds = {".js": "javascript", ".css": "text/css", ".svg": "image/svg+xml"}
     for path in STATIC.rglob("*.*"):
@@ -437,6 +452,15 @@ def test_damaged_missing_and_locked_datasets_are_refused(base, tmp_path) -> None
     film = next(root.rglob("*.mp4"))
     film.unlink()
     with pytest.raises(DatasetCorruptError, match=film.name):
+        ViewedDataset(root)
+
+
+@pytest.mark.parametrize("change", [{"fps": 0}, {"fps": "fast"}, {"features": 3}, {"features": {"action": {}}}])
+def test_a_description_of_another_shape_is_refused(tmp_path, change) -> None:
+    root = record_ours(tmp_path / "d", 1)
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps({**info, **change}))
+    with pytest.raises(DatasetCorruptError, match=r"info\.json"):
         ViewedDataset(root)
 
 

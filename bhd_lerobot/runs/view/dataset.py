@@ -29,10 +29,11 @@ _COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 @dataclass(frozen=True)
 class _Content:
-    """What was read, and the stamp of the files that it was read from."""
+    """What was read, the stamp of the files that it was read from, and what the page knows of all episodes."""
 
     state: DatasetState
     stamp: str
+    summary: dict[str, Any]
 
 
 class ViewedDataset:
@@ -54,10 +55,17 @@ class ViewedDataset:
         self._content = self._read()
 
     def _read(self) -> _Content:
-        if (self.root / layout.INFO).is_file():
+        info = self.root / layout.INFO
+        if info.is_file():
             RootLock(self.root).release()
         stamp = stamp_of(self.root)
-        return _Content(load_state(self.root), stamp)
+        try:
+            state = load_state(self.root)
+            if not state.info["fps"] > 0:
+                raise corrupt(info, f"its fps is {state.info['fps']!r}")
+            return _Content(state, stamp, _summary(state, stamp))
+        except (AttributeError, KeyError, TypeError) as error:  # JSON, but of another shape
+            raise corrupt(info, f"it does not describe a dataset ({type(error).__name__}: {error})") from error
 
     @property
     def stamp(self) -> str:
@@ -82,31 +90,7 @@ class ViewedDataset:
 
     def summary(self) -> dict[str, Any]:
         """Return what the page knows of all episodes, column by column."""
-        content = self._content
-        state = content.state
-        tasks: dict[str, int] = {}
-        columns: dict[str, list[Any]] = {
-            "frames": [row["length"] for row in state.rows],
-            "task": [tasks.setdefault(_instruction(row), len(tasks)) for row in state.rows],
-            "outcome": [_outcome(row) for row in state.rows],
-            "score": [row.get(f"{PREFIX}score") for row in state.rows],
-            "late": [_late_frames(row) for row in state.rows],
-            "interventions": [_listed(row.get(f"{PREFIX}interventions")) for row in state.rows],
-        }
-        return {
-            "name": self.root.resolve().name,
-            "root": str(self.root),
-            "stamp": content.stamp,
-            "robot": state.info.get("robot_type"),
-            "fps": state.info["fps"],
-            "frames": state.num_frames,
-            "cameras": [_camera(key, feature) for key, feature in state.info["features"].items() if _is_film(feature)],
-            "unfinished": (self.root / layout.STAGING).exists(),
-            "tasks": list(tasks),
-            "outcomes": list(OUTCOMES),
-            "takes_interventions": keys.EVENT in state.info["features"],
-            "episodes": columns,
-        }
+        return self._content.summary
 
     def packed(self, index: int) -> bytes:
         """Return an episode as `packing` makes bytes of it.
@@ -187,6 +171,32 @@ def stamp_of(root: Path) -> str:
         found = True
         digest.update(f"{path.name} {about.st_mtime_ns} {about.st_size} {about.st_ino}\n".encode())
     return digest.hexdigest() if found else ""
+
+
+def _summary(state: DatasetState, stamp: str) -> dict[str, Any]:
+    tasks: dict[str, int] = {}
+    columns: dict[str, list[Any]] = {
+        "frames": [row["length"] for row in state.rows],
+        "task": [tasks.setdefault(_instruction(row), len(tasks)) for row in state.rows],
+        "outcome": [_outcome(row) for row in state.rows],
+        "score": [row.get(f"{PREFIX}score") for row in state.rows],
+        "late": [_late_frames(row) for row in state.rows],
+        "interventions": [_listed(row.get(f"{PREFIX}interventions")) for row in state.rows],
+    }
+    return {
+        "name": state.root.resolve().name,
+        "root": str(state.root),
+        "stamp": stamp,
+        "robot": state.info.get("robot_type"),
+        "fps": state.info["fps"],
+        "frames": state.num_frames,
+        "cameras": [_camera(key, feature) for key, feature in state.info["features"].items() if _is_film(feature)],
+        "unfinished": (state.root / layout.STAGING).exists(),
+        "tasks": list(tasks),
+        "outcomes": list(OUTCOMES),
+        "takes_interventions": keys.EVENT in state.info["features"],
+        "episodes": columns,
+    }
 
 
 def _row(state: DatasetState, index: int) -> Row:

@@ -7,6 +7,8 @@ import { drawScan } from "./scan_view.js";
 import { on, shown, state } from "./store.js";
 import { drawTop, sameScene } from "./top_view.js";
 
+const WIDTH = 220; // [px] that a view should have, or there are two rows of them
+
 let followers = []; // functions that show the present time
 
 export function startViews() {
@@ -14,6 +16,11 @@ export function startViews() {
   on("time", follow);
   on("playing", follow);
   on("theme", follow);
+  new ResizeObserver(arrange).observe(byId("views"));
+}
+
+function arrange() {
+  byId("views").classList.toggle("rows", followers.length > 0 && byId("views").children.length * WIDTH > byId("views").clientWidth);
 }
 
 const follow = () => followers.forEach((show) => show());
@@ -23,6 +30,7 @@ function build() {
   followers = cards.flatMap((card) => card.follow);
   byId("views").replaceChildren(...cards.map((card) => card.element));
   byId("views").hidden = cards.length === 0;
+  arrange();
   follow();
 }
 
@@ -61,8 +69,17 @@ function films() {
     const [high, wide] = aspect(camera.shape);
     made.element.classList.add("of-film");
     made.element.style.setProperty("--aspect", `${(wide * sources.length) / (high * 1.08)}`); // its heading takes some
+    if (sources.length > 1) stacking(made.element.querySelector(".inside"), wide / high);
     return made;
   });
+}
+
+// Two films lie beside or above each other, whichever makes them larger.
+function stacking(box, ratio) {
+  new ResizeObserver(() => {
+    const { clientWidth: wide, clientHeight: high } = box;
+    box.classList.toggle("stacked", Math.min(wide / ratio, high / 2) > Math.min(wide / 2 / ratio, high));
+  }).observe(box);
 }
 
 function scans() {
