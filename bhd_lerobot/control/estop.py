@@ -83,13 +83,15 @@ class EstopInputs:
     Args:
         press: what presses: sets the word of the emergency stop. Called from any thread and from a signal handler, as
             often as it likes; must neither block nor raise.
+        hear: gets the terminal's keys that do not press, from the thread that waits for them; must not block either.
 
     Attributes:
         causes: what has pressed so far, in words, each once, in the order of the first time.
     """
 
-    def __init__(self, press: Callable[[], None]) -> None:
+    def __init__(self, press: Callable[[], None], hear: Callable[[bytes], None] = lambda keys: None) -> None:
         self.causes: list[str] = []
+        self._hear_others = hear
         self._press_word = press
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -196,6 +198,7 @@ class EstopInputs:
     def _hear_keys(self, said: bytes) -> None:
         if any(key in said for key in KEYS):
             self._press("key")
+        self._hear_others(bytes(key for key in said if key not in KEYS))
         if not said and self._terminal is not None:  # it is gone; that is a SIGHUP, which ends a run
             self._poll.unregister(self._terminal.descriptor)
 

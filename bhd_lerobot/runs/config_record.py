@@ -64,8 +64,9 @@ class RecordConfig:
         resume: continue the dataset at `dataset.root`, or start it if there is none.
         output_dir: run folder, for the resolved configuration and pictures; a new one in `outputs/record` if nothing.
         preview_video: make an MP4 of the first episode; if nothing, where images can be rendered.
-        estop_key: space or `e` in the terminal is an emergency stop; if nothing, where there is a terminal and the
-            robot runs on the wall clock.
+        estop_key: space or `e` in the terminal is an emergency stop, `s` ends the episode as a success and `f` as a
+            failure, and with `i` an intervention begins or ends; if nothing, where there is a terminal and the robot
+            runs on the wall clock.
         estop_signal: this signal is an emergency stop, too: `SIGUSR1`, `SIGUSR2` or `SIGQUIT`.
         display_data: show what happens live in Rerun or Foxglove; of robots side by side the first. The names of these
             options are those of `lerobot-record`.

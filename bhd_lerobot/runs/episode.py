@@ -18,6 +18,7 @@ from bhd_lerobot.robots.simulation import FrameReport, Simulation
 from bhd_lerobot.runs.drivers import DriverLog, flagged
 from bhd_lerobot.runs.episode_images import EpisodeImages, Observer
 from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
+from bhd_lerobot.runs.marks import Marks
 from bhd_lerobot.tasks.task import Event, Task
 
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.
@@ -41,6 +42,7 @@ class EpisodeLoop:
 
     Attributes:
         emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
+        marks: takes what a person says about the running episodes.
     """
 
     observer: Observer | None = None
@@ -55,6 +57,7 @@ class EpisodeLoop:
         self.simulation, self.task, self.brain = simulation, task, brain
         self.tolerance = tolerance or TimingTolerance()
         self.emergency_stop = False
+        self.marks = Marks(simulation.n)
         self._last_frame = -1  # number of the last frame on the wall clock
         self._open_images: Callable[[], Any] | None = None
         self._frames = max(1, round(task.duration_s * simulation.rates.fps))
@@ -143,6 +146,7 @@ class EpisodeLoop:
             )
         self._length[ids] = 0
         self._drivers.start(ids)
+        self.marks.begin(ids)
         self._truth = None
 
     def _frame(self) -> list[tuple[int, Event]]:
@@ -216,6 +220,7 @@ class EpisodeLoop:
         self._truth = simulation.truth(report)
         reward, event = self.task.judge(self._truth, simulation.running)
         event = add_faults(event, report.mode, simulation.running)
+        event, driven = self.marks.frame(event, simulation.running)
         taken, by_goals = self._drivers.frame(running, self._length, is_missed=is_missed)
         values |= {
             # While a goal is followed, what a policy learns from is where the reference was.
@@ -226,7 +231,7 @@ class EpisodeLoop:
             keys.WATCHDOG: report.watchdog,
             keys.MODE: report.mode,
             keys.REWARD: reward,
-            keys.EVENT: flagged(event, taken),
+            keys.EVENT: flagged(event, taken | driven),
         }
         self._store(running, values)
         if self.observer is not None:

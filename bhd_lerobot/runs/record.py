@@ -31,6 +31,7 @@ from bhd_lerobot.runs.episode import EpisodeLoop
 from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.runs.language_rows import language_column
 from bhd_lerobot.runs.live_view import live_view
+from bhd_lerobot.runs.marks import KEYS, Marks
 from bhd_lerobot.runs.plots import Trajectory, TrajectoryAlbum
 from bhd_lerobot.runs.preview import Preview
 from bhd_lerobot.runs.provenance import episode_metadata
@@ -61,7 +62,8 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     n = 1 if config.robot.clock == "realtime" or not is_here else min(config.n_envs, config.dataset.num_episodes)
     simulation = make_robot(config.robot, n, config.threads)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
-    pressed = EstopInputs(simulation.bridge.estop)
+    marks = Marks(n)
+    pressed = EstopInputs(simulation.bridge.estop, marks.hear)
     with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)
         task = make_task(config.task, simulation.n, config.dataset.fps)
@@ -74,6 +76,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
             loop = ClusterLoop(
                 simulation, task, brain, config.timing, crew=crew, config=config, brain_config=config.brain
             )
+        loop.marks = marks
         tell_refusals(simulation, console)
         preview = _make_preview(config, simulation, console)
         if simulation.camera_names and is_here:
@@ -190,6 +193,8 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
     if is_live:
         key = "space or e, or " if has_key else ""
         console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} {os.getpid()}")
+    if has_key:
+        console.print(f"Keys: {KEYS}")
 
 
 def open_recorder(
