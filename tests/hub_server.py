@@ -9,16 +9,23 @@ import hashlib
 import json
 import re
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Self
 from urllib.parse import parse_qs, unquote, urlsplit
 
 LFS_SUFFIXES = (".parquet", ".mp4", ".safetensors", ".png", ".bin")
 _REPO = r"(?P<kind>models|datasets)/(?P<name>[^/]+/[^/]+)"
+
+
+@lru_cache(256)
+def _sha(content: bytes, algorithm: str, prefix: bytes = b"") -> str:
+    return hashlib.new(algorithm, prefix + content).hexdigest()
 
 
 @dataclass
@@ -30,13 +37,13 @@ class Blob:
 
     @property
     def oid(self) -> str:
-        """Its git name; of an LFS file, that of the pointer, which a client never needs."""
-        return hashlib.sha1(b"blob %d\0" % len(self.content) + self.content).hexdigest()
+        """Its git name; of an LFS file, one that follows from its checksum."""
+        return self.sha256[:40] if self.lfs else _sha(self.content, "sha1", b"blob %d\0" % len(self.content))
 
     @property
     def sha256(self) -> str:
         """Its checksum."""
-        return hashlib.sha256(self.content).hexdigest()
+        return _sha(self.content, "sha256")
 
 
 @dataclass
@@ -292,6 +299,15 @@ class _Handler(BaseHTTPRequestHandler):
                 self.hub.repositories[f"{kind}/{name}"] = Repository(private=private)
         self._answer({"url": url, "name": name, **({"error": "exists"} if exists else {})}, 409 if exists else 200)
 
+    def _delete(self, body: bytes) -> None:
+        wanted = json.loads(body)
+        kind = f"{wanted.get('type') or 'model'}s"
+        user, _may = self._user()
+        name = f"{wanted.get('organization') or user}/{wanted['name']}"
+        self._repository(kind, name, write=True)
+        del self.hub.repositories[f"{kind}/{name}"]
+        self._answer({})
+
     def _validate(self, _: bytes) -> None:
         self._answer({"errors": [], "warnings": []})
 
@@ -456,6 +472,7 @@ def _entries(files: dict[str, Blob], folder: str, *, recursive: bool) -> list[di
 _ROUTES = [
     ("GET", "/api/whoami-v2", "whoami"),
     ("POST", "/api/repos/create", "create"),
+    ("DELETE", "/api/repos/delete", "delete"),
     ("POST", "/api/validate-yaml", "validate"),
     ("GET", rf"/api/{_REPO}", "info"),
     ("GET", rf"/api/{_REPO}/revision/(?P<revision>.+)", "info"),
@@ -473,8 +490,8 @@ _ROUTES = [
 
 
 @contextmanager
-def real_client(hub: HubServer, token: str | None = "hf_me") -> Iterator[Any]:
-    """Point the real client, in this process, to a server; yields a `pytest.MonkeyPatch` for more.
+def real_client(server: HubServer | str, token: str | None = "hf_me") -> Iterator[Any]:
+    """Point the real client, in this process, to a server, or its address; yields a `pytest.MonkeyPatch` for more.
 
     The client reads its environment when it is imported, so its constants are changed.
     """
@@ -482,17 +499,16 @@ def real_client(hub: HubServer, token: str | None = "hf_me") -> Iterator[Any]:
     from huggingface_hub import RepoCard, constants
     from huggingface_hub.utils import _http
 
+    url = server if isinstance(server, str) else server.url
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(constants, "ENDPOINT", hub.url)
-        patch.setattr(
-            constants, "HUGGINGFACE_CO_URL_TEMPLATE", f"{hub.url}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
-        )
+        patch.setattr(constants, "ENDPOINT", url)
+        patch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", f"{url}/{{repo_id}}/resolve/{{revision}}/{{filename}}")
         patch.setattr(constants, "HF_HUB_OFFLINE", False)
         patch.setattr(constants, "HF_HUB_DISABLE_XET", True)
         patch.setattr(constants, "HF_HUB_DISABLE_PROGRESS_BARS", True)
         # To check a model's card it asks the Hub on the internet, whatever HF_ENDPOINT is.
         patch.setattr(RepoCard, "validate", lambda card, repo_type=None: None)
-        patch.setenv("HF_ENDPOINT", hub.url)
+        patch.setenv("HF_ENDPOINT", url)
         patch.setenv("HF_HUB_OFFLINE", "0")
         patch.delenv("HF_TOKEN", raising=False)
         if token is not None:
@@ -500,3 +516,9 @@ def real_client(hub: HubServer, token: str | None = "hf_me") -> Iterator[Any]:
         _http.close_session()
         yield patch
         _http.close_session()
+
+
+if __name__ == "__main__":  # in a process of its own, until its input ends
+    with HubServer() as running:
+        print(running.url, flush=True)
+        sys.stdin.read()

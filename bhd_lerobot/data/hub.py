@@ -1,12 +1,13 @@
 """A dataset on the Hub, through its own client: one commit for all that changed, and the tag that LeRobot looks for."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.hub_errors import hub_errors, require_token
-from bhd_lerobot.data.remote import Item, RemoteFile, check_repo_id, in_order
+from bhd_lerobot.data.remote import Item, RemoteFile, check_repo_id, in_order, largest_first, refuse_damaged
+from bhd_lerobot.data.remote_pool import run_all
 from bhd_lerobot.errors import TransferError
 
 if TYPE_CHECKING:
@@ -97,22 +98,20 @@ class HubDataset:
             return bytes(answer.content)
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
-        """Download files of the listed commit. Those that arrived in an earlier attempt are not fetched again.
+        """Download files of the listed commit.
 
         Raises:
-            TransferError: not all of them came; those that did are kept.
+            TransferError: not all of them came, or one came otherwise; those that came well are kept.
         """
-        from huggingface_hub import snapshot_download
+        from huggingface_hub import hf_hub_download
+
+        def fetch_one(path: str) -> None:
+            # By the commit's hash: with a name, the client would fall back to what it has if the Hub is away.
+            hf_hub_download(self.name, path, repo_type="dataset", revision=self.commit, local_dir=folder)
+            refuse_damaged(folder / path, self._listed[path], self.name, path)
 
         with hub_errors(self.name, "download", revision=self.revision):
-            # By its hash: with a name, the client takes an unfinished folder for the dataset if the Hub is away.
-            snapshot_download(
-                self.name,
-                repo_type="dataset",
-                revision=self.commit,
-                local_dir=folder,
-                allow_patterns=_patterns(paths, self._listed),
-            )
+            run_all(fetch_one, largest_first(paths, self._listed))
 
     def send(self, items: Sequence[Item], deleted: Sequence[str], check: Callable[[], None]) -> None:
         """Upload files, remove others, and set the tags.
@@ -208,19 +207,3 @@ def _file(entry: Any) -> RemoteFile:
     if entry.lfs is not None:
         return RemoteFile(entry.lfs.size, entry.lfs.sha256)
     return RemoteFile(entry.size, entry.blob_id, "git")
-
-
-def _patterns(paths: Sequence[str], listed: Iterable[str]) -> list[str]:
-    """Return patterns that match these paths and no other: whole folders as one, since every file is matched with each.
-
-    A pattern's ``*`` matches slashes, too.
-    """
-    wanted = set(paths)
-    partly = {parent for path in listed if path not in wanted for parent in _parents(path)}
-    return sorted({next((f"{one}/*" for one in _parents(path) if one not in partly), path) for path in wanted})
-
-
-def _parents(path: str) -> list[str]:
-    """Return the folders of a path, the outermost first."""
-    parts = path.split("/")[:-1]
-    return ["/".join(parts[: number + 1]) for number in range(len(parts))]

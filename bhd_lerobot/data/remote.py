@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bhd_lerobot.data import layout
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, TransferError
 
 CARD = "README.md"
 PICTURE = "preview.png"
@@ -29,7 +29,8 @@ class RemoteFile:
     Attributes:
         size: its bytes.
         digest: its checksum in hexadecimal; None if the place knows none.
-        algorithm: how the checksum is made: `sha256`, or `git`, the name that git gives to the content.
+        algorithm: how the checksum is made: `sha256`; `git`, the name that git gives to the content; or `xxh128`, which
+            takes a tenth of the time and finds damage, though no malice.
     """
 
     size: int
@@ -80,10 +81,10 @@ class Remote(Protocol):
         """Return the content of a small file; None if there is none."""
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
-        """Copy files into a folder. Those that it holds from an earlier attempt are not fetched again.
+        """Copy files into a folder, each of which is then the listed one, to the last byte.
 
         Raises:
-            TransferError: not all of them came; those that did are kept.
+            TransferError: not all of them came, or one came otherwise; those that came well are kept.
         """
 
     def send(self, items: Sequence[Item], deleted: Sequence[str], check: Callable[[], None]) -> None:
@@ -101,9 +102,14 @@ class Remote(Protocol):
 
 def digest(content: Path | bytes, algorithm: str) -> str:
     """Return the checksum of some content, as `RemoteFile` names them."""
+    hasher: Any
     if algorithm == "git":
         size = len(content) if isinstance(content, bytes) else content.stat().st_size
         hasher = hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
+    elif algorithm == "xxh128":
+        import xxhash
+
+        hasher = xxhash.xxh3_128()
     else:
         hasher = hashlib.sha256()
     if isinstance(content, bytes):
@@ -112,7 +118,28 @@ def digest(content: Path | bytes, algorithm: str) -> str:
         with open(content, "rb") as file:
             while chunk := file.read(_CHUNK):
                 hasher.update(chunk)
-    return hasher.hexdigest()
+    return str(hasher.hexdigest())
+
+
+def is_whole(path: Path, file: RemoteFile) -> bool:
+    """Return whether a file on this machine is the listed one; where no checksum is listed, its size decides."""
+    if not path.is_file() or path.stat().st_size != file.size:
+        return False
+    return file.digest is None or digest(path, file.algorithm) == file.digest
+
+
+def refuse_damaged(path: Path, file: RemoteFile, place: str, name: str) -> None:
+    """Remove a file that came otherwise than it was listed, and say so.
+
+    Raises:
+        TransferError: it did.
+    """
+    if not is_whole(path, file):
+        path.unlink(missing_ok=True)
+        raise TransferError(
+            f"Could not download {place}: {name} came otherwise than it was listed. It was changed meanwhile, or "
+            "damaged on the way."
+        )
 
 
 def is_url(place: str) -> bool:
@@ -163,6 +190,11 @@ def listed(names: Iterable[str], at_most: int = 3) -> str:
     names = sorted(names)
     more = f" and {len(names) - at_most} more" if len(names) > at_most else ""
     return f"{', '.join(names[:at_most])}{more}"
+
+
+def largest_first(paths: Iterable[str], files: Mapping[str, RemoteFile]) -> list[str]:
+    """Return paths so that no large file is left for the end, when the other threads have nothing to do."""
+    return sorted(paths, key=lambda path: (-files[path].size, path))
 
 
 def in_order(paths: Iterable[str]) -> list[str]:

@@ -9,13 +9,23 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock, to_json, write_errors
-from bhd_lerobot.data.remote import SUBSET, Remote, RemoteFile, digest, in_order, is_recorded, listed, megabytes, total
+from bhd_lerobot.data.remote import (
+    SUBSET,
+    Remote,
+    RemoteFile,
+    in_order,
+    is_recorded,
+    is_whole,
+    listed,
+    megabytes,
+    total,
+)
+from bhd_lerobot.data.remote_pool import run_all
 from bhd_lerobot.data.remote_subset import Subset, files_of, read_subset
 from bhd_lerobot.data.state import load_state
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError
@@ -96,8 +106,10 @@ class _Pull:
                 locks.append(RootLock(self._root))
             same = self._same(there)
             meta = [path for path in there if not is_recorded(path) or path.startswith("meta/")]
-            self._get(meta, there, same)
-            subset = self._wanted(select, there, same)
+            subset = None
+            if select is not None:
+                self._get(meta, there, same)
+                subset = self._wanted(select, there)
             wanted = {path for path in there if subset is None or path in subset.files or path in meta} | same
             self._get(sorted(wanted), there, same)
             whole = all(path in wanted for path in there if is_recorded(path))
@@ -182,20 +194,9 @@ class _Pull:
                 f"{megabytes(free)} free. Free some space, or name another --root."
             )
         self._remote.fetch(missing, staging)
-        whole = _compare(staging, missing, there)
-        torn = [path for path in missing if path not in whole]
-        for path in torn:
-            (staging / path).unlink(missing_ok=True)
-        if torn:
-            raise TransferError(
-                f"Could not download {self._remote.name}: {listed(torn)} came otherwise than they were listed. It was "
-                "changed meanwhile, or they were damaged on the way. Repeat."
-            )
         self._fetched += missing
 
-    def _wanted(self, select: Select | None, there: Mapping[str, RemoteFile], same: set[str]) -> Subset | None:
-        if select is None:
-            return None
+    def _wanted(self, select: Select, there: Mapping[str, RemoteFile]) -> Subset:
         try:
             chosen = {int(one) for one in select(self._staging)}
             files_of(self._staging, sorted(chosen))
@@ -235,16 +236,15 @@ class _Pull:
 
 
 def _compare(folder: Path, paths: Sequence[str], there: Mapping[str, RemoteFile]) -> set[str]:
-    """Return which files have the listed size and checksum; where no checksum is known, the size decides."""
+    """Return which files are the listed ones."""
+    found: set[str] = set()
 
-    def is_same(path: str) -> bool:
-        file, local = there[path], folder / path
-        if not local.is_file() or local.stat().st_size != file.size:
-            return False
-        return file.digest is None or digest(local, file.algorithm) == file.digest
+    def compare(path: str) -> None:
+        if is_whole(folder / path, there[path]):
+            found.add(path)
 
-    with ThreadPoolExecutor(_HASHERS) as pool:
-        return {path for path, same in zip(paths, pool.map(is_same, paths), strict=True) if same}
+    run_all(compare, paths, _HASHERS)
+    return found
 
 
 def _link(source: Path, target: Path) -> None:

@@ -4,19 +4,22 @@ Beside the dataset lies a list of its files with their checksums, because object
 the same by. `meta/info.json` is written last and removed first, so that there is either all of a dataset or none.
 """
 
+import contextlib
 import errno
 import json
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.data import layout
-from bhd_lerobot.data.remote import Item, RemoteFile, digest, in_order
+from bhd_lerobot.data.remote import Item, RemoteFile, digest, largest_first, refuse_damaged
+from bhd_lerobot.data.remote_pool import WORKERS, run_all
 from bhd_lerobot.errors import BhdError, ConfigError, TransferError
 
 MANIFEST = "bhd_files.json"
-"""The list of files with size and SHA-256; not a part of the dataset."""
+"""The list of files with size and checksum; not a part of the dataset."""
 
 _EXTRAS = {"s3": "lerobot_robot_bhd[s3]", "s3a": "lerobot_robot_bhd[s3]", "gs": "gcsfs", "gcs": "gcsfs"}
 _EXTRAS |= {"az": "adlfs", "abfs": "adlfs", "abfss": "adlfs", "sftp": "paramiko", "ssh": "paramiko"}
@@ -24,10 +27,11 @@ _EXTRAS |= {"az": "adlfs", "abfs": "adlfs", "abfss": "adlfs", "sftp": "paramiko"
 _FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", "webhdfs", "webdav", "dbfs"}
 """Where folders must be made first. To make the folder of an object store's object may mean to make a bucket."""
 
-_BATCH_BYTES = 64e6
-"""Bytes that are sent at once, after which the list is written: as much is sent again at most after a kill."""
+_NOTED_BYTES = 64e6
+"""Bytes that are sent before the list is written: about as much is sent again after a kill."""
 
-_BATCH_FILES = 64
+ALGORITHM = "xxh128"
+"""Checksum in the list of files."""
 
 
 class StoreDataset:
@@ -71,6 +75,8 @@ class StoreDataset:
             raise ConfigError(f"{url} cannot be used: {error}. Known protocols: {known}.") from error
         kinds = self._fs.protocol if isinstance(self._fs.protocol, tuple) else (self._fs.protocol,)
         self._has_folders = not _FOLDERS.isdisjoint(kinds)
+        # Others, such as FTP, have one connection for all threads.
+        self._workers = WORKERS if self._fs.async_impl or not {"file", "local", "memory"}.isdisjoint(kinds) else 1
         self._known: dict[str, RemoteFile] = {}
         self._there: dict[str, RemoteFile] = {}
 
@@ -106,20 +112,21 @@ class StoreDataset:
                 return None
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
-        """Copy files into a folder. Those that it holds whole from an earlier attempt are not fetched again.
+        """Copy files into a folder.
 
         Raises:
-            TransferError: not all of them came; those that did are kept.
+            TransferError: not all of them came, or one came otherwise; those that came well are kept.
         """
+
+        def fetch_one(path: str) -> None:
+            part = folder / f"{path}.part"
+            part.parent.mkdir(parents=True, exist_ok=True)
+            self._fs.get_file(self._at(path), str(part))
+            refuse_damaged(part, self._there[path], self.name, path)
+            part.replace(folder / path)
+
         with store_errors(self.name, "download"):
-            wanted = [path for path in paths if not (folder / path).is_file()]
-            for batch in _batches(wanted, lambda path: self._there[path].size):
-                parts = {path: folder / f"{path}.part" for path in batch}
-                for part in parts.values():
-                    part.parent.mkdir(parents=True, exist_ok=True)
-                self._fs.get([self._at(path) for path in batch], [str(part) for part in parts.values()])
-                for path, part in parts.items():
-                    part.replace(folder / path)
+            run_all(fetch_one, largest_first(paths, self._there), self._workers)
 
     def send(self, items: Sequence[Item], deleted: Sequence[str], check: Callable[[], None]) -> None:
         """Write files and remove others; the list of files after each batch, and `meta/info.json` last.
@@ -146,28 +153,46 @@ class StoreDataset:
                 self._write_manifest()
             if deleted:
                 self._fs.rm([self._at(path) for path in deleted])
-            for batch in _batches(in_order(by_path), lambda path: by_path[path].size):
-                self._put([by_path[path] for path in batch])
+            self._put(list(by_path.values()))
             check()
             if info is not None:
-                self._known[layout.INFO] = RemoteFile(info.size, digest(info.content, "sha256"))
+                self._known[layout.INFO] = _about(info)
                 self._write_manifest()
-                self._put([info], note=False)
+                self._put_one(info)
 
-    def _put(self, items: Sequence[Item], note: bool = True) -> None:
-        files = [item for item in items if isinstance(item.content, Path)]
-        sums = {item.path: RemoteFile(item.size, digest(item.content, "sha256")) for item in items} if note else {}
+    def _put(self, items: Sequence[Item]) -> None:
+        """Write files, and note those that arrived, now and then and at the end, also if one fails."""
+        if not items:
+            return
+        lock, unnoted = threading.Lock(), 0
+
+        def put(item: Item) -> None:
+            nonlocal unnoted
+            about = _about(item)
+            self._put_one(item)
+            with lock:
+                self._known[item.path] = about
+                unnoted += item.size
+                if unnoted > _NOTED_BYTES:
+                    unnoted = 0
+                    self._write_manifest()
+
         if self._has_folders:
             for folder in {self._at(item.path).rpartition("/")[0] for item in items}:
                 self._fs.makedirs(folder, exist_ok=True)
-        if files:
-            self._fs.put([str(item.content) for item in files], [self._at(item.path) for item in files])
-        for item in items:
-            if isinstance(item.content, bytes):
-                self._fs.pipe_file(self._at(item.path), item.content)
-        self._known |= sums
-        if note:
-            self._write_manifest()
+        try:
+            run_all(put, sorted(items, key=lambda item: (-item.size, item.path)), self._workers)
+        except Exception:
+            with contextlib.suppress(Exception):  # the first one tells more
+                self._write_manifest()
+            raise
+        self._write_manifest()
+
+    def _put_one(self, item: Item) -> None:
+        if isinstance(item.content, Path):
+            self._fs.put_file(str(item.content), self._at(item.path))
+        else:
+            self._fs.pipe_file(self._at(item.path), item.content)
 
     def _keep_info(self) -> Item:
         content = self._fs.cat_file(self._at(layout.INFO))
@@ -176,12 +201,15 @@ class StoreDataset:
     def _read_manifest(self) -> dict[str, RemoteFile]:
         try:
             listed = json.loads(self._fs.cat_file(self._at(MANIFEST)))
-            return {path: RemoteFile(int(one["size"]), str(one["sha256"])) for path, one in listed["files"].items()}
+            return {
+                path: RemoteFile(int(one["size"]), str(one[ALGORITHM]), ALGORITHM)
+                for path, one in listed["files"].items()
+            }
         except (ValueError, KeyError, TypeError, AttributeError):
             return {}  # a kill left half of it: nothing is known, so everything is compared by sending it again
 
     def _write_manifest(self) -> None:
-        listed = {path: {"size": one.size, "sha256": one.digest} for path, one in sorted(self._known.items())}
+        listed = {path: {"size": one.size, ALGORITHM: one.digest} for path, one in sorted(self._known.items())}
         self._fs.pipe_file(self._at(MANIFEST), json.dumps({"format": 1, "files": listed}, indent=1).encode())
 
     def _at(self, path: str) -> str:
@@ -237,14 +265,5 @@ def _matters(path: str) -> bool:
     return path.startswith(("data/", "videos/", "meta/"))
 
 
-def _batches(paths: Sequence[str], size: Callable[[str], int]) -> Iterator[list[str]]:
-    batch: list[str] = []
-    held = 0.0
-    for path in paths:
-        if batch and (held + size(path) > _BATCH_BYTES or len(batch) == _BATCH_FILES):
-            yield batch
-            batch, held = [], 0.0
-        batch.append(path)
-        held += size(path)
-    if batch:
-        yield batch
+def _about(item: Item) -> RemoteFile:
+    return RemoteFile(item.size, digest(item.content, ALGORITHM), ALGORITHM)

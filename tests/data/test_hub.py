@@ -491,7 +491,7 @@ def test_damage_on_the_way_is_noticed(hub: HubServer, root: Path, tmp_path: Path
     blob.content = bytes(broken)
     try:
         type(blob).sha256 = property(lambda one: listed if one is blob else honest.fget(one))  # type: ignore
-        with pytest.raises(TransferError, match="came otherwise than they were listed"):
+        with pytest.raises(TransferError, match="came otherwise than it was listed"):
             pull(HubDataset("me/d"), tmp_path / "e")
     finally:
         type(blob).sha256 = honest

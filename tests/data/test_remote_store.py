@@ -113,10 +113,10 @@ class Dying:
         return call
 
 
-@pytest.mark.parametrize("step", range(14))
+@pytest.mark.parametrize("step", range(10))
 def test_an_upload_that_dies_anywhere_shows_nothing_and_goes_on(root: Path, tmp_path: Path, monkeypatch, step) -> None:
     """At every write: no reader finds a dataset that is not whole, and the repetition sends what is missing."""
-    monkeypatch.setattr(remote_store, "_BATCH_FILES", 1)
+    monkeypatch.setattr(remote_store, "WORKERS", 1)
     memory = fsspec.filesystem("memory")
     memory.store.clear()
     old, target, url = tmp_path / "old", tmp_path / "e", "memory://b/d"
@@ -141,18 +141,10 @@ def test_an_upload_that_dies_anywhere_shows_nothing_and_goes_on(root: Path, tmp_
 
 
 def test_what_arrived_is_not_sent_again(root: Path, url: str, monkeypatch) -> None:
-    monkeypatch.setattr(remote_store, "_BATCH_FILES", 1)
+    monkeypatch.setattr(remote_store, "WORKERS", 1)
     first = StoreDataset(url)
-    put, sent = first._fs.put, []
-
-    def three(local: list[str], *args: object, **kwargs: object) -> object:
-        if len(sent) == 3:
-            raise ConnectionResetError("gone")
-        sent.extend(local)
-        return put(local, *args, **kwargs)
-
     with monkeypatch.context() as patch:
-        patch.setattr(first._fs, "put", three)
+        patch.setattr(first._fs, "put_file", Dying(3).wrap(first._fs.put_file))
         with pytest.raises(TransferError):
             push(root, first)
     report = push(root, StoreDataset(url))
@@ -161,19 +153,11 @@ def test_what_arrived_is_not_sent_again(root: Path, url: str, monkeypatch) -> No
 
 
 def test_a_download_that_dies_leaves_no_dataset_and_goes_on(root: Path, url: str, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(remote_store, "_BATCH_FILES", 1)
+    monkeypatch.setattr(remote_store, "WORKERS", 1)
     push(root, StoreDataset(url))
     source = StoreDataset(url)
-    get, fetched = source._fs.get, []
-
-    def some(remote: list[str], *args: object, **kwargs: object) -> object:
-        if len(fetched) == 4:
-            raise ConnectionResetError("gone")
-        fetched.extend(remote)
-        return get(remote, *args, **kwargs)
-
     with monkeypatch.context() as patch:
-        patch.setattr(source._fs, "get", some)
+        patch.setattr(source._fs, "get_file", Dying(4).wrap(source._fs.get_file))
         with pytest.raises(TransferError, match="cannot be reached"):
             pull(source, tmp_path / "e")
     assert not (tmp_path / "e").exists()
@@ -234,14 +218,14 @@ def test_some_episodes(root: Path, url: str, tmp_path: Path) -> None:
 
 def test_a_change_during_the_upload_is_not_shown(root: Path, monkeypatch) -> None:
     store = StoreDataset("memory://b/changed")
-    put = store._fs.put
+    put = store._fs.put_file
 
     def put_and_change(*args: object, **kwargs: object) -> object:
         (root / layout.STATS).write_text("{}")
         return put(*args, **kwargs)
 
     with monkeypatch.context() as patch:
-        patch.setattr(store._fs, "put", put_and_change)
+        patch.setattr(store._fs, "put_file", put_and_change)
         with pytest.raises(DatasetError, match="changed by another program"):
             push(root, store)
     assert layout.INFO not in StoreDataset("memory://b/changed").files()

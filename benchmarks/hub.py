@@ -1,0 +1,237 @@
+"""Speed of `bhd-data push` and `bhd-data pull` beside the bare clients: `python -m benchmarks.hub`.
+
+The same files go to the same server on this machine and come back: to a Hub, beside `upload_folder` and
+`snapshot_download`; and to an S3-compatible store and a folder, beside fsspec's `put` and `get`. Ours checks the
+dataset before, compares it with a snapshot after, knows what is there already, and verifies the checksum of every file
+that comes. They run in turns, each in a place of its own; the first of each is not counted. Both clients of the Hub use
+HTTP, without Xet. Cards are left out: the bare clients make none. A folder on this machine has no goal: the system
+copies files within its own memory, faster than anybody reads them for a checksum.
+"""
+
+import argparse
+import importlib.util
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from benchmarks._spread import ratios, spread, write
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.hub import HubDataset
+from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.data.remote_pull import pull
+from bhd_lerobot.data.remote_push import push
+from bhd_lerobot.data.remote_store import StoreDataset
+
+GOAL = 0.9  # of the speed of the bare client
+WIDTH = 512  # numbers in a frame
+
+SERVER = Path(__file__).resolve().parents[1] / "tests" / "hub_server.py"
+
+_MOTO = """
+import sys
+from moto.server import ThreadedMotoServer
+server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+server.start()
+print("http://%s:%s" % server.get_host_and_port(), flush=True)
+sys.stdin.read()
+"""
+
+type Turn = Callable[[Path, str], None]
+"""Moves a dataset: its folder here, and a name for a place of its own."""
+
+
+def record(root: Path, megabytes: int, files: int) -> int:
+    """Record random numbers, which no file format makes smaller, into some data files; return the bytes of all."""
+    layout.DATA_FILES_SIZE_IN_MB = max(1, megabytes // files)  # type: ignore[misc]
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (WIDTH,), "names": [f"s{i}.pos" for i in range(WIDTH)]},
+    }
+    rng = np.random.default_rng(0)
+    frames = 1000
+    with DatasetRecorder.create("bench/hub", 25, features, robot_type="none", root=root) as recorder:
+        for _ in range(max(1, round(megabytes * 1e6 / (frames * WIDTH * 4)))):
+            writer = recorder.begin_episode()
+            writer.set_columns({"observation.state": rng.random((frames, WIDTH), np.float32)})
+            recorder.save(writer, task="none", metadata={"outcome": "success"})
+    return sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
+
+
+def took(move: Turn, folder: Path, name: str) -> float:
+    """Return how long a move takes [s]."""
+    started = time.perf_counter()
+    move(folder, name)
+    return time.perf_counter() - started
+
+
+@contextmanager
+def child(*arguments: str) -> Iterator[str]:
+    """Run a server in a process of its own until the end of the block; yields the first line that it prints."""
+    process = subprocess.Popen(
+        [sys.executable, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@contextmanager
+def hub() -> Iterator[dict[str, Turn]]:
+    """Run a Hub on this machine; yields the moves."""
+    from huggingface_hub import HfApi, snapshot_download
+    from huggingface_hub.utils import disable_progress_bars
+
+    disable_progress_bars()
+
+    def bare_push(root: Path, name: str) -> None:
+        HfApi().create_repo(f"me/{name}", repo_type="dataset")
+        HfApi().upload_folder(repo_id=f"me/{name}", repo_type="dataset", folder_path=root)
+        HfApi().create_tag(f"me/{name}", tag="v3.0", repo_type="dataset")
+
+    def bare_pull(root: Path, name: str) -> None:
+        snapshot_download(f"me/{name}", repo_type="dataset", local_dir=root)
+
+    with child(str(SERVER)) as url, _load_server().real_client(url):
+        yield {
+            "push": lambda root, name: _nothing(push(root, HubDataset(f"me/{name}", create=True))),
+            "bare push": bare_push,
+            "pull": lambda root, name: _nothing(pull(HubDataset(f"me/{name}"), root)),
+            "bare pull": bare_pull,
+            "forget": lambda _, name: HfApi().delete_repo(f"me/{name}", repo_type="dataset"),
+        }
+
+
+@contextmanager
+def store(base: str) -> Iterator[dict[str, Turn]]:
+    """Move below a URL; yields the moves."""
+    from fsspec.core import url_to_fs  # type: ignore[import-untyped]
+
+    fs, path = url_to_fs(base)
+
+    def bare_push(root: Path, name: str) -> None:
+        fs.put(f"{root}/", f"{path}/{name}/", recursive=True)
+
+    def bare_pull(root: Path, name: str) -> None:
+        fs.get(f"{path}/{name}/", f"{root}/", recursive=True)
+
+    yield {
+        "push": lambda root, name: _nothing(push(root, StoreDataset(f"{base}/{name}"))),
+        "bare push": bare_push,
+        "pull": lambda root, name: _nothing(pull(StoreDataset(f"{base}/{name}"), root)),
+        "bare pull": bare_pull,
+        "forget": lambda _, name: fs.rm(f"{path}/{name}", recursive=True),
+    }
+
+
+@contextmanager
+def s3() -> Iterator[dict[str, Turn]]:
+    """Run an S3-compatible store on this machine; yields the moves."""
+    import fsspec  # type: ignore[import-untyped]
+
+    with child("-c", _MOTO) as url:
+        os.environ |= {
+            "AWS_ENDPOINT_URL": url,
+            "AWS_ACCESS_KEY_ID": "key",
+            "AWS_SECRET_ACCESS_KEY": "secret",
+            "AWS_DEFAULT_REGION": "us-east-1",
+        }
+        fsspec.filesystem("s3").mkdir("bench")
+        with store("s3://bench") as moves:
+            yield moves
+
+
+def measure(moves: dict[str, Turn], root: Path, folder: Path, turns: int) -> dict[str, list[float]]:
+    """Return how long each move took, turn by turn [s]; who begins alternates."""
+    times: dict[str, list[float]] = {"push": [], "bare push": [], "pull": [], "bare pull": []}
+    for turn in range(turns + 1):
+        for way in ("push", "pull"):
+            names = [way, f"bare {way}"]
+            for name in names if turn % 2 else reversed(names):
+                place = f"{name.split()[0] if name == way else 'bare'}{turn}".replace("pull", "push")
+                here = root if way == "push" else folder / f"{place}_here"
+                os.sync()  # what was written before is not paid for now
+                times[name].append(took(moves[name], here, place))
+                if way == "pull":
+                    _same(root, here)
+                    shutil.rmtree(here)
+        for place in (f"push{turn}", f"bare{turn}"):
+            moves["forget"](root, place)
+    return {name: values[1:] for name, values in times.items()}
+
+
+def _same(root: Path, here: Path) -> None:
+    for path in root.rglob("*.parquet"):
+        if (here / path.relative_to(root)).stat().st_size != path.stat().st_size:
+            raise AssertionError(f"{path} did not come whole")
+
+
+def _nothing(_: Any) -> None:
+    """Drop a result."""
+
+
+def _load_server() -> ModuleType:
+    # By its path: another distribution installs a package with the name `tests`.
+    spec = importlib.util.spec_from_file_location("hub_server", SERVER)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["hub_server"] = module  # dataclasses look for it
+    spec.loader.exec_module(module)
+    return module
+
+
+def main() -> int:
+    """Print what was measured; return 1 if the goal was missed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--megabytes", type=int, default=200)
+    parser.add_argument("--files", type=int, default=8, help="about so many data files")
+    parser.add_argument("--turns", type=int, default=7)
+    parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
+    options = parser.parse_args()
+    results: dict[str, Any] = {"goal": GOAL}
+    met = True
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folder = Path(name)
+        size = record(folder / "data", options.megabytes, options.files)
+        results["bytes"] = size
+        for place in ("hub", "s3", "folder"):
+            moves = stack.enter_context(
+                {"hub": hub, "s3": s3, "folder": lambda: store(f"file://{folder}/shelf")}[place]()
+            )
+            times = measure(moves, folder / "data", folder, options.turns)
+            for way in ("push", "pull"):
+                ours, bare = ([size / 1e6 / one for one in times[key]] for key in (way, f"bare {way}"))
+                share = spread(ratios(ours, bare))
+                results[f"{place}_{way}"] = {"mb_per_s": spread(ours), "bare_mb_per_s": spread(bare), "ratio": share}
+                has_goal = place != "folder"
+                met = met and (not has_goal or share["median"] >= GOAL)
+                print(
+                    f"{place:>6} {way}: {statistics.median(ours):6.0f} MB/s, the bare client "
+                    f"{statistics.median(bare):6.0f} MB/s; ratio {share['median']:.2f} "
+                    f"({share['low']:.2f} to {share['high']:.2f}){f', goal {GOAL}' if has_goal else ''}",
+                    flush=True,
+                )
+    results["met"] = met
+    write(options.json, results)
+    return int(not met)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
