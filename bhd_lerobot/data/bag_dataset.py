@@ -5,7 +5,11 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from bhd_lerobot.data.bag_tracks import TrackOptions
 from bhd_lerobot.data.recorder import DatasetRecorder
 
 
@@ -25,6 +29,62 @@ class ImportReport:
     frames: int = 0
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class RobotImport:
+    """What becomes of a bag.
+
+    Attributes:
+        robot_type: of the dataset.
+        task: the instruction.
+        fps: frames a second.
+        observation_names, action_names: of the dataset's numbers, in order.
+        tracks: how the bag is read.
+        max_speed: largest of each action [m/s, rad/s]; what is applied keeps to it.
+        max_age_s: age of the oldest reading beyond which a frame is late.
+        max_gap_s: silence of a sensor that ends an episode.
+        command_timeout_s: silence after which a command is no longer in force and the robot stands.
+        min_episode_s: shorter episodes are left out.
+        outcome: what the episodes ended with; None if nobody said.
+    """
+
+    robot_type: str
+    task: str
+    fps: int
+    observation_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+    tracks: TrackOptions
+    max_speed: tuple[float, ...]
+    max_age_s: float
+    max_gap_s: float
+    command_timeout_s: float
+    min_episode_s: float
+    outcome: str | None = None
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Topics by what they are read for."""
+        cameras = {f"camera/{name}": topic for name, topic in self.tracks.cameras.items()}
+        return {**self.tracks.topics, **cameras}
+
+    def identity(self) -> dict[str, Any]:
+        """Return what decides the episodes, JSON values. What a recording says of a simulation is not in it."""
+        tracks = self.tracks
+        return {
+            "imported": {
+                "format": "rosbag2",
+                "topics": self.topics,
+                "stamps": tracks.stamps,
+                "scan_frame": tracks.scan_frame,
+                "scan_yaw": tracks.scan_yaw,
+                "odom_frame": tracks.odom_frame,
+                "max_age_s": self.max_age_s,
+                "max_gap_s": self.max_gap_s,
+                "command_timeout_s": None if np.isinf(self.command_timeout_s) else self.command_timeout_s,
+                "min_episode_s": self.min_episode_s,
+            }
+        }
 
 
 @contextlib.contextmanager

@@ -12,62 +12,16 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.data import features as keys
-from bhd_lerobot.data.bag_dataset import ImportReport, all_or_nothing
+from bhd_lerobot.data.bag_dataset import ImportReport, RobotImport, all_or_nothing
 from bhd_lerobot.data.bag_images import decode_image
 from bhd_lerobot.data.bag_read import Bag, Picker
-from bhd_lerobot.data.bag_tracks import Track, TrackOptions, read_tracks, seconds
+from bhd_lerobot.data.bag_tracks import Track, read_tracks, seconds
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.data.resample import NANO, Grid, clock_jumps, grids, newest
 from bhd_lerobot.data.ros2_base import GYRO, ODOMETRY, TWIST
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.tasks.task import Event
-
-
-@dataclass(frozen=True)
-class RobotImport:
-    """What becomes of a bag.
-
-    Attributes:
-        robot_type: of the dataset.
-        task: the instruction.
-        fps: frames a second.
-        observation_names, action_names: of the dataset's numbers, in order.
-        tracks: how the bag is read.
-        max_speed: largest of each action [m/s, rad/s]; what is applied keeps to it.
-        max_age_s: age of the oldest reading beyond which a frame is late.
-        max_gap_s: silence of a sensor that ends an episode.
-        command_timeout_s: silence after which a command is no longer in force and the robot stands.
-        min_episode_s: shorter episodes are left out.
-        outcome: what the episodes ended with; None if nobody said.
-    """
-
-    robot_type: str
-    task: str
-    fps: int
-    observation_names: tuple[str, ...]
-    action_names: tuple[str, ...]
-    tracks: TrackOptions
-    max_speed: tuple[float, ...]
-    max_age_s: float
-    max_gap_s: float
-    command_timeout_s: float
-    min_episode_s: float
-    outcome: str | None = None
-
-    def identity(self) -> dict[str, Any]:
-        """Return what decides the episodes, JSON values."""
-        tracks = self.tracks
-        return {
-            "source": "rosbag2",
-            "robot": self.robot_type,
-            "fps": self.fps,
-            "stamps": tracks.stamps,
-            "topics": {**tracks.topics, **{f"camera/{name}": topic for name, topic in tracks.cameras.items()}},
-            "max_age_s": self.max_age_s,
-            "max_gap_s": self.max_gap_s,
-            "command_timeout_s": None if np.isinf(self.command_timeout_s) else self.command_timeout_s,
-        }
 
 
 def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wanted: RobotImport) -> ImportReport:
@@ -106,11 +60,11 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
             report.problems += bag.problems
             report.notes += [f"{bag.path.name}: {note}" for note in robot_bag.notes]
         if recorder is None:
+            sensors = ", ".join(topic for role, topic in wanted.topics.items() if role != "cmd")
             told = "; ".join([*report.notes, *report.problems])
             raise DatasetError(
                 f"No episode of {wanted.min_episode_s:g} s or more came out of {', '.join(str(b.path) for b in bags)}: "
-                f"there is no such time in which all of {', '.join(wanted.identity()['topics'].values())} but the "
-                f"commands were heard at least every {wanted.max_gap_s:g} s. {told}"
+                f"there is no such time in which {sensors} were heard at least every {wanted.max_gap_s:g} s. {told}"
             )
     return report
 

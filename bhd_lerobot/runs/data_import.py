@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.data.bag_dataset import ImportReport
+from bhd_lerobot.data.bag_dataset import ImportReport, RobotImport
 from bhd_lerobot.data.bag_read import Bag, find_bags
 from bhd_lerobot.data.bag_restore import is_ours, restore
-from bhd_lerobot.data.bag_robot import RobotImport, import_robot
+from bhd_lerobot.data.bag_robot import import_robot
 from bhd_lerobot.data.bag_tracks import TrackOptions
 from bhd_lerobot.data.ros2_types import require_rosbags
 from bhd_lerobot.errors import ConfigError, unknown_name
