@@ -395,7 +395,10 @@ def test_a_dataset_that_changes_is_noticed_and_read_again(tmp_path) -> None:
         assert "does not exist" in content.decode()
         record_ours(root, 3)
         assert (found := server.json("/api/stamp"))["now"] != found["shown"]
-        # An episode may have another number now: what the page shows must not be marked.
+        # An episode may have another number now: what the page shows is neither filled in with it nor marked.
+        status, _, content = server.ask("/api/episodes/0")
+        assert status == 409
+        assert "has changed on disk" in content.decode()
         status, content = server.mark(0, {"outcome": "success"})
         assert status == 409
         assert "has changed on disk" in content.decode()

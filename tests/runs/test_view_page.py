@@ -224,6 +224,12 @@ def test_filters_search_and_sorting(browser, filmed) -> None:
         page.wait_for_selector(".card-a[data-episode='1']")
         assert numbers(page, ".row[aria-selected=true]") == [1]
         assert page.get_attribute("#list", "aria-activedescendant") == "episode-1"
+        # Keys that come faster than episodes are not lost.
+        fire = "(key) => document.dispatchEvent(new KeyboardEvent('keydown', {key}))"
+        page.evaluate(
+            f"() => {{ for (const key of ['ArrowDown', 'ArrowDown', 'ArrowDown', 'ArrowUp']) ({fire})(key); }}"
+        )
+        page.wait_for_selector(".card-a[data-episode='3']")
 
 
 def test_two_episodes_side_by_side(browser, base) -> None:

@@ -88,6 +88,13 @@ class ViewedDataset:
                 self._content = self._read()
                 self._packed.clear()
 
+    def _check_unchanged(self) -> None:
+        if stamp_of(self.root) != self._content.stamp:
+            raise DatasetError(
+                f"{self.root} has changed on disk since it was read, so an episode may have another number now. "
+                "Load it again."
+            )
+
     def summary(self) -> dict[str, Any]:
         """Return what the page knows of all episodes, column by column."""
         return self._content.summary
@@ -96,12 +103,13 @@ class ViewedDataset:
         """Return an episode as `packing` makes bytes of it.
 
         Raises:
-            DatasetError: there is no such episode.
+            DatasetError: there is no such episode, or the dataset has changed on disk.
             DatasetCorruptError: its file cannot be read.
         """
         content = self._content
         key = (content.stamp, index)
         with self._lock:  # one reader at a time: two processors are not made faster by ten
+            self._check_unchanged()
             if key in self._packed:
                 self._packed.move_to_end(key)
                 return self._packed[key]
@@ -120,11 +128,7 @@ class ViewedDataset:
             DatasetError: there is no such episode, or the dataset cannot be changed; it is as it was.
         """
         with self._lock:
-            if stamp_of(self.root) != self._content.stamp:
-                raise DatasetError(
-                    f"{self.root} has changed on disk since it was read, so an episode may have another number now. "
-                    "Load it again, and mark then."
-                )
+            self._check_unchanged()
             mark_episode(self.root, index, wanted)
             self._content = self._read()
             self._packed.clear()
@@ -140,7 +144,7 @@ class ViewedDataset:
         """Return the picture of a camera whose images lie in the data files, or None if there is no such picture.
 
         Raises:
-            DatasetError: there is no such episode.
+            DatasetError: there is no such episode, or the dataset has changed on disk.
             DatasetCorruptError: its file cannot be read.
         """
         feature = self.state.info["features"].get(key)
@@ -148,6 +152,7 @@ class ViewedDataset:
         if feature is None or feature["dtype"] != "image" or not 0 <= frame < row["length"]:
             return None
         with self._lock:
+            self._check_unchanged()
             stored = _table(self.state, row, [key])[key][frame].as_py() or {}
         if stored.get("bytes"):
             return bytes(stored["bytes"])

@@ -12,14 +12,22 @@ import { startTheme } from "./theme.js";
 import { startTimeline } from "./timeline.js";
 import { startViews } from "./views.js";
 
+const PAUSE_MS = 80;
 const LOOK_MS = 2000; // between two looks at whether the dataset has changed
 let before = null; // the episode that was selected before this one
 let refusal = null; // why the changed dataset could not be read
+let loading = 0; // requests that are under way
 let wanted = 0; // number of the newest request, so that a slow answer does not replace a newer one
 
 async function select(index, { compare = undefined, time = 0 } = {}) {
   if (index === undefined || index >= state.dataset.episodes.frames.length) return;
   const mine = ++wanted;
+  state.aimed = index;
+  emit("aimed");
+  scrollTo(index);
+  if (loading > 0) await new Promise((done) => setTimeout(done, PAUSE_MS)); // a key that is held down loads the last one
+  if (mine !== wanted) return;
+  loading++;
   const other = compare === undefined ? state.b?.index ?? null : compare;
   try {
     const { stamp } = state.dataset;
@@ -31,18 +39,22 @@ async function select(index, { compare = undefined, time = 0 } = {}) {
     state.time = time;
     emit("episodes");
     seek(time);
-    scrollTo(index);
     remember();
     preload(stamp);
   } catch (error) {
     toast(error.message, true);
+    if (mine !== wanted) return;
+    state.aimed = state.a?.index ?? null;
+    emit("aimed");
+  } finally {
+    loading--;
   }
 }
 
 // What comes next is there when it is asked for.
 function preload(stamp) {
   const next = neighbour(1);
-  if (next !== undefined && next !== state.a.index) loadEpisode(next, stamp).catch(() => {});
+  if (next !== undefined && next !== state.aimed) loadEpisode(next, stamp).catch(() => {});
 }
 
 function choose(index, isCompared) {
@@ -53,7 +65,7 @@ function choose(index, isCompared) {
 function toggleCompare() {
   if (state.b) return endCompare();
   const count = state.dataset.episodes.frames.length;
-  const other = before !== null && before !== state.a.index && before < count ? before : neighbour(neighbour(1) === state.a.index ? -1 : 1);
+  const other = before !== null && before !== state.a.index && before < count ? before : neighbour(neighbour(1) === state.aimed ? -1 : 1);
   if (other === state.a.index) return toast("There is no other episode to compare with.");
   select(state.a.index, { compare: other, time: state.time });
 }

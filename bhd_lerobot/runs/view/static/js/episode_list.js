@@ -25,11 +25,12 @@ export function startList(onChoose) {
   new ResizeObserver(draw).observe(byId("list"));
   on("dataset", () => { drawChips(); refresh(); });
   on("episodes", draw);
+  on("aimed", draw);
 }
 
 // Return the episode that is some rows below the selected one, or the first one if none is selected.
 export function neighbour(rows) {
-  const at = order.indexOf(state.a?.index);
+  const at = order.indexOf(state.aimed);
   if (at < 0) return order[0];
   return order[Math.min(order.length - 1, Math.max(0, at + rows))];
 }
@@ -86,7 +87,7 @@ function draw() {
   const rows = [];
   for (let place = first; place < last; place++) rows.push(row(order[place], place));
   byId("list-space").replaceChildren(...rows);
-  const selected = state.a && order.slice(first, last).includes(state.a.index) ? `episode-${state.a.index}` : null;
+  const selected = order.slice(first, last).includes(state.aimed) ? `episode-${state.aimed}` : null;
   if (selected) list.setAttribute("aria-activedescendant", selected);
   else list.removeAttribute("aria-activedescendant");
 }
@@ -103,7 +104,7 @@ function row(index, place) {
   }, "compare");
   return make("div", {
     id: `episode-${index}`, class: `row${state.b?.index === index ? " compared" : ""}`, role: "option",
-    "aria-selected": `${state.a?.index === index}`, "data-episode": `${index}`, "data-outcome": outcome[index],
+    "aria-selected": `${state.aimed === index}`, "data-episode": `${index}`, "data-outcome": outcome[index],
     style: { top: `${place * ROW}px`, "--colour": outcomeColour(outcome[index]) },
     onclick: (event) => choose(index, event.shiftKey || event.ctrlKey || event.metaKey),
   },

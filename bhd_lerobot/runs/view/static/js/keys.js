@@ -32,12 +32,12 @@ export function startKeys({ move, compare }) {
   };
   document.addEventListener("keydown", (event) => {
     if (byId("dialog").open || event.ctrlKey || event.metaKey || event.altKey) return;
-    const isTyping = event.target.matches("input, textarea, select");
+    const isTyping = event.target.matches?.("input, textarea, select");
     if (isTyping) {
       if (event.key === "Escape") event.target.blur();
       if (!(event.target.id === "search" && ["ArrowUp", "ArrowDown"].includes(event.key))) return;
     }
-    if (event.key === " " && event.target.matches("button, summary")) return; // it presses what has the focus
+    if (event.key === " " && event.target.matches?.("button, summary")) return; // it presses what has the focus
     const action = actions[event.key];
     if (!action || (!state.a && !["?", "/", "ArrowDown", "ArrowUp"].includes(event.key))) return;
     event.preventDefault();

@@ -3,6 +3,7 @@
 export const state = {
   dataset: null, // what /api/dataset says
   a: null, // the selected episode, as `loadEpisode` returns it
+  aimed: null, // number of the episode that is being loaded, or is: keys may be faster than the disk
   b: null, // the one that it is compared with
   time: 0, // [s] since the start of both
   playing: false,
