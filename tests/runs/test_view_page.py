@@ -150,10 +150,11 @@ def test_everything_moves_together(browser, base) -> None:
 
 def test_playing_goes_on_to_the_end_and_stops(browser, base) -> None:
     with served(base) as server, opened(browser, server) as page:
-        page.keyboard.press("3")
-        assert page.get_attribute("[data-rate='2']", "aria-pressed") == "true"
+        page.keyboard.press("1")
         page.keyboard.press(" ")
         assert page.get_attribute("#play", "aria-label") == "Pause"
+        page.keyboard.press("3")
+        assert page.get_attribute("[data-rate='2']", "aria-pressed") == "true"
         wait_until(page, "document.querySelector('video').currentTime > 0.3")
         wait_until(page, "document.querySelector('#play').getAttribute('aria-label') === 'Play'")
         assert shown_frames(page)["drawing"] == {19}
