@@ -120,6 +120,11 @@ class HubDataset:
             TransferError: not all was uploaded. What was is not sent again, and nobody sees it before all of it is.
         """
         with hub_errors(self.name, "upload the dataset to", revision=self.revision):
+            found = self._commit_of(self._tag)
+            if found is not None and (items or deleted or found != self.commit):
+                raise TransferError(
+                    f"{self.name} has a tag {self._tag!r} already, which stands for something else. Choose another."
+                )
             if items or deleted:
                 self._commit(items, deleted, check)
             if self._branch == MAIN:
@@ -192,9 +197,12 @@ class HubDataset:
             parent = info.oid
         self.commit = parent
 
+    def _commit_of(self, tag: str | None) -> str | None:
+        return next((one.target_commit for one in self._list_refs().tags if one.name == tag), None)
+
     def _set_tag(self, tag: str) -> None:
         """Let a tag point at the pushed commit. A tag cannot be moved, so it is gone for a moment, as with LeRobot."""
-        found = next((one.target_commit for one in self._list_refs().tags if one.name == tag), None)
+        found = self._commit_of(tag)
         if found == self.commit:
             return
         api = self._api

@@ -49,6 +49,7 @@ class PullReport:
         fetched: files that were fetched.
         fetched_bytes: their bytes.
         kept: files that were there already.
+        problem: why the dataset is not sound, as it is not where it came from either; empty if it is.
     """
 
     root: Path
@@ -58,6 +59,7 @@ class PullReport:
     fetched: list[str]
     fetched_bytes: int
     kept: int
+    problem: str = ""
 
 
 def pull(remote: Remote, root: Path | str, *, select: Select | None = None, replace: bool = False) -> PullReport:
@@ -74,7 +76,7 @@ def pull(remote: Remote, root: Path | str, *, select: Select | None = None, repl
 
     Raises:
         DatasetExistsError: there is another dataset at `root`, or a changed one, and `replace` is false.
-        DatasetError: the remote dataset is not sound, or has none of the wanted episodes.
+        DatasetError: the remote dataset has another format, or none of the wanted episodes.
         DatasetLockedError: `root` is being recorded, repaired or pulled by another process.
         DatasetWriteError: this disk refuses the files.
         TransferError: not all of it came; what did is kept, and the next attempt goes on with it.
@@ -118,6 +120,12 @@ class _Pull:
             else:
                 shutil.rmtree(self._staging)
             info = json.loads((self._root / layout.INFO).read_bytes())
+            problem = ""
+            if whole:
+                try:
+                    load_state(self._root)
+                except DatasetError as error:
+                    problem = str(error)
             return PullReport(
                 root=self._root,
                 episodes=None if subset is None else subset.episodes,
@@ -126,6 +134,7 @@ class _Pull:
                 fetched=in_order(self._fetched),
                 fetched_bytes=total(there[path] for path in self._fetched),
                 kept=len(wanted) - len(self._fetched),
+                problem=problem,
             )
         except (ConfigError, DatasetError):
             if is_new:  # refused: there is nothing to go on with
@@ -148,8 +157,23 @@ class _Pull:
         for path in there:
             if path.startswith("/") or ".." in PurePosixPath(path).parts:
                 raise TransferError(f"{name} has a file {path!r}, which would lie outside of the dataset.")
+        self._refuse_other_format()
         hidden = {path for path in there if path.startswith(".") or path == SUBSET}
         return {path: file for path, file in there.items() if path not in hidden}
+
+    def _refuse_other_format(self) -> None:
+        """Say so before everything is fetched."""
+        name = self._remote.name
+        try:
+            version = json.loads(self._remote.read(layout.INFO) or b"")["codebase_version"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise DatasetError(
+                f"{name} is no LeRobot dataset: its {layout.INFO} cannot be read ({error!r})."
+            ) from error
+        if not str(version).startswith("v3."):
+            raise DatasetError(
+                f"{name} has dataset format {version}; this program reads v3.x. Convert it with LeRobot."
+            )
 
     def _same(self, there: Mapping[str, RemoteFile]) -> set[str]:
         """Return what need not be fetched because `root` has it; refuse a root that holds something else."""
@@ -219,9 +243,7 @@ class _Pull:
         root, staging = self._root, self._staging
         shutil.rmtree(staging / ".cache", ignore_errors=True)
         _remove_others(staging, wanted)
-        if subset is None:
-            load_state(staging)
-        else:
+        if subset is not None:
             about = {"source": self._remote.name, "episodes": subset.episodes}
             (staging / SUBSET).write_bytes(to_json(about))
         if root.is_dir() and any(root.iterdir()):

@@ -1,13 +1,14 @@
 """Copy a dataset to the Hub or below a URL: what differs, and nothing else."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.card import is_generated
-from bhd_lerobot.data.remote import CARD, PICTURE, Item, Remote, is_recorded, total
+from bhd_lerobot.data.remote import CARD, PICTURE, Item, Remote, RemoteFile, is_recorded, total
 from bhd_lerobot.data.remote_local import LocalDataset, open_local
+from bhd_lerobot.data.remote_pool import run_all
 from bhd_lerobot.data.state import DatasetState
 from bhd_lerobot.errors import DatasetError
 
@@ -76,7 +77,7 @@ def push(
         cards, kept_card = _cards(local, remote, make_card, replace_card, is_there=CARD in there)
         items = [item for item in local.items if item.path not in (CARD, PICTURE)] + cards
         try:
-            changed = [item for item in items if not item.is_like(there.get(item.path))]
+            changed = _changed(items, there)
         except OSError as error:
             raise DatasetError(f"{root} cannot be read: {error}.") from error
         wanted = {item.path for item in items}
@@ -93,6 +94,17 @@ def push(
             left_out=local.left_out,
             kept_card=kept_card,
         )
+
+
+def _changed(items: Sequence[Item], there: Mapping[str, RemoteFile]) -> list[Item]:
+    same: set[str] = set()
+
+    def compare(item: Item) -> None:
+        if item.is_like(there.get(item.path)):
+            same.add(item.path)
+
+    run_all(compare, items)
+    return [item for item in items if item.path not in same]
 
 
 def _cards(

@@ -81,8 +81,8 @@ def draw(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, str] | No
     for picture in (_camera, _ways, _curves):
         try:
             drawn = picture(summary, state)
-        except BhdError:
-            continue  # of a robot that this version does not know, for example: the next kind of picture
+        except (BhdError, KeyError, IndexError, ValueError):
+            continue  # of a robot that this version does not know, or knows otherwise: the next kind of picture
         if drawn is not None:
             return drawn
     return None

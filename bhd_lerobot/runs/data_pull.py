@@ -55,7 +55,7 @@ def _run(options: argparse.Namespace) -> int:
             again=again,
         )
     print(tell(report, source))
-    return 0
+    return 1 if report.problem else 0
 
 
 def pull_dataset(
@@ -118,6 +118,8 @@ def tell(report: "PullReport", source: str) -> str:
             f"    bhd-train --dataset.repo_id={name} --dataset.root={report.root} --dataset.episodes="
             f'"{report.episodes if len(report.episodes) <= 20 else "[...]"}"',
         ]
+    if report.problem:
+        lines.append(f"  it came as it is there, and is not sound: {report.problem}")
     return "\n".join(lines)
 
 

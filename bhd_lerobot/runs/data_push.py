@@ -1,6 +1,7 @@
 """`bhd-data push`: a dataset to the Hub, or below a URL."""
 
 import argparse
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -108,7 +109,8 @@ def push_dataset(
         from bhd_lerobot.runs.data_card import CardOptions, make_card
 
         named = None if is_url(target) else target
-        return make_card(state, CardOptions(named, "" if named else target, licence, tags))
+        shown = re.sub(r"//[^/@]*@", "//", target)  # without a password
+        return make_card(state, CardOptions(named, "" if named else shown, licence, tags))
 
     again = again or push_command(root, target, private=private is True, tags=tags)
     quiet_bars()

@@ -61,16 +61,19 @@ def prompt_interrupt(stopped: str) -> Iterator[None]:
         stopped: what is left, and how to go on; told if the process ends here. Whoever catches the `KeyboardInterrupt`
             tells it otherwise.
     """
-    if threading.current_thread() is not threading.main_thread():
+    is_hosted = hasattr(sys, "ps1") or "ipykernel" in sys.modules  # by a shell or a notebook, which goes on
+    if is_hosted or threading.current_thread() is not threading.main_thread():
         yield
         return
     former = signal.getsignal(signal.SIGINT)
+    timer: threading.Timer | None = None
 
     def leave() -> None:
         print(f"\nStopped; {stopped}.", file=sys.stderr, flush=True)
         os._exit(130)
 
     def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal timer
         signal.signal(signal.SIGINT, former)
         timer = threading.Timer(PATIENCE_S, leave)
         timer.daemon = True
@@ -82,6 +85,8 @@ def prompt_interrupt(stopped: str) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, former)
+        if timer is not None:
+            timer.cancel()  # all threads have ended
 
 
 def quiet_bars() -> None:

@@ -529,3 +529,30 @@ def test_loading_by_name_says_what_is_wrong(hub: HubServer, root: Path, tmp_path
         local_metadata("me/d", tmp_path / "e", revision="old")
     with pytest.raises(ConfigError, match="does not say which"):
         local_metadata("me/d", root, revision="main")
+
+
+def test_a_tag_of_a_release_does_not_move(hub: HubServer, root: Path) -> None:
+    push(root, HubDataset("me/d", create=True, tag="one"))
+    push(root, HubDataset("me/d", create=True, tag="one"))  # the same again
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+    with pytest.raises(TransferError, match="has a tag 'one' already"):
+        push(root, HubDataset("me/d", create=True, tag="one"))
+    assert stored(hub) == stored(hub, "one") != content(root)
+
+
+def test_what_is_not_sound_there_comes_as_it_is_and_that_is_said(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    files = dict(hub.dataset("me/d").files())
+    lost = next(path for path in files if path.startswith("videos/"))
+    del files[lost]
+    commit = hub.dataset("me/d").add("torn", files)
+    report = pull(HubDataset("me/d", commit), tmp_path / "e")
+    assert lost in report.problem
+    blob = files[layout.INFO]
+    files[layout.INFO] = type(blob)(blob.content.replace(b"v3.0", b"v2.1"), lfs=False)
+    hub.dataset("me/d").add("old", files)
+    hub.reset()
+    with pytest.raises(DatasetError, match=r"format v2\.1"):
+        pull(HubDataset("me/d", "old"), tmp_path / "f")
+    assert not hub.asked("GET .*/resolve/.*/data/")  # said before everything was fetched
