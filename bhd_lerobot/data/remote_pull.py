@@ -107,6 +107,8 @@ class _Pull:
             if self._root.is_dir():
                 locks.append(RootLock(self._root))
             same = self._same(there)
+            if layout.INFO not in same:
+                self._refuse_other_format()
             meta = [path for path in there if not is_recorded(path) or path.startswith("meta/")]
             subset = None
             if select is not None:
@@ -157,7 +159,6 @@ class _Pull:
         for path in there:
             if path.startswith("/") or ".." in PurePosixPath(path).parts:
                 raise TransferError(f"{name} has a file {path!r}, which would lie outside of the dataset.")
-        self._refuse_other_format()
         hidden = {path for path in there if path.startswith(".") or path == SUBSET}
         return {path: file for path, file in there.items() if path not in hidden}
 
