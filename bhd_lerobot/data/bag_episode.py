@@ -1,14 +1,14 @@
 """An episode of a dataset as topics of a bag: what is said of it, its columns, and what is there to look at."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.data import bag_checksum, layout
 from bhd_lerobot.data import features as keys
-from bhd_lerobot.data import layout
 from bhd_lerobot.data import ros2_types as types
 from bhd_lerobot.data import ros2_views as views
 from bhd_lerobot.data.bag_images import COMPRESSED, IMAGE, encode_image, film_frames
@@ -26,7 +26,7 @@ from bhd_lerobot.data.ros2_parts import (
     own_topic,
     stamp_tree,
 )
-from bhd_lerobot.data.ros2_split import parts_of
+from bhd_lerobot.data.ros2_split import check_topics, parts_of
 from bhd_lerobot.data.schema import DEFAULT_FEATURES, LANGUAGE
 from bhd_lerobot.data.state import DatasetState, Row, slot_of
 from bhd_lerobot.errors import UnsupportedDatasetError
@@ -72,7 +72,7 @@ class EpisodeTopics:
         self._robot = str(state.info.get("robot_type") or "")
         self._next_start = round(start_s * NANO)
         self._parts = {key: self._parts_of(key) for key in self._features}
-        _check_topics(part for parts in self._parts.values() for part in parts)
+        check_topics(part for parts in self._parts.values() for part in parts)
         self.custom = {"bhd_format": str(types.FORMAT), "bhd_repo_id": repo_id, "bhd_robot_type": self._robot}
 
     def _parts_of(self, key: str) -> list[Part]:
@@ -108,7 +108,7 @@ class EpisodeTopics:
         self._next_start = int(ended[-1]) + _PAUSE_NS
         index = np.arange(n)
         at_start, at_end = Frames(episode, index, observed), Frames(episode, index, ended)
-        streams = [Stream(EPISODE_TOPIC, types.EPISODE, [(start, self._episode(row, start))], latched=True)]
+        streams = [Stream(EPISODE_TOPIC, types.EPISODE, [(start, self._episode(row, columns, start))], latched=True)]
         if still := views.static_transforms(self._view.frames, start):
             streams.append(Stream("/tf_static", views.TF, [(start, still[0])], latched=True))
         for key, parts in self._parts.items():
@@ -162,7 +162,7 @@ class EpisodeTopics:
             streams.append(_stream(f"/{camera}/camera_info", views.CAMERA_INFO, frames, told))
         return streams
 
-    def _episode(self, row: Row, start: int) -> bytes:
+    def _episode(self, row: Row, columns: Mapping[str, NDArray[Any]], start: int) -> bytes:
         identity = self._state.identity or {}
         metadata = {name.removeprefix(PREFIX): value for name, value in row.items() if name.startswith(PREFIX)}
         topics = [
@@ -170,7 +170,7 @@ class EpisodeTopics:
             for key, parts in self._parts.items()
             for part in parts
         ]
-        fields = {
+        fields: dict[str, Any] = {
             "stamp": stamp_tree(np.array([start])),
             "format": types.FORMAT,
             "repo_id": self._repo_id,
@@ -185,7 +185,9 @@ class EpisodeTopics:
             "recording": json.dumps(identity.get("recording", {})),
             "video": json.dumps(identity.get("video", {})),
             "topics": json.dumps(topics),
+            "checksums": json.dumps({key: bag_checksum.of_column(values) for key, values in columns.items()}),
         }
+        fields["checksum"] = bag_checksum.of_texts(fields)
         return encode(types.EPISODE, fields, 1)[0]
 
 
@@ -197,17 +199,6 @@ def camera_name(key: str) -> str:
 def image_topic(key: str, *, compressed: bool) -> str:
     """Return the topic of a camera's pictures."""
     return f"/{camera_name(key)}/image_raw" + ("/compressed" if compressed else "")
-
-
-def _check_topics(parts: Iterable[Part]) -> None:
-    seen: set[str] = set()
-    for part in parts:
-        if part.topic in seen:
-            raise UnsupportedDatasetError(
-                f"Two features would share the topic {part.topic}, because their names differ only in characters that "
-                "no topic may have. Rename one."
-            )
-        seen.add(part.topic)
 
 
 def _split(

@@ -44,7 +44,7 @@ def the_frame(topic: str, frames: Sequence[str]) -> str:
     """
     names, counts = np.unique(np.array(frames, dtype=str), return_counts=True)
     if len(names) > 1:
-        found = ", ".join(f"{name!r} in {count} messages" for name, count in zip(names, counts, strict=True))
+        found = ", ".join(f"{str(name)!r} in {count} messages" for name, count in zip(names, counts, strict=True))
         raise DatasetError(
             f"{topic} has messages in several frames: {found}. They come from several sensors or robots; make a bag "
             "of one of them."

@@ -4,7 +4,7 @@ import contextlib
 import re
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,7 @@ class Bag:
                 counts = {}
                 for channel, *_ in file.messages():
                     counts[channel] = counts.get(channel, 0) + 1
+                self._note(file.problems)
             for number, (name, msgtype, serialisation) in file.channels.items():
                 if serialisation not in ("cdr", "") and counts.get(number):
                     raise DatasetError(
@@ -124,11 +125,14 @@ class Bag:
             problems += file.problems
         if self.expected is not None and total < self.expected and not problems:
             problems.append(f"{self.path.name}: its metadata count {self.expected} messages; it has {total}")
-        self.problems = [*self.problems, *(problem for problem in problems if problem not in self.problems)]
+        self._note(problems)
         return {
             name: Messages(np.array(times[name], np.int64), np.array(order[name], np.int64), data[name])
             for name in times
         }
+
+    def _note(self, problems: Iterable[str]) -> None:
+        self.problems += [problem for problem in problems if problem not in self.problems]
 
     def payloads(self, topic: str) -> Iterator[bytes]:
         """Yield the whole messages of a topic, in the order in which `read` has them."""

@@ -8,19 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.data import bag_checksum
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data import ros2_types as types
 from bhd_lerobot.data.bag_dataset import ImportReport, all_or_nothing
 from bhd_lerobot.data.bag_episode import (
-    EPISODE_TOPIC,
     OUTCOME_COLUMNS,
     OUTCOME_TOPIC,
     STATE_COLUMNS,
     STATE_TOPIC,
     image_topic,
 )
+from bhd_lerobot.data.bag_headers import REMEDY, episode_headers
 from bhd_lerobot.data.bag_images import COMPRESSED, IMAGE, decode_image
-from bhd_lerobot.data.bag_read import Bag, Picker, Topic
+from bhd_lerobot.data.bag_read import Bag, Picker
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.data.ros2_base import BareTwistPart, ScanPart
@@ -32,13 +33,6 @@ from bhd_lerobot.data.video import VideoSettings
 from bhd_lerobot.errors import DatasetError, DatasetMismatchError
 
 _SAME = ("robot_type", "fps", "features", "recording", "video")
-_REMEDY = "Export it again, or import it as a bag of a real robot, with --resample."
-
-
-def is_ours(topics: Mapping[str, Topic]) -> bool:
-    """Return whether a bag holds episodes that `bag_export` wrote."""
-    topic = topics.get(EPISODE_TOPIC)
-    return topic is not None and topic.msgtype == types.EPISODE and topic.count > 0
 
 
 def restore(bags: Sequence[Bag], root: Path | str | None, repo_id: str) -> ImportReport:
@@ -98,7 +92,7 @@ class _BagEpisodes:
     def __init__(self, bag: Bag) -> None:
         self._bag = bag
         self._topics = bag.topics()
-        self._episodes = _headers(bag)
+        self._episodes = episode_headers(bag)
         wanted = {STATE_TOPIC, OUTCOME_TOPIC}
         images: set[str] = set()
         for episode in self._episodes:
@@ -140,6 +134,14 @@ class _BagEpisodes:
                 columns[key] = self._vector(feature, parts, at)
             elif feature["dtype"] in ("string", "language") and key != keys.SUBTASK:
                 columns[key] = self._texts(key, observed)
+        changed = [
+            key for key, values in columns.items() if bag_checksum.of_column(values) != episode["checksums"][key]
+        ]
+        if changed:
+            raise DatasetError(
+                f"{self._bag.path}: {changed[0]} of episode {episode['episode_index']} is not what was exported: its "
+                f"checksum is wrong, so the bag is damaged or was changed. {REMEDY}"
+            )
         writer = recorder.begin_episode()
         try:
             writer.set_columns(columns)
@@ -182,7 +184,7 @@ class _BagEpisodes:
         damage = f" ({'; '.join(self._bag.problems)})" if self._bag.problems else ""
         return DatasetError(
             f"{self._bag.path} was written by bhd-data export, but {topic} lacks {missing} of {frames} messages of an "
-            f"episode{damage}. {_REMEDY}"
+            f"episode{damage}. {REMEDY}"
         )
 
     def _places(
@@ -243,42 +245,8 @@ class _BagEpisodes:
             if topic in self._topics and self._topics[topic].msgtype == msgtype:
                 return topic
         raise DatasetError(
-            f"{self._bag.path} has no pictures for {key}: {image_topic(key, compressed=False)} is missing. {_REMEDY}"
+            f"{self._bag.path} has no pictures for {key}: {image_topic(key, compressed=False)} is missing. {REMEDY}"
         )
-
-
-def _headers(bag: Bag) -> list[dict[str, Any]]:
-    """Return what is said of each episode of a bag, in the order of time."""
-    messages = bag.read([EPISODE_TOPIC])[EPISODE_TOPIC].data
-    plain = ("robot_type", "fps", "episode_index", "frames", "task", "format", "stamp.sec", "stamp.nanosec")
-    structured = ("features", "metadata", "metadata_types", "recording", "video", "topics")
-    episodes = []
-    for message in messages:
-        found = {path: values[0] for path, values in decode(types.EPISODE, [message], (*plain, *structured)).items()}
-        if found["format"] != types.FORMAT:
-            raise DatasetError(
-                f"{bag.path} was written with version {found['format']} of our messages; this program reads version "
-                f"{types.FORMAT}. Use the version of bhd_lerobot that wrote it."
-            )
-        try:
-            found |= {key: json.loads(found[key]) for key in structured}
-        except ValueError as error:
-            raise DatasetError(f"{bag.path}: what {EPISODE_TOPIC} says is no JSON: {error}.") from error
-        found |= {key: int(found[key]) for key in ("fps", "episode_index", "frames")}
-        found["metadata"] = _complete(found["metadata"], found["metadata_types"])
-        episodes.append({**found, "start": int(found["stamp.sec"]) * NANO + int(found["stamp.nanosec"])})
-    episodes.sort(key=lambda episode: episode["start"])
-    starts = [episode["start"] for episode in episodes[1:]] + [np.iinfo(np.int64).max]
-    return [{**episode, "next_start": start} for episode, start in zip(episodes, starts, strict=True)]
-
-
-def _complete(metadata: Mapping[str, Any], kinds: Mapping[str, str]) -> dict[str, Any]:
-    """Return metadata in which no value is missing: an edit may leave some out, the recorder wants them all."""
-    nothing = {"string": "", "bool": False, "int64": 0, "double": float("nan")}
-    return {
-        key: nothing.get(kinds.get(key, ""), []) if value is None else value
-        for key, value in {**dict.fromkeys(kinds), **metadata}.items()
-    }
 
 
 def _time(table: Mapping[str, Any], path: str) -> NDArray[np.int64]:

@@ -100,7 +100,8 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
     for role, topic in {**wanted, **cameras}.items():
         found = messages[topic.name]
         if not len(found.data):
-            raise DatasetError(f"{bag.path} has no readable message of {topic.name}; {'; '.join(bag.problems)}.")
+            damage = "".join(f" Damaged: {problem}." for problem in bag.problems)
+            raise DatasetError(f"{bag.path} has no readable message of {topic.name}.{damage}")
         stamps = _stamps(topic, found)
         times = message_times(found.received, stamps, options.stamps)
         if stamps is not None and options.stamps == "auto" and (wrong := int((~sane(found.received, stamps)).sum())):
@@ -109,7 +110,7 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
                 "time of reception was taken instead (--stamps=header or receive decides for all)"
             )
         values = _values(role, topic, found.data, _Reading(options, static, notes))
-        finite = np.isfinite(values).all(axis=1)
+        finite = (np.abs(values) < np.finfo(np.float32).max).all(axis=1)  # the dataset's numbers are float32
         if not finite.all():
             notes.append(f"{topic.name}: {int((~finite).sum())} messages with values that are not finite, left out")
         tracks[role] = Track(topic.name, topic.msgtype, times[finite], found.order[finite], values[finite])
@@ -127,7 +128,7 @@ def _topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) -> Topic
         what = "no message of" if name in topics else "no topic"
         raise DatasetError(
             f"{bag.path} has {what} {name}, which {_MEANING[role]} is read from. Name another one with {option}."
-            f"{hint} The bag has: {there}."
+            f"{hint} The bag has: {there}." + "".join(f" Damaged: {problem}." for problem in bag.problems)
         )
     if topics[name].msgtype not in types:
         raise DatasetError(

@@ -1,7 +1,7 @@
 """Which topics carry the numbers of a feature: the names decide."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from bhd_lerobot.bodies.body import LidarSpec
@@ -18,6 +18,7 @@ from bhd_lerobot.data.ros2_base import (
     TwistPart,
 )
 from bhd_lerobot.data.ros2_parts import IntegersPart, NumbersPart, Part, own_topic
+from bhd_lerobot.errors import UnsupportedDatasetError
 
 PARTS: Mapping[str, type[Part]] = {
     kind.__name__: kind
@@ -74,3 +75,19 @@ def parts_of(
     if left:
         parts.append(NumbersPart(own_topic(key), tuple(left)))
     return parts
+
+
+def check_topics(parts: Iterable[Part]) -> None:
+    """Check that no two parts share a topic.
+
+    Raises:
+        UnsupportedDatasetError: two do.
+    """
+    seen: set[str] = set()
+    for part in parts:
+        if part.topic in seen:
+            raise UnsupportedDatasetError(
+                f"Two features would share the topic {part.topic}, because their names differ only in characters that "
+                "no topic may have. Rename one."
+            )
+        seen.add(part.topic)

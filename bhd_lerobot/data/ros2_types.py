@@ -35,6 +35,8 @@ string metadata                 # what is recorded of the episode, without the p
 string metadata_types           # type of each of these values, JSON
 string recording                # identity of the recording, JSON
 string video                    # settings of the video encoder, JSON
+int64 checksum                  # CRC-32 of task to topics
+string checksums                # CRC-32 of each column's bytes as the dataset has them, JSON
 string topics                   # which topic carries which numbers of which feature, JSON
 """,
     STATE: """

@@ -281,6 +281,20 @@ def test_bags_of_ours_that_lost_messages_are_refused_not_shortened(turtlebot3, t
     assert not (tmp_path / "back").exists()
 
 
+def test_a_number_that_was_changed_is_noticed(turtlebot3, tmp_path, capsys):
+    bags = export(turtlebot3, tmp_path / "bags", "--episodes=0")
+    path = bags / "episode_000000" / "episode_000000.mcap"
+    action = read_episode(turtlebot3, 0)["action"][5].astype(np.float64).tobytes()[:8]
+    content = bytearray(path.read_bytes())
+    content[content.index(action) + 6] ^= 1
+    path.write_bytes(content)
+    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 2
+    error = capsys.readouterr().err
+    assert "of episode 0 is not what was exported" in error
+    assert "--resample" in error
+    assert not (tmp_path / "back").exists()
+
+
 def test_bags_of_two_datasets_do_not_become_one(turtlebot3, ur5, tmp_path, capsys):
     one, other = export(turtlebot3, tmp_path / "a"), export(ur5, tmp_path / "b")
     arguments = ["import", str(one), str(other), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]

@@ -394,6 +394,37 @@ def test_a_dataset_that_is_there_stays(tmp_path, plain, capsys):
     assert "no bag at" in capsys.readouterr().err
 
 
+def test_a_bag_that_is_named_twice_is_refused(tmp_path, plain, capsys):
+    arguments = ["import", str(plain), f"{plain}/../plain", "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
+    assert data.main(arguments) == 2
+    assert "named twice" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("source", ["mcap", "sqlite3", "ours"])
+def test_random_damage_is_read_or_refused_and_never_a_surprise(tmp_path, source):
+    if source == "ours":
+        assert run(write(tmp_path / "bag", drive(seconds=2)), tmp_path / "d") == 0
+        assert data.main(["export", str(tmp_path / "d"), f"--output={tmp_path / 'bags'}", "--one_bag"]) == 0
+        (path,) = (tmp_path / "bags").glob("*.mcap")
+    else:
+        (path,) = (one for one in write(tmp_path / "bag", drive(seconds=2), source).iterdir() if one.suffix != ".yaml")
+    whole, damaged = path.read_bytes(), tmp_path / f"damaged{path.suffix}"
+    statuses = set()
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        content = np.frombuffer(whole, np.uint8).copy()
+        reach = len(content) if seed % 2 else 6000
+        content[rng.integers(0, reach, rng.choice([1, 3, 20]))] = rng.integers(0, 256)
+        damaged.write_bytes(content.tobytes())
+        root = tmp_path / f"out_{seed}"
+        arguments = ["import", str(damaged), "--repo_id=t/t", f"--root={root}"] + [TASK] * (source != "ours")
+        status = data.main(arguments)
+        statuses.add(status)
+        assert status in (0, 2)
+        assert root.exists() == (status == 0)
+    assert statuses == {0, 2}
+
+
 def test_a_bag_that_cannot_be_used_leaves_no_dataset(tmp_path, plain, capsys):
     bad = write(tmp_path / "bad", list(filter(without("/odom"), drive())))
     good = tmp_path / "good"
