@@ -1,7 +1,9 @@
 """The documents are true: generated parts are up to date, links and files exist, commands parse, messages are real."""
 
 import ast
+import contextlib
 import importlib.util
+import io
 import re
 import shlex
 from collections.abc import Iterator
@@ -143,7 +145,14 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     elif program == "bhd-replay":
         parse(ReplayConfig, arguments)
     elif program == "bhd-data":
-        data._parser().parse_args(arguments)
+        # In running text a command is named without its arguments.
+        named = ["--help"] if len(arguments) == 1 else []
+        with contextlib.redirect_stdout(io.StringIO()):
+            try:
+                data._parser().parse_args([*arguments, *named])
+            except SystemExit as end:
+                if end.code:
+                    raise
     elif program == "bhd-monitor":
         monitor._parser().parse_args(arguments)
     else:

@@ -91,8 +91,12 @@ def corrupt(path: Path, reason: object) -> DatasetCorruptError:
     return DatasetCorruptError(f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}. {_REMEDY}")
 
 
-def load_state(root: Path) -> DatasetState:
+def load_state(root: Path, *, films: bool = True) -> DatasetState:
     """Read what is committed and check that every file it needs is there and readable.
+
+    Args:
+        root: the dataset.
+        films: whether films must be there, too.
 
     Reads file footers, not their pages: a damaged value inside a file is found by `bhd_lerobot.data.repair.repair`.
 
@@ -101,12 +105,14 @@ def load_state(root: Path) -> DatasetState:
         DatasetCorruptError: a file is missing, unreadable or contradicts the others; the message names it.
     """
     if not (root / layout.INFO).is_file():
-        found = "has no meta/info.json" if root.is_dir() else "does not exist"
+        found = "has no meta/info.json" if root.is_dir() else "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"{root} is not a LeRobot dataset: it {found}.")
     info = read_json(root / layout.INFO)
     for key in ("codebase_version", "features", "fps", "total_episodes", "total_frames", "total_tasks"):
         if key not in info:
             raise corrupt(root / layout.INFO, f"it has no {key!r}")
+    if not isinstance(info["features"], dict) or not all(isinstance(one, dict) for one in info["features"].values()):
+        raise corrupt(root / layout.INFO, "its features are no JSON objects")
     if not str(info["codebase_version"]).startswith("v3."):
         raise DatasetError(f"{root} has dataset format {info['codebase_version']}; this program reads v3.x.")
     identity = read_json(root / layout.IDENTITY) if (root / layout.IDENTITY).exists() else None
@@ -116,7 +122,7 @@ def load_state(root: Path) -> DatasetState:
         if len(state.tasks) < info["total_tasks"]:
             raise corrupt(root / layout.TASKS, f"it has {len(state.tasks)} of {info['total_tasks']} tasks")
         _read_rows(state)
-        _check_files(state)
+        _check_files(state, films)
     return state
 
 
@@ -181,7 +187,7 @@ def _read_rows(state: DatasetState) -> None:
     state.rows = [by_index[index] for index in range(total)]
 
 
-def _check_files(state: DatasetState) -> None:
+def _check_files(state: DatasetState, films: bool) -> None:
     start = 0
     for row in state.rows:
         if row["dataset_from_index"] != start or row["dataset_to_index"] != start + row["length"]:
@@ -199,7 +205,7 @@ def _check_files(state: DatasetState) -> None:
             raise corrupt(path, error) from error
         if found != wanted:
             raise corrupt(path, f"it has {found} frames; its episodes have {wanted}")
-    for key in state.video_keys:
+    for key in state.video_keys if films else ():
         for slot in ordered_slots(state.rows, f"videos/{key}"):
             path = state.root / layout.video_file(key, slot)
             if not path.is_file() or path.stat().st_size == 0:

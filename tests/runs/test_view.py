@@ -452,9 +452,9 @@ def test_damaged_missing_and_locked_datasets_are_refused(base, tmp_path) -> None
     finally:
         lock.release()
     root = Path(shutil.copytree(base, tmp_path / "d"))
-    film = next(root.rglob("*.mp4"))
-    film.unlink()
-    with pytest.raises(DatasetCorruptError, match=film.name):
+    path = next((root / "data").rglob("*.parquet"))
+    path.unlink()
+    with pytest.raises(DatasetCorruptError, match=path.name):
         ViewedDataset(root)
 
 
@@ -467,10 +467,14 @@ def test_a_description_of_another_shape_is_refused(tmp_path, change) -> None:
         ViewedDataset(root)
 
 
-def test_a_film_that_goes_away_is_missing_and_nothing_else_is(base, tmp_path) -> None:
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_film_that_is_not_there_is_missing_and_nothing_else_is(base, tmp_path, at_once: bool) -> None:
     root = Path(shutil.copytree(base, tmp_path / "d"))
+    film = next(root.rglob("*.mp4"))
+    if at_once:
+        film.unlink()
     with served(root) as server:
-        next(root.rglob("*.mp4")).unlink()
+        film.unlink(missing_ok=True)
         assert server.ask(f"/films/{FRONT}/0/0.mp4")[0] == 404
         assert server.ask("/api/episodes/0")[0] == 200
         path = next((root / "data").rglob("*.parquet"))

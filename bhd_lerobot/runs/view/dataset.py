@@ -60,7 +60,7 @@ class ViewedDataset:
             RootLock(self.root).release()
         stamp = stamp_of(self.root)
         try:
-            state = load_state(self.root)
+            state = load_state(self.root, films=False)  # a missing film is said in its place on the page
             if not state.info["fps"] > 0:
                 raise corrupt(info, f"its fps is {state.info['fps']!r}")
             return _Content(state, stamp, _summary(state, stamp))
