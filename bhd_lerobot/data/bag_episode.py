@@ -115,7 +115,7 @@ class EpisodeTopics:
             frames = at_end if key == keys.APPLIED_ACTION else at_start
             for part, values in _split(self._features[key], parts, columns.get(key)):
                 if isinstance(part, ScanPart):
-                    streams.append(_scan_stream(part, at_start, values, columns.get(keys.AGE)))
+                    streams.append(scan_stream(part, at_start, values, columns.get(keys.AGE)))
                 else:
                     streams.append(_stream(part.topic, part.msgtype, frames, part.encode(frames, values)))
                 if isinstance(part, OdometryPart):
@@ -228,7 +228,7 @@ def _stream(topic: str, msgtype: str, frames: Frames, messages: Sequence[bytes])
     return Stream(topic, msgtype, zip(frames.stamps.tolist(), messages, strict=True))
 
 
-def _scan_stream(part: ScanPart, frames: Frames, values: NDArray[Any], age: NDArray[Any] | None) -> Stream:
+def scan_stream(part: ScanPart, frames: Frames, values: NDArray[Any], age: NDArray[Any] | None) -> Stream:
     """Return each scan once, stamped when it was measured and received with the first frame that has it.
 
     A scan that was seen in one frame and not in the one before was measured after that one: the age, which on the wall

@@ -5,10 +5,13 @@ import re
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.data import ros2_types as types
+from bhd_lerobot.data.bag_episode import scan_stream
+from bhd_lerobot.data.ros2_base import ScanPart
 from bhd_lerobot.data.ros2_cdr import decode, encode
-from bhd_lerobot.data.ros2_parts import Frames, header
+from bhd_lerobot.data.ros2_parts import Frames, header, header_stamps
 from bhd_lerobot.data.ros2_split import parts_of
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.tasks.task import Event
@@ -104,3 +107,18 @@ def test_without_rosbags_the_command_that_installs_it_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag2", None)
     with pytest.raises(ConfigError, match=r"pip install 'lerobot_robot_bhd\[ros2\]'"):
         types.require_rosbags()
+
+
+def test_a_scan_is_never_stamped_before_an_observation_that_did_not_have_it():
+    """On the wall clock the age includes the way to the brain: 5 ms here, for a scan 1 ms after an observation."""
+    lidar = turtlebot3_burger().lidar
+    part = ScanPart("/scan", tuple(f"scan_{beam:03d}.pos" for beam in range(4)), lidar)
+    observed = np.array([0, 100, 200, 300]) * 10**6 + 10**18
+    values = np.repeat([[1.0], [1.0], [2.0], [2.0]], 4, axis=1)
+    age = np.array([0.005, 0.105, 0.104, 0.204], np.float32)
+    stream = scan_stream(part, Frames(0, np.arange(4), observed), values, age)
+    received, messages = zip(*stream.messages, strict=True)
+    assert received == (observed[0], observed[2])
+    first, second = header_stamps(SCAN, messages)
+    assert first == pytest.approx(observed[0] - 5 * 10**6, abs=100)
+    assert second == observed[1] + 1
