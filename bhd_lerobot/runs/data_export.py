@@ -2,7 +2,6 @@
 
 import argparse
 import math
-import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -21,6 +20,7 @@ from bhd_lerobot.data.ros2_base import FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME
 from bhd_lerobot.data.ros2_views import RobotView, StaticFrame
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.runs.data_command import Commands, add_command, root_of
+from bhd_lerobot.runs.episode_list import parse_episodes
 
 _BASE_LINK = (0.0, 0.0, 0.010)  # [m] over the floor, turtlebot3_burger.urdf
 _WHEELS = {"wheel_left_joint": ("qpos_7", "qvel_6"), "wheel_right_joint": ("qpos_8", "qvel_7")}
@@ -68,21 +68,6 @@ def _run(options: argparse.Namespace) -> int:
         f"{options.output}: {what}, {report.messages} messages, in {bags}. Look at one: ros2 bag play {report.bags[0]}"
     )
     return 0
-
-
-def parse_episodes(text: str) -> list[int]:
-    """Return the episodes that a list such as ``0,3,5-9`` names.
-
-    Raises:
-        ConfigError: it is no such list.
-    """
-    wanted: list[int] = []
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", part)
-        if match is None or (match[2] is not None and int(match[2]) < int(match[1])):
-            raise ConfigError(f"--episodes is {text!r}; it must be a list such as 0,3,5-9.")
-        wanted += range(int(match[1]), int(match[2] or match[1]) + 1)
-    return wanted
 
 
 def robot_view(robot_type: str | None) -> RobotView:

@@ -20,7 +20,7 @@ from bhd_lerobot.data.inspect import dataset_info
 from bhd_lerobot.data.read import read_episode
 from bhd_lerobot.data.state import load_state
 from bhd_lerobot.runs import data
-from bhd_lerobot.runs.data_export import parse_episodes, robot_view
+from bhd_lerobot.runs.data_export import robot_view
 from tests.data import support
 from tests.runs.support import run_record
 
@@ -313,10 +313,6 @@ def test_an_episode_that_was_marked_later_comes_back(turtlebot3, tmp_path):
     assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
     assert load_state(tmp_path / "back").rows[1]["bhd/outcome"] == "failure"
     assert read_episode(tmp_path / "back", 1)["event"][-1] == 11
-
-
-def test_lists_of_episodes():
-    assert parse_episodes("0, 3,5-7") == [0, 3, 5, 6, 7]
 
 
 def test_nothing_heavy_is_imported_before_it_is_needed():
