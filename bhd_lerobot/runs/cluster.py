@@ -108,7 +108,10 @@ def _errors(address: str) -> Iterator[None]:
             ) from error
         if address == "auto":
             raise ClusterError(f"There is no Ray cluster on this machine (ray.address=auto). {_REMEDY}") from error
-        raise ClusterError(f"The Ray cluster at {address!r} cannot be used: {reason} {_REMEDY}") from error
+        raise ClusterError(
+            f"The Ray cluster at {address!r} cannot be used: {reason}. If it was started with a token, set "
+            f"RAY_AUTH_MODE=token here, too. {_REMEDY}"
+        ) from error
 
 
 @contextmanager

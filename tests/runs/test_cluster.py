@@ -135,7 +135,9 @@ def test_a_recording_is_the_same_although_a_worker_and_a_machine_die(cluster, tm
             crews.append(self)
 
     def a_worker() -> int:
-        return int(next(one for one in crews[0]._workers if one.is_ready).host.rpartition(" ")[2])
+        # One that was killed just now may not have been missed yet.
+        pids = [int(one.host.rpartition(" ")[2]) for one in crews[0]._workers if one.is_ready]
+        return next(pid for pid in pids if not gone(pid))
 
     def kill_its_machine() -> None:
         raylet = parent_of(a_worker())
