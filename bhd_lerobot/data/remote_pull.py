@@ -122,12 +122,6 @@ class _Pull:
             else:
                 shutil.rmtree(self._staging)
             info = json.loads((self._root / layout.INFO).read_bytes())
-            problem = ""
-            if whole:
-                try:
-                    load_state(self._root)
-                except DatasetError as error:
-                    problem = str(error)
             return PullReport(
                 root=self._root,
                 episodes=None if subset is None else subset.episodes,
@@ -136,7 +130,7 @@ class _Pull:
                 fetched=in_order(self._fetched),
                 fetched_bytes=total(there[path] for path in self._fetched),
                 kept=len(wanted) - len(self._fetched),
-                problem=problem,
+                problem=_problem(self._root) if whole else "",
             )
         except (ConfigError, DatasetError):
             if is_new:  # refused: there is nothing to go on with
@@ -256,6 +250,15 @@ class _Pull:
             shutil.rmtree(self._old)
         else:
             staging.rename(root)
+
+
+def _problem(root: Path) -> str:
+    """Return why a dataset is not sound; nothing if it is."""
+    try:
+        load_state(root)
+    except DatasetError as error:
+        return str(error)
+    return ""
 
 
 def _compare(folder: Path, paths: Sequence[str], there: Mapping[str, RemoteFile]) -> set[str]:
