@@ -249,7 +249,7 @@ def test_nothing_is_left_when_the_disk_refuses(turtlebot3, tmp_path, monkeypatch
     ("arguments", "told"),
     [
         (["--episodes=7"], "no episode 7 in"),
-        (["--episodes=3-1"], "such as 0,3,5-9"),
+        (["--episodes=3-1"], "runs backwards; write 1-3"),
         (["--episodes=a"], "such as 0,3,5-9"),
         (["--start_time=-1"], "--start_time is -1"),
         (["--start_time=nan"], "--start_time is nan"),
