@@ -26,12 +26,12 @@ class HubDataset:
 
     Attributes:
         name: `user/name`.
-        kind: `hub`.
+        folder: None: it does not lie on this machine.
         revision: branch, tag or commit; None for what stock LeRobot takes.
         commit: hash of the commit that `files` listed; None before, and if there is no repository yet.
     """
 
-    kind = "hub"
+    folder: Path | None = None
 
     def __init__(
         self,

@@ -4,6 +4,7 @@ A `Remote` lists its files with a checksum each, so that a transfer that is repe
 """
 
 import hashlib
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -66,11 +67,11 @@ class Remote(Protocol):
 
     Attributes:
         name: what the user calls it.
-        kind: `hub` or `store`.
+        folder: where it lies, if that is on this machine.
     """
 
     name: str
-    kind: str
+    folder: Path | None
 
     def files(self) -> dict[str, RemoteFile]:
         """Return all files by path; none if there is nothing yet.
@@ -122,6 +123,20 @@ def digest(content: Path | bytes, algorithm: str) -> str:
             while count := file.readinto(buffer):
                 hasher.update(buffer[:count])
     return str(hasher.hexdigest())
+
+
+def refuse_overlap(root: Path, remote: Remote) -> None:
+    """Refuse to copy a dataset onto itself, or into itself: its files would be removed to be replaced.
+
+    Raises:
+        ConfigError: the two folders are one, or one lies in the other.
+    """
+    if remote.folder is None:
+        return
+    here, there = root.expanduser().resolve(), remote.folder.expanduser().resolve()
+    is_one = here.exists() and there.exists() and os.path.samefile(here, there)
+    if is_one or here.is_relative_to(there) or there.is_relative_to(here):
+        raise ConfigError(f"{remote.name} and {root} are the same folder, or one lies in the other. Name another one.")
 
 
 def is_whole(path: Path, file: RemoteFile) -> bool:

@@ -23,6 +23,7 @@ from bhd_lerobot.data.remote import (
     is_whole,
     listed,
     megabytes,
+    refuse_overlap,
     total,
 )
 from bhd_lerobot.data.remote_pool import run_all
@@ -75,6 +76,7 @@ def pull(remote: Remote, root: Path | str, *, select: Select | None = None, repl
             dataset stay.
 
     Raises:
+        ConfigError: both are the same folder.
         DatasetExistsError: there is another dataset at `root`, or a changed one, and `replace` is false.
         DatasetError: the remote dataset has another format, or none of the wanted episodes.
         DatasetLockedError: `root` is being recorded, repaired or pulled by another process.
@@ -83,6 +85,7 @@ def pull(remote: Remote, root: Path | str, *, select: Select | None = None, repl
     """
     root = Path(root).expanduser()
     root = root.parent.resolve() / root.name if not root.is_symlink() else root.resolve()
+    refuse_overlap(root, remote)
     with write_errors("pull the dataset", root, "What arrived is kept beside it; the dataset itself was not touched."):
         return _Pull(remote, root, replace).run(select)
 

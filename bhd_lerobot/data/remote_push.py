@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.card import is_generated
-from bhd_lerobot.data.remote import CARD, PICTURE, Item, Remote, RemoteFile, is_recorded, total
+from bhd_lerobot.data.remote import CARD, PICTURE, Item, Remote, RemoteFile, is_recorded, refuse_overlap, total
 from bhd_lerobot.data.remote_local import LocalDataset, open_local
 from bhd_lerobot.data.remote_pool import run_all
 from bhd_lerobot.data.state import DatasetState
@@ -69,9 +69,11 @@ def push(
         replace_card: overwrite a card at the remote place that a person wrote.
 
     Raises:
+        ConfigError: both are the same folder.
         DatasetError: the dataset is not whole and finalised, is in use, or was changed meanwhile.
         TransferError: the place cannot be reached or does not let this user write; what was sent is not sent again.
     """
+    refuse_overlap(Path(root), remote)
     with open_local(Path(root)) as local:
         there = remote.files()
         cards, kept_card = _cards(local, remote, make_card, replace_card, is_there=CARD in there)

@@ -39,10 +39,8 @@ class StoreDataset:
 
     Attributes:
         name: the URL.
-        kind: `store`.
+        folder: where it lies, if that is on this machine.
     """
-
-    kind = "store"
 
     def __init__(self, url: str, storage_options: dict[str, Any] | None = None) -> None:
         """Name it; nothing is asked for yet.
@@ -60,6 +58,8 @@ class StoreDataset:
 
         protocol, _, path = url.partition("://")
         self.name = url.rstrip("/")
+        if "::" in url:
+            raise ConfigError(f"{url} is a chain of file systems. Name the one where the dataset is to lie.")
         if protocol in ("http", "https", "data", "hf", "lerobot"):
             raise ConfigError(f"{url} cannot be written to or listed. Name a folder, or a dataset as user/name.")
         if not path.strip("/"):
@@ -75,6 +75,7 @@ class StoreDataset:
             raise ConfigError(f"{url} cannot be used: {error}. Known protocols: {known}.") from error
         kinds = self._fs.protocol if isinstance(self._fs.protocol, tuple) else (self._fs.protocol,)
         self._has_folders = not _FOLDERS.isdisjoint(kinds)
+        self.folder: Path | None = Path(self._root) if not {"file", "local"}.isdisjoint(kinds) else None
         # Others, such as FTP, have one connection for all threads.
         self._workers = WORKERS if self._fs.async_impl or not {"file", "local", "memory"}.isdisjoint(kinds) else 1
         self._known: dict[str, RemoteFile] = {}

@@ -262,6 +262,21 @@ def test_no_store_and_no_credentials(root: Path, monkeypatch) -> None:
         push(root, StoreDataset("s3://bucket/d"))
 
 
+def test_a_dataset_is_not_copied_onto_itself(root: Path, tmp_path: Path) -> None:
+    before = content(root)
+    link = tmp_path / "link"
+    link.symlink_to(root)
+    for folder in (root, root / "meta", root.parent, link, link / "new"):
+        with pytest.raises(ConfigError, match="the same folder"):
+            push(root, StoreDataset(f"file://{folder}"))
+    for target in (root, link, root / "copy"):
+        with pytest.raises(ConfigError, match="the same folder"):
+            pull(StoreDataset(f"file://{root}"), target, replace=True)
+    assert content(root) == before
+    with pytest.raises(ConfigError, match="a chain"):
+        StoreDataset("simplecache::s3://bucket/d")
+
+
 def test_what_is_not_installed_is_named(monkeypatch) -> None:
     def missing(*_: object, **__: object) -> None:
         raise ImportError("Install s3fs to access S3")
