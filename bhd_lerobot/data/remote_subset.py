@@ -1,7 +1,6 @@
 """Which files hold some episodes, and the note that a folder has only those."""
 
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import pyarrow.parquet as pq
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.remote import SUBSET
 from bhd_lerobot.data.state import corrupt
-from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.errors import DatasetError
 
 
 @dataclass(frozen=True)
@@ -27,21 +26,6 @@ class Subset:
 
     episodes: list[int]
     files: set[str]
-
-
-def parse_episodes(text: str) -> list[int]:
-    """Return the numbers in a list such as ``0,3,5-9``, ascending.
-
-    Raises:
-        ConfigError: it is none.
-    """
-    found: set[int] = set()
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d+)(?:-(\d+))?\s*", part)
-        if match is None or (match[2] is not None and int(match[2]) < int(match[1])):
-            raise ConfigError(f"episodes is {text!r}; give numbers and ranges, such as 0,3,5-9.")
-        found.update(range(int(match[1]), int(match[2] or match[1]) + 1))
-    return sorted(found)
 
 
 def files_of(root: Path, episodes: Sequence[int]) -> set[str]:

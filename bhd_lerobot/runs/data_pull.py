@@ -10,6 +10,7 @@ from bhd_lerobot.data.remote import check_repo_id, counted, is_url, megabytes
 from bhd_lerobot.errors import ConfigError, DatasetWriteError, TransferError
 from bhd_lerobot.runs.data_command import Commands, add_command
 from bhd_lerobot.runs.data_transfer import command_line, prompt_interrupt, quiet_bars, split_list, storage_options
+from bhd_lerobot.runs.episode_list import parse_episodes, short
 
 if TYPE_CHECKING:
     from bhd_lerobot.data.remote_pull import PullReport, Select
@@ -108,7 +109,7 @@ def tell(report: "PullReport", source: str) -> str:
     else:
         lines.append(f"  nothing to fetch: all {report.kept} files are there")
     if report.episodes is not None:
-        chosen = _ranges(report.episodes)
+        chosen = short(report.episodes)
         name = "me/some" if is_url(source) else source
         lines[0] = f"{report.root}: {len(report.episodes)} of {report.total_episodes} episodes: {chosen}"
         if report.is_whole:
@@ -131,9 +132,7 @@ def _selection(options: argparse.Namespace) -> "Select | None":
     """
     if options.episodes is None and options.outcome is None and options.min_score is None:
         return None
-    from bhd_lerobot.data.remote_subset import parse_episodes
-
-    episodes = None if options.episodes is None else parse_episodes(options.episodes)
+    episodes = None if options.episodes is None else sorted(set(parse_episodes(options.episodes)))
     if options.outcome is None and options.min_score is None:
         return lambda _: episodes or []
     from bhd_lerobot.data.selection import EpisodeFilter
@@ -146,17 +145,6 @@ def _selection(options: argparse.Namespace) -> "Select | None":
         return wanted.select(LeRobotDatasetMetadata("bhd/pull", root=folder), episodes)
 
     return select
-
-
-def _ranges(numbers: Sequence[int]) -> str:
-    """Return ascending numbers in the form of --episodes."""
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
 
 
 def _places(options: argparse.Namespace) -> tuple[str, Path]:

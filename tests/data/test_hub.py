@@ -14,7 +14,7 @@ from bhd_lerobot.data.disk import RootLock
 from bhd_lerobot.data.hub import HubDataset
 from bhd_lerobot.data.remote_pull import pull
 from bhd_lerobot.data.remote_push import Card, PushReport, push
-from bhd_lerobot.data.remote_subset import files_of, parse_episodes
+from bhd_lerobot.data.remote_subset import files_of
 from bhd_lerobot.data.source import local_metadata
 from bhd_lerobot.errors import (
     ConfigError,
@@ -416,10 +416,6 @@ def test_episodes_that_do_not_exist(hub: HubServer, root: Path, tmp_path: Path) 
     with pytest.raises(DatasetError, match=r"no episode 6.*from 0 to 5"):
         pull(HubDataset("me/d"), tmp_path / "e", select=lambda folder: [6])
     assert list(tmp_path.iterdir()) == [root]
-    assert parse_episodes("0,3, 5-7") == [0, 3, 5, 6, 7]
-    for wrong in ("", "a", "3-1", "-1", "1,,2", "1.5"):
-        with pytest.raises(ConfigError, match="such as 0,3,5-9"):
-            parse_episodes(wrong)
 
 
 def test_a_changed_dataset_is_not_overwritten_unless_that_is_said(hub: HubServer, root: Path, tmp_path: Path) -> None:

@@ -134,10 +134,16 @@ def test_a_recording_is_the_same_although_a_worker_and_a_machine_die(cluster, tm
             super().__init__(*arguments)
             crews.append(self)
 
+    killed: list[int] = []
+
     def a_worker() -> int:
-        # One that was killed just now may not have been missed yet.
+        # The crew may not have missed yet the one that was killed just now.
         pids = [int(one.host.rpartition(" ")[2]) for one in crews[0]._workers if one.is_ready]
-        return next(pid for pid in pids if not gone(pid))
+        return next(pid for pid in pids if pid not in killed)
+
+    def kill_a_worker() -> None:
+        killed.append(a_worker())
+        os.kill(killed[0], signal.SIGKILL)
 
     def kill_its_machine() -> None:
         raylet = parent_of(a_worker())
@@ -147,7 +153,7 @@ def test_a_recording_is_the_same_although_a_worker_and_a_machine_die(cluster, tm
 
     # When the eighth is saved, 42 are missing, and no more than 16 of them can be on their way or waiting to be saved.
     monkeypatch.setattr(cluster_loop, "Crew", Seen)
-    after_saves(monkeypatch, {3: lambda: os.kill(a_worker(), signal.SIGKILL), 8: kill_its_machine})
+    after_saves(monkeypatch, {3: kill_a_worker, 8: kill_its_machine})
     many = {"dataset__num_episodes": 50, "n_envs": 2, "dataset__episode_time_s": 5}
     result, printed = run_record(tmp_path / "ray", **on(cluster, ray__episodes_per_task=2), **many)
     cluster.spare.append(add_machine(cluster))
