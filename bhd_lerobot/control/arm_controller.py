@@ -46,6 +46,7 @@ class ArmController(Controller):
         self.blocked = np.zeros(n, np.bool_)
         self._any_blocked = self._any_bad = False
         self.busy = self.goals.busy  # the same array
+        self._half_tick = 0.5 / control_hz  # [s]
         # Ticks for which a joint has been too far from its reference.
         self._off_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
         self._unwatched: NDArray[np.bool_] = np.zeros(n, np.bool_)  # stopped hard, or on the way back already
@@ -71,6 +72,11 @@ class ArmController(Controller):
             self.stop(bad, Mode.FAULT)
             mask = mask & ~bad
         if np.count_nonzero(self.busy & mask):
+            left = mask & self.goals.following & ~self.setpoints.active
+            # A trajectory's command is where a smooth motion is at the end of a tick; a setpoint's goes a tick at one
+            # speed. Going on from the speed at the end would change the command's own by half a tick's acceleration
+            # on top of what is allowed.
+            self.velocity -= np.where(left[:, None], self.acceleration * self._half_tick, 0.0)
             self.goals.drop_for_setpoint(mask)
         self.setpoints.head_for(values, mask, self.command)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.ur5 import ur5
@@ -475,6 +475,7 @@ def act(rig: Rig, kind: str, value: float) -> None:
 
 
 @settings(max_examples=20)
+@example([(("goal", 1.0), 137), (("stream", 0.0), 0), (("stream", 0.0), 0), (("goal", 0.0), 1), (("setpoint", 0.0), 1)])
 @given(st.lists(st.tuples(actions, st.integers(0, 200)), max_size=10))
 def test_whatever_happens_the_command_never_jumps_and_every_goal_has_one_result(script: list) -> None:
     rig = Rig()

@@ -371,7 +371,7 @@ def test_an_episode_that_kills_every_worker_is_given_up(cluster):
     assert got == [0]
     assert isinstance(error, ClusterError)
     assert "3 workers were lost while they ran episode 1" in str(error)
-    assert printed.count("A worker was lost") == 2
+    assert printed.count("A worker was lost") >= 2  # more if one took an episode before with it
 
 
 def test_what_workers_print_is_prefixed_and_bounded(cluster):

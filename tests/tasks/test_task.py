@@ -41,6 +41,6 @@ def test_an_unknown_split_is_an_error_that_lists_the_valid_ones() -> None:
 def test_numbers_that_are_recorded_stay_what_they_are() -> None:
     assert [event.cause for event in Event] == [
         "nothing", "success", "collision", "stuck", "timeout", "intervention", "estop", "wrong_object",
-        "dropped", "unreachable", "fault",
+        "dropped", "unreachable", "fault", "failure",
     ]  # fmt: skip
-    assert [int(event) for event in Event] == list(range(11))
+    assert [int(event) for event in Event] == list(range(12))
