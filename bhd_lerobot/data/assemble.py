@@ -7,7 +7,7 @@ every column comes along, and the new dataset appears complete or not at all. Fi
 
 import copy
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from bhd_lerobot.data import layout, statistics
 from bhd_lerobot.data.assemble_files import build_data, build_videos
 from bhd_lerobot.data.disk import Disk, to_json
 from bhd_lerobot.data.episode_table import PREFIX, read_stats
+from bhd_lerobot.data.exchange import link_others
 from bhd_lerobot.data.identity import comparable, differences
 from bhd_lerobot.data.layout import Slot
 from bhd_lerobot.data.meta_files import tasks_table, write_meta
@@ -29,7 +30,7 @@ from bhd_lerobot.errors import DatasetError, DatasetMismatchError
 EDITS = "meta/edits.jsonl"
 """What was done to a dataset after its recording: one JSON object a line."""
 
-_INDEXES = ("episode_index", "index", "task_index")
+_WRITTEN = ("info.json", "stats.json", "tasks.parquet", "bhd.json", "edits.jsonl", "episodes/chunk-*/file-*.parquet")
 
 
 def assemble(
@@ -38,6 +39,7 @@ def assemble(
     disk: Disk,
     *,
     types: Mapping[str, pa.DataType] | None = None,
+    in_place: bool = False,
     edit: Mapping[str, Any],
     identity: Mapping[str, Any] | None,
 ) -> None:
@@ -48,6 +50,8 @@ def assemble(
         new: an empty or missing folder: becomes the dataset's root, or the place that `exchange.begin` gave.
         disk: how to write.
         types: Arrow types of metadata columns that no source has, by name without prefix.
+        in_place: the new content takes the place of the only source's. Then files that stay are linked; two datasets
+            never share one, because other programs write into files.
         edit: what is told in ``meta/edits.jsonl`` of this step.
         identity: content of ``meta/bhd.json``; no such file if None.
 
@@ -59,18 +63,26 @@ def assemble(
     """
     sources = _sources(picks)
     check_alike(sources)
-    kinds = {**_metadata_types(sources), **(types or {})}
+    kinds = {**_types(sources, "metadata_types", PREFIX), **(types or {})}
+    extra = _types(sources, "extra_types", "")
     tasks = _tasks(picks)
     info = _info(sources, len(picks), sum(pick.row["length"] for pick in picks), len(tasks))
-    rows = _rows(picks, kinds)
+    rows = _rows(picks, kinds, extra)
     plan = Plan(picks, rows, tasks, info, Files(picks))
-    build_data(plan, new, disk)
-    build_videos(plan, new, disk)
+    take = disk.link if in_place else disk.copy
+    build_data(plan, new, disk, take)
+    build_videos(plan, new, disk, take)
     disk.make_folder(new / "meta")
+    if len(sources) == 1:
+        link_others(sources[0].root / "meta", new / "meta", disk, *_WRITTEN, take=take)
+    if in_place:
+        link_others(sources[0].root / "data", new / "data", disk, "chunk-*/file-*.parquet")
+        if (sources[0].root / "videos").is_dir():
+            link_others(sources[0].root / "videos", new / "videos", disk, "*/chunk-*/file-*.mp4")
     sink = pa.BufferOutputStream()
     pq.write_table(tasks_table(list(tasks)), sink)
     disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
-    write_meta(new, info, rows, kinds, _stats(picks, rows, tasks), disk=disk)
+    write_meta(new, info, rows, kinds, _stats(picks, rows, tasks), disk=disk, extra=extra)
     if identity is not None:
         disk.write(new / layout.IDENTITY, to_json(identity))
     lines = [line for source in sources for line in _edits_of(source)] + [json.dumps(edit, ensure_ascii=False)]
@@ -101,9 +113,18 @@ def _kind(state: DatasetState) -> dict[str, Any]:
         "fps": state.info["fps"],
         "robot_type": state.info.get("robot_type"),
         "features": {
-            key: {name: feature.get(name) for name in ("dtype", "shape", "names")} for key, feature in features.items()
+            key: {
+                **{name: feature.get(name) for name in ("dtype", "shape", "names")},
+                # How numbers became depth pictures; what else is told of a film may differ.
+                **{n: v for n, v in (state.info["features"][key].get("info") or {}).items() if _is_meaning(n)},
+            }
+            for key, feature in features.items()
         },
     }
+
+
+def _is_meaning(name: str) -> bool:
+    return "depth" in name or name.removeprefix("video.") in ("shift", "use_log")
 
 
 def _sources(picks: Sequence[Pick]) -> list[DatasetState]:
@@ -114,22 +135,26 @@ def _sources(picks: Sequence[Pick]) -> list[DatasetState]:
         if not any(pick.source is source for source in sources):
             sources.append(pick.source)
     for source in sources:
-        if (source.root / layout.STAGING).exists() or source.without_stats:
+        if (source.root / layout.STAGING).exists() or (source.without_stats and source.identity is not None):
             raise DatasetError(
                 f"{source.root} is not finalised: its recording was interrupted, or goes on. Run `bhd-data repair "
                 f"{source.root}` first."
             )
+        if source.without_stats:
+            raise DatasetError(
+                f"{source.root} has no statistics of single episodes. Run `bhd-data check --fix {source.root}` first."
+            )
     return sources
 
 
-def _metadata_types(sources: Sequence[DatasetState]) -> dict[str, pa.DataType]:
+def _types(sources: Sequence[DatasetState], name: str, prefix: str) -> dict[str, pa.DataType]:
     types: dict[str, pa.DataType] = {}
     for source in sources:
-        for name, kind in source.metadata_types.items():
-            if types.setdefault(name, kind) != kind and not pa.types.is_null(kind):
+        for column, kind in getattr(source, name).items():
+            if types.setdefault(column, kind) != kind:
                 raise DatasetMismatchError(
-                    f"{source.root}: the metadata {PREFIX}{name} of its episodes is {kind}; in {sources[0].root} it is "
-                    f"{types[name]}. They cannot be one column."
+                    f"{source.root}: the metadata {prefix}{column} of its episodes is {kind}; in {sources[0].root} it "
+                    f"is {types[column]}. They cannot be one column."
                 )
     return types
 
@@ -162,13 +187,14 @@ def _info(sources: Sequence[DatasetState], episodes: int, frames: int, tasks: in
     }
 
 
-def _rows(picks: Sequence[Pick], types: Mapping[str, pa.DataType]) -> list[Row]:
+def _rows(picks: Sequence[Pick], types: Iterable[str], extra: Iterable[str]) -> list[Row]:
     rows, start = [], 0
     for index, pick in enumerate(picks):
         length = pick.row["length"]
         row = {"episode_index": index, "tasks": list(pick.row["tasks"]), "length": length}
         row |= {"dataset_from_index": start, "dataset_to_index": start + length}
         row |= {PREFIX + name: pick.metadata.get(name, pick.row.get(PREFIX + name)) for name in types}
+        row |= {name: pick.row.get(name) for name in extra}
         rows.append(row)
         start += length
     return rows
@@ -190,18 +216,35 @@ def _stats(picks: Sequence[Pick], rows: Sequence[Row], tasks: Mapping[str, int])
         columns: dict[str, np.ndarray] = {
             "episode_index": np.full(length, place),
             "index": np.arange(row["dataset_from_index"], row["dataset_to_index"]),
-            **({"task_index": np.full(length, task)} if len(pick.row["tasks"]) == 1 else {}),
+            "task_index": np.full(length, task) if len(pick.row["tasks"]) == 1 else _task_indexes(pick, tasks),
             **pick.columns,
         }
         fresh = statistics.column_stats({key: values for key, values in columns.items() if key in own})
         for key, stat in {**own, **fresh}.items():
             for name in own[key]:
                 stacked.setdefault(key, {}).setdefault(name, []).append(stat[name])
-    whole = {
-        key: {name: np.stack(values) for name, values in stat.items() if len(values) == len(picks)}
-        for key, stat in stacked.items()
-    }
-    return {key: stat for key, stat in whole.items() if {"min", "max", "mean", "std", "count"} <= stat.keys()}
+    for key, stat in stacked.items():
+        for name, values in stat.items():
+            if len(values) != len(picks):
+                # Later files of LeRobot's would have more columns than these, and nothing would load any more.
+                raise DatasetMismatchError(
+                    f"Only some of the datasets have the statistic {name} of {key}; there are others of before it came "
+                    "up. `lerobot-edit-dataset --operation.type recompute_stats` computes all of them."
+                )
+    return {key: {name: np.stack(values) for name, values in stat.items()} for key, stat in stacked.items()}
+
+
+def _task_indexes(pick: Pick, tasks: Mapping[str, int]) -> np.ndarray:
+    """Return the new number of the instruction of every frame of an episode that has several."""
+    slot = slot_of(pick.row, "data")
+    path = pick.source.root / layout.data_file(slot)
+    try:
+        table = pq.ParquetFile(path).read(columns=["episode_index", "task_index"], use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise corrupt(path, error) from error
+    own = table["episode_index"].to_numpy() == pick.row["episode_index"]
+    renumbered = np.array([tasks.get(task, -1) for task in pick.source.tasks])
+    return renumbered[table["task_index"].to_numpy()[own]]
 
 
 def _stored(source: DatasetState, slot: Slot) -> tuple[dict[int, int], dict[str, statistics.Stats]]:

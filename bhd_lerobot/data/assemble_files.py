@@ -16,9 +16,12 @@ from bhd_lerobot.data.state import corrupt, slot_columns
 from bhd_lerobot.data.video_splice import splice
 from bhd_lerobot.errors import DatasetMismatchError
 
+type Take = Callable[[Path, Path], None]
+"""How a file that stays as it is gets to its new place."""
 
-def build_data(plan: Plan, new: Path, disk: Disk) -> None:
-    """Write the data files below `new`, and into the rows in which file each episode is.
+
+def build_data(plan: Plan, new: Path, disk: Disk, take: Take) -> None:
+    """Write the data files below `new`, and into the rows in which file each episode is; `take` those that stay.
 
     Raises:
         DatasetCorruptError: a data file cannot be read.
@@ -34,7 +37,7 @@ def build_data(plan: Plan, new: Path, disk: Disk) -> None:
         disk.make_folder(target.parent)
         sources = [run.source.root / layout.data_file(run.slot) for run in group.runs]
         if len(sources) == 1 and _is_same(group.runs[0], plan):
-            disk.link(sources[0], target)
+            take(sources[0], target)
         else:
             disk.write(target, b"")
             with pq.ParquetWriter(target, schema, **PARQUET_OPTIONS) as writer:
@@ -46,8 +49,8 @@ def build_data(plan: Plan, new: Path, disk: Disk) -> None:
             plan.rows[place].update(slot_columns("data", group.target))
 
 
-def build_videos(plan: Plan, new: Path, disk: Disk) -> None:
-    """Write the films below `new`, and into the rows where each episode is in them.
+def build_videos(plan: Plan, new: Path, disk: Disk, take: Take) -> None:
+    """Write the films below `new`, and into the rows where each episode is in them; `take` those that stay.
 
     Raises:
         DatasetCorruptError: a film cannot be read.
@@ -81,7 +84,7 @@ def build_videos(plan: Plan, new: Path, disk: Disk) -> None:
                 ]
                 parts.append((run.source.root / layout.video_file(key, run.slot), spans))
             if len(parts) == 1 and group.runs[0].whole:
-                disk.link(parts[0][0], target)
+                take(parts[0][0], target)
                 starts = [span[0] for span in parts[0][1]]
             else:
                 disk.write(target, b"")

@@ -165,6 +165,9 @@ def _read_episodes(files: Files, findings: Findings) -> None:
         try:
             file = pq.ParquetFile(path, page_checksum_verification=True)
             columns = [column for column in file.schema_arrow.names if not column.startswith("stats/")]
+            if len(columns) == len(file.schema_arrow.names) and not files.is_ours:
+                what = "it has no statistics of single episodes, without which nothing can be edited"
+                findings.warning("stats", name, what, stats_remedy(files))
             part = file.read().select(columns).to_pydict()
         except (OSError, pa.ArrowException, ValueError) as error:
             findings.error("files", name, f"it cannot be read: {one_line(error)}", _COPY)
@@ -230,11 +233,20 @@ def _check_names(files: Files, findings: Findings) -> None:
         findings.error("files", name, "it is missing", _RECORD)
     leftovers = sorted(there - wanted)
     remedy = "bhd-data repair removes it." if files.is_ours else "Look what it is; it may hold unfinished episodes."
-    if leftovers:
+    torn = [name for name in leftovers if name.endswith(".parquet") and _is_cut_off(files.root / name)]
+    if torn:
+        what = "its writer was killed; an episode may be in it, and LeRobot loads nothing while it is there"
+        findings.error("files", few(torn, 3), what, "bhd-data repair recovers what is whole.")
+    elif leftovers:
         findings.warning("files", few(leftovers, 3), "no saved episode is in it", remedy)
     if (files.root / layout.STAGING).exists():
         what = "a recording was interrupted; what it saved is complete, and not yet merged"
         findings.warning("files", layout.STAGING, what, "bhd-data repair finishes it.")
+
+
+def _is_cut_off(path: Path) -> bool:
+    data = path.read_bytes()
+    return data[:4] == b"PAR1" != data[-4:]
 
 
 def stats_remedy(files: Files) -> str:

@@ -189,7 +189,9 @@ def _build_meta(
         disk.make_folder((new / layout.episodes_file(source)).parent)
         disk.link(path, new / layout.episodes_file(source))
         done, slot = done + len(old_rows), source
-    write_meta(new, state.info, rows, state.metadata_types, stats, disk=disk, done=done, slot=slot)
+    write_meta(
+        new, state.info, rows, state.metadata_types, stats, disk=disk, extra=state.extra_types, done=done, slot=slot
+    )
 
 
 def _all_stats(state: DatasetState, schema: Schema, known: Mapping[int, EpisodeStats]) -> dict[str, statistics.Stats]:

@@ -160,9 +160,7 @@ def rewrite(
     with write_errors(f"{edit['edit']} episodes", state.root, "The dataset is as it was."):
         try:
             new = exchange.begin(state.root, disk)
-            assemble(picks, new, disk, types=types, edit=_timed(edit), identity=identity)
-            kept = (layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY, EDITS, "meta/episodes/chunk-*/*.parquet")
-            exchange.link_others(state.root / "meta", new / "meta", disk, *(n.removeprefix("meta/") for n in kept))
+            assemble(picks, new, disk, types=types, in_place=True, edit=_timed(edit), identity=identity)
         except BaseException:
             with contextlib.suppress(OSError):
                 disk.remove_tree(state.root / layout.STAGING)

@@ -66,7 +66,10 @@ def checked_metadata(metadata: Mapping[str, Any], types: Mapping[str, pa.DataTyp
 
 
 def episode_table(
-    rows: Sequence[Row], types: Mapping[str, pa.DataType], stats: Mapping[str, Mapping[str, np.ndarray]]
+    rows: Sequence[Row],
+    types: Mapping[str, pa.DataType],
+    stats: Mapping[str, Mapping[str, np.ndarray]],
+    extra: Mapping[str, pa.DataType] | None = None,
 ) -> pa.Table:
     """Return rows of ``meta/episodes``.
 
@@ -74,6 +77,7 @@ def episode_table(
         rows: light columns of E episodes, all with the same keys.
         types: type of the metadata columns, by name without prefix.
         stats: feature -> statistic -> values of shape (E, ...).
+        extra: type of columns that are another program's, by name.
     """
     names, arrays = [], []
     for name in rows[0]:
@@ -81,6 +85,8 @@ def episode_table(
             kind = _TASKS
         elif name.startswith(PREFIX):
             kind = types[name.removeprefix(PREFIX)]
+        elif extra is not None and name in extra:
+            kind = extra[name]
         else:
             kind = pa.float64() if name.endswith("_timestamp") else _INT
         names.append(name)

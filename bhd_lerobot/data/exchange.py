@@ -5,6 +5,7 @@ and from there on the folders are exchanged, each with two renames. A kill befor
 some rubbish in the staging folder; a kill after it is completed by `roll_forward` at the next open.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 from bhd_lerobot.data import layout
@@ -45,11 +46,13 @@ def roll_forward(root: Path, disk: Disk) -> bool:
     return True
 
 
-def link_others(old: Path, new: Path, disk: Disk, *replaced: str) -> None:
-    """Link everything below `old` into `new`, but the files that match `replaced`."""
+def link_others(
+    old: Path, new: Path, disk: Disk, *replaced: str, take: Callable[[Path, Path], None] | None = None
+) -> None:
+    """Link everything below `old` into `new`, but the files that match `replaced`; or `take` it in another way."""
     disk.make_folder(new)
     skipped = {path for pattern in replaced for path in old.glob(pattern)}
     for path in sorted(old.rglob("*")):
         if path.is_file() and path not in skipped:
             disk.make_folder((new / path.relative_to(old)).parent)
-            disk.link(path, new / path.relative_to(old))
+            (take or disk.link)(path, new / path.relative_to(old))

@@ -7,12 +7,14 @@ is doubtful, such as a value that is out of range, is for a person.
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data import exchange, layout
 from bhd_lerobot.data.compact import compact
 from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.data.episode_table import read_stats
 from bhd_lerobot.data.findings import Finding, Severity
 from bhd_lerobot.data.meta_files import write_meta
 from bhd_lerobot.data.salvage_stats import stats_of
@@ -53,7 +55,7 @@ def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
             if any(one.check == "counts" for one in wanted):
                 done.append(_count_frames(root, disk))
             if any(one.check == "stats" for one in wanted):
-                done.append(_compute_stats(load_state(root), disk))
+                done.append(compute_stats(load_state(root), disk))
             disk.remove_tree(root / layout.STAGING)
     finally:
         lock.release()
@@ -77,19 +79,41 @@ def _count_frames(root: Path, disk: Disk) -> str:
     return f"{layout.INFO}: total_frames is {frames}, as the episodes say; it was {before}"
 
 
-def _compute_stats(state: DatasetState, disk: Disk) -> str:
+def compute_stats(state: DatasetState, disk: Disk) -> str:
+    """Compute the statistics of all episodes from their frames, store them, and return what was done in a line."""
     if state.identity is not None:
         state.without_stats = set(range(state.num_episodes))
         compact(state, Schema(state.info["features"]), disk, {})
     else:
         rows = [dict(row) for row in state.rows]
-        stats = stats_of(_tables(state), state.info["features"], state.root, rows)
+        depth = _stored_depth(state)
+        stats = stats_of(_tables(state), state.info["features"], state.root, rows, depth)
         new = exchange.begin(state.root, disk)
         skipped = ("episodes/chunk-*/file-*.parquet", "stats.json")
         exchange.link_others(state.root / "meta", new / "meta", disk, *skipped)
-        write_meta(new, state.info, rows, state.metadata_types, stats, disk=disk)
+        write_meta(new, state.info, rows, state.metadata_types, stats, disk=disk, extra=state.extra_types)
         exchange.complete(state.root, disk)
     return f"{layout.STATS} and meta/episodes: statistics of {state.num_episodes} episodes, computed from their frames"
+
+
+def _stored_depth(state: DatasetState) -> list[dict[str, dict[str, np.ndarray]]]:
+    """Return the statistics of depth pictures of every episode, which cannot be computed here."""
+    found: list[dict[str, dict[str, np.ndarray]]] = [{} for _ in state.rows]
+    for slot, rows in ordered_slots(state.rows, "meta/episodes").items():
+        path = state.root / layout.episodes_file(slot)
+        try:
+            file = pq.ParquetFile(path)
+            order = file.read(columns=["episode_index"], use_threads=False)["episode_index"].to_pylist()
+            stored = read_stats(file)
+        except (OSError, pa.ArrowException, ValueError) as error:
+            raise corrupt(path, error) from error
+        for row in rows:
+            place = order.index(row["episode_index"])
+            for key, stat in stored.items():
+                feature = state.info["features"].get(key, {})
+                if feature.get("dtype") in ("video", "image") and 3 not in (feature["shape"][0], feature["shape"][-1]):
+                    found[row["episode_index"]][key] = {name: values[place] for name, values in stat.items()}
+    return found
 
 
 def _tables(state: DatasetState) -> Iterator[pa.Table]:

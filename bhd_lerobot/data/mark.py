@@ -79,9 +79,13 @@ class _Changes:
         self._state, self._outcome, self._intervention, self._clear = state, outcome, intervention, clear
         self._slots = ordered_slots(state.rows, "data")
         self._features = state.info["features"]
-        if keys.EVENT not in self._features and (intervention is not None or clear):
+        # What a column of another program's means, this one does not know.
+        self._has_events = state.identity is not None and keys.EVENT in self._features
+        self._has_success = state.identity is not None and keys.SUCCESS in self._features
+        if not self._has_events and (intervention is not None or clear):
             raise DatasetError(
-                f"{state.root} has no column {keys.EVENT!r}, so no frame can be marked. Its outcome can (--outcome)."
+                f"{state.root} has no column {keys.EVENT!r} of this program, so no frame can be marked. Its outcome "
+                "can (--outcome)."
             )
 
     def pick(self, row: Row) -> Pick:
@@ -89,7 +93,7 @@ class _Changes:
         metadata: dict[str, Any] = {}
         columns: dict[str, np.ndarray] = {}
         told: dict[str, Any] = {"episode": row["episode_index"]}
-        if keys.EVENT in self._features:
+        if self._has_events:
             events = self._column(row, keys.EVENT)
             columns[keys.EVENT] = events
             told |= self._intervene(events, row, metadata)
@@ -99,9 +103,9 @@ class _Changes:
             metadata["outcome"] = self._outcome
             if "success" in self._state.metadata_types or "outcome" not in self._state.metadata_types:
                 metadata["success"] = is_success
-            if keys.EVENT in self._features:
+            if self._has_events:
                 columns[keys.EVENT][-1] = Event[self._outcome.upper()]
-            if keys.SUCCESS in self._features:
+            if self._has_success:
                 columns[keys.SUCCESS] = np.zeros(length, np.bool_)
                 columns[keys.SUCCESS][-1] = is_success
         self.log.append(told)

@@ -28,6 +28,7 @@ def write_meta(
     stats: Mapping[str, statistics.Stats],
     *,
     disk: Disk,
+    extra: Mapping[str, pa.DataType] | None = None,
     done: int = 0,
     slot: Slot | None = None,
 ) -> None:
@@ -40,6 +41,7 @@ def write_meta(
         types: Arrow type of the metadata columns, by name without prefix.
         stats: feature -> statistic -> values of all episodes, shape (E, ...).
         disk: how to write.
+        extra: Arrow type of columns that are another program's, by name.
         done: so many of the first episodes are in files already.
         slot: the last of those files.
     """
@@ -53,7 +55,7 @@ def write_meta(
             row.update(slot_columns("meta/episodes", slot))
         values = {key: {name: array[part] for name, array in stat.items()} for key, stat in stats.items()}
         sink = pa.BufferOutputStream()
-        table = episode_table(rows[part], types, values)
+        table = episode_table(rows[part], types, values, extra)
         pq.write_table(table, sink, write_statistics=False, **PARQUET_OPTIONS)
         disk.make_folder((new / layout.episodes_file(slot)).parent)
         disk.write(new / layout.episodes_file(slot), sink.getvalue())

@@ -10,9 +10,13 @@ from bhd_lerobot.data import layout, video
 from bhd_lerobot.data.compact import compact
 from bhd_lerobot.data.disk import Disk, RootLock, write_errors
 from bhd_lerobot.data.exchange import roll_forward
+from bhd_lerobot.data.fix import compute_stats
+from bhd_lerobot.data.parquet_rescue import MAGIC
 from bhd_lerobot.data.salvage import salvage
+from bhd_lerobot.data.salvage_films import whole_frames
+from bhd_lerobot.data.salvage_told import Told
 from bhd_lerobot.data.schema import Schema
-from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots
+from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots, read_json, slot_of
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError
 
 
@@ -71,7 +75,8 @@ def repair(root: Path | str) -> RepairReport:
     lock = RootLock(root)
     try:
         disk = Disk()
-        if (root / layout.INFO).is_file() and not (root / layout.IDENTITY).exists():
+        is_ours = (root / layout.IDENTITY).exists()
+        if (root / layout.INFO).is_file() and (not is_ours or went_on(root)):
             return _repair_foreign(root, disk)
         with write_errors("repair the dataset", root, "Its saved episodes are intact."):
             state, report = settle(root, disk)
@@ -87,19 +92,74 @@ def repair(root: Path | str) -> RepairReport:
 
 
 def _repair_foreign(root: Path, disk: Disk) -> RepairReport:
-    """Mend what another program recorded: nothing if it can be read, and else everything that is whole."""
+    """Mend what another program wrote: nothing if all of it can be read, and else everything that is whole."""
     with write_errors("repair the dataset", root, "Its files are as they were."):
-        roll_forward(root, disk)
+        completed = ("an edit that was interrupted",) if roll_forward(root, disk) else ()
         disk.remove_tree(root / layout.STAGING)  # of an attempt that was interrupted
     try:
         state = load_state(root)
-        _check_deeply(state)
+        if unfinished := unfinished_files(root):
+            raise corrupt(unfinished[0], "its writer was killed")
+        extra = sorted(name for name in layout.recorded_files(root) - state.files() if name.startswith("data/"))
+        if extra := [name for name in extra if (root / name).read_bytes()[: len(MAGIC)] == MAGIC]:
+            raise corrupt(root / extra[0], "no episode of meta/episodes is in it")
+        _check_readable(state)
     except DatasetCorruptError as error:
         rescued = salvage(root, disk)
         wrong = str(error).split(". ", 1)[0]
-        done = (f"{wrong}: {rescued.episodes} whole episodes were recovered; their statistics are new",)
+        done = (*completed, f"{wrong}: {rescued.episodes} whole episodes were recovered; their statistics are new")
         return RepairReport(root, rescued.episodes, rescued.frames, done, (), rescued.lost, rescued.aside)
-    return RepairReport(root, state.num_episodes, state.num_frames)
+    if state.rows and not _has_stats(root):
+        with write_errors("repair the dataset", root, "Its files are as they were."):
+            completed = (*completed, compute_stats(state, disk))
+            disk.remove_tree(root / layout.STAGING)
+    return RepairReport(root, state.num_episodes, state.num_frames, completed)
+
+
+def unfinished_files(root: Path) -> list[Path]:
+    """Return the data and episode files without a footer. Ours never are: they get their names when they are whole."""
+    found = []
+    for name in sorted(layout.recorded_files(root)):
+        path = root / name
+        if path.suffix == ".parquet":
+            with open(path, "rb") as file:
+                begin = file.read(len(MAGIC))
+                file.seek(max(0, path.stat().st_size - len(MAGIC)))
+                if begin == MAGIC and file.read() != MAGIC:
+                    found.append(path)
+    return found
+
+
+def went_on(root: Path) -> list[Path]:
+    """Return what another program left unfinished when it went on with a dataset of ours.
+
+    A file that our own rows need and that is cut off is damage of another kind, and not for guessing.
+    """
+    unfinished = unfinished_files(root)
+    rows = Told(root, []).rows.values() if unfinished else ()
+    needed = {root / layout.data_file(slot_of(row, "data")) for row in rows}
+    return [] if not rows or needed & set(unfinished) else unfinished
+
+
+def _has_stats(root: Path) -> bool:
+    try:
+        return bool(read_json(root / layout.STATS))
+    except DatasetCorruptError:
+        return False
+
+
+def _check_readable(state: DatasetState) -> None:
+    """Check that all frames of all episodes can be read, where their rows say that they are."""
+    for slot in ordered_slots(state.rows, "data"):
+        _check_data(state.root / layout.data_file(slot))
+    for key in state.video_keys:
+        kind = f"videos/{key}"
+        for slot, rows in ordered_slots(state.rows, kind).items():
+            path = state.root / layout.video_file(key, slot)
+            needed = max(round(row[f"{kind}/from_timestamp"] * state.info["fps"]) + row["length"] for row in rows)
+            frames, problem = whole_frames(path)
+            if frames < needed:
+                raise corrupt(path, f"it has {frames} of {needed} frames; {problem or 'it ends'}")
 
 
 def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[DatasetState, RepairReport]:
@@ -120,6 +180,10 @@ def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[Datas
     state = load_state(root)
     dropped: list[str] = []
     if state.identity is not None:
+        if unfinished := went_on(root):
+            raise corrupt(
+                unfinished[0], "another program went on with this dataset and was killed. bhd-data repair helps"
+            )
         # Only in our own datasets: another program may know what its files are for.
         dropped = sorted(layout.recorded_files(root) - state.files())
         for name in dropped:
@@ -136,13 +200,7 @@ def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[Datas
 
 def _check_deeply(state: DatasetState) -> None:
     for slot in ordered_slots(state.rows, "data"):
-        path = state.root / layout.data_file(slot)
-        try:
-            file = pq.ParquetFile(path, page_checksum_verification=True)
-            for group in range(file.num_row_groups):
-                file.read_row_group(group, use_threads=False)
-        except (OSError, pa.ArrowException) as error:
-            raise corrupt(path, error) from error
+        _check_data(state.root / layout.data_file(slot))
     for key in state.video_keys:
         for slot, rows in ordered_slots(state.rows, f"videos/{key}").items():
             path = state.root / layout.video_file(key, slot)
@@ -153,3 +211,12 @@ def _check_deeply(state: DatasetState) -> None:
                 raise corrupt(path, error) from error
             if found != wanted:
                 raise corrupt(path, f"it has {found} frames; its episodes have {wanted}")
+
+
+def _check_data(path: Path) -> None:
+    try:
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        for group in range(file.num_row_groups):
+            file.read_row_group(group, use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise corrupt(path, error) from error

@@ -10,7 +10,7 @@ import contextlib
 import copy
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,9 @@ from bhd_lerobot.data import exchange, layout
 from bhd_lerobot.data.disk import Disk, to_json, write_errors
 from bhd_lerobot.data.meta_files import MEBIBYTE, PARQUET_OPTIONS, tasks_table, write_meta
 from bhd_lerobot.data.parquet_rescue import rescue
-from bhd_lerobot.data.salvage_films import Films
+from bhd_lerobot.data.salvage_films import Films, Found
 from bhd_lerobot.data.salvage_stats import stats_of
+from bhd_lerobot.data.salvage_told import Told
 from bhd_lerobot.data.state import Row, corrupt, read_json, read_tasks, slot_columns
 from bhd_lerobot.errors import DatasetCorruptError, DatasetLockedError, UnsupportedDatasetError
 
@@ -48,21 +49,6 @@ class Salvage:
     aside: Path
 
 
-@dataclass
-class Found:
-    """An episode whose frames were found.
-
-    Attributes:
-        number: the number that it had.
-        table: its frames.
-        films: for each camera the parts of films that show it.
-    """
-
-    number: int
-    table: pa.Table
-    films: dict[str, Any] = field(default_factory=dict)
-
-
 def salvage(root: Path, disk: Disk) -> Salvage:
     """Recover every whole episode; the caller holds the lock.
 
@@ -77,35 +63,52 @@ def salvage(root: Path, disk: Disk) -> Salvage:
     check_unused(root)
     info = read_json(root / layout.INFO)
     lost: list[str] = []
-    found, tables_lost = _frames(root, info)
-    lost += tables_lost
-    films = Films(root, info)
-    kept = films.assign(found, lost)
+    told = Told(root, lost)
+    found, is_torn = _frames(root, info, lost)
+    films = Films(root, info, told.rows)
+    kept = films.assign(found, lost, is_torn=is_torn)
     if not kept:
         reasons = "".join(f"\n  {line}" for line in lost)
         raise DatasetCorruptError(f"No whole episode of {root} can be recovered; nothing was changed.{reasons}")
+    numbers = {one.number for one in found}
+    lost += [f"episode {number}: its frames are gone" for number in sorted(told.rows.keys() - numbers)]
     missing = int(info.get("total_episodes") or 0) - len(kept)
     if missing > 0 and not lost:
         lost.append(f"{missing} episodes that info.json counts: no file has a trace of them")
     with write_errors("recover the dataset", root, "The damaged files are as they were."):
         aside = _keep_aside(root, disk)
         new = exchange.begin(root, disk)
-        tasks, known = _tasks(root, kept, lost)
+        tasks, known = _tasks(root, kept, told, lost)
         rows = _rows(kept, tasks, known)
         described = _info(info, kept, len(tasks))
         _write_data(kept, rows, described, new, disk)
         films.write(kept, rows, described, new, disk)
-        stats = stats_of((one.table for one in kept), described["features"], new, rows)
-        disk.make_folder(new / "meta")
+        told.complete(kept, rows)
+        stats = stats_of((one.table for one in kept), described["features"], new, rows, told.stats_of(kept))
+        exchange.link_others(root / "meta", new / "meta", disk, *_WRITTEN, take=disk.copy)
         sink = pa.BufferOutputStream()
         pq.write_table(tasks_table(tasks), sink)
         disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
-        write_meta(new, described, rows, {}, stats, disk=disk)
+        write_meta(new, described, rows, told.metadata_types, stats, disk=disk, extra=told.extra_types)
         disk.write(new / layout.INFO, to_json(described))
+        if (root / layout.IDENTITY).exists():
+            _disown(root / layout.IDENTITY, new / layout.IDENTITY, disk)
         exchange.complete(root, disk)
         disk.remove_tree(root / layout.STAGING)
-        disk.remove_tree(root / "images")  # frames of films that were not encoded yet; they are in `aside`
+        for folder in ("images", *(path.name for path in root.glob("tmp*") if path.is_dir())):
+            disk.remove_tree(root / folder)  # of films that were being made; they are in `aside`
     return Salvage(len(kept), sum(one.table.num_rows for one in kept), tuple(lost), aside)
+
+
+_WRITTEN = ("info.json", "stats.json", "tasks.parquet", "bhd.json", "episodes/chunk-*/file-*.parquet")
+
+
+def _disown(old: Path, new: Path, disk: Disk) -> None:
+    """Keep what is told about the recording, but not as one that its recorder can go on with."""
+    identity = read_json(old)
+    recording = identity.get("recording")
+    edited = {"edit": "recovered"}
+    disk.write(new, to_json({**identity, "recording": {**(recording or {}), "edited": edited}}))
 
 
 def check_unused(root: Path) -> None:
@@ -130,10 +133,10 @@ def check_unused(root: Path) -> None:
                         )
 
 
-def _frames(root: Path, info: dict[str, Any]) -> tuple[list[Found], list[str]]:
-    """Return the episodes whose frames are whole, in order, and what is lost."""
+def _frames(root: Path, info: dict[str, Any], lost: list[str]) -> tuple[list[Found], bool]:
+    """Return the episodes whose frames are whole, in order, and whether some frames are missing behind them."""
     found: list[Found] = []
-    lost: list[str] = []
+    is_torn = False
     schema = _schema(root, info)
     shapes = {
         key: feature["shape"]
@@ -146,23 +149,31 @@ def _frames(root: Path, info: dict[str, Any]) -> tuple[list[Found], list[str]]:
             rescued = rescue(path, schema, shapes)
         except OSError as error:
             lost.append(f"{name}: {error.strerror or error}")
+            is_torn = True
             continue
         except ValueError as error:
             raise UnsupportedDatasetError(f"{path} has no footer and cannot be read without: {error}.") from error
-        if rescued.lost_bytes:
+        if rescued.groups and rescued.lost_bytes:
             lost.append(f"{name}: {rescued.lost_bytes} bytes at its end, an episode that was being saved")
-        elif rescued.problem and not rescued.groups:
+        elif not rescued.groups:
             lost.append(f"{name}: {rescued.problem}")
+        is_torn |= bool(rescued.lost_bytes) or not rescued.groups
         if not rescued.groups:
             continue
         table = pa.concat_tables(rescued.groups).combine_chunks()
+        if missing := [column for column in schema.names if column not in table.column_names]:
+            lost.append(f"{name}: it has no column {', '.join(missing)}")
+            continue
+        table = table.select(schema.names)
+        if not table.schema.metadata:
+            table = table.replace_schema_metadata(schema.metadata)
         for number, part in _episodes(table):
             frames = part["frame_index"].to_numpy()
             if np.array_equal(frames, np.arange(len(frames))):
                 found.append(Found(number, part))
             else:
                 lost.append(f"{name}: episode {number}, whose frames are not numbered from 0 on")
-    return found, lost
+    return found, is_torn
 
 
 def _schema(root: Path, info: dict[str, Any]) -> pa.Schema:
@@ -182,19 +193,25 @@ def _episodes(table: pa.Table) -> Iterator[tuple[int, pa.Table]]:
         yield int(numbers[start]), table.slice(start, end - start)
 
 
-def _tasks(root: Path, kept: Sequence[Found], lost: list[str]) -> tuple[list[str], dict[int, int]]:
+def _tasks(root: Path, kept: Sequence[Found], told: Told, lost: list[str]) -> tuple[list[str], dict[int, int]]:
     """Return the instructions that are used, and the new number of each old one."""
     used = sorted({int(index) for one in kept for index in pc.unique(one.table["task_index"]).to_pylist()})
     try:
-        sentences = read_tasks(root / layout.TASKS)
+        sentences = dict(enumerate(read_tasks(root / layout.TASKS)))
     except DatasetCorruptError as error:
-        sentences = []
-        lost.append(f"{layout.TASKS}: the instructions ({error})")
+        sentences = {}
+        for one in kept:
+            # Where an episode has one instruction, its number and its words are both there.
+            words = told.rows.get(one.number, {}).get("tasks") or []
+            numbers = pc.unique(one.table["task_index"]).to_pylist()
+            if len(words) == len(numbers) == 1:
+                sentences[int(numbers[0])] = words[0]
+        if set(used) - sentences.keys():
+            lost.append(f"{layout.TASKS}: the words of some instructions ({error})")
     texts: dict[str, int] = {}
     known: dict[int, int] = {}
     for index in used:
-        sentence = sentences[index] if index < len(sentences) else f"{_LOST_TASK} {index}"
-        known[index] = texts.setdefault(sentence, len(texts))
+        known[index] = texts.setdefault(sentences.get(index, f"{_LOST_TASK} {index}"), len(texts))
     return list(texts), known
 
 
@@ -256,11 +273,15 @@ def _write_data(kept: Sequence[Found], rows: Sequence[Row], info: dict[str, Any]
                 disk.make_folder(target.parent)
                 disk.write(target, b"")
                 writer = pq.ParquetWriter(target, kept[0].table.schema, **PARQUET_OPTIONS)
-            writer.write_table(one.table.cast(kept[0].table.schema))
+            writer.write_table(_as(kept[0].table.schema, one.table))
             row.update(slot_columns("data", slot or (0, 0)))
     finally:
         if writer is not None:
             writer.close()
+
+
+def _as(schema: pa.Schema, table: pa.Table) -> pa.Table:
+    return table if table.schema.equals(schema, check_metadata=True) else table.cast(schema)
 
 
 def _keep_aside(root: Path, disk: Disk) -> Path:

@@ -18,6 +18,7 @@ def stats_of(
     features: Mapping[str, Mapping[str, Any]],
     new: Path,
     rows: Sequence[Row],
+    stored: Sequence[Mapping[str, Mapping[str, np.ndarray]]] | None = None,
 ) -> dict[str, statistics.Stats]:
     """Return feature -> statistic -> values of all episodes, shape (E, ...).
 
@@ -26,6 +27,7 @@ def stats_of(
         features: LeRobot feature dictionaries.
         new: root of the dataset, with its films.
         rows: of the episodes, with the places of their films.
+        stored: statistics of each episode's pictures that are known already. Those of depth are never computed here.
     """
     from lerobot.datasets.compute_stats import compute_episode_stats
 
@@ -38,9 +40,15 @@ def stats_of(
     for table, row in zip(episodes, rows, strict=True):
         columns = {key: _array(table, key, feature["shape"]) for key, feature in plain.items()}
         own = dict(compute_episode_stats(columns, plain))
+        known = {} if stored is None else stored[row["episode_index"]]
         for key, feature in features.items():
-            if feature["dtype"] not in ("video", "image") or feature["shape"][2] != 3:
-                continue  # of depth, LeRobot's statistics are in metres, and info says which; they are left out
+            if feature["dtype"] not in ("video", "image"):
+                continue
+            if key in known:
+                own[key] = known[key]
+                continue
+            if 3 not in (feature["shape"][0], feature["shape"][-1]):
+                continue  # depth: its statistics are in metres, by the encoder's scale
             pictures = _film(new, key, row) if feature["dtype"] == "video" else _pictures(table, key)
             own[key] = statistics.image_stats(np.stack([statistics.image_histogram(one) for one in pictures]))
         for key, stat in own.items():

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.layout import Slot
-from bhd_lerobot.errors import DatasetCorruptError, DatasetError
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError
 
 _REMEDY = "Restore this file from a copy (or from the Hub), or record into a new root; nothing was changed."
 
@@ -34,6 +34,7 @@ class DatasetState:
         rows: one per committed episode, in order.
         without_stats: committed episodes whose statistics are not stored yet.
         metadata_types: Arrow type of every ``bhd/`` column, empty before the first episode.
+        extra_types: Arrow type of columns that neither LeRobot nor this package writes.
     """
 
     root: Path
@@ -43,6 +44,7 @@ class DatasetState:
     rows: list[Row] = field(default_factory=list)
     without_stats: set[int] = field(default_factory=set)
     metadata_types: dict[str, pa.DataType] = field(default_factory=dict)
+    extra_types: dict[str, pa.DataType] = field(default_factory=dict)
 
     @property
     def num_episodes(self) -> int:
@@ -113,6 +115,11 @@ def load_state(root: Path, *, films: bool = True) -> DatasetState:
             raise corrupt(root / layout.INFO, f"it has no {key!r}")
     if not isinstance(info["features"], dict) or not all(isinstance(one, dict) for one in info["features"].values()):
         raise corrupt(root / layout.INFO, "its features are no JSON objects")
+    if info.get("data_path") not in (None, layout.DATA_PATH) or info.get("video_path") not in (None, layout.VIDEO_PATH):
+        raise UnsupportedDatasetError(
+            f"{root} keeps its files at {info.get('data_path')!r} and {info.get('video_path')!r}; this program reads "
+            f"{layout.DATA_PATH!r} and {layout.VIDEO_PATH!r}. Copy it with lerobot-edit-dataset first."
+        )
     if not str(info["codebase_version"]).startswith("v3."):
         raise DatasetError(f"{root} has dataset format {info['codebase_version']}; this program reads v3.x.")
     identity = read_json(root / layout.IDENTITY) if (root / layout.IDENTITY).exists() else None
@@ -154,6 +161,8 @@ def read_tasks(path: Path) -> list[str]:
         pairs = sorted(zip(table["task_index"].to_pylist(), table[name].to_pylist(), strict=True))
     except (OSError, pa.ArrowException, KeyError, StopIteration) as error:
         raise corrupt(path, error) from error
+    if [index for index, _ in pairs] != list(range(len(pairs))):
+        raise corrupt(path, f"its numbers are not 0 to {len(pairs) - 1}, each once")
     return [task for _, task in pairs]
 
 
@@ -173,18 +182,33 @@ def _read_rows(state: DatasetState) -> None:
             index = row.get("episode_index")
             if index is None or index >= total:
                 continue  # a save that was interrupted before it counted
+            if not row.get("tasks"):
+                raise corrupt(path, f"episode {index} has no instruction")
             if index in by_index:
                 raise corrupt(path, f"episode {index} is in another file as well")
             by_index[index] = row
             if not has_stats:
                 state.without_stats.add(index)
-        if not state.metadata_types:
-            fields = {name: file.schema_arrow.field(name).type for name in light if name.startswith("bhd/")}
-            state.metadata_types = {name.removeprefix("bhd/"): kind for name, kind in fields.items()}
+        own, extra = column_types(file.schema_arrow)
+        state.metadata_types = {**own, **state.metadata_types}
+        state.extra_types = {**extra, **state.extra_types}
     for index in range(total):
         if index not in by_index:
             raise corrupt(state.root / "meta/episodes", f"info.json counts {total} episodes, but {index} is missing")
     state.rows = [by_index[index] for index in range(total)]
+
+
+def column_types(schema: pa.Schema) -> tuple[dict[str, pa.DataType], dict[str, pa.DataType]]:
+    """Return the types of the columns of ``meta/episodes`` that are ours, without prefix, and of those of others."""
+    own = {name.removeprefix("bhd/"): schema.field(name).type for name in schema.names if name.startswith("bhd/")}
+    known = ("bhd/", "stats/", "data/", "videos/", "meta/episodes/")
+    extra = {
+        name: schema.field(name).type for name in schema.names if not name.startswith(known) and name not in _STRUCTURE
+    }
+    return own, extra
+
+
+_STRUCTURE = ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index")
 
 
 def _check_files(state: DatasetState, films: bool) -> None:

@@ -15,7 +15,7 @@ type Span = tuple[int, int]
 """First frame of a part in its file, and the number of its frames."""
 
 
-def splice(parts: Sequence[tuple[Path, Sequence[Span]]], target: Path, fps: int) -> None:
+def splice(parts: Sequence[tuple[Path, Sequence[Span]]], target: Path, fps: int | Fraction) -> None:
     """Write spans of frames of several films, one after the other, into one film.
 
     Args:
@@ -41,7 +41,7 @@ def splice(parts: Sequence[tuple[Path, Sequence[Span]]], target: Path, fps: int)
                     joined.time_base = stream.time_base
                 for (start, _), packets in zip(spans, _by_span(path, source, spans, fps), strict=True):
                     # Counted in frames from the new film's start, so no rounding adds up.
-                    shift = round(Fraction(written - start, fps) / stream.time_base)
+                    shift = round(Fraction(written - start) / Fraction(fps) / stream.time_base)
                     for packet in packets:
                         packet.pts, packet.dts = packet.pts + shift, packet.dts + shift
                         if last is not None and packet.dts <= last:
@@ -62,7 +62,7 @@ def _opened(path: Path) -> Any:
         raise DatasetCorruptError(f"{path} is not a readable video ({error}). Restore it from a copy.") from error
 
 
-def _by_span(path: Path, source: Any, spans: Sequence[Span], fps: int) -> list[list[Any]]:
+def _by_span(path: Path, source: Any, spans: Sequence[Span], fps: int | Fraction) -> list[list[Any]]:
     """Return the packets of each span in decoding order, with the data that they need."""
     import av
 
@@ -91,9 +91,9 @@ def _by_span(path: Path, source: Any, spans: Sequence[Span], fps: int) -> list[l
     return found
 
 
-def _frames(source: Any, stream: Any, fps: int) -> Iterator[tuple[int, Any]]:
+def _frames(source: Any, stream: Any, fps: int | Fraction) -> Iterator[tuple[int, Any]]:
     """Yield the number and the packet of every frame."""
     begin = stream.start_time or 0
     for packet in source.demux(stream):
         if packet.dts is not None and packet.size:
-            yield round(Fraction(packet.pts - begin) * stream.time_base * fps), packet
+            yield round(Fraction(packet.pts - begin) * stream.time_base * Fraction(fps)), packet

@@ -65,7 +65,7 @@ def loaded(root: Path, frames: int) -> None:
         ("film", 2, "frames", 2),
         ("film", 3, "counting", 3),
         ("stream", 3, "frames", 3),
-        ("stream", 3, "encoding", 2),  # its film lies in a temporary folder under no name
+        ("stream", 3, "encoding", 3),  # its film lies in a temporary folder
         ("image", 3, "saved", 3),
     ],
 )
@@ -95,6 +95,8 @@ def test_every_whole_episode_is_recovered(
 
 def test_what_was_lost_is_told(lerobot: KillServer, tmp_path: Path) -> None:
     root = recorded(lerobot, tmp_path / "d", "stream", 3, "encoding")
+    for folder in root.glob("tmp*"):
+        shutil.rmtree(folder)
     report = repair(root)
     assert report.lost == (f"episode 2: no whole film of {CAMERA}",)
     text = str(report)
