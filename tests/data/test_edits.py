@@ -2,15 +2,21 @@
 
 import errno
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.data import assemble, layout
+from bhd_lerobot.data.check_dataset import check_dataset
 from bhd_lerobot.data.disk import Disk, RootLock
 from bhd_lerobot.data.edits import delete, edits_of, keep, merge, split
+from bhd_lerobot.data.fix import fix
 from bhd_lerobot.data.inspect import dataset_info
 from bhd_lerobot.data.mark import mark
 from bhd_lerobot.data.recorder import DatasetRecorder
@@ -23,6 +29,7 @@ from bhd_lerobot.errors import (
     DatasetLockedError,
     DatasetMismatchError,
     DatasetWriteError,
+    UnsupportedDatasetError,
 )
 from tests.data import support
 from tests.data.edit_support import NUMBERS, assert_sound, content, record, steps_of
@@ -103,7 +110,6 @@ def test_stock_lerobot_reads_the_result(filmed: Path, tmp_path: Path) -> None:
 
 
 def test_data_are_those_of_lerobots_own_merge(plain: Path, tmp_path: Path) -> None:
-    import pyarrow.parquet as pq
     from lerobot.datasets.dataset_tools import merge_datasets
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -292,3 +298,92 @@ def test_edits_are_lines_of_json(tmp_path: Path) -> None:
     lines = (root / assemble.EDITS).read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["edit"] for line in lines] == ["delete", "mark"]
     assert json.loads(lines[1])["note"] == "ä 'quoted'\nline"
+
+
+def stock(root: Path) -> Path:
+    """Let a dataset be another program's, with a column of its own and files beside."""
+    (root / "meta/bhd.json").unlink()
+    path = next(root.glob("meta/episodes/*/*.parquet"))
+    table = pq.read_table(path)
+    names = [f"person {index}" for index in range(table.num_rows)]
+    pq.write_table(table.append_column("operator", pa.array(names)), path)
+    (root / "meta/subtasks.json").write_text("{}")
+    (root / "data/NOTES.txt").write_text("notes")
+    return root
+
+
+def operators(root: Path) -> list[str]:
+    return pq.read_table(next(root.glob("meta/episodes/*/*.parquet")))["operator"].to_pylist()
+
+
+def test_what_other_programs_wrote_is_kept(plain: Path, tmp_path: Path) -> None:
+    root = stock(shutil.copytree(plain, tmp_path / "d"))
+    keep(root, [4, 1], tmp_path / "kept")
+    assert operators(tmp_path / "kept") == ["person 4", "person 1"]
+    assert (tmp_path / "kept/meta/subtasks.json").exists()
+    merge([tmp_path / "kept", plain], tmp_path / "all")
+    assert operators(tmp_path / "all") == ["person 4", "person 1"] + [None] * 6
+    before = [one.columns for one in content(root)]
+    mark(root, [0], outcome="failure")
+    assert operators(root) == [f"person {index}" for index in range(6)]
+    assert (root / "data/NOTES.txt").read_text() == "notes"
+    assert [one.columns for one in content(root)] == before  # what its columns mean, we do not know
+    (root / "meta/stats.json").unlink()
+    assert fix(root, check_dataset(root).findings)
+    assert operators(root) == [f"person {index}" for index in range(6)]
+
+
+def test_datasets_share_no_file(plain: Path, filmed: Path, tmp_path: Path) -> None:
+    """Other programs write into files; what happens to one dataset must not happen to another."""
+    for number, source in enumerate((plain, filmed)):
+        keep(source, range(4), tmp_path / f"k{number}")
+        split(source, {"all": range(4)}, tmp_path / f"s{number}")
+        for path in tmp_path.rglob("*"):
+            assert path.is_dir() or path.stat().st_nlink == 1, path
+
+
+def test_links_of_a_cache_are_followed(filmed: Path, tmp_path: Path) -> None:
+    """The Hub's client keeps datasets as relative links."""
+    for path in filmed.rglob("*"):
+        if path.is_file():
+            link = tmp_path / "cache" / path.relative_to(filmed)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(os.path.relpath(path, link.parent))
+    keep(tmp_path / "cache", range(4), tmp_path / "kept")
+    assert content(tmp_path / "kept") == content(filmed)
+    mark(tmp_path / "cache", [0], outcome="stuck")
+    assert content(tmp_path / "cache")[1:] == content(filmed)[1:]
+
+
+def test_instructions_of_an_episode_that_has_several(tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    features = {"action": {"dtype": "float32", "shape": (1,), "names": ["a"]}}
+    dataset = LeRobotDataset.create("t/t", fps=10, features=features, root=tmp_path / "d", use_videos=False)
+    for episode in range(3):
+        for frame in range(4):
+            dataset.add_frame({"action": np.array([episode], np.float32), "task": f"{episode}" if frame < 2 else "end"})
+        dataset.save_episode()
+    dataset.finalize()
+    keep(tmp_path / "d", [2, 1], tmp_path / "kept")
+    assert [set(one.task) for one in content(tmp_path / "kept")] == [{"2", "end"}, {"1", "end"}]
+    assert_sound(tmp_path / "kept")
+    loaded = LeRobotDataset("t/t", root=tmp_path / "kept")
+    assert [loaded[index]["task"] for index in (0, 3, 4, 7)] == ["2", "end", "1", "end"]
+
+
+def test_depth_of_another_scale_does_not_merge(filmed: Path, tmp_path: Path) -> None:
+    other = shutil.copytree(filmed, tmp_path / "other")
+    info = json.loads((other / "meta/info.json").read_text())
+    info["features"][support.CAMERA]["info"]["video.depth_max"] = 3.0
+    (other / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(DatasetMismatchError, match=r"depth_max: not"):
+        merge([filmed, other], tmp_path / "all")
+
+
+def test_files_at_other_places_are_refused_by_name(plain: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(plain, tmp_path / "d")
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps({**info, "data_path": "frames/{episode_index}.parquet"}))
+    with pytest.raises(UnsupportedDatasetError, match=r"frames/\{episode_index\}"):
+        delete(root, [0])

@@ -1,5 +1,6 @@
 """What stock LeRobot leaves behind SIGKILL is recovered: every whole episode, as it would have been."""
 
+import json
 import os
 import random
 import shutil
@@ -11,11 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from bhd_lerobot.data.check_dataset import Severity, check_dataset
 from bhd_lerobot.data.disk import Disk
-from bhd_lerobot.data.repair import repair
+from bhd_lerobot.data.edits import edits_of, keep
+from bhd_lerobot.data.mark import mark
+from bhd_lerobot.data.repair import repair, settle
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError, DatasetWriteError
 from tests.data.edit_support import Episode, assert_sound, content
 from tests.data.kill_support import KillServer
@@ -64,6 +69,8 @@ def loaded(root: Path, frames: int) -> None:
         ("film", 3, "encoding", 3),  # its pictures are still there
         ("film", 2, "frames", 2),
         ("film", 3, "counting", 3),
+        ("film", 3, "joining", 3),  # its film is finished, in a temporary folder
+        ("stream", 3, "joining", 3),
         ("stream", 3, "frames", 3),
         ("stream", 3, "encoding", 3),  # its film lies in a temporary folder
         ("image", 3, "saved", 3),
@@ -168,9 +175,9 @@ def test_a_torn_film_costs_the_episodes_behind_the_tear(lerobot: KillServer, tru
 def test_torn_data_cost_the_episodes_behind_the_tear(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
     origin = recorded(lerobot, tmp_path / "origin", "none", 4, "saved")
     size = next(origin.glob("data/*/*.parquet")).stat().st_size
-    for keep in (0.3, 0.6, 0.9):
-        root = shutil.copytree(origin, tmp_path / f"d{keep}")
-        os.truncate(next(root.glob("data/*/*.parquet")), int(size * keep))
+    for share in (0.3, 0.6, 0.9):
+        root = shutil.copytree(origin, tmp_path / f"d{share}")
+        os.truncate(next(root.glob("data/*/*.parquet")), int(size * share))
         report = repair(root)
         assert 1 <= report.episodes <= 3
         assert "bytes at its end" in report.lost[0]
@@ -250,3 +257,112 @@ def test_numbers_are_counted_anew(lerobot: KillServer, tmp_path: Path) -> None:
     assert sorted(set(table["episode_index"].to_pylist())) == [0, 1, 2]
     assert table["note"].to_pylist()[0] == "3/0"
     assert_sound(root)
+
+
+# --- no episode ever gets what is another's ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sessions(lerobot: KillServer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sessions of three episodes each, with a film of its own for each session."""
+    root = recorded(lerobot, tmp_path_factory.mktemp("sessions") / "d", "film", 3)
+    return recorded(lerobot, root, "film", 3)
+
+
+def numbers(root: Path) -> list[int]:
+    """Return which episodes a dataset holds, by their frames, after checking that their films are theirs."""
+    found = []
+    for episode in content(root):
+        number = int(episode.columns["observation.state"][0][2])
+        for index, picture in enumerate(episode.films.get(CAMERA, [])):
+            grey = 20 + (37 * number + 11 * index) % 200
+            assert abs(float(np.frombuffer(picture, np.uint8).mean()) - grey) < 4, (number, index)
+        found.append(number)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("gone", "left"),
+    [
+        ("videos/observation.images.top/chunk-000/file-000.mp4", [3, 4, 5]),
+        ("videos/observation.images.top/chunk-000/file-001.mp4", [0, 1, 2]),
+        ("data/chunk-000/file-000.parquet", [3, 4, 5]),
+        ("meta/episodes/chunk-000/file-001.parquet", [0, 1, 2, 3, 4, 5]),
+        ("meta/episodes/chunk-000/file-000.parquet", [3, 4, 5]),  # whose the other film is can only be guessed
+    ],
+)
+def test_what_is_gone_costs_its_own_episodes(sessions: Path, tmp_path: Path, gone: str, left: list[int]) -> None:
+    root = shutil.copytree(sessions, tmp_path / "d")
+    (root / gone).unlink()
+    report = repair(root)
+    assert numbers(root) == left
+    assert bool(report.lost) == (len(left) < 6)
+    assert_sound(root)
+
+
+def test_a_film_with_a_hole_is_a_sound_film(sessions: Path, tmp_path: Path) -> None:
+    """LeRobot reads where the rows say; a film may hold more."""
+    root = shutil.copytree(sessions, tmp_path / "d")
+    film = root / "videos/observation.images.top/chunk-000/file-000.mp4"
+    keep(root, [0, 2], tmp_path / "kept")
+    # As if the rows of the kept ones pointed into the film that still holds all three.
+    path = tmp_path / "kept/meta/episodes/chunk-000/file-000.parquet"
+    shutil.copy(film, tmp_path / "kept/videos/observation.images.top/chunk-000/file-000.mp4")
+    table = pq.read_table(path)
+    for name, values in (("from_timestamp", [0.0, 1.1]), ("to_timestamp", [0.5, 1.8])):
+        place = table.schema.get_field_index(f"videos/{CAMERA}/{name}")
+        table = table.set_column(place, table.schema.field(place), pa.array(values))
+    pq.write_table(table, path)
+    assert numbers(tmp_path / "kept") == [0, 2]
+    assert not repair(tmp_path / "kept")
+    assert numbers(tmp_path / "kept") == [0, 2]
+
+
+def test_an_episode_that_was_recorded_again(lerobot: KillServer, tmp_path: Path) -> None:
+    """Which of its two attempts a film shows is told nowhere."""
+    root = recorded(lerobot, tmp_path / "d", "film", 4, "saved", again=2)
+    report = repair(root)
+    assert numbers(root) == [0, 1]
+    assert "episode 2: a first attempt, which was recorded again" in report.lost
+
+
+def test_a_kill_in_the_first_episode_of_a_second_session(lerobot: KillServer, tmp_path: Path) -> None:
+    """No count is wrong then, and yet LeRobot loads nothing: a file without a footer lies there."""
+    root = recorded(lerobot, tmp_path / "d", "film", 2)
+    recorded(lerobot, root, "film", 1, "encoding")
+    assert [one.check for one in check_dataset(root).findings if one.severity is Severity.ERROR] == ["files"]
+    assert repair(root).episodes == 3
+    assert numbers(root) == [0, 1, 2]
+    loaded(root, 18)
+    first = recorded(lerobot, tmp_path / "first", "film", 1, "encoding")
+    assert repair(first).episodes == 1
+
+
+def test_torn_statistics_are_computed_anew(sessions: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(sessions, tmp_path / "d")
+    before = content(root)
+    (root / "meta/stats.json").write_text("{")
+    assert "statistics of 6 episodes" in str(repair(root))
+    assert content(root) == before
+    assert_sound(root)
+
+
+def test_marks_and_columns_of_others_survive(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 3)
+    mark(root, [1], outcome="success", note="seen")
+    recorded(lerobot, root, "none", 2, "saved")
+    repair(root)
+    assert [one.metadata.get("bhd/outcome") for one in content(root)] == [None, "success", None, None, None]
+    assert [edit["note"] for edit in edits_of(root)] == ["seen"]
+
+
+def test_our_own_dataset_that_lerobot_went_on_with(lerobot: KillServer, tmp_path: Path) -> None:
+    for count, die in ((1, "counting"), (2, "saved")):
+        root = recorded(lerobot, tmp_path / f"d{count}", "none", 3)
+        (root / "meta/bhd.json").write_text(json.dumps({"format": 1, "recording": {"seed": 1}, "video": {}}))
+        recorded(lerobot, root, "none", count, die)
+        if count == 1:  # our recorder does not throw away what it did not write
+            with pytest.raises(DatasetCorruptError, match="bhd-data repair"):
+                settle(root, Disk())
+        assert repair(root).episodes == 3 + count
+        assert json.loads((root / "meta/bhd.json").read_text())["recording"]["edited"] == {"edit": "recovered"}

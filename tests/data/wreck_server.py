@@ -45,22 +45,44 @@ def frame(episode: int, index: int, video: str) -> dict[str, Any]:
     return values
 
 
-def run(job: dict[str, Any]) -> None:
-    """Record; `die` says when to go: `never`, `saved`, `frames`, `encoding`, or `counting`."""
+def save_again(dataset: LeRobotDataset, episode: int, video: str) -> None:
+    """Fail to save an episode at its film, as a full disk does, and record it again, longer."""
+    save_video = dataset_writer.DatasetWriter._save_episode_video
+
+    def fail(*args: object, **kwargs: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    dataset_writer.DatasetWriter._save_episode_video = fail
+    try:
+        dataset.save_episode()
+    except OSError:
+        dataset.clear_episode_buffer()
+    dataset_writer.DatasetWriter._save_episode_video = save_video
+    for index in range(length(episode)):
+        dataset.add_frame(frame(episode, index, video))
+    dataset.save_episode()
+
+
+def opened(job: dict[str, Any]) -> LeRobotDataset:
+    """Create a dataset, or go on with it."""
     root, video = Path(job["root"]), job["video"]
-    progress = os.open(job["progress"], os.O_WRONLY | os.O_CREAT | os.O_APPEND) if "progress" in job else None
     streaming = {"streaming_encoding": video == "stream"}
     if root.exists():
-        dataset = LeRobotDataset.resume("t/t", root=root, **streaming)
-    else:
-        features = dict(FEATURES)
-        if video != "none":
-            kind = "image" if video == "image" else "video"
-            features[CAMERA] = {"dtype": kind, "shape": (32, 48, 3), "names": ["height", "width", "channels"]}
-        dataset = LeRobotDataset.create(
-            "t/t", fps=10, features=features, root=root, robot_type="toy",
-            use_videos=video in ("film", "stream"), **streaming,
-        )  # fmt: skip
+        return LeRobotDataset.resume("t/t", root=root, **streaming)
+    features = dict(FEATURES)
+    if video != "none":
+        kind = "image" if video == "image" else "video"
+        features[CAMERA] = {"dtype": kind, "shape": (32, 48, 3), "names": ["height", "width", "channels"]}
+    return LeRobotDataset.create(
+        "t/t", fps=10, features=features, root=root, robot_type="toy",
+        use_videos=video in ("film", "stream"), **streaming,
+    )  # fmt: skip
+
+
+def run(job: dict[str, Any]) -> None:
+    """Record; `die` says when to go: `never`, `saved`, `frames`, `encoding`, `joining`, or `counting`."""
+    dataset, video = opened(job), job["video"]
+    progress = os.open(job["progress"], os.O_WRONLY | os.O_CREAT | os.O_APPEND) if "progress" in job else None
 
     def die(*args: object, **kwargs: object) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -70,11 +92,16 @@ def run(job: dict[str, Any]) -> None:
         for index in range(length(episode)):
             dataset.add_frame(frame(episode, index, video))
         if episode == first + job["episodes"] - 1:
+            if job["die"] == "joining":
+                dataset_writer.concatenate_video_files = die
             if job["die"] == "encoding":
                 dataset_writer.DatasetWriter._save_episode_video = die
             if job["die"] == "counting":
                 dataset.meta.save_episode = die
-        dataset.save_episode()
+        if episode == job.get("again"):
+            save_again(dataset, episode, video)
+        else:
+            dataset.save_episode()
         if progress is not None:
             os.write(progress, f"saved {episode}\n".encode())
     if job["die"] == "saved":
