@@ -61,7 +61,7 @@ def salvage(root: Path, disk: Disk) -> Salvage:
         DatasetWriteError: the disk refuses; the wreck is as it was.
     """
     check_unused(root)
-    info = read_json(root / layout.INFO)
+    info = _info_of(root)
     lost: list[str] = []
     told = Told(root, lost)
     found, is_torn = _frames(root, info, lost)
@@ -98,6 +98,22 @@ def salvage(root: Path, disk: Disk) -> Salvage:
         for folder in ("images", *(path.name for path in root.glob("tmp*") if path.is_dir())):
             disk.remove_tree(root / folder)  # of films that were being made; they are in `aside`
     return Salvage(len(kept), sum(one.table.num_rows for one in kept), tuple(lost), aside)
+
+
+def _info_of(root: Path) -> dict[str, Any]:
+    """Return ``info.json``. LeRobot empties it before it writes it, so a kill may leave nothing."""
+    try:
+        info = read_json(root / layout.INFO)
+        if isinstance(info.get("features"), dict) and isinstance(info.get("fps"), int | float):
+            return info
+        reason = "it has no features or no fps"
+    except DatasetCorruptError as error:
+        reason = str(error.__cause__ or error)
+    raise DatasetCorruptError(
+        f"{root / layout.INFO} is corrupt: {reason}. It says what the columns are, without which nothing can be read. "
+        "Copy the meta/info.json of another recording with the same robot and cameras there, and repeat: its counts "
+        "do not matter. Nothing was changed."
+    )
 
 
 _WRITTEN = ("info.json", "stats.json", "tasks.parquet", "bhd.json", "episodes/chunk-*/file-*.parquet")

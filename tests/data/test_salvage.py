@@ -21,7 +21,7 @@ from bhd_lerobot.data.disk import Disk
 from bhd_lerobot.data.edits import edits_of, keep
 from bhd_lerobot.data.mark import mark
 from bhd_lerobot.data.repair import repair, settle
-from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError, DatasetWriteError
+from bhd_lerobot.errors import DatasetCorruptError, DatasetLockedError, DatasetWriteError
 from tests.data.edit_support import Episode, assert_sound, content
 from tests.data.kill_support import KillServer
 
@@ -135,6 +135,7 @@ def test_a_session_that_went_on_and_was_killed(lerobot: KillServer, truth: dict,
 
 def test_random_kills_lose_no_saved_episode(lerobot: KillServer, tmp_path: Path) -> None:
     rng = random.Random(11)
+    another = recorded(lerobot, tmp_path / "another", "none", 1)
     for kill in range(4):
         root, progress = tmp_path / f"d{kill}", tmp_path / f"progress{kill}"
         job = {"video": "none", "episodes": 10_000, "die": "never", "progress": str(progress)}
@@ -146,6 +147,11 @@ def test_random_kills_lose_no_saved_episode(lerobot: KillServer, tmp_path: Path)
         os.kill(pid, 9)
         lerobot.end()
         saved = progress.read_text().count("\n")
+        info = root / "meta/info.json"
+        if not info.read_text():  # LeRobot was about to write it; the message says what helps
+            with pytest.raises(DatasetCorruptError, match=r"Copy the meta/info\.json of another recording"):
+                repair(root)
+            shutil.copy(another / "meta/info.json", info)
         report = repair(root)
         assert saved <= report.episodes <= saved + 1
         assert_sound(root)
@@ -202,8 +208,16 @@ def test_nothing_left_changes_nothing(lerobot: KillServer, tmp_path: Path) -> No
         repair(root)
     assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
     (root / "meta/info.json").write_text("{")
-    with pytest.raises(DatasetError, match=r"info\.json"):
+    with pytest.raises(DatasetCorruptError, match=r"Copy the meta/info\.json of another recording"):
         repair(root)
+
+
+def test_info_of_another_recording_helps(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 4, "saved")
+    another = recorded(lerobot, tmp_path / "another", "none", 1)
+    shutil.copy(another / "meta/info.json", root / "meta/info.json")
+    assert repair(root).episodes == 4
+    assert [e.columns for e in content(root)] == [e.columns for e in truth["none"][:4]]
 
 
 def test_a_full_disk_leaves_the_wreck_as_it_was(
