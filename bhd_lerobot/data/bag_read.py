@@ -20,6 +20,8 @@ from bhd_lerobot.errors import DatasetError
 _KINDS: dict[str, Any] = {".mcap": McapFile, ".db3": SqliteFile}
 _HEAD_BYTES = 256  # that are enough for a header
 
+_END_OF_TIME = 1 << 63  # [ns] more do not fit into a time
+
 
 @dataclass(frozen=True)
 class Topic:
@@ -104,7 +106,7 @@ class Bag:
         times: dict[str, list[int]] = {name: [] for name in (*topics, *heads)}
         order: dict[str, list[int]] = {name: [] for name in (*topics, *heads)}
         data: dict[str, list[bytes]] = {name: [] for name in (*topics, *heads)}
-        problems, total = [], 0
+        problems, total, lost = [], 0, 0
         for file in self._open():
             wanted: dict[int, tuple[list[int], list[int], list[bytes], int | None]] = {}
             for channel, received, buffer, first, last in file.messages():
@@ -116,13 +118,22 @@ class Bag:
                 stamps, places, payloads, size = wanted[channel]
                 if size == 0:
                     continue
-                places.append(total)
                 payload = bytes(buffer[first:last])
                 if self.per_message:
-                    payload = zstd().decompress(payload)
+                    try:
+                        payload = zstd().decompress(payload)
+                    except Exception:  # of whichever zstd there is
+                        lost += 1
+                        continue
+                if not 0 <= received < _END_OF_TIME:
+                    lost += 1
+                    continue
+                places.append(total)
                 stamps.append(received)
                 payloads.append(payload if size is None else payload[:size])
             problems += file.problems
+        if lost:
+            problems.append(f"{self.path.name}: {lost} messages that cannot be decompressed, or have no possible time")
         if self.expected is not None and total < self.expected and not problems:
             problems.append(f"{self.path.name}: its metadata count {self.expected} messages; it has {total}")
         self._note(problems)

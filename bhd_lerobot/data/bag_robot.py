@@ -18,7 +18,7 @@ from bhd_lerobot.data.bag_read import Bag, Picker
 from bhd_lerobot.data.bag_tracks import Track, read_tracks, seconds
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.resample import NANO, Grid, clock_jumps, grids, newest
+from bhd_lerobot.data.resample import CLOCK_STEP_NS, NANO, STEP_BACK_NS, Grid, clock_jumps, grids, newest
 from bhd_lerobot.data.ros2_base import GYRO, ODOMETRY, TWIST
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.tasks.task import Event
@@ -92,12 +92,31 @@ class _RobotBag:
         self._tracks = read_tracks(bag, wanted.tracks, self.notes)
         self._pictures = {role: Picker(bag, one.topic) for role, one in self._tracks.items() if _is_camera(role)}
         self._begin = min(int(track.times.min()) for track in self._tracks.values())
+        self._check_clocks()
+
+    def _check_clocks(self) -> None:
+        """Check that commands and sensors are of one time.
+
+        Raises:
+            DatasetError: they are not: a bare Twist has the recorder's time, and headers may have a simulation's.
+        """
+        cmd = self._tracks["cmd"].times
+        sensors = [track.times for role, track in self._tracks.items() if role != "cmd"]
+        begin, end = min(int(one.min()) for one in sensors), max(int(one.max()) for one in sensors)
+        if int(cmd.max()) < begin - NANO or int(cmd.min()) > end + NANO:
+            raise DatasetError(
+                f"{self._bag.path}: {self._tracks['cmd'].topic} is from {cmd.min() / NANO:.1f} to "
+                f"{cmd.max() / NANO:.1f} s and the sensors are from {begin / NANO:.1f} to {end / NANO:.1f} s, so no "
+                "command belongs to them. Their stamps are of different clocks; --stamps=receive takes the recorder's "
+                "for all."
+            )
 
     def episodes(self) -> Iterator[_Episode]:
         """Yield the episodes in order."""
         wanted = self._wanted
         every = list(self._tracks.values())
-        jumps = clock_jumps([track.times for track in every], [track.order for track in every])
+        step = CLOCK_STEP_NS if wanted.tracks.stamps == "receive" else STEP_BACK_NS
+        jumps = clock_jumps([track.times for track in every], [track.order for track in every], step)
         bounds = [0, *jumps.tolist(), np.iinfo(np.int64).max]
         if len(jumps):
             self.notes.append(f"the clock jumped back {len(jumps)} times; each time a new episode begins")
@@ -157,6 +176,7 @@ class _RobotBag:
         except BaseException:
             writer.discard()
             raise
+        self._tell_silence(columns, int(times[0]))
         late = int(columns[keys.LATE].sum())
         if late:
             self.notes.append(
@@ -199,17 +219,41 @@ class _RobotBag:
         }
 
     def _commands(self, track: Track, times: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the command in force at each frame, shape (n, 2), and its age [ns]; 0 and -1 where there is none."""
-        place = newest(track.times, times)
+        """Return the command in force at the end of each frame, shape (n, 2), and its age then [ns]; 0 and -1 if none.
+
+        An action is what was asked for over the frame that an observation begins. What answers the observation comes
+        after it: the command in force when the observation was taken is the answer to the one before.
+        """
+        ends = times + round(NANO / self._wanted.fps)
+        place = np.searchsorted(track.times, ends, side="left") - 1
         known = np.maximum(place, 0)
         if not len(track.times):
             return np.zeros((len(times), len(TWIST))), np.full(len(times), -1, np.int64)
-        age = np.where(place < 0, -1, times - track.times[known])
+        age = np.where(place < 0, -1, ends - track.times[known])
         timeout = self._wanted.command_timeout_s
         if np.isfinite(timeout):
             age = np.where(age > round(timeout * NANO), -1, age)
         order = [TWIST.index(name) for name in self._wanted.action_names]
         return np.where(age[:, None] >= 0, track.values[known], 0.0)[:, order], age
+
+    def _tell_silence(self, columns: Mapping[str, NDArray[Any]], begin: int) -> None:
+        """Tell how many frames have no command, and whether the robot drove in them."""
+        silent = columns[keys.MODE] == int(Mode.HOLD)
+        if not silent.any():
+            return
+        names = list(self._wanted.observation_names)
+        speeds = columns[keys.OBSERVATION_STATE][:, [names.index(name) for name in TWIST]]
+        moving = int((silent & (np.abs(speeds) > _MOVES).any(axis=1)).sum())
+        drove = (
+            f", though the robot moved in {moving} of them: --command_timeout=inf is for robots that go on with the "
+            "last command"
+            if moving
+            else ""
+        )
+        self.notes.append(
+            f"{int(silent.sum())} of {len(silent)} frames of the episode {seconds(begin - self._begin)} after the "
+            f"start have no command that is younger than {self._wanted.command_timeout_s:g} s; their action is 0{drove}"
+        )
 
     def _state(self, episode: _Episode) -> NDArray[np.float32]:
         times, tracks = episode.grid.times, episode.tracks
@@ -240,6 +284,10 @@ class _RobotBag:
     def _picture(self, role: str, place: int) -> NDArray[np.uint8]:
         track = self._tracks[role]
         return decode_image(track.topic, track.msgtype, self._pictures[role].get(place))
+
+
+_MOVES = 0.01
+"""[m/s, rad/s] A robot that is slower stands."""
 
 
 def _is_camera(role: str) -> bool:

@@ -48,7 +48,7 @@ class TrackOptions:
     cameras: Mapping[str, str]
     beams: int
     lidar: LidarSpec
-    stamps: str = "auto"
+    stamps: str = "receive"
     scan_frame: str | None = None
     odom_frame: str | None = None
     scan_yaw: float | None = None
@@ -106,8 +106,8 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
         times = message_times(found.received, stamps, options.stamps)
         if stamps is not None and options.stamps == "auto" and (wrong := int((~sane(found.received, stamps)).sum())):
             notes.append(
-                f"{topic.name}: {wrong} of {len(times)} header stamps are not within 0.5 s of the reception, and the "
-                "time of reception was taken instead (--stamps=header or receive decides for all)"
+                f"{topic.name}: {wrong} of {len(times)} header stamps are not within 0.5 s of the reception; the "
+                f"{'headers were' if times is stamps else 'times of reception were'} taken for all of them"
             )
         values = _values(role, topic, found.data, _Reading(options, static, notes))
         finite = (np.abs(values) < np.finfo(np.float32).max).all(axis=1)  # the dataset's numbers are float32

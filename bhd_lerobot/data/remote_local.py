@@ -97,6 +97,11 @@ def _refuse_unfinished(state: DatasetState) -> None:
 def _files(state: DatasetState, stamps: dict[str, Any]) -> tuple[list[str], list[str]]:
     """Return the files that belong to the dataset, and those that look like its own and belong to no episode."""
     needed = state.files()
+    if unseen := sorted(needed - stamps.keys()):
+        raise DatasetError(
+            f"{state.root}: {listed(unseen)} lie behind a link to a folder, which is not followed. Copy the dataset "
+            "with `cp -rL`, and take the copy."
+        )
     left_out = sorted(name for name in stamps if is_recorded(name) and name not in needed)
     skipped = {*left_out, SUBSET}
     names = [name for name in sorted(stamps) if name not in skipped and name.split("/")[0] not in _TEMPORARY]

@@ -90,6 +90,10 @@ def pull(remote: Remote, root: Path | str, *, select: Select | None = None, repl
         return _Pull(remote, root, replace).run(select)
 
 
+_MARKER = ".bhd-pull"
+"""In folders beside the target that this program made, and may remove."""
+
+
 class _Pull:
     def __init__(self, remote: Remote, root: Path, replace: bool) -> None:
         self._remote, self._root, self._replace = remote, root, replace
@@ -97,14 +101,26 @@ class _Pull:
         self._old = root.with_name(f".{root.name}.old")
         self._fetched: list[str] = []
 
+    def _refuse_others(self) -> None:
+        for folder in (self._staging, self._old):
+            is_empty = folder.is_dir() and not any(folder.iterdir())
+            if folder.exists() and not is_empty and not (folder / _MARKER).exists():
+                raise DatasetError(
+                    f"{folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
+                    "there. Move it, or choose another --root."
+                )
+
     def run(self, select: Select | None) -> PullReport:
         there = self._files()
         if os.path.ismount(self._root):
             raise DatasetError(f"{self._root} is a mount point, which cannot be exchanged. Name a folder in it.")
+        self._refuse_others()
         if self._old.is_dir() and not self._root.exists():
             self._old.rename(self._root)  # a kill between the two renames
+            (self._root / _MARKER).unlink(missing_ok=True)
         is_new = not self._staging.exists()
         self._staging.mkdir(parents=True, exist_ok=True)
+        (self._staging / _MARKER).touch()
         locks = [RootLock(self._staging, self._root)]
         try:
             if self._root.is_dir():
@@ -248,11 +264,13 @@ class _Pull:
             for path in _foreign(root, wanted):
                 _link(root / path, staging / path)
             shutil.rmtree(self._old, ignore_errors=True)
+            (root / _MARKER).touch()
             root.rename(self._old)
             staging.rename(root)
             shutil.rmtree(self._old)
         else:
             staging.rename(root)
+        (root / _MARKER).unlink(missing_ok=True)
 
 
 def _problem(root: Path) -> str:
@@ -286,7 +304,7 @@ def _link(source: Path, target: Path) -> None:
 
 def _foreign(root: Path, wanted: Iterable[str]) -> list[str]:
     """Return the files of a folder that belong to no dataset: notes, for example."""
-    ours = {*wanted, SUBSET, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY}
+    ours = {*wanted, _MARKER, SUBSET, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY}
     found = (path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
     return [path for path in found if path not in ours and not is_recorded(path) and not path.startswith(".cache/")]
 
@@ -294,7 +312,7 @@ def _foreign(root: Path, wanted: Iterable[str]) -> list[str]:
 def _remove_others(folder: Path, wanted: set[str]) -> None:
     """Remove what an attempt for another version left."""
     for path in sorted(folder.rglob("*"), reverse=True):
-        if path.is_file() and path.relative_to(folder).as_posix() not in wanted:
+        if path.is_file() and path.relative_to(folder).as_posix() not in {*wanted, _MARKER}:
             path.unlink()
         elif path.is_dir() and not any(path.iterdir()):
             path.rmdir()

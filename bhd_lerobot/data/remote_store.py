@@ -10,6 +10,7 @@ import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -100,8 +101,8 @@ class StoreDataset:
         self._there = {}
         for path, size in sizes.items():
             known = self._known.get(path)
-            is_known = known is not None and known.size == size
-            self._there[path] = known if known is not None and is_known else RemoteFile(size, None)
+            # Where the size is not the one that was written, the checksum will not be either: that is told.
+            self._there[path] = RemoteFile(size, None) if known is None else replace(known, size=size)
         return dict(self._there)
 
     def read(self, path: str) -> bytes | None:
@@ -153,13 +154,23 @@ class StoreDataset:
             if stale:
                 self._write_manifest()
             if deleted:
-                self._fs.rm([self._at(path) for path in deleted])
+                run_all(self._remove, deleted, self._workers)
             self._put(list(by_path.values()))
             check()
+            if items and self._read_manifest() != self._known:
+                raise TransferError(
+                    f"Another push wrote to {self.name} at the same time, so what lies there now may be of both. There "
+                    "is no meta/info.json, so nobody takes it for a dataset. Push again, one after the other."
+                )
             if info is not None:
                 self._known[layout.INFO] = _about(info)
                 self._write_manifest()
                 self._put_one(info)
+
+    def _remove(self, path: str) -> None:
+        # One by one: `rm` takes brackets and stars in a name for a pattern, and removes what it fits.
+        with contextlib.suppress(FileNotFoundError):
+            self._fs.rm_file(self._at(path))
 
     def _put(self, items: Sequence[Item]) -> None:
         """Write files, and note those that arrived, now and then and at the end, also if one fails."""

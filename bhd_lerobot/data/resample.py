@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 Times = NDArray[np.int64]
 NANO = 1_000_000_000
-STEP_BACK_NS = NANO // 2  # a clock that goes back further has jumped; what is less is sorted
+STEP_BACK_NS = NANO // 2  # stamps that go back further are of a clock that has jumped; what is less is sorted
+CLOCK_STEP_NS = NANO // 20  # the same of the recorder's own clock, which nothing but a jump lets go back
+_NEARLY_ALL = 0.99
 
 
 @dataclass(frozen=True)
@@ -37,16 +39,16 @@ def message_times(received: Times, stamps: Times | None, policy: str, tolerance_
     Args:
         received: when the recorder got them.
         stamps: of their headers; None if they have none.
-        policy: ``"header"`` or ``"receive"`` take one of them; ``"auto"`` takes the header's if it is sane: before
-            the message was received, and not by more than the tolerance. Each message is judged by itself, so that no
-            later one decides about it.
+        policy: ``"header"`` or ``"receive"`` take one of them; ``"auto"`` takes the headers' of a topic if nearly all
+            of them are sane: before the message was received, and not by more than the tolerance. Two clocks in one
+            topic would mix up its order.
         tolerance_ns: on both sides, for two clocks that differ a little; a tenth of it after the reception.
     """
     if stamps is None or policy == "receive":
         return received
     if policy == "header":
         return stamps
-    return np.where(sane(received, stamps, tolerance_ns), stamps, received)
+    return stamps if sane(received, stamps, tolerance_ns).mean() >= _NEARLY_ALL else received
 
 
 def sane(received: Times, stamps: Times, tolerance_ns: int = NANO // 2) -> NDArray[np.bool_]:
@@ -55,21 +57,22 @@ def sane(received: Times, stamps: Times, tolerance_ns: int = NANO // 2) -> NDArr
     return (stamps > 0) & (delay <= tolerance_ns) & (delay >= -tolerance_ns // 10)
 
 
-def clock_jumps(times: Sequence[Times], order: Sequence[Times]) -> Times:
+def clock_jumps(times: Sequence[Times], order: Sequence[Times], step_ns: int = STEP_BACK_NS) -> Times:
     """Return where the clock jumped back: places in the bag's order, of the first message after each jump.
 
     Args:
         times: of each topic's messages, in the order in which they were written.
         order: their places among all messages of the bag.
+        step_ns: by how much a clock that has jumped goes back.
     """
-    if not any((np.diff(one) < -STEP_BACK_NS).any() for one in times):
+    if not any((np.diff(one) < -step_ns).any() for one in times):
         return np.zeros(0, np.int64)  # a bag may also have been written topic by topic
     places = np.concatenate(list(order))
     by_place = np.argsort(places, kind="stable")
     clock, places = np.concatenate(list(times))[by_place], places[by_place]
     jumps, begin = [], 0
     while len(clock) > begin:
-        behind = np.maximum.accumulate(clock[begin:]) - clock[begin:] > STEP_BACK_NS
+        behind = np.maximum.accumulate(clock[begin:]) - clock[begin:] > step_ns
         if not behind.any():
             break
         begin += int(behind.argmax())

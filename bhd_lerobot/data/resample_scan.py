@@ -94,7 +94,7 @@ def resampled_scans(
         topic: for messages.
 
     Raises:
-        DatasetError: a scan does not see all around.
+        DatasetError: most scans do not see all around; single ones that do not are lost.
     """
     n = len(ranges)
     result = np.empty((n, beams))
@@ -102,12 +102,39 @@ def resampled_scans(
     keys = np.stack([lengths, geometry["angle_min"], geometry["angle_increment"], geometry["range_min"]], axis=1)
     turn = tuple(rotation.reshape(-1).tolist())
     kinds, which = np.unique(keys, axis=0, return_inverse=True)
+    partial = 0
+    reason: DatasetError | None = None
     for kind, (count, angle_min, increment, range_min) in enumerate(kinds):
         rows = np.flatnonzero(which.reshape(-1) == kind)
         if count < 1 or not np.isfinite([angle_min, increment]).all() or (increment == 0 and beams > 1):
             result[rows] = np.nan
             continue
-        beam = nearest_beams(Sweep(int(count), float(angle_min), float(increment)), beams, turn, topic)
-        block = np.stack([np.asarray(ranges[row], np.float64) for row in rows])
+        try:
+            beam = nearest_beams(Sweep(int(count), float(angle_min), float(increment)), beams, turn, topic)
+        except DatasetError as error:
+            # A driver that lost a packet sends a part of a turn: that scan is lost. A scanner that sees a part of the
+            # world always does.
+            partial += len(rows)
+            reason = error
+            result[rows] = np.nan
+            continue
+        block = _without_holes(np.stack([np.asarray(ranges[row], np.float64) for row in rows]))
         result[rows] = clean_ranges(block[:, beam], lidar, float(range_min))
+    if reason is not None and 2 * partial > n:
+        raise reason
     return result
+
+
+def _without_holes(block: Array) -> Array:
+    """Fill single beams without a measurement from their neighbours, shape (n, m).
+
+    Drivers that sort points into bins leave some empty, which is not a number, and not free space. What is missing in a
+    row of more than two is no such bin.
+    """
+    for _ in range(2):
+        empty = np.isnan(block)
+        if not empty.any():
+            break
+        before, after = np.roll(block, 1, axis=1), np.roll(block, -1, axis=1)
+        block = np.where(empty, np.where(np.isnan(before), after, before), block)
+    return block

@@ -44,7 +44,7 @@ def add_to(commands: Commands) -> None:
     )
     real.add_argument("--odometry", action="store_true", help="observe x.pos, y.pos and theta.pos, too")
     real.add_argument("--beams", type=int, default=360, help="beams of a scan in the dataset (default: 360)")
-    real.add_argument("--stamps", default="auto", help="whose time counts: auto (default), header or receive")
+    real.add_argument("--stamps", default="receive", help="whose time counts: receive (default), header or auto")
     real.add_argument("--scan_frame", metavar="FRAME", help="name of the scanner's frame, if it is not base_scan")
     real.add_argument("--scan_yaw", type=float, metavar="RAD", help="where its zero points; 0 is straight ahead")
     real.add_argument("--odom_frame", metavar="FRAME", help="name of the base's frame, if it is not base_footprint")
@@ -95,7 +95,7 @@ _PLAIN = ("task", "imu", "scan_frame", "scan_yaw", "odom_frame", "max_age", "com
 def _refuse_options(options: argparse.Namespace) -> None:
     given = [name for name in _PLAIN if getattr(options, name) is not None]
     given += ["camera"] * bool(options.camera) + ["odometry"] * options.odometry
-    for name, default in (("fps", 10), ("beams", 360), ("stamps", "auto"), ("max_gap", 1.0)):
+    for name, default in (("fps", 10), ("beams", 360), ("stamps", "receive"), ("max_gap", 1.0)):
         given += [name] * (getattr(options, name) != default)
     if given:
         raise ConfigError(

@@ -453,9 +453,33 @@ def test_a_kill_between_the_renames_is_mended(hub: HubServer, root: Path, tmp_pa
     send(root)
     target = tmp_path / "e"
     pull(HubDataset("me/d"), target)
+    (target / ".bhd-pull").touch()
     target.rename(tmp_path / ".e.old")
     assert pull(HubDataset("me/d"), target).fetched == []
     assert content(target) == content(root)
+
+
+@pytest.mark.parametrize("name", [".e.old", ".e.pull"])
+def test_folders_of_others_in_its_way_are_left_alone(hub: HubServer, root: Path, tmp_path: Path, name: str) -> None:
+    send(root)
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "thesis.txt").write_text("years")
+    with pytest.raises(DatasetError, match="is in the way"):
+        pull(HubDataset("me/d"), tmp_path / "e")
+    assert (tmp_path / name / "thesis.txt").read_text() == "years"
+    assert not (tmp_path / "e").exists()
+
+
+def test_a_folder_behind_a_link_is_not_taken_for_gone(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    """What is not seen must not be removed at the other end."""
+    copied = Path(shutil.copytree(root, tmp_path / "copied"))
+    send(root)
+    before = HubDataset("me/d").files()
+    (copied / "videos").rename(tmp_path / "big")
+    (copied / "videos").symlink_to(tmp_path / "big")
+    with pytest.raises(DatasetError, match="behind a link"):
+        send(copied)
+    assert HubDataset("me/d").files() == before
 
 
 def test_a_full_disk_is_seen_before_and_during(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:

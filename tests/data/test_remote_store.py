@@ -288,3 +288,55 @@ def test_what_is_not_installed_is_named(monkeypatch) -> None:
 
 async def _no_sleep(*_: object) -> None:
     return None
+
+
+@pytest.mark.parametrize("names", [("runa/d", "run[a]/d"), ("run1/d", "run?/d"), ("runs/d", "r*/d")])
+def test_names_are_no_patterns(root: Path, url: str, names: tuple[str, str]) -> None:
+    """What is removed below one name must not be removed below those that the name would fit as a pattern."""
+    place = url.rsplit("/", 2)[0]
+    plain, odd = (f"{place}/{name}" for name in names)
+    for one in (plain, odd):
+        push(root, StoreDataset(one))
+    before = stored(plain)
+    with fsspec.open(f"{odd}/data/chunk-000/file-009.parquet", "wb") as file:
+        file.write(b"stale")
+    assert push(root, StoreDataset(odd)).deleted == ["data/chunk-000/file-009.parquet"]
+    assert stored(plain) == before
+    assert stored(odd) == content(root)
+
+
+def test_a_file_that_was_cut_there_is_refused_and_can_be_sent_again(root: Path, url: str, tmp_path: Path) -> None:
+    push(root, StoreDataset(url))
+    film = next(name for name in content(root) if name.endswith(".mp4"))
+    with fsspec.open(f"{url}/{film}", "wb") as file:
+        file.write((root / film).read_bytes()[:-40])
+    with pytest.raises(TransferError, match=Path(film).name):
+        pull(StoreDataset(url), tmp_path / "e")
+    assert not (tmp_path / "e").exists()
+    assert push(root, StoreDataset(url)).sent == [film]
+    pull(StoreDataset(url), tmp_path / "e")
+    assert content(tmp_path / "e") == content(root)
+
+
+def test_two_pushes_at_once_leave_nothing_that_looks_whole(
+    root: Path, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = Path(shutil.copytree(root, tmp_path / "other"))
+    with support.resume(other, video=True) as recorder:
+        support.record(recorder, video=True)
+    put = StoreDataset._put
+    is_first = True
+
+    def put_and_be_overtaken(self: StoreDataset, items: list) -> None:
+        nonlocal is_first
+        put(self, items)
+        if is_first:
+            is_first = False
+            push(other, StoreDataset(url))
+
+    monkeypatch.setattr(StoreDataset, "_put", put_and_be_overtaken)
+    with pytest.raises(TransferError, match="at the same time"):
+        push(root, StoreDataset(url))
+    monkeypatch.undo()
+    push(root, StoreDataset(url))
+    assert stored(url) == content(root)

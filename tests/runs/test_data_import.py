@@ -89,8 +89,9 @@ def test_a_scan_is_the_newest_one_and_lies_right(tmp_path, plain):
     stamps = np.array([message.header.stamp.sec * NANO + message.header.stamp.nanosec
                        for topic, _, message in drive() if topic == "/scan"])  # fmt: skip
     start = json.loads(dataset_info(tmp_path / "d").episodes[0].metadata["source"])["start_ns"]
+    received = np.array([at for topic, at, _ in drive() if topic == "/scan"])
     for frame, scan in enumerate(scans):
-        stamp = stamps[np.searchsorted(stamps, start + frame * NANO // 10, side="right") - 1]
+        stamp = stamps[np.searchsorted(received, start + frame * NANO // 10, side="right") - 1]
         assert scan == pytest.approx(bags.distance(angle, (stamp - START) / NANO), abs=1e-6)
 
 
@@ -256,11 +257,53 @@ def test_stamps_that_cannot_be_true_are_told_and_the_reception_counts(tmp_path, 
         (topic, at, bags.odometry(at - 1000 * NANO) if topic == "/odom" else message) for topic, at, message in drive()
     ]
     source = write(tmp_path / "bag", messages)
-    imported(source, tmp_path / "d")
+    imported(source, tmp_path / "d", "--stamps=auto")
     assert "/odom: 120 of 120 header stamps are not within 0.5 s" in capsys.readouterr().err
     assert "no such time" in refused(source, tmp_path / "e", capsys, "--stamps=header")
-    imported(source, tmp_path / "e", "--stamps=receive")
+    imported(source, tmp_path / "e")
     assert "header stamps" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("late_ms", [0, 1, 20, 50, 99])
+def test_an_action_is_the_answer_to_its_observation(tmp_path, late_ms):
+    """A brain answers each observation after a while; the action of a frame is that answer, not the one before."""
+    base = [one for one in drive(seconds=4) if one[0] != "/cmd_vel"]
+    imported(write(tmp_path / "silent", [*base, ("/cmd_vel", base[0][1], bags.twist(0, 0))]), tmp_path / "a")
+    start = json.loads(dataset_info(tmp_path / "a").episodes[0].metadata["source"])["start_ns"]
+    answers = [
+        ("/cmd_vel", start + frame * NANO // 10 + late_ms * NANO // 1000, bags.twist(frame / 1000, -frame / 500))
+        for frame in range(60)
+    ]
+    imported(write(tmp_path / "bag", sorted([*base, *answers], key=lambda one: one[1])), tmp_path / "b")
+    action = read_episode(tmp_path / "b", 0)["action"]
+    assert action[:, 0] == pytest.approx(np.arange(len(action)) / 1000)
+    assert action[:, 1] == pytest.approx(-np.arange(len(action)) / 500)
+
+
+def test_frames_without_a_command_are_told(tmp_path, capsys):
+    messages = [one for one in drive() if one[0] != "/cmd_vel" or one[1] < START + NANO]
+    info = imported(write(tmp_path / "bag", messages), tmp_path / "d")
+    error = capsys.readouterr().err
+    columns = read_episode(tmp_path / "d", 0)
+    silent = int((columns["control.mode"] == 2).sum())
+    assert 30 < silent < info.frames
+    assert f"{silent} of {info.frames} frames" in error
+    assert "--command_timeout=inf" in error  # it drives on
+    imported(tmp_path / "bag", tmp_path / "e", "--command_timeout=inf")
+    assert "no command" not in capsys.readouterr().err
+
+
+def test_commands_of_another_clock_are_refused(tmp_path, capsys):
+    messages = [(topic, at + 1000 * NANO if topic == "/cmd_vel" else at, message) for topic, at, message in drive()]
+    assert "Their stamps are of different clocks" in refused(write(tmp_path / "bag", messages), tmp_path / "d", capsys)
+
+
+def test_a_step_of_the_recorders_clock_begins_an_episode(tmp_path, capsys):
+    """As of NTP: what was heard before and after must not be sorted into each other."""
+    half = START + 4 * NANO
+    messages = [(topic, at if at < half else at - 3 * NANO // 10, message) for topic, at, message in drive(seconds=8)]
+    assert len(imported(write(tmp_path / "bag", messages), tmp_path / "d").episodes) == 2
+    assert "the clock jumped back" in capsys.readouterr().err
 
 
 def test_a_truncated_bag_is_taken_to_its_end_and_told(tmp_path, capsys, plain):
