@@ -57,19 +57,22 @@ def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any]
     return build_root(root, fill, disk)
 
 
-def build_root(root: Path, fill: Callable[[Path], None], disk: Disk) -> RootLock:
+def build_root(
+    root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str = "Resume it (--resume=true), remove it"
+) -> RootLock:
     """Build a dataset beside its place, rename it, and return the lock on it.
 
     Args:
         root: where to put it; must not exist.
         fill: writes everything into the folder that it is given.
         disk: how to write.
+        remedy: what can be done if it exists.
 
     Raises:
         DatasetExistsError: `root` exists.
         DatasetWriteError: it cannot be written.
     """
-    exists = DatasetExistsError(f"{root} exists already. Resume it (--resume=true), remove it, or choose another root.")
+    exists = DatasetExistsError(f"{root} exists already. {remedy}, or choose another root.")
     if root.exists() or root.is_symlink():
         raise exists
     with write_errors("create the dataset", root, "Nothing was written there."):

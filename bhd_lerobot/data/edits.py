@@ -188,7 +188,15 @@ def _write_new(
         video = (identities[0] or {}).get("video", {})
         identity = {"format": FORMAT, "recording": {**recording, "edited": dict(edit)}, "video": video}
     disk = Disk()
-    lock = build_root(target, lambda folder: assemble(picks, folder, disk, edit=_timed(edit), identity=identity), disk)
+    for source in {pick.source.root.resolve() for pick in picks}:
+        if source in target.resolve().parents:
+            raise ConfigError(f"{target} lies in {source}, which is to stay as it is. Choose a place beside it.")
+    lock = build_root(
+        target,
+        lambda folder: assemble(picks, folder, disk, edit=_timed(edit), identity=identity),
+        disk,
+        "Remove it",
+    )
     lock.release()
     return EditReport(target, len(picks), sum(pick.row["length"] for pick in picks))
 

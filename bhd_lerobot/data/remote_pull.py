@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.assemble import EDITS
 from bhd_lerobot.data.disk import RootLock, to_json, write_errors
 from bhd_lerobot.data.remote import (
     SUBSET,
@@ -304,7 +305,7 @@ def _link(source: Path, target: Path) -> None:
 
 def _foreign(root: Path, wanted: Iterable[str]) -> list[str]:
     """Return the files of a folder that belong to no dataset: notes, for example."""
-    ours = {*wanted, _MARKER, SUBSET, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY}
+    ours = {*wanted, _MARKER, SUBSET, EDITS, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY}
     found = (path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
     return [path for path in found if path not in ours and not is_recorded(path) and not path.startswith(".cache/")]
 

@@ -1,16 +1,19 @@
 """Copy a dataset to the Hub or below a URL: what differs, and nothing else."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.assemble import EDITS
 from bhd_lerobot.data.card import is_generated
+from bhd_lerobot.data.edits import edits_of
 from bhd_lerobot.data.remote import CARD, PICTURE, Item, Remote, RemoteFile, is_recorded, refuse_overlap, total
 from bhd_lerobot.data.remote_local import LocalDataset, open_local
 from bhd_lerobot.data.remote_pool import run_all
 from bhd_lerobot.data.state import DatasetState
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import DatasetError, DatasetExistsError
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,12 @@ class PushReport:
 
 
 def push(
-    root: Path | str, remote: Remote, *, make_card: MakeCard | None = None, replace_card: bool = False
+    root: Path | str,
+    remote: Remote,
+    *,
+    make_card: MakeCard | None = None,
+    replace_card: bool = False,
+    replace: bool = False,
 ) -> PushReport:
     """Make a remote dataset the same as the one on this machine.
 
@@ -67,8 +75,10 @@ def push(
         remote: where to.
         make_card: generates a card; None sends none but the user's own.
         replace_card: overwrite a card at the remote place that a person wrote.
+        replace: overwrite a dataset at the remote place that is another one, or has more episodes.
 
     Raises:
+        DatasetExistsError: there is another dataset, or one with more episodes, and `replace` is false.
         ConfigError: both are the same folder.
         DatasetError: the dataset is not whole and finalised, is in use, or was changed meanwhile.
         TransferError: the place cannot be reached or does not let this user write; what was sent is not sent again.
@@ -76,6 +86,8 @@ def push(
     refuse_overlap(Path(root), remote)
     with open_local(Path(root)) as local:
         there = remote.files()
+        if not replace and layout.INFO in there:
+            _refuse_another(local, remote)
         cards, kept_card = _cards(local, remote, make_card, replace_card, is_there=CARD in there)
         items = [item for item in local.items if item.path not in (CARD, PICTURE)] + cards
         try:
@@ -83,7 +95,7 @@ def push(
         except OSError as error:
             raise DatasetError(f"{root} cannot be read: {error}.") from error
         wanted = {item.path for item in items}
-        ours = (layout.STATS, layout.TASKS, layout.IDENTITY)
+        ours = (layout.STATS, layout.TASKS, layout.IDENTITY, EDITS)
         deleted = sorted(path for path in there if path not in wanted and (is_recorded(path) or path in ours))
         remote.send(changed, deleted, local.check_unchanged)
         return PushReport(
@@ -95,6 +107,34 @@ def push(
             deleted=deleted,
             left_out=local.left_out,
             kept_card=kept_card,
+        )
+
+
+def _refuse_another(local: LocalDataset, remote: Remote) -> None:
+    """Refuse to overwrite what this dataset is no later version of; a store keeps no history.
+
+    Raises:
+        DatasetExistsError: what lies there has other columns, another rate or robot or format, or more episodes, though
+            none was deleted here.
+    """
+    info = local.state.info
+    try:
+        there = json.loads(remote.read(layout.INFO) or b"{}")
+        columns = {key: feature["dtype"] for key, feature in there["features"].items()}
+        told = (columns, there["fps"], there.get("robot_type"), str(there["codebase_version"])[:2])
+        episodes = int(there["total_episodes"])
+    except (ValueError, KeyError, TypeError, AttributeError):
+        told, episodes = ({}, None, None, ""), 0
+    own = {key: feature["dtype"] for key, feature in info["features"].items()}
+    if told != (own, info["fps"], info.get("robot_type"), str(info["codebase_version"])[:2]):
+        raise DatasetExistsError(
+            f"{remote.name} is another dataset: it has other columns, another rate, robot or format than {local.root}. "
+            "Choose another place, or give up what lies there with --replace."
+        )
+    if episodes > local.state.num_episodes and not any(edit.get("edit") == "delete" for edit in edits_of(local.root)):
+        raise DatasetExistsError(
+            f"{remote.name} has {episodes} episodes, {local.root} has {local.state.num_episodes} and none was deleted "
+            "from it: it is an older one, or another. Pull that one, or give it up with --replace."
         )
 
 

@@ -16,7 +16,9 @@ from bhd_lerobot.data import layout
 from bhd_lerobot.data.layout import Slot
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError
 
-_REMEDY = "Restore this file from a copy (or from the Hub), or record into a new root; nothing was changed."
+_REMEDY = (
+    "Restore this file from a copy (or from the Hub), or see what `bhd-data repair` can recover; nothing was changed."
+)
 
 Row = dict[str, Any]
 """One row of ``meta/episodes``, without the statistics."""

@@ -59,7 +59,8 @@ def _filter(options: argparse.Namespace) -> int:
 
 
 def _delete(options: argparse.Namespace) -> int:
-    print(delete(root_of(options), parse_episodes(options.episodes)))
+    report = delete(root_of(options), parse_episodes(options.episodes))
+    print(f"{report}; episodes {options.episodes} are gone, and those behind them have new numbers")
     return 0
 
 

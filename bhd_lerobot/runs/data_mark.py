@@ -37,5 +37,8 @@ def _run(options: argparse.Namespace) -> int:
         clear_interventions=options.clear_interventions,
         note=options.note,
     )
-    print(f"marked; {report}")
+    said = [options.outcome] * bool(options.outcome)
+    said += [f"an intervention in frames {span[0]} to {span[1]}"] if span is not None else []
+    said += ["no interventions"] * options.clear_interventions
+    print(f"{report}; episodes {options.episodes}: {', '.join(said)}")
     return 0

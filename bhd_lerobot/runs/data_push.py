@@ -32,6 +32,9 @@ def add_to(commands: Commands) -> None:
     command.add_argument("--licence", "--license", default="apache-2.0", help="licence of the card")
     command.add_argument("--no-card", action="store_true", help="send no card but one that lies in the folder")
     command.add_argument("--replace-card", action="store_true", help="overwrite a card there that somebody edited")
+    command.add_argument(
+        "--replace", action="store_true", help="overwrite a dataset there that is another one, or has more episodes"
+    )
     command.add_argument("--storage_options", help="options of the URL's file system, JSON")
 
 
@@ -47,6 +50,7 @@ def _run(options: argparse.Namespace) -> int:
         tags=split_list(options.tags),
         licence=None if options.licence == "apache-2.0" else options.licence,
         **{"no-card": options.no_card, "replace-card": options.replace_card},
+        replace=options.replace,
         storage_options=options.storage_options,
     )
     options.stopped = left_by_interrupt(root, again)
@@ -61,6 +65,7 @@ def _run(options: argparse.Namespace) -> int:
             licence=options.licence,
             card=not options.no_card,
             replace_card=options.replace_card,
+            replace=options.replace,
             storage=options.storage_options,
             again=again,
         )
@@ -79,6 +84,7 @@ def push_dataset(
     licence: str = "apache-2.0",
     card: bool = True,
     replace_card: bool = False,
+    replace: bool = False,
     storage: str | None = None,
     again: str | None = None,
 ) -> "PushReport":
@@ -94,6 +100,7 @@ def push_dataset(
         licence: licence of the card.
         card: whether a card is made.
         replace_card: overwrite a card that a person edited.
+        replace: overwrite a dataset there that is another one, or has more episodes.
         storage: options of the URL's file system, JSON.
         again: the command to repeat.
 
@@ -120,7 +127,7 @@ def push_dataset(
             if is_url(target)
             else HubDataset(target, branch, private=private, tag=tag, create=True)
         )
-        return push(root, remote, make_card=make if card else None, replace_card=replace_card)
+        return push(root, remote, make_card=make if card else None, replace_card=replace_card, replace=replace)
     except ConfigError:
         raise
     except BhdError as error:

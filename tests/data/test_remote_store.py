@@ -9,6 +9,7 @@ import fsspec
 import pytest
 
 from bhd_lerobot.data import layout, remote_store
+from bhd_lerobot.data.edits import delete
 from bhd_lerobot.data.remote_pull import pull
 from bhd_lerobot.data.remote_push import push
 from bhd_lerobot.data.remote_store import MANIFEST, StoreDataset
@@ -93,7 +94,11 @@ def test_a_longer_dataset_replaces_what_differs(root: Path, url: str, tmp_path: 
     assert report.kept > 0
     with support.create(tmp_path / "small") as recorder:
         support.record(recorder)
-    assert push(tmp_path / "small", StoreDataset(url)).deleted
+    before = stored(url)
+    with pytest.raises(DatasetExistsError, match=r"is another dataset.*--replace"):
+        push(tmp_path / "small", StoreDataset(url))
+    assert stored(url) == before
+    assert push(tmp_path / "small", StoreDataset(url), replace=True).deleted
     assert stored(url) == content(tmp_path / "small")
 
 
@@ -128,7 +133,7 @@ def test_an_upload_that_dies_anywhere_shows_nothing_and_goes_on(root: Path, tmp_
         for name in ("put_file", "pipe_file", "rm_file"):
             patch.setattr(type(memory), name, dying.wrap(getattr(type(memory), name)))
         with pytest.raises(TransferError, match="cannot be reached"):
-            push(root, StoreDataset(url))
+            push(root, StoreDataset(url), replace=True)
     if step == 0:  # nothing was changed yet
         pull(StoreDataset(url), target)
         assert content(target) == content(old)
@@ -136,7 +141,7 @@ def test_an_upload_that_dies_anywhere_shows_nothing_and_goes_on(root: Path, tmp_
         with pytest.raises(TransferError, match=r"no meta/info\.json"):
             pull(StoreDataset(url), target)
         assert not target.exists()
-    push(root, StoreDataset(url))
+    push(root, StoreDataset(url), replace=True)
     assert stored(url) == content(root)
 
 
@@ -338,5 +343,19 @@ def test_two_pushes_at_once_leave_nothing_that_looks_whole(
     with pytest.raises(TransferError, match="at the same time"):
         push(root, StoreDataset(url))
     monkeypatch.undo()
-    push(root, StoreDataset(url))
+    push(root, StoreDataset(url), replace=True)
     assert stored(url) == content(root)
+
+
+def test_an_older_copy_does_not_replace_a_longer_one(root: Path, url: str, tmp_path: Path) -> None:
+    """A store keeps no history; fewer episodes are right only where some were deleted."""
+    longer = Path(shutil.copytree(root, tmp_path / "longer"))
+    with support.resume(longer, video=True) as recorder:
+        support.record(recorder, video=True)
+    push(longer, StoreDataset(url))
+    with pytest.raises(DatasetExistsError, match=r"has 4 episodes, .* has 3 and none was deleted"):
+        push(root, StoreDataset(url))
+    assert stored(url) == content(longer)
+    delete(longer, [0])
+    push(longer, StoreDataset(url))
+    assert stored(url) == content(longer)
