@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.hub_errors import hub_errors, require_token
-from bhd_lerobot.data.remote import Item, RemoteFile, check_repo_id, in_order, largest_first, refuse_damaged
+from bhd_lerobot.data.remote import Item, RemoteFile, check_repo_id, in_order, largest_first, listed, refuse_damaged
 from bhd_lerobot.data.remote_pool import run_all
 from bhd_lerobot.errors import TransferError
 
@@ -177,6 +177,11 @@ class HubDataset:
         self._api.preupload_lfs_files(
             self.name, additions, repo_type="dataset", revision=self._branch, free_memory=False
         )
+        if ignored := [one.path_in_repo for one in additions if getattr(one, "_should_ignore", False)]:
+            raise TransferError(
+                f"Could not upload the dataset to {self.name}: the repository's .gitignore names {listed(ignored)}, "
+                "and the Hub would leave them out. Change that file there; nothing was changed."
+            )
         removals = [CommitOperationDelete(path) for path in deleted]
         operations = [*additions, *removals]
         count = -(-len(operations) // _COMMIT_SIZE)

@@ -201,7 +201,7 @@ class _Pull:
             raise DatasetExistsError(
                 f"{root} is a recording that was interrupted. Run bhd-data repair {root}, or choose another --root."
             )
-        if any(root.iterdir()) and not (root / layout.INFO).is_file() and not self._replace:
+        if any(root.iterdir()) and not (root / layout.INFO).is_file():
             raise DatasetExistsError(f"{root} exists and is no dataset. Choose another folder with --root.")
         same = _compare(root, [path for path in there if (root / path).is_file()], there)
         changed = {path for path in there if (root / path).is_file() and path not in same}
@@ -297,6 +297,13 @@ def _compare(folder: Path, paths: Sequence[str], there: Mapping[str, RemoteFile]
 
 def _link(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
+    if source.is_symlink():
+        target.symlink_to(os.readlink(source))
+        return
+    if source.is_dir():
+        target.mkdir(exist_ok=True)
+        target.chmod(source.stat().st_mode & 0o7777)
+        return
     try:
         os.link(source, target)
     except OSError:
@@ -304,10 +311,20 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _foreign(root: Path, wanted: Iterable[str]) -> list[str]:
-    """Return the files of a folder that belong to no dataset: notes, for example."""
+    """Return what in a folder belongs to no dataset, folders before what is in them: notes, for example, or `.git`."""
     ours = {*wanted, _MARKER, SUBSET, EDITS, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY}
-    found = (path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
-    return [path for path in found if path not in ours and not is_recorded(path) and not path.startswith(".cache/")]
+    found: list[str] = []
+    for place, folders, files in os.walk(root):
+        inside = Path(place).relative_to(root)
+        folders[:] = [name for name in folders if (inside / name).as_posix() != ".cache/huggingface"]
+        # A link to a folder is a thing of its own, and an empty folder may mean something to who made it.
+        names = [*files, *(name for name in folders if _is_kept(root / inside / name))]
+        found += [(inside / name).as_posix() for name in names]
+    return [path for path in found if path not in ours and not is_recorded(path)]
+
+
+def _is_kept(folder: Path) -> bool:
+    return folder.is_symlink() or not any(folder.iterdir())
 
 
 def _remove_others(folder: Path, wanted: set[str]) -> None:

@@ -7,6 +7,7 @@ the same by. `meta/info.json` is written last and removed first, so that there i
 import contextlib
 import errno
 import json
+import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -58,7 +59,8 @@ class StoreDataset:
         from fsspec.core import url_to_fs  # type: ignore[import-untyped]
 
         protocol, _, path = url.partition("://")
-        self.name = url.rstrip("/")
+        # What is shown, and kept in files: without a password, which may hold any character.
+        self.name = re.sub(r"(://)[^@]*:.*@", r"\1", url.rstrip("/"))
         if "::" in url:
             raise ConfigError(f"{url} is a chain of file systems. Name the one where the dataset is to lie.")
         if protocol in ("http", "https", "data", "hf", "lerobot"):
@@ -66,7 +68,7 @@ class StoreDataset:
         if not path.strip("/"):
             raise ConfigError(f"{url} names no folder. Give one, for example {protocol}://bucket/folder.")
         try:
-            self._fs, self._root = url_to_fs(self.name, **(storage_options or {}))
+            self._fs, self._root = url_to_fs(url.rstrip("/"), **(storage_options or {}))
         except ImportError as error:
             package = _EXTRAS.get(protocol, "")
             remedy = f" Install it: pip install '{package}'" if package else ""

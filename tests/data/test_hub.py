@@ -578,3 +578,50 @@ def test_what_is_not_sound_there_comes_as_it_is_and_that_is_said(hub: HubServer,
     with pytest.raises(DatasetError, match=r"format v2\.1"):
         pull(HubDataset("me/d", "old"), tmp_path / "f")
     assert not hub.asked("GET .*/resolve/.*/data/")  # said before everything was fetched
+
+
+def test_what_belongs_to_no_dataset_survives_an_exchange(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    """A dataset under version control, with links and folders of its own."""
+    send(root)
+    target = tmp_path / "e"
+    pull(HubDataset("me/d"), target)
+    (target / ".git/refs/tags").mkdir(parents=True)
+    (target / ".git/HEAD").write_text("ref")
+    (target / ".cache/app").mkdir(parents=True)
+    (target / ".cache/app/x").write_text("x")
+    (target / "plots").symlink_to(tmp_path)
+    (target / "gone").symlink_to("nowhere")
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+    send(root)
+    assert pull(HubDataset("me/d"), target, replace=True).fetched
+    assert (target / ".git/refs/tags").is_dir()
+    assert (target / ".git/HEAD").read_text() == "ref"
+    assert (target / ".cache/app/x").read_text() == "x"
+    assert (target / "plots").is_symlink()
+    assert (target / "gone").is_symlink()
+    assert not (target / ".bhd-pull").exists()
+
+
+def test_a_folder_that_is_no_dataset_is_never_replaced(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    (tmp_path / "e/data/chunk-000").mkdir(parents=True)
+    (tmp_path / "e/data/chunk-000/file-777.parquet").write_text("mine")
+    with pytest.raises(DatasetExistsError, match="is no dataset"):
+        pull(HubDataset("me/d"), tmp_path / "e", replace=True)
+    assert (tmp_path / "e/data/chunk-000/file-777.parquet").read_text() == "mine"
+
+
+def test_what_the_repository_ignores_is_told(hub: HubServer, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from huggingface_hub import HfApi
+
+    preupload = HfApi.preupload_lfs_files
+
+    def ignoring(self: HfApi, repo_id: str, additions: list, **options: object) -> None:
+        preupload(self, repo_id, additions, **options)
+        additions[0]._should_ignore = True
+
+    monkeypatch.setattr(HfApi, "preupload_lfs_files", ignoring)
+    with pytest.raises(TransferError, match=r"\.gitignore names"):
+        send(root)
+    assert layout.INFO not in HubDataset("me/d").files()

@@ -359,3 +359,15 @@ def test_an_older_copy_does_not_replace_a_longer_one(root: Path, url: str, tmp_p
     delete(longer, [0])
     push(longer, StoreDataset(url))
     assert stored(url) == content(longer)
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("memory://user:pass/wo@rd@host/d", "memory://host/d"),
+        ("memory://bucket/a@b/d", "memory://bucket/a@b/d"),
+        ("memory://bucket/d/", "memory://bucket/d"),
+    ],
+)
+def test_a_password_is_not_shown(url: str, shown: str) -> None:
+    assert StoreDataset(url).name == shown
