@@ -18,13 +18,13 @@ import pyarrow.parquet as pq
 from bhd_lerobot.data import layout, statistics
 from bhd_lerobot.data.assemble_files import build_data, build_videos
 from bhd_lerobot.data.disk import Disk, to_json
-from bhd_lerobot.data.episode_table import PREFIX, read_stats
+from bhd_lerobot.data.episode_table import PREFIX, stored_stats
 from bhd_lerobot.data.exchange import link_others
 from bhd_lerobot.data.identity import comparable, differences
 from bhd_lerobot.data.layout import Slot
 from bhd_lerobot.data.meta_files import tasks_table, write_meta
 from bhd_lerobot.data.picks import Files, Pick, Plan
-from bhd_lerobot.data.state import DatasetState, Row, corrupt, slot_of
+from bhd_lerobot.data.state import DatasetState, Row, corrupt, read_frames, slot_of
 from bhd_lerobot.errors import DatasetError, DatasetMismatchError
 
 EDITS = "meta/edits.jsonl"
@@ -207,9 +207,10 @@ def _stats(picks: Sequence[Pick], rows: Sequence[Row], tasks: Mapping[str, int])
     for place, pick in enumerate(picks):
         slot = slot_of(pick.row, "meta/episodes")
         if (id(pick.source), slot) not in files:
-            files[id(pick.source), slot] = _stored(pick.source, slot)
-        order, stored = files[id(pick.source), slot]
-        index = order[pick.row["episode_index"]]
+            order, stored = stored_stats(pick.source.root / layout.episodes_file(slot))
+            files[id(pick.source), slot] = {index: place for place, index in enumerate(order)}, stored
+        places, stored = files[id(pick.source), slot]
+        index = places[pick.row["episode_index"]]
         own = {key: {name: values[index] for name, values in stat.items()} for key, stat in stored.items()}
         row, length = rows[place], pick.row["length"]
         task = tasks[pick.row["tasks"][0]]
@@ -236,25 +237,11 @@ def _stats(picks: Sequence[Pick], rows: Sequence[Row], tasks: Mapping[str, int])
 
 def _task_indexes(pick: Pick, tasks: Mapping[str, int]) -> np.ndarray:
     """Return the new number of the instruction of every frame of an episode that has several."""
-    slot = slot_of(pick.row, "data")
-    path = pick.source.root / layout.data_file(slot)
-    try:
-        table = pq.ParquetFile(path).read(columns=["episode_index", "task_index"], use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise corrupt(path, error) from error
+    path = pick.source.root / layout.data_file(slot_of(pick.row, "data"))
+    table = read_frames(path, ["episode_index", "task_index"])
     own = table["episode_index"].to_numpy() == pick.row["episode_index"]
     renumbered = np.array([tasks.get(task, -1) for task in pick.source.tasks])
     return renumbered[table["task_index"].to_numpy()[own]]
-
-
-def _stored(source: DatasetState, slot: Slot) -> tuple[dict[int, int], dict[str, statistics.Stats]]:
-    path = source.root / layout.episodes_file(slot)
-    try:
-        file = pq.ParquetFile(path)
-        order = file.read(columns=["episode_index"], use_threads=False)["episode_index"].to_pylist()
-        return {index: place for place, index in enumerate(order)}, read_stats(file)
-    except (OSError, pa.ArrowException, ValueError) as error:
-        raise corrupt(path, error) from error
 
 
 def _edits_of(source: DatasetState) -> list[str]:

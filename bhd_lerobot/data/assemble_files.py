@@ -12,7 +12,7 @@ from bhd_lerobot.data import layout, video
 from bhd_lerobot.data.disk import Disk
 from bhd_lerobot.data.meta_files import MEBIBYTE, PARQUET_OPTIONS
 from bhd_lerobot.data.picks import Group, Plan, Run
-from bhd_lerobot.data.state import corrupt, slot_columns
+from bhd_lerobot.data.state import corrupt, read_frames, slot_columns
 from bhd_lerobot.data.video_splice import splice
 from bhd_lerobot.errors import DatasetMismatchError
 
@@ -136,10 +136,7 @@ def _schema(path: Path) -> pa.Schema:
 
 def _episodes(run: Run, path: Path, plan: Plan) -> Iterable[pa.Table]:
     """Yield the frames of each episode of a run, with their new numbers; readers fetch an episode as one row group."""
-    try:
-        table = pq.ParquetFile(path, page_checksum_verification=True).read(use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise corrupt(path, error) from error
+    table = read_frames(path)
     first = min(row["dataset_from_index"] for row in plan.files.rows(run.source, "data")[run.slot])
     renumbered = np.array([plan.tasks.get(task, -1) for task in run.source.tasks])
     for place in run.places:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.findings import Findings, few, one_line
+from bhd_lerobot.data.parquet_rescue import is_cut_off
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.errors import DatasetError
 
@@ -233,7 +234,7 @@ def _check_names(files: Files, findings: Findings) -> None:
         findings.error("files", name, "it is missing", _RECORD)
     leftovers = sorted(there - wanted)
     remedy = "bhd-data repair removes it." if files.is_ours else "Look what it is; it may hold unfinished episodes."
-    torn = [name for name in leftovers if name.endswith(".parquet") and _is_cut_off(files.root / name)]
+    torn = [name for name in leftovers if name.endswith(".parquet") and is_cut_off(files.root / name)]
     if torn:
         what = "its writer was killed; an episode may be in it, and LeRobot loads nothing while it is there"
         findings.error("files", few(torn, 3), what, "bhd-data repair recovers what is whole.")
@@ -242,11 +243,6 @@ def _check_names(files: Files, findings: Findings) -> None:
     if (files.root / layout.STAGING).exists():
         what = "a recording was interrupted; what it saved is complete, and not yet merged"
         findings.warning("files", layout.STAGING, what, "bhd-data repair finishes it.")
-
-
-def _is_cut_off(path: Path) -> bool:
-    data = path.read_bytes()
-    return data[:4] == b"PAR1" != data[-4:]
 
 
 def stats_remedy(files: Files) -> str:

@@ -13,11 +13,11 @@ import pyarrow.parquet as pq
 
 from bhd_lerobot.data import exchange, layout, statistics, video
 from bhd_lerobot.data.disk import Disk
-from bhd_lerobot.data.episode_table import read_stats
+from bhd_lerobot.data.episode_table import stored_stats
 from bhd_lerobot.data.layout import Slot
 from bhd_lerobot.data.meta_files import MEBIBYTE, PARQUET_OPTIONS, write_meta
 from bhd_lerobot.data.schema import Schema, as_numpy
-from bhd_lerobot.data.state import DatasetState, Row, corrupt, ordered_slots, slot_columns, slot_of
+from bhd_lerobot.data.state import DatasetState, Row, corrupt, ordered_slots, read_frames, slot_columns, slot_of
 
 EpisodeStats = dict[str, statistics.Stats]
 
@@ -211,13 +211,7 @@ def _all_stats(state: DatasetState, schema: Schema, known: Mapping[int, EpisodeS
             for row in rows:
                 _store(result, row["episode_index"], known[row["episode_index"]])
             continue
-        path = state.root / layout.episodes_file(slot)
-        try:
-            file = pq.ParquetFile(path)
-            order = file.read(columns=["episode_index"], use_threads=False)["episode_index"].to_pylist()
-            stored = read_stats(file)
-        except (OSError, pa.ArrowException, ValueError) as error:
-            raise corrupt(path, error) from error
+        order, stored = stored_stats(state.root / layout.episodes_file(slot))
         places = [i for i, index in enumerate(order) if index < state.num_episodes]
         for key, stat in stored.items():
             for name, values in stat.items():
@@ -233,10 +227,7 @@ def _stats_from_data(
     state: DatasetState, schema: Schema, slot: Slot, rows: list[Row], result: dict[str, statistics.Stats]
 ) -> None:
     path = state.root / layout.data_file(slot)
-    try:
-        table = pq.ParquetFile(path, page_checksum_verification=True).read(schema.float_keys, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise corrupt(path, error) from error
+    table = read_frames(path, schema.float_keys)
     first = min(row["dataset_from_index"] for row in state.rows if slot_of(row, "data") == slot)
     columns = {key: as_numpy(table[key]) for key in schema.float_keys}
     for row in rows:

@@ -106,7 +106,7 @@ def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | s
                 raise ConfigError(f"Episode {episode} is wanted in {owner[episode]!r} and in {name!r}.")
     with opened([Path(root)]) as (state,):
         for name, episodes in parts.items():
-            _check_episodes(state, episodes)
+            check_episodes(state, episodes)
             if not episodes:
                 raise ConfigError(f"Part {name!r} would have no episode; {root} has {len(state.rows)}.")
             if (Path(folder) / name).exists():
@@ -129,7 +129,7 @@ def delete(root: Path | str, episodes: Sequence[int]) -> EditReport:
             refuses.
     """
     with opened([Path(root)]) as (state,):
-        _check_episodes(state, episodes)
+        check_episodes(state, episodes)
         gone = set(episodes)
         picks = [Pick(state, row) for row in state.rows if row["episode_index"] not in gone]
         edit = {"edit": "delete", "episodes": sorted(gone)}
@@ -171,7 +171,7 @@ def rewrite(
 
 
 def _keep(state: DatasetState, episodes: Sequence[int], target: Path, name: str) -> EditReport:
-    _check_episodes(state, episodes)
+    check_episodes(state, episodes)
     edit = {"edit": name, "of": state.root.name, "episodes": list(episodes)}
     identity = _edited(state, edit)
     picks = [Pick(state, state.rows[episode]) for episode in episodes]
@@ -220,7 +220,13 @@ def _timed(edit: Mapping[str, Any]) -> dict[str, Any]:
     return {"time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"), **edit}
 
 
-def _check_episodes(state: DatasetState, episodes: Sequence[int]) -> None:
+def check_episodes(state: DatasetState, episodes: Sequence[int]) -> None:
+    """Check that there are such episodes, and that none is named twice.
+
+    Raises:
+        DatasetError: there is no such episode.
+        ConfigError: one is named twice.
+    """
     wrong = sorted({episode for episode in episodes if not 0 <= episode < len(state.rows)})
     if wrong:
         raise DatasetError(f"There is no episode {wrong[0]} in {state.root}; valid: 0 to {len(state.rows) - 1}.")

@@ -1,13 +1,14 @@
 """The rows of ``meta/episodes``: light columns, metadata of ours, and statistics."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.data.state import Row
+from bhd_lerobot.data.state import Row, corrupt
 from bhd_lerobot.errors import FrameError
 
 PREFIX = "bhd/"
@@ -122,3 +123,17 @@ def read_stats(file: pq.ParquetFile) -> dict[str, dict[str, np.ndarray]]:
             values = inner
         result.setdefault(feature, {})[statistic] = values.to_numpy(zero_copy_only=False).reshape(shape)
     return result
+
+
+def stored_stats(path: Path) -> tuple[list[int], dict[str, dict[str, np.ndarray]]]:
+    """Return the episodes in one file of ``meta/episodes``, in its order, and their statistics as `read_stats` does.
+
+    Raises:
+        DatasetCorruptError: it cannot be read.
+    """
+    try:
+        file = pq.ParquetFile(path)
+        order = file.read(columns=["episode_index"], use_threads=False)["episode_index"].to_pylist()
+        return order, read_stats(file)
+    except (OSError, pa.ArrowException, ValueError) as error:
+        raise corrupt(path, error) from error

@@ -14,12 +14,12 @@ import pyarrow.parquet as pq
 from bhd_lerobot.data import exchange, layout
 from bhd_lerobot.data.compact import compact
 from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
-from bhd_lerobot.data.episode_table import read_stats
+from bhd_lerobot.data.episode_table import stored_stats
 from bhd_lerobot.data.findings import Finding, Severity
 from bhd_lerobot.data.meta_files import write_meta
 from bhd_lerobot.data.salvage_stats import stats_of
 from bhd_lerobot.data.schema import Schema
-from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots, read_json
+from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots, read_frames, read_json
 
 
 def is_fixable(finding: Finding) -> bool:
@@ -100,15 +100,10 @@ def _stored_depth(state: DatasetState) -> list[dict[str, dict[str, np.ndarray]]]
     """Return the statistics of depth pictures of every episode, which cannot be computed here."""
     found: list[dict[str, dict[str, np.ndarray]]] = [{} for _ in state.rows]
     for slot, rows in ordered_slots(state.rows, "meta/episodes").items():
-        path = state.root / layout.episodes_file(slot)
-        try:
-            file = pq.ParquetFile(path)
-            order = file.read(columns=["episode_index"], use_threads=False)["episode_index"].to_pylist()
-            stored = read_stats(file)
-        except (OSError, pa.ArrowException, ValueError) as error:
-            raise corrupt(path, error) from error
+        order, stored = stored_stats(state.root / layout.episodes_file(slot))
+        places = {index: place for place, index in enumerate(order)}
         for row in rows:
-            place = order.index(row["episode_index"])
+            place = places[row["episode_index"]]
             for key, stat in stored.items():
                 feature = state.info["features"].get(key, {})
                 if feature.get("dtype") in ("video", "image") and 3 not in (feature["shape"][0], feature["shape"][-1]):
@@ -119,11 +114,7 @@ def _stored_depth(state: DatasetState) -> list[dict[str, dict[str, np.ndarray]]]
 def _tables(state: DatasetState) -> Iterator[pa.Table]:
     """Yield the frames of every episode."""
     for slot, rows in ordered_slots(state.rows, "data").items():
-        path = state.root / layout.data_file(slot)
-        try:
-            table = pq.ParquetFile(path, page_checksum_verification=True).read(use_threads=False)
-        except (OSError, pa.ArrowException) as error:
-            raise corrupt(path, error) from error
+        table = read_frames(state.root / layout.data_file(slot))
         first = rows[0]["dataset_from_index"]
         for row in rows:
             yield table.slice(row["dataset_from_index"] - first, row["length"])

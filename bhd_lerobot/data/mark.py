@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data import layout
-from bhd_lerobot.data.edits import EditReport, opened, rewrite
+from bhd_lerobot.data.edits import EditReport, check_episodes, opened, rewrite
 from bhd_lerobot.data.picks import Pick
 from bhd_lerobot.data.schema import as_numpy
-from bhd_lerobot.data.state import DatasetState, Row, corrupt, ordered_slots, slot_of
+from bhd_lerobot.data.state import DatasetState, Row, ordered_slots, read_frames, slot_of
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.tasks.task import OUTCOMES, Event
 
@@ -59,11 +58,10 @@ def mark(
     if not episodes:
         raise ConfigError("Say which episodes to mark.")
     with opened([Path(root)]) as (state,):
-        wrong = [episode for episode in episodes if not 0 <= episode < len(state.rows)]
-        if wrong:
-            raise DatasetError(f"There is no episode {wrong[0]} in {root}; valid: 0 to {len(state.rows) - 1}.")
+        check_episodes(state, episodes)
         changes = _Changes(state, outcome, intervention, clear_interventions)
-        picks = [changes.pick(row) if row["episode_index"] in set(episodes) else Pick(state, row) for row in state.rows]
+        meant = set(episodes)
+        picks = [changes.pick(row) if row["episode_index"] in meant else Pick(state, row) for row in state.rows]
         edit = {"edit": "mark", "episodes": changes.log, **({"note": note} if note else {})}
         types = _COLUMNS if outcome is not None and "outcome" not in state.metadata_types else {}
         return rewrite(state, picks, edit, state.identity, types)
@@ -143,10 +141,7 @@ class _Changes:
     def _column(self, row: Row, key: str) -> np.ndarray:
         slot = slot_of(row, "data")
         path = self._state.root / layout.data_file(slot)
-        try:
-            table = pq.ParquetFile(path, page_checksum_verification=True).read(columns=[key], use_threads=False)
-        except (OSError, pa.ArrowException) as error:
-            raise corrupt(path, error) from error
+        table = read_frames(path, [key])
         first = row["dataset_from_index"] - self._slots[slot][0]["dataset_from_index"]
         return as_numpy(table[key])[first : first + row["length"]].copy()
 

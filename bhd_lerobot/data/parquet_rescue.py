@@ -62,6 +62,20 @@ class _Page:
     uncompressed: int
 
 
+def is_parquet(path: Path) -> bool:
+    """Tell whether a file begins like a Parquet file."""
+    with open(path, "rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+def is_cut_off(path: Path) -> bool:
+    """Tell whether a Parquet file has no footer. A writer that is killed leaves none."""
+    with open(path, "rb") as file:
+        begin = file.read(len(MAGIC))
+        file.seek(max(0, path.stat().st_size - len(MAGIC)))
+        return begin == MAGIC and file.read() != MAGIC
+
+
 def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | None = None) -> Rescued:
     """Return the row groups of a file, with its footer or without.
 

@@ -11,7 +11,7 @@ from bhd_lerobot.data.compact import compact
 from bhd_lerobot.data.disk import Disk, RootLock, write_errors
 from bhd_lerobot.data.exchange import roll_forward
 from bhd_lerobot.data.fix import compute_stats
-from bhd_lerobot.data.parquet_rescue import MAGIC
+from bhd_lerobot.data.parquet_rescue import is_cut_off, is_parquet
 from bhd_lerobot.data.salvage import salvage
 from bhd_lerobot.data.salvage_films import whole_frames
 from bhd_lerobot.data.salvage_told import Told
@@ -101,7 +101,7 @@ def _repair_foreign(root: Path, disk: Disk) -> RepairReport:
         if unfinished := unfinished_files(root):
             raise corrupt(unfinished[0], "its writer was killed")
         extra = sorted(name for name in layout.recorded_files(root) - state.files() if name.startswith("data/"))
-        if extra := [name for name in extra if (root / name).read_bytes()[: len(MAGIC)] == MAGIC]:
+        if extra := [name for name in extra if is_parquet(root / name)]:
             raise corrupt(root / extra[0], "no episode of meta/episodes is in it")
         _check_readable(state)
     except DatasetCorruptError as error:
@@ -118,16 +118,8 @@ def _repair_foreign(root: Path, disk: Disk) -> RepairReport:
 
 def unfinished_files(root: Path) -> list[Path]:
     """Return the data and episode files without a footer. Ours never are: they get their names when they are whole."""
-    found = []
-    for name in sorted(layout.recorded_files(root)):
-        path = root / name
-        if path.suffix == ".parquet":
-            with open(path, "rb") as file:
-                begin = file.read(len(MAGIC))
-                file.seek(max(0, path.stat().st_size - len(MAGIC)))
-                if begin == MAGIC and file.read() != MAGIC:
-                    found.append(path)
-    return found
+    paths = [root / name for name in sorted(layout.recorded_files(root))]
+    return [path for path in paths if path.suffix == ".parquet" and is_cut_off(path)]
 
 
 def went_on(root: Path) -> list[Path]:

@@ -200,6 +200,18 @@ def _read_rows(state: DatasetState) -> None:
     state.rows = [by_index[index] for index in range(total)]
 
 
+def read_frames(path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Return a data file, or some of its columns.
+
+    Raises:
+        DatasetCorruptError: it cannot be read, or a page is not what was written.
+    """
+    try:
+        return pq.ParquetFile(path, page_checksum_verification=True).read(columns, use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise corrupt(path, error) from error
+
+
 def column_types(schema: pa.Schema) -> tuple[dict[str, pa.DataType], dict[str, pa.DataType]]:
     """Return the types of the columns of ``meta/episodes`` that are ours, without prefix, and of those of others."""
     own = {name.removeprefix("bhd/"): schema.field(name).type for name in schema.names if name.startswith("bhd/")}
