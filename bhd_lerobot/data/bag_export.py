@@ -15,6 +15,7 @@ from bhd_lerobot.data import ros2_types as types
 from bhd_lerobot.data import ros2_views as views
 from bhd_lerobot.data.bag_episode import EpisodeTopics
 from bhd_lerobot.data.bag_write import BagWriter, new_folder
+from bhd_lerobot.data.creation import refuse_inside
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.data.state import DatasetState, Row, corrupt, load_state, ordered_slots
 from bhd_lerobot.errors import DatasetError
@@ -66,10 +67,12 @@ def export_bags(
 
     Raises:
         DatasetError: no such dataset or episode.
+        ConfigError: `output` lies in the dataset.
         DatasetExistsError: `output` is there already.
         UnsupportedDatasetError: it holds something that no message is made for.
     """
     root, output = Path(root), Path(output)
+    refuse_inside(output, root)
     types.require_rosbags()
     state = load_state(root)
     rows = _chosen(state, options.episodes)

@@ -11,7 +11,7 @@ from typing import Any
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.data.schema import Schema
-from bhd_lerobot.errors import DatasetExistsError, DatasetLockedError
+from bhd_lerobot.errors import ConfigError, DatasetExistsError, DatasetLockedError
 
 
 def new_info(fps: int, schema: Schema, robot_type: str) -> dict[str, Any]:
@@ -92,6 +92,16 @@ def build_root(
             shutil.rmtree(building, ignore_errors=True)
             raise
     return lock
+
+
+def refuse_inside(target: Path, source: Path) -> None:
+    """Refuse to write into a dataset that is only read: it would be uploaded and checked with it.
+
+    Raises:
+        ConfigError: `target` lies in `source`.
+    """
+    if source.resolve() in target.resolve().parents:
+        raise ConfigError(f"{target} lies in {source}, which is to stay as it is. Choose a place beside it.")
 
 
 def _remove_abandoned(parent: Path, prefix: str) -> None:

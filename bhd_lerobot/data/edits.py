@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from bhd_lerobot.data import exchange, layout
 from bhd_lerobot.data.assemble import EDITS, assemble, check_alike
-from bhd_lerobot.data.creation import build_root
+from bhd_lerobot.data.creation import build_root, refuse_inside
 from bhd_lerobot.data.disk import Disk, RootLock, write_errors
 from bhd_lerobot.data.identity import FORMAT
 from bhd_lerobot.data.picks import Pick
@@ -188,9 +188,8 @@ def _write_new(
         video = (identities[0] or {}).get("video", {})
         identity = {"format": FORMAT, "recording": {**recording, "edited": dict(edit)}, "video": video}
     disk = Disk()
-    for source in {pick.source.root.resolve() for pick in picks}:
-        if source in target.resolve().parents:
-            raise ConfigError(f"{target} lies in {source}, which is to stay as it is. Choose a place beside it.")
+    for source in {pick.source.root for pick in picks}:
+        refuse_inside(target, source)
     lock = build_root(
         target,
         lambda folder: assemble(picks, folder, disk, edit=_timed(edit), identity=identity),

@@ -71,7 +71,7 @@ def repair(root: Path | str) -> RepairReport:
     """
     root = Path(root)
     if not root.is_dir():
-        raise DatasetError(f"{root} is not a LeRobot dataset: it does not exist.")
+        raise DatasetError(f"{root} is not a LeRobot dataset: it {'is a file' if root.exists() else 'does not exist'}.")
     lock = RootLock(root)
     try:
         disk = Disk()
@@ -107,7 +107,10 @@ def _repair_foreign(root: Path, disk: Disk) -> RepairReport:
     except DatasetCorruptError as error:
         rescued = salvage(root, disk)
         wrong = str(error).split(". ", 1)[0]
-        done = (*completed, f"{wrong}: {rescued.episodes} whole episodes were recovered; their statistics are new")
+        done = (
+            *completed,
+            f"{rescued.episodes} whole episodes were recovered, with new statistics. What was wrong: {wrong}",
+        )
         return RepairReport(root, rescued.episodes, rescued.frames, done, (), rescued.lost, rescued.aside)
     if state.rows and not _has_stats(root):
         with write_errors("repair the dataset", root, "Its files are as they were."):

@@ -261,6 +261,12 @@ def test_what_cannot_be_exported_is_refused(turtlebot3, tmp_path, capsys, argume
     assert list(tmp_path.iterdir()) == []
 
 
+def test_bags_do_not_get_into_the_dataset(turtlebot3, capsys):
+    assert data.main(["export", str(turtlebot3), f"--output={turtlebot3 / 'bags'}"]) == 2
+    assert "which is to stay as it is" in capsys.readouterr().err
+    assert not (turtlebot3 / "bags").exists()
+
+
 def test_what_is_there_is_not_overwritten(turtlebot3, tmp_path, capsys):
     (tmp_path / "bags").mkdir()
     (tmp_path / "bags" / "note").write_text("mine")
