@@ -1,51 +1,42 @@
 """`bhd-data`: everything that is done with a dataset between recording and training."""
 
 import argparse
+import importlib
 import sys
 from collections.abc import Sequence
 
 from bhd_lerobot.errors import BhdError
-from bhd_lerobot.runs import (
-    data_check,
-    data_edit,
-    data_export,
-    data_import,
-    data_info,
-    data_mark,
-    data_pull,
-    data_push,
-    data_repair,
-    data_timing,
-    data_view,
-)
+from bhd_lerobot.runs.start import INTERRUPTED, leaving_on_interrupt
 
-# In the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
+# Modules, in the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
 COMMANDS = (
-    data_info,
-    data_timing,
-    data_check,
-    data_repair,
-    data_mark,
-    data_edit,
-    data_view,
-    data_push,
-    data_pull,
-    data_export,
-    data_import,
+    "data_info",
+    "data_timing",
+    "data_check",
+    "data_repair",
+    "data_mark",
+    "data_edit",
+    "data_view",
+    "data_push",
+    "data_pull",
+    "data_export",
+    "data_import",
 )
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="bhd-data", description=__doc__.split(": ", 1)[1])
-    commands = parser.add_subparsers(dest="command", required=True)
-    for command in COMMANDS:
-        command.add_to(commands)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", required=True)
+    for name in COMMANDS:
+        importlib.import_module(f"bhd_lerobot.runs.{name}").add_to(commands)
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bhd-data`; return the exit status."""
-    options = _parser().parse_args(arguments)
+    with leaving_on_interrupt():
+        parser = _parser()
+    options = parser.parse_args(arguments)
     try:
         return options.run(options)
     except BhdError as error:
@@ -53,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         print(f"Stopped; {options.stopped}.", file=sys.stderr)
-        return 130
+        return INTERRUPTED
 
 
 if __name__ == "__main__":

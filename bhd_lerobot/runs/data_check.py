@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -11,14 +12,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, MobileBase, PositionLimits
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.check_dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.data.check_values import Limits
 from bhd_lerobot.data.fix import fix
-from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS
 from bhd_lerobot.runs.data_command import Commands, add_command, root_of
 
+# No option of a robot changes its limits, and its configuration takes seconds to import.
+_BODIES: dict[str | None, Callable[[], Arm | MobileBase]] = {"turtlebot3": turtlebot3_burger, "ur5": ur5}
 _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
 
 
@@ -66,12 +70,11 @@ def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, video
 
 def limits_of(robot_type: str | None) -> Limits:
     """Return what a robot of ours keeps to: the ranges of its joints, or the largest speeds of a base."""
-    kinds = {str(kind.get_choice_name(kind)): kind for kind in SIMULATED_ROBOTS}
-    if robot_type not in kinds:
+    if robot_type not in _BODIES:
         return {}
-    body = kinds[robot_type]().body()
+    body = _BODIES[robot_type]()
     limits = body.limits
-    if isinstance(body, Arm):
+    if isinstance(limits, PositionLimits):
         low, high = np.asarray(limits.lower), np.asarray(limits.upper)
     else:
         high = np.asarray(limits.velocity)

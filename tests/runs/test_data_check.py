@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS
 from bhd_lerobot.runs import data, data_check, data_repair
 from bhd_lerobot.runs.data_check import limits_of
 from tests.runs.support import run_record
@@ -72,6 +73,17 @@ def test_limits_are_those_of_the_robots() -> None:
     assert 6.2 < high < 6.3
     assert arm["observation.state"]["gripper.pos"] == (0.0, 0.085)
     assert limits_of("so101_follower") == limits_of(None) == {}
+
+
+def test_every_robot_of_ours_has_the_limits_of_its_configuration() -> None:
+    for kind in SIMULATED_ROBOTS:
+        limits = kind().body().limits
+        told = limits_of(kind.get_choice_name(kind))["control.applied_action"]
+        assert list(told) == list(limits.names)
+        for index, (low, high) in enumerate(told.values()):
+            arm = hasattr(limits, "upper")
+            assert high == (limits.upper if arm else limits.velocity)[index]
+            assert low == (limits.lower[index] if arm else -high)
 
 
 @pytest.mark.parametrize(("command", "said"), [("check", "nothing was changed"), ("repair", "run it again to finish")])

@@ -1,0 +1,88 @@
+"""How a command begins: from its first moment on, Ctrl-C is a line and status 130.
+
+What a command needs takes seconds to import. An interrupt in the middle of that is a traceback, or is swallowed by a
+library that catches everything; so this module imports next to nothing, and ends the process itself meanwhile.
+"""
+
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+INTERRUPTED = 128 + signal.SIGINT
+"""The exit status after Ctrl-C."""
+
+
+@contextmanager
+def leaving_on_interrupt() -> Iterator[None]:
+    """End the process at Ctrl-C, with a line and status 130; for imports, when there is nothing to be lost yet.
+
+    Where Ctrl-C is ignored, as of a command in the background of a script, or somebody else minds it, nothing is done.
+    """
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    try:
+        signal.signal(signal.SIGINT, _leave)
+    except ValueError:  # not the main thread, which is the one that is interrupted
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    os.write(2, b"Stopped before it began; nothing was changed.\n")
+    os._exit(INTERRUPTED)
+
+
+def run(module: str) -> int:
+    """Import a module and run its `main`; return the exit status."""
+    try:
+        with leaving_on_interrupt():
+            main = importlib.import_module(module).main
+        status: int = main()
+    except KeyboardInterrupt:  # where the program does not mind it by itself
+        print("Stopped.", file=sys.stderr)
+        return INTERRUPTED
+    return status
+
+
+def record() -> int:
+    """Run `bhd-record`."""
+    return run("bhd_lerobot.runs.record")
+
+
+def train() -> int:
+    """Run `bhd-train`."""
+    return run("bhd_lerobot.runs.train")
+
+
+def evaluate() -> int:
+    """Run `bhd-eval`."""
+    return run("bhd_lerobot.runs.evaluate")
+
+
+def replay() -> int:
+    """Run `bhd-replay`."""
+    return run("bhd_lerobot.runs.replay")
+
+
+def data() -> int:
+    """Run `bhd-data`."""
+    return run("bhd_lerobot.runs.data")
+
+
+def doctor() -> int:
+    """Run `bhd-doctor`."""
+    return run("bhd_lerobot.runs.doctor")
+
+
+def monitor() -> int:
+    """Run `bhd-monitor`."""
+    return run("bhd_lerobot.runs.monitor")

@@ -1,0 +1,105 @@
+"""Ctrl-C in the first seconds of a command, while Python imports what it needs."""
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from bhd_lerobot.runs import data, start
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]
+STARTS = {"bhd-eval": start.evaluate}  # the others have the names of their commands
+
+
+def started(folder: Path, program: str, *, ignored: bool = False) -> subprocess.CompletedProcess:
+    """Run a module that interrupts itself as the console scripts run ours."""
+    (folder / "slow.py").write_text(program)
+    how = "signal.SIG_IGN" if ignored else "signal.default_int_handler"
+    command = f"import signal, sys; signal.signal(signal.SIGINT, {how}); import bhd_lerobot.runs.start as s; "
+    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    return subprocess.run(
+        [sys.executable, "-c", command + "sys.exit(s.run('slow'))"],
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        f"try:\n    {INTERRUPT.replace(chr(10), chr(10) + '    ')}pass\nexcept BaseException:\n    pass\n",
+        f"{INTERRUPT}raise AssertionError('it went on')\n",
+    ],
+    ids=["in a library that catches everything", "in an import"],
+)
+def test_ctrl_c_during_an_import_is_a_line_and_status_130(tmp_path: Path, program: str) -> None:
+    done = started(tmp_path, program + "def main():\n    raise AssertionError('it went on')\n")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (130, "", 1)
+    assert done.stderr.startswith("Stopped before it began")
+
+
+def test_ctrl_c_afterwards_is_minded_by_the_program_or_else_a_line(tmp_path: Path) -> None:
+    own = f"def main():\n    try:\n        {INTERRUPT.replace(chr(10), chr(10) + '        ')}pass\n"
+    done = started(tmp_path, own + "    except KeyboardInterrupt:\n        return 7\n")
+    assert (done.returncode, done.stderr) == (7, "")
+    done = started(tmp_path, f"def main():\n    {INTERRUPT.replace(chr(10), chr(10) + '    ')}return 0\n")
+    assert (done.returncode, done.stderr) == (130, "Stopped.\n")
+
+
+def test_where_ctrl_c_is_ignored_it_stays_ignored(tmp_path: Path) -> None:
+    done = started(tmp_path, f"{INTERRUPT}def main():\n    return 5\n", ignored=True)
+    assert (done.returncode, done.stderr) == (5, "")
+
+
+@pytest.mark.parametrize("script", sorted(SCRIPTS))
+def test_every_command_can_begin_this_way(script: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    begin = STARTS.get(script) or getattr(start, script.removeprefix("bhd-"))
+    begun: list[str] = []
+    monkeypatch.setattr(start, "run", lambda module: begun.append(module) or 3)
+    assert begin() == 3
+    (module,) = begun
+    assert callable(importlib.import_module(module).main)
+    assert SCRIPTS[script] in (f"{module}:main", f"bhd_lerobot.runs.start:{begin.__name__}")
+
+
+def test_what_runs_before_ctrl_c_is_minded_imports_next_to_nothing() -> None:
+    program = "import bhd_lerobot.runs.start, bhd_lerobot.runs.data, sys; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT, stdin=subprocess.DEVNULL
+    )
+    loaded = {name.partition(".")[0] for name in done.stdout.split()}
+    assert not loaded & {"numpy", "torch", "lerobot", "rich", "yaml", "pyarrow", "huggingface_hub", "mujoco"}
+
+
+def test_help_imports_nothing_that_takes_seconds() -> None:
+    program = "import bhd_lerobot.runs.data as d, sys; d._parser(); print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT, stdin=subprocess.DEVNULL
+    )
+    loaded = {name.partition(".")[0] for name in done.stdout.split()}
+    assert not loaded & {"torch", "lerobot", "pandas", "mujoco", "pinocchio", "matplotlib", "huggingface_hub", "ray"}
+
+
+def test_the_handler_before_comes_back() -> None:
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with start.leaving_on_interrupt():
+            assert signal.getsignal(signal.SIGINT) is start._leave
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        with pytest.raises(SystemExit):
+            data.main(["--help"])
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, former)
