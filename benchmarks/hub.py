@@ -36,7 +36,7 @@ from bhd_lerobot.data.remote_store import StoreDataset
 GOAL = 0.9  # of the speed of the bare client
 WIDTH = 512  # numbers in a frame
 
-SERVER = Path(__file__).resolve().parents[1] / "tests" / "hub_server.py"
+TESTS = Path(__file__).resolve().parents[1] / "tests"
 
 _MOTO = """
 import sys
@@ -75,10 +75,11 @@ def took(move: Turn, folder: Path, name: str) -> float:
 
 
 @contextmanager
-def child(*arguments: str) -> Iterator[str]:
+def child(*arguments: str, folder: Path | None = None) -> Iterator[str]:
     """Run a server in a process of its own until the end of the block; yields the first line that it prints."""
     process = subprocess.Popen(
         [sys.executable, *arguments],
+        cwd=folder,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -108,7 +109,7 @@ def hub() -> Iterator[dict[str, Turn]]:
     def bare_pull(root: Path, name: str) -> None:
         snapshot_download(f"me/{name}", repo_type="dataset", local_dir=root)
 
-    with child(str(SERVER)) as url, _load_server().real_client(url):
+    with child("-m", "hub_server", folder=TESTS) as url, _load_client().real_client(url):
         yield {
             "push": lambda root, name: _nothing(push(root, HubDataset(f"me/{name}", create=True))),
             "bare push": bare_push,
@@ -186,13 +187,12 @@ def _nothing(_: Any) -> None:
     """Drop a result."""
 
 
-def _load_server() -> ModuleType:
+def _load_client() -> ModuleType:
     # By its path: another distribution installs a package with the name `tests`.
-    spec = importlib.util.spec_from_file_location("hub_server", SERVER)
+    spec = importlib.util.spec_from_file_location("hub_client", TESTS / "hub_server" / "client.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules["hub_server"] = module  # dataclasses look for it
     spec.loader.exec_module(module)
     return module
 

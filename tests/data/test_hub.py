@@ -2,7 +2,6 @@
 
 import shutil
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,51 +25,20 @@ from bhd_lerobot.errors import (
     TransferError,
 )
 from tests.data import support
-from tests.hub_server import Fault, HubServer, real_client
+from tests.hub_server.client import real_client
+from tests.hub_server.fixtures import EPISODES, content
+from tests.hub_server.server import Fault, HubServer
 
-EPISODES = 6
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of several data and video files."""
-    root = tmp_path_factory.mktemp("recorded") / "d"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(layout, "DATA_FILES_SIZE_IN_MB", 0.005)
-        patch.setattr(layout, "VIDEO_FILES_SIZE_IN_MB", 0.002)
-        with support.create(root, video=True) as recorder:
-            for _ in range(EPISODES):
-                support.record(recorder, video=True)
-    assert len(list((root / "data").rglob("*.parquet"))) > 1
-    return root
+pytest_plugins = ["tests.hub_server.fixtures"]
 
 
 @pytest.fixture
-def root(recorded: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(recorded, tmp_path / "d"))
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[HubServer]:
-    with HubServer() as one:
-        yield one
-
-
-@pytest.fixture
-def hub(server: HubServer) -> Iterator[HubServer]:
-    server.reset()
-    server.repositories.clear()
-    with real_client(server) as patch:
-        patch.setattr("time.sleep", lambda seconds: None)  # the client waits before it tries again
-        yield server
+def root(many_files: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(many_files, tmp_path / "d"))
 
 
 def send(root: Path, branch: str | None = None, **options: object) -> PushReport:
     return push(root, HubDataset("me/d", branch, create=True), **options)  # type: ignore[arg-type]
-
-
-def content(root: Path) -> dict[str, bytes]:
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
 def stored(hub: HubServer, revision: str = "main") -> dict[str, bytes]:
@@ -192,10 +160,10 @@ def test_a_connection_that_breaks_during_a_download_is_taken_up(hub: HubServer, 
         ("nonsense", "me/d", "expired or was revoked"),
     ],
 )
-def test_who_may_not_write_is_told_why(server: HubServer, root: Path, token, name: str, words: str) -> None:
+def test_who_may_not_write_is_told_why(running_hub: HubServer, root: Path, token, name: str, words: str) -> None:
     before = content(root)
-    server.repositories.clear()
-    with real_client(server, token), pytest.raises(TransferError, match=words):
+    running_hub.repositories.clear()
+    with real_client(running_hub, token), pytest.raises(TransferError, match=words):
         push(root, HubDataset(name, create=True))
     assert content(root) == before
 

@@ -15,6 +15,7 @@ from bhd_lerobot.data.remote_push import push
 from bhd_lerobot.data.remote_store import MANIFEST, StoreDataset
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError
 from tests.data import support
+from tests.hub_server.fixtures import content
 
 EPISODES = 3
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
@@ -65,10 +66,6 @@ def use_s3(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {**KEYS, "AWS_ENDPOINT_URL": address}.items():
         monkeypatch.setenv(name, value)
     fsspec.filesystem("s3").clear_instance_cache()
-
-
-def content(root: Path) -> dict[str, bytes]:
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
 def stored(url: str) -> dict[str, bytes]:

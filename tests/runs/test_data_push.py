@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +24,14 @@ from bhd_lerobot.runs import data
 from bhd_lerobot.runs import record as record_module
 from bhd_lerobot.runs.data_check import limits_of
 from bhd_lerobot.runs.eval_statistics import wilson
-from tests.hub_server import Fault, HubServer, real_client
+from tests.hub_server.fixtures import content
+from tests.hub_server.server import Fault, HubServer
 from tests.runs.support import options as record_options
 from tests.runs.support import run_record
 from tests.runs.train_support import MLP, curve, make_dataset, run_train
 from tests.runs.train_support import options as train_options
+
+pytest_plugins = ["tests.hub_server.fixtures"]
 
 
 @pytest.fixture(scope="module")
@@ -44,29 +46,11 @@ def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset(tmp_path_factory.mktemp("lesson") / "set")
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[HubServer]:
-    with HubServer() as one:
-        yield one
-
-
-@pytest.fixture
-def hub(server: HubServer) -> Iterator[HubServer]:
-    server.reset()
-    server.repositories.clear()
-    with real_client(server):
-        yield server
-
-
 @pytest.fixture
 def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder, which is empty."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def content(root: Path) -> dict[str, bytes]:
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
 def text_of(hub: HubServer, name: str, path: str = "README.md") -> str:

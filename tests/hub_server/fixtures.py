@@ -1,0 +1,53 @@
+"""Fixtures around the Hub of the tests; a test module takes them by `pytest_plugins`."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from bhd_lerobot.data import layout
+from tests.data import support
+from tests.hub_server.client import real_client
+from tests.hub_server.server import HubServer
+
+EPISODES = 6
+
+
+@pytest.fixture(scope="session")
+def running_hub() -> Iterator[HubServer]:
+    """One server for all tests, with what they left there."""
+    with HubServer() as one:
+        yield one
+
+
+@pytest.fixture
+def hub(running_hub: HubServer) -> Iterator[HubServer]:
+    """An empty server, to which the real client is pointed; the client does not wait before it tries again."""
+    running_hub.reset()
+    running_hub.repositories.clear()
+    with real_client(running_hub) as patch:
+        # In the client alone: the tests themselves do wait.
+        hasty = SimpleNamespace(**{**vars(time), "sleep": lambda seconds: None})
+        patch.setattr("huggingface_hub.utils._http.time", hasty)
+        yield running_hub
+
+
+@pytest.fixture(scope="session")
+def many_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of `EPISODES` episodes in several data and video files; copy it before it is changed."""
+    root = tmp_path_factory.mktemp("many_files") / "d"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(layout, "DATA_FILES_SIZE_IN_MB", 0.005)
+        patch.setattr(layout, "VIDEO_FILES_SIZE_IN_MB", 0.002)
+        with support.create(root, video=True) as recorder:
+            for _ in range(EPISODES):
+                support.record(recorder, video=True)
+    assert len(list((root / "data").rglob("*.parquet"))) > 1
+    return root
+
+
+def content(root: Path) -> dict[str, bytes]:
+    """Return every file below a folder."""
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
