@@ -42,7 +42,7 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 
 def run(module: str) -> int:
-    """Import a module and run its `main`; return the exit status."""
+    """Import a module and run its `main`; return the exit status. The process is to end then."""
     try:
         with leaving_on_interrupt():
             main = importlib.import_module(module).main
@@ -50,6 +50,9 @@ def run(module: str) -> int:
     except KeyboardInterrupt:  # where the program does not mind it by itself
         print("Stopped.", file=sys.stderr)
         return INTERRUPTED
+    finally:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # what libraries do at the very end is no traceback either
     return status
 
 

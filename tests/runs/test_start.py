@@ -58,6 +58,12 @@ def test_ctrl_c_afterwards_is_minded_by_the_program_or_else_a_line(tmp_path: Pat
     assert (done.returncode, done.stderr) == (130, "Stopped.\n")
 
 
+def test_ctrl_c_while_the_process_ends_is_no_traceback(tmp_path: Path) -> None:
+    at_exit = "import atexit, os, signal\natexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
+    done = started(tmp_path, f"{at_exit}def main():\n    print('done', flush=True)\n    return 0\n")
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "done\n", "")
+
+
 def test_where_ctrl_c_is_ignored_it_stays_ignored(tmp_path: Path) -> None:
     done = started(tmp_path, f"{INTERRUPT}def main():\n    return 5\n", ignored=True)
     assert (done.returncode, done.stderr) == (5, "")
