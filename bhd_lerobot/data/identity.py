@@ -7,7 +7,7 @@ from typing import Any
 
 from bhd_lerobot.data.schema import Schema
 from bhd_lerobot.data.state import DatasetState
-from bhd_lerobot.errors import ConfigError, DatasetMismatchError
+from bhd_lerobot.errors import ConfigError, DatasetEditedError, DatasetMismatchError
 
 FORMAT = 1
 """Version of ``meta/bhd.json``."""
@@ -46,15 +46,24 @@ def check_identity(
 
     Raises:
         DatasetMismatchError: with every difference: key, recorded value, requested value.
+        DatasetEditedError: it was edited after its recording.
     """
     if state.identity is None:
         raise DatasetMismatchError(
-            f"{state.root} was not recorded by this program (it has no meta/bhd.json). Record into another root."
+            f"{state.root} was not recorded by this program, or not all of it (it has no meta/bhd.json). Record into "
+            "another root."
         )
     if state.identity.get("format") != FORMAT:
         raise DatasetMismatchError(
             f"{state.root} was recorded with version {state.identity.get('format')} of this recorder's format; this "
             f"program continues version {FORMAT}. Record into another root."
+        )
+    if edit := (state.identity.get("recording") or {}).get("edited"):
+        name = edit.get("edit", "edit") if isinstance(edit, Mapping) else "edit"
+        raise DatasetEditedError(
+            f"{state.root} was edited after its recording ({name}), so it cannot be continued: its next episode would "
+            "not be the one that its seed says. Record what is missing into another root, with another seed, and merge "
+            "the two."
         )
     recorded: dict[str, Any] = {"robot_type": state.info.get("robot_type"), "fps": state.info["fps"]}
     requested: dict[str, Any] = {"robot_type": robot_type, "fps": fps}

@@ -19,7 +19,7 @@ from bhd_lerobot.control.tolerance import verdict
 from bhd_lerobot.data.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.errors import ConfigError, RealtimeError, RenderingError
+from bhd_lerobot.errors import ConfigError, DatasetEditedError, RealtimeError, RenderingError
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.robots.simulation import Simulation, describe
 from bhd_lerobot.runs.cluster_loop import ClusterLoop, open_crew
@@ -37,6 +37,7 @@ from bhd_lerobot.runs.preview import Preview
 from bhd_lerobot.runs.provenance import episode_metadata
 from bhd_lerobot.runs.record_report import RecordResult, tell_refusals, tell_summary
 from bhd_lerobot.runs.registry import make_brain, make_robot, make_simulation, make_task
+from bhd_lerobot.runs.resume_advice import instead_of_resuming
 from bhd_lerobot.runs.signals import stop_on_signals
 from bhd_lerobot.tasks.task import Task, episode_seed
 
@@ -314,14 +315,19 @@ def _push(config: RecordConfig, result: RecordResult, console: Console) -> None:
     console.print(escape(said), soft_wrap=True, highlight=False)
 
 
-def _main(config: RecordConfig) -> int:
-    result = record(config)
-    return result.exit_status
+def _main(config: RecordConfig, arguments: Sequence[str]) -> int:
+    try:
+        return record(config).exit_status
+    except DatasetEditedError as error:
+        for line in instead_of_resuming(config, arguments):
+            error.add_note(line)
+        raise
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bhd-record`; return the exit status."""
-    return run(_main, RecordConfig, arguments)
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    return run(lambda config: _main(config, arguments), RecordConfig, arguments)
 
 
 if __name__ == "__main__":
