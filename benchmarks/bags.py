@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 from benchmarks._spread import ratios, spread, write
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.bag_export import ExportOptions, export_bags
-from bhd_lerobot.data.bag_read import find_bags
+from bhd_lerobot.data.bag_find import find_bags
 from bhd_lerobot.data.bag_restore import restore
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.runs import data

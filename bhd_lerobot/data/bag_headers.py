@@ -10,7 +10,7 @@ from bhd_lerobot.data import bag_checksum
 from bhd_lerobot.data import ros2_types as types
 from bhd_lerobot.data.bag_episode import EPISODE_TOPIC
 from bhd_lerobot.data.bag_read import Bag, Topic
-from bhd_lerobot.data.ros2_cdr import decode
+from bhd_lerobot.data.ros2_cdr_read import decode
 from bhd_lerobot.data.ros2_parts import NANO
 from bhd_lerobot.errors import DatasetError
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.data.ros2_cdr import decode, encode
+from bhd_lerobot.data.ros2_cdr import encode
+from bhd_lerobot.data.ros2_cdr_read import decode
 from bhd_lerobot.data.ros2_parts import Frames, header
 from bhd_lerobot.data.state import corrupt
 from bhd_lerobot.errors import DatasetError

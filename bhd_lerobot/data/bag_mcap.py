@@ -4,6 +4,7 @@
 shows only in the order in which messages were written. So the records are walked here: https://mcap.dev/spec.
 """
 
+import contextlib
 import importlib
 import mmap
 import struct
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
+from bhd_lerobot.data.bag_qos import offered
 from bhd_lerobot.errors import DatasetError
 
 _MAGIC = b"\x89MCAP0\r\n"
@@ -27,6 +29,7 @@ class McapFile:
 
     Attributes:
         channels: number -> topic, type, serialisation; those seen so far.
+        publishers: number -> how many offered the channel's topic, where the recorder wrote it.
         problems: what could not be read, in sentences.
 
     Args:
@@ -39,6 +42,7 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.channels: dict[int, tuple[str, str, str]] = {}
+        self.publishers: dict[int, int] = {}
         self.problems: list[str] = []
         self._schemas: dict[int, str] = {0: ""}
         with path.open("rb") as file:
@@ -58,12 +62,14 @@ class McapFile:
             return None
         (start,) = struct.unpack_from("<Q", self._data, end)
         counts: dict[int, int] | None = None
-        if 0 < start < end - 9:
-            for op, at, stop in _records(self._data, start, end - 9):
+        try:
+            for op, at, stop in _records(self._data, start, end - 9) if 0 < start < end - 9 else ():
                 self._define(op, self._data, at, stop)
                 if op == _STATISTICS:
                     size = struct.unpack_from("<I", self._data, at + 42)[0]
                     counts = dict(struct.iter_unpack("<HQ", self._data[at + 46 : at + 46 + size]))
+        except struct.error:
+            return None
         return counts if counts is not None and counts.keys() <= self.channels.keys() else None
 
     def messages(self) -> Iterator[tuple[int, int, Any, int, int]]:
@@ -136,8 +142,10 @@ class McapFile:
         elif op == _CHANNEL:
             number, schema = struct.unpack_from("<HH", data, at)
             topic, at = _text(data, at + 4)
-            encoding, _ = _text(data, at)
+            encoding, at = _text(data, at)
             self.channels[number] = (topic, self._schemas.get(schema, ""), encoding)
+            with contextlib.suppress(struct.error):  # what is damaged there is not needed
+                self.publishers[number] = offered(_pairs(data, at, end).get("offered_qos_profiles"))
 
 
 def _message(data: Any, at: int) -> tuple[int, int]:
@@ -159,6 +167,17 @@ def _records(data: Any, at: int, end: int) -> Iterator[tuple[int, int, int]]:
 def _text(data: Any, at: int) -> tuple[str, int]:
     (size,) = struct.unpack_from("<I", data, at)
     return bytes(data[at + 4 : at + 4 + size]).decode(errors="replace"), at + 4 + size
+
+
+def _pairs(data: Any, at: int, end: int) -> dict[str, str]:
+    """Return a map of texts."""
+    stop = min(at + 4 + struct.unpack_from("<I", data, at)[0], end)
+    at += 4
+    pairs = {}
+    while at < stop:
+        key, at = _text(data, at)
+        pairs[key], at = _text(data, at)
+    return pairs
 
 
 def _decompressor(name: str, path: Path) -> Callable[[bytes], bytes]:

@@ -1,35 +1,51 @@
 """Bags as they are: folders or files, SQLite or MCAP, in the order in which they were written, damage and all."""
 
 import contextlib
-import re
 import shutil
 import tempfile
+from array import array
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from bhd_lerobot.data.bag_mcap import McapFile, zstd
 from bhd_lerobot.data.bag_sqlite import SqliteFile
 from bhd_lerobot.errors import DatasetError
 
-_KINDS: dict[str, Any] = {".mcap": McapFile, ".db3": SqliteFile}
+FILES: dict[str, Any] = {".mcap": McapFile, ".db3": SqliteFile}
+"""Ending of a file's name -> what reads it."""
 _HEAD_BYTES = 256  # that are enough for a header
 
+_ZSTD = b"\x28\xb5\x2f\xfd"  # that a compressed message begins with
 _END_OF_TIME = 1 << 63  # [ns] more do not fit into a time
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag: its name, its type, and how many messages it has."""
+    """A topic of a bag.
+
+    Attributes:
+        name, msgtype: what it is called, and the type of most of its messages.
+        count: how many messages it has.
+        others: other types of which it has messages, too.
+        serialisation: of its messages.
+        connections: messages of each connection (of a publisher, if the recorder kept them apart) in one of the bag's
+            files; empty if there is but one.
+        publishers: how many offered it when the recorder subscribed; 0 if that is not known.
+    """
 
     name: str
     msgtype: str
     count: int
+    others: tuple[str, ...] = ()
+    serialisation: str = "cdr"
+    connections: tuple[int, ...] = ()
+    publishers: int = 0
 
 
 @dataclass
@@ -39,12 +55,37 @@ class Messages:
     Attributes:
         received: when [ns], shape (n,).
         order: each one's place among all messages of the bag, shape (n,).
+        sizes: each one's size [bytes], shape (n,).
         data: each one's bytes, or their beginning.
     """
 
     received: NDArray[np.int64]
     order: NDArray[np.int64]
+    sizes: NDArray[np.int64]
     data: list[bytes]
+
+    def part(self, mask: NDArray[np.bool_]) -> "Messages":
+        """Return some of them."""
+        data = [one for one, wanted in zip(self.data, mask.tolist(), strict=True) if wanted]
+        return Messages(self.received[mask], self.order[mask], self.sizes[mask], data)
+
+
+class _Collected:
+    """Messages of a topic while they are read."""
+
+    def __init__(self, size: int | None) -> None:
+        self.size = size  # of what is kept of each; all if None
+        self.received, self.order, self.sizes, self.data = array("q"), array("q"), array("q"), list[bytes]()
+
+    def add(self, received: int, place: int, payload: bytes) -> None:
+        self.received.append(received)
+        self.order.append(place)
+        self.sizes.append(len(payload))
+        self.data.append(payload if self.size is None else payload[: self.size])
+
+    def messages(self) -> Messages:
+        received, order, sizes = (np.array(one, np.int64) for one in (self.received, self.order, self.sizes))
+        return Messages(received, order, sizes, self.data)
 
 
 @dataclass
@@ -56,7 +97,8 @@ class Bag:
         files: its files in order.
         expected: messages that its metadata count; None if it has none.
         problems: what is wrong with it and did not keep it from being read, in sentences.
-        per_message: whether each message is compressed.
+        per_message: whether its metadata say that each message is compressed.
+        publishers: topic -> how many offered it, by its metadata.
     """
 
     path: Path
@@ -64,33 +106,39 @@ class Bag:
     expected: int | None = None
     problems: list[str] = field(default_factory=list)
     per_message: bool = False
+    publishers: dict[str, int] = field(default_factory=dict)
 
     def topics(self) -> dict[str, Topic]:
         """Return its topics by name.
 
         Raises:
-            DatasetError: a file cannot be read at all, or a topic has messages of two types.
+            DatasetError: a file cannot be read at all.
         """
-        found: dict[str, Topic] = {}
+        types: dict[str, Counter[tuple[str, str]]] = {}  # messages by type and serialisation
+        connections: dict[str, list[int]] = {}
+        publishers = dict(self.publishers)
         for file in self._open():
             counts = file.summary()
             if counts is None:
-                counts = {}
-                for channel, *_ in file.messages():
-                    counts[channel] = counts.get(channel, 0) + 1
+                counts = Counter(channel for channel, *_ in file.messages())
                 self._note(file.problems)
+            here: dict[str, list[int]] = {}
             for number, (name, msgtype, serialisation) in file.channels.items():
-                if serialisation not in ("cdr", "") and counts.get(number):
-                    raise DatasetError(
-                        f"{name} in {self.path} is serialised as {serialisation!r}; only cdr can be read."
-                    )
-                before = found.get(name, Topic(name, msgtype, 0))
-                if before.msgtype != msgtype:
-                    raise DatasetError(
-                        f"{name} in {self.path} has messages of two types, {before.msgtype} and {msgtype}. Make a bag "
-                        "with one of them: ros2 bag convert."
-                    )
-                found[name] = Topic(name, msgtype, before.count + counts.get(number, 0))
+                count = counts.get(number, 0)
+                types.setdefault(name, Counter())[msgtype, serialisation] += count
+                here.setdefault(name, []).extend([count] * bool(count))
+                publishers[name] = max(publishers.get(name, 0), file.publishers.get(number, 0))
+            for name, several in here.items():
+                connections[name] = max(connections.get(name, []), several, key=len)
+        found = {}
+        for name, kinds in types.items():
+            (msgtype, serialisation), _ = kinds.most_common(1)[0]
+            others = sorted({kind for (kind, _), count in kinds.items() if count} - {msgtype})
+            each = tuple(connections[name]) if len(connections[name]) > 1 else ()
+            total = sum(kinds.values())
+            found[name] = Topic(
+                name, msgtype, total, tuple(others), serialisation or "cdr", each, publishers.get(name, 0)
+            )
         return found
 
     def read(self, topics: Collection[str], heads: Collection[str] = ()) -> dict[str, Messages]:
@@ -103,60 +151,79 @@ class Bag:
         Raises:
             DatasetError: a file cannot be read at all.
         """
-        times: dict[str, list[int]] = {name: [] for name in (*topics, *heads)}
-        order: dict[str, list[int]] = {name: [] for name in (*topics, *heads)}
-        data: dict[str, list[bytes]] = {name: [] for name in (*topics, *heads)}
-        problems, total, lost = [], 0, 0
-        for file in self._open():
-            wanted: dict[int, tuple[list[int], list[int], list[bytes], int | None]] = {}
-            for channel, received, buffer, first, last in file.messages():
-                total += 1
-                if channel not in wanted:
-                    name = file.channels.get(channel, ("", "", ""))[0]
-                    ours = (times.get(name, []), order.get(name, []), data.get(name, []))
-                    wanted[channel] = (*ours, _HEAD_BYTES if name in heads else None if name in topics else 0)
-                stamps, places, payloads, size = wanted[channel]
-                if size == 0:
-                    continue
-                payload = bytes(buffer[first:last])
-                if self.per_message:
-                    try:
-                        payload = zstd().decompress(payload)
-                    except Exception:  # of whichever zstd there is
-                        lost += 1
-                        continue
-                if not 0 <= received < _END_OF_TIME:
-                    lost += 1
-                    continue
-                places.append(total)
-                stamps.append(received)
-                payloads.append(payload if size is None else payload[:size])
-            problems += file.problems
-        if lost:
-            problems.append(f"{self.path.name}: {lost} messages that cannot be decompressed, or have no possible time")
-        if self.expected is not None and total < self.expected and not problems:
-            problems.append(f"{self.path.name}: its metadata count {self.expected} messages; it has {total}")
+        found = {name: _Collected(_HEAD_BYTES if name in heads else None) for name in (*topics, *heads)}
+        walk = _Walk(self, found)
+        for name, received, place, payload in walk.messages():
+            found[name].add(received, place, payload)
+        problems = walk.problems
+        if walk.lost:
+            problems.append(
+                f"{self.path.name}: {walk.lost} messages that cannot be decompressed, or have no possible time"
+            )
+        if walk.packed and not self.per_message:
+            problems.append(
+                f"{self.path.name}: its messages are compressed one by one (compression_mode: MESSAGE), which only the "
+                "missing metadata.yaml could say; they were decompressed"
+            )
+        if self.expected is not None and walk.total < self.expected and not problems:
+            problems.append(f"{self.path.name}: its metadata count {self.expected} messages; it has {walk.total}")
         self._note(problems)
-        return {
-            name: Messages(np.array(times[name], np.int64), np.array(order[name], np.int64), data[name])
-            for name in times
-        }
+        return {name: one.messages() for name, one in found.items()}
+
+    def payloads(self, topic: str) -> Iterator[tuple[int, bytes]]:
+        """Yield the messages of a topic that `read` has: their places among all messages of the bag, and all bytes."""
+        for _, _, place, payload in _Walk(self, (topic,)).messages():
+            yield place, payload
 
     def _note(self, problems: Iterable[str]) -> None:
         self.problems += [problem for problem in problems if problem not in self.problems]
 
-    def payloads(self, topic: str) -> Iterator[bytes]:
-        """Yield the whole messages of a topic, in the order in which `read` has them."""
-        for file in self._open():
-            for channel, _, buffer, first, last in file.messages():
-                if file.channels.get(channel, ("",))[0] == topic:
-                    payload = bytes(buffer[first:last])
-                    yield zstd().decompress(payload) if self.per_message else payload
-
     def _open(self) -> Iterator[Any]:
         for path in self.files:
-            with _plain(path) as plain, contextlib.closing(_KINDS[plain.suffix](plain)) as file:
+            with _plain(path) as plain, contextlib.closing(FILES[plain.suffix](plain)) as file:
                 yield file
+
+
+class _Walk:
+    """One way through a bag's messages, in the order in which they were written.
+
+    Attributes:
+        total: messages that the bag has, of all topics.
+        lost: messages of the wanted topics that cannot be decompressed, or have no possible time.
+        packed: messages that were compressed.
+        problems: what could not be read, in sentences.
+    """
+
+    def __init__(self, bag: Bag, wanted: Collection[str]) -> None:
+        self.total = self.lost = self.packed = 0
+        self.problems: list[str] = []
+        self._bag, self._wanted = bag, wanted
+
+    def messages(self) -> Iterator[tuple[str, int, int, bytes]]:
+        """Yield topic, receive time [ns], place among all messages, and bytes."""
+        for file in self._bag._open():
+            names: dict[int, str] = {}
+            for channel, received, buffer, first, last in file.messages():
+                self.total += 1
+                name = names.get(channel)
+                if name is None:
+                    told = file.channels.get(channel, ("",))[0]
+                    name = names[channel] = told if told in self._wanted else ""
+                if not name:
+                    continue
+                payload = bytes(buffer[first:last])
+                if payload.startswith(_ZSTD):  # a serialised message never does
+                    self.packed += 1
+                    try:
+                        payload = zstd().decompress(payload)
+                    except Exception:  # of whichever zstd there is
+                        self.lost += 1
+                        continue
+                if not 0 <= received < _END_OF_TIME:
+                    self.lost += 1
+                    continue
+                yield name, received, self.total, payload
+            self.problems += file.problems
 
 
 class Picker:
@@ -173,69 +240,21 @@ class Picker:
         self._payloads = bag.payloads(topic)
 
     def get(self, place: int) -> bytes:
-        """Return a message, by its place in what `Bag.read` returns."""
+        """Return a message, by its place among all messages of the bag (`Messages.order`)."""
         if place < self._place:
             self._place, self._payloads = -1, self._bag.payloads(self._topic)
         while self._place < place:
-            self._payload = next(self._payloads)
-            self._place += 1
+            self._place, self._payload = next(self._payloads)
         return self._payload
 
 
-def find_bags(path: Path) -> list[Bag]:
-    """Return the bag at a path, or the bags in a folder of bags.
-
-    Raises:
-        DatasetError: there is none, or a file of one is missing.
-    """
-    if path.is_file():
-        if _suffix(path) not in _KINDS:
-            raise DatasetError(f"{path} is no bag: its name ends in neither .mcap nor .db3, by option with .zstd.")
-        return [Bag(path, [path])]
-    if not path.is_dir():
-        raise DatasetError(f"There is no bag at {path}: it does not exist.")
-    if bag := _folder(path):
-        return [bag]
-    inside = [bag for folder in sorted(path.iterdir(), key=_natural) if folder.is_dir() and (bag := _folder(folder))]
-    if not inside:
-        raise DatasetError(
-            f"There is no bag at {path}: it has no metadata.yaml, no .mcap and no .db3 file, and no folder that has."
-        )
-    return inside
-
-
-def _folder(path: Path) -> Bag | None:
-    files = sorted((file for file in path.iterdir() if _suffix(file) in _KINDS and file.is_file()), key=_natural)
-    metadata = path / "metadata.yaml"
-    if not metadata.is_file():
-        problem = f"{path.name}: it has no metadata.yaml, as after a recording that was killed"
-        return Bag(path, files, problems=[problem]) if files else None
+def first_time(path: Path) -> int | None:
+    """Return when the first message of a file was received [ns]; None if it cannot be read."""
     try:
-        told = yaml.safe_load(metadata.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
-        # rosbag2's first versions wrote the folder in front of the name, and a moved bag has another one
-        names = [Path(name).name for name in told["relative_file_paths"]]
-        expected, mode = int(told["message_count"]), str(told.get("compression_mode") or "").lower()
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, UnicodeDecodeError) as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        if not files:
-            raise DatasetError(f"{metadata} cannot be read ({reason[:200]}), and there is no bag file.") from error
-        return Bag(path, files, problems=[f"{path.name}: metadata.yaml cannot be read ({reason[:200]})"])
-    missing = [name for name in names if not (path / name).is_file()]
-    if missing:
-        there = ", ".join(file.name for file in files) or "none"
-        raise DatasetError(f"{path} lacks its file {missing[0]}, which metadata.yaml lists; bag files there: {there}.")
-    wrong = [name for name in names if _suffix(Path(name)) not in _KINDS]
-    if wrong:
-        raise DatasetError(f"{path / wrong[0]} is neither MCAP nor SQLite, and cannot be read.")
-    return Bag(path, [path / name for name in names], expected, per_message=mode == "message")
-
-
-def _suffix(path: Path) -> str:
-    return Path(path.stem).suffix if path.suffix == ".zstd" else path.suffix
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+        with _plain(path) as plain, contextlib.closing(FILES[plain.suffix](plain)) as file:
+            return next((int(received) for _, received, *_ in file.messages()), None)
+    except DatasetError:
+        return None
 
 
 @contextlib.contextmanager

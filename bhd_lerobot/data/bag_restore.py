@@ -25,7 +25,7 @@ from bhd_lerobot.data.bag_read import Bag, Picker
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.data.ros2_base import BareTwistPart, ScanPart
-from bhd_lerobot.data.ros2_cdr import decode
+from bhd_lerobot.data.ros2_cdr_read import decode
 from bhd_lerobot.data.ros2_parts import NANO, Part, head_stamps, header_stamps, own_topic
 from bhd_lerobot.data.ros2_split import PARTS
 from bhd_lerobot.data.schema import LANGUAGE
@@ -150,7 +150,7 @@ class _BagEpisodes:
                     topic = self._image_topic(key)
                     places = self._places(topic, head_stamps(topic, self._messages[topic].data), observed)
                     pictures = self._pictures.setdefault(topic, Picker(self._bag, topic))
-                    for place in places.tolist():
+                    for place in self._messages[topic].order[places].tolist():
                         image = decode_image(topic, self._topics[topic].msgtype, pictures.get(place))
                         writer.add_image(key, image)
             recorder.save(writer, task=episode["task"], metadata=episode["metadata"])

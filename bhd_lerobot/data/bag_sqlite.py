@@ -1,5 +1,6 @@
 """SQLite files of rosbag2, read in the order in which messages were written, also damaged ones."""
 
+import contextlib
 import os
 import shutil
 import sqlite3
@@ -8,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from bhd_lerobot.data.bag_qos import offered
 from bhd_lerobot.errors import DatasetError
 
 
@@ -16,6 +18,7 @@ class SqliteFile:
 
     Attributes:
         channels: number -> topic, type, serialisation.
+        publishers: number -> how many offered the topic, where the recorder wrote it.
         problems: what could not be read, in sentences.
 
     Args:
@@ -44,6 +47,10 @@ class SqliteFile:
                 "or try `sqlite3 BAG .recover`."
             ) from error
         self.channels: dict[int, tuple[str, str, str]] = {number: (a, b, c) for number, a, b, c in rows}
+        self.publishers: dict[int, int] = {}
+        with contextlib.suppress(sqlite3.Error):  # rosbag2's first versions have no such column
+            rows = self._connection.execute("SELECT id, offered_qos_profiles FROM topics").fetchall()
+            self.publishers = {number: offered(profiles) for number, profiles in rows}
 
     def close(self) -> None:
         """Give the file back."""
@@ -84,10 +91,10 @@ class SqliteFile:
             for channel, received, data in self._connection.execute(
                 "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
             ):
-                if not isinstance(data, bytes):
-                    raise sqlite3.DatabaseError("a message is no bytes")
                 count += 1
-                yield channel, received, data, 0, len(data)
+                # Of a damaged row a value may be of any type: it has no possible time, or cannot be decoded.
+                payload = data if isinstance(data, bytes) else b""
+                yield channel, received if isinstance(received, int) else -1, payload, 0, len(payload)
         except sqlite3.Error as error:
             self.problems.append(
                 f"{self.path.name}: after {count} messages it cannot be read any more ({error}); what is before is read"

@@ -1,7 +1,8 @@
 """The topics of a robot's bag as tracks: when something was measured, and what; sorted by time, judged one by one."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,25 +10,17 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.data import bag_frames as frames
-from bhd_lerobot.data.bag_images import COMPRESSED, IMAGE
 from bhd_lerobot.data.bag_read import Bag, Messages, Topic
-from bhd_lerobot.data.resample import Times, message_times, sane
+from bhd_lerobot.data.bag_sound import sound_messages
+from bhd_lerobot.data.bag_wanted import TYPES, static_topics, told_publishers, wanted_topic
+from bhd_lerobot.data.resample import STEP_BACK_NS, Times, clock_jumps, message_times, sane
 from bhd_lerobot.data.resample_scan import resampled_scans
-from bhd_lerobot.data.ros2_base import BareTwistPart, GyroPart, OdometryPart, ScanPart, TwistPart, odometry
-from bhd_lerobot.data.ros2_cdr import decode
+from bhd_lerobot.data.ros2_base import BareTwistPart, GyroPart, TwistPart, odometry
+from bhd_lerobot.data.ros2_cdr_read import decode
 from bhd_lerobot.data.ros2_parts import NANO, head_stamps, header_stamps
 from bhd_lerobot.errors import DatasetError
 
 Array = NDArray[np.float64]
-
-_TYPES = {
-    "scan": (ScanPart.msgtype,),
-    "odom": (OdometryPart.msgtype,),
-    "cmd": (TwistPart.msgtype, BareTwistPart.msgtype),
-    "imu": (GyroPart.msgtype,),
-    "camera": (IMAGE, COMPRESSED),
-}
-_STATIC = "/tf_static"
 
 
 @dataclass(frozen=True)
@@ -63,7 +56,8 @@ class Track:
         msgtype: their type.
         times: when they happened [ns], shape (n,).
         order: their places in the bag, shape (n,).
-        values: numbers of each, shape (n, d); of a camera, its place among the topic's messages, shape (n, 1).
+        values: numbers of each, shape (n, d); of a camera, its place in the bag, shape (n, 1).
+        restarts: places in the bag at which the headers' clock has begun anew, shape (k,).
     """
 
     topic: str
@@ -71,6 +65,7 @@ class Track:
     times: Times
     order: Times
     values: Array
+    restarts: Times = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def part(self, mask: NDArray[np.bool_]) -> "Track":
         """Return some of its messages, sorted by time; those of the same time stay in their order."""
@@ -88,20 +83,23 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
         notes: what somebody should know is added to it.
 
     Raises:
-        DatasetError: a topic is missing, empty, of another type, or in a frame that is not known.
+        DatasetError: a topic is missing, empty, of another type or mostly unreadable, or its frame is not known.
     """
     topics = bag.topics()
-    wanted = {role: _topic(bag, topics, role, name) for role, name in options.topics.items()}
-    cameras = {f"camera/{name}": _topic(bag, topics, "camera", topic) for name, topic in options.cameras.items()}
-    names = {topic.name for topic in wanted.values()} | ({_STATIC} & topics.keys())
+    wanted = {role: wanted_topic(bag, topics, role, name) for role, name in options.topics.items()}
+    cameras = {f"camera/{name}": wanted_topic(bag, topics, "camera", topic) for name, topic in options.cameras.items()}
+    notes += told_publishers(topics, {**wanted, **cameras})
+    names = {topic.name for topic in wanted.values()} | (static_topics(options.topics["scan"]) & topics.keys())
     messages = bag.read(names, {topic.name for topic in cameras.values()})
-    static = frames.static_frames(messages[_STATIC].data) if _STATIC in messages else {}
+    static = frames.static_frames(
+        [one for name in sorted(static_topics(options.topics["scan"]) & names) for one in messages[name].data]
+    )
     tracks = {}
     for role, topic in {**wanted, **cameras}.items():
-        found = messages[topic.name]
-        if not len(found.data):
+        if not len(messages[topic.name].data):
             damage = "".join(f" Damaged: {problem}." for problem in bag.problems)
             raise DatasetError(f"{bag.path} has no readable message of {topic.name}.{damage}")
+        found = sound_messages(bag.path, topic, messages[topic.name], bag.problems)
         stamps = _stamps(topic, found)
         times = message_times(found.received, stamps, options.stamps)
         if stamps is not None and options.stamps == "auto" and (wrong := int((~sane(found.received, stamps)).sum())):
@@ -109,47 +107,34 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
                 f"{topic.name}: {wrong} of {len(times)} header stamps are not within 0.5 s of the reception; the "
                 f"{'headers were' if times is stamps else 'times of reception were'} taken for all of them"
             )
-        values = _values(role, topic, found.data, _Reading(options, static, notes))
-        finite = (np.abs(values) < np.finfo(np.float32).max).all(axis=1)  # the dataset's numbers are float32
+        values = _values(role, topic, found, _Reading(options, static, notes))
+        fits = np.abs(values) < np.finfo(np.float32).max  # the dataset's numbers are float32
+        finite = np.logical_and.reduce(fits, axis=1)
         if not finite.all():
-            notes.append(f"{topic.name}: {int((~finite).sum())} messages with values that are not finite, left out")
-        tracks[role] = Track(topic.name, topic.msgtype, times[finite], found.order[finite], values[finite])
-        if not len(tracks[role].times):
+            what = "are no scan of a whole turn" if role == "scan" else "with values that are not finite"
+            notes.append(f"{topic.name}: {int((~finite).sum())} of {len(finite)} messages {what}, left out")
+        track = Track(topic.name, topic.msgtype, times[finite], found.order[finite], values[finite])
+        if not len(track.times):
             raise DatasetError(f"{bag.path}: no message of {topic.name} has finite values.")
+        if stamps is not None and times is not stamps and role != "cmd":
+            track = dataclasses.replace(track, restarts=_restarts(topic.name, stamps[finite], track.order, notes))
+        tracks[role] = track
     return tracks
 
 
-def _topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) -> Topic:
-    option, types = (f"--{role}", _TYPES[role])
-    if name not in topics or not topics[name].count:
-        there = ", ".join(f"{one.name} ({one.msgtype}, {one.count})" for one in topics.values()) or "none"
-        fitting = [one.name for one in topics.values() if one.msgtype in types and one.count]
-        hint = f" Of the right type: {', '.join(fitting)}." if fitting else ""
-        what = "no message of" if name in topics else "no topic"
-        raise DatasetError(
-            f"{bag.path} has {what} {name}, which {_MEANING[role]} is read from. Name another one with {option}."
-            f"{hint} The bag has: {there}." + "".join(f" Damaged: {problem}." for problem in bag.problems)
-        )
-    if topics[name].msgtype not in types:
-        raise DatasetError(
-            f"{name} in {bag.path} is of type {topics[name].msgtype}; valid for {option}: {', '.join(types)}."
-        )
-    return topics[name]
-
-
-_MEANING = {
-    "scan": "the scan",
-    "odom": "the robot's speed",
-    "cmd": "the action",
-    "imu": "the yaw rate of the gyroscope",
-    "camera": "the picture",
-}
+def _restarts(topic: str, stamps: Times, order: Times, notes: list[str]) -> Times:
+    """Return where the clock of the headers begins anew, as when a simulation is restarted."""
+    jumps = clock_jumps([stamps], [order], STEP_BACK_NS)
+    if len(jumps) <= max(1, len(stamps) // 100):
+        return jumps
+    notes.append(f"{topic}: the header stamps go back {len(jumps)} times, which no restart explains; they are not used")
+    return np.zeros(0, np.int64)
 
 
 def _stamps(topic: Topic, messages: Messages) -> Times | None:
     if topic.msgtype == BareTwistPart.msgtype:
         return None
-    if topic.msgtype in _TYPES["camera"]:
+    if topic.msgtype in TYPES["camera"]:
         return head_stamps(topic.name, messages.data)
     return header_stamps(topic.msgtype, messages.data)
 
@@ -163,7 +148,8 @@ class _Reading:
     notes: list[str]
 
 
-def _values(role: str, topic: Topic, data: Sequence[bytes], reading: _Reading) -> Array:
+def _values(role: str, topic: Topic, messages: Messages, reading: _Reading) -> Array:
+    data = messages.data
     if role == "scan":
         return _scans(topic, data, reading)
     if role == "odom":
@@ -175,12 +161,12 @@ def _values(role: str, topic: Topic, data: Sequence[bytes], reading: _Reading) -
         return kind(topic.name, ()).decode(data)
     if role == "imu":
         return GyroPart(topic.name, ()).decode(data)
-    return np.arange(len(data), dtype=np.float64)[:, None]
+    return messages.order.astype(np.float64)[:, None]
 
 
 def _scans(topic: Topic, data: Sequence[bytes], reading: _Reading) -> Array:
     options, notes = reading.options, reading.notes
-    geometry = ("angle_min", "angle_increment", "range_min")
+    geometry = ("angle_min", "angle_increment", "range_min", "range_max")
     found: dict[str, Any] = decode(topic.msgtype, data, ("ranges", "header.frame_id", *geometry))
     frame = frames.the_frame(topic.name, found["header.frame_id"].tolist())
     rotation, source = frames.scanner_rotation(topic.name, frame, reading.static, options.scan_frame, options.scan_yaw)
@@ -192,6 +178,12 @@ def _scans(topic: Topic, data: Sequence[bytes], reading: _Reading) -> Array:
     if counts != {options.beams}:
         few = f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
         notes.append(f"{topic.name}: scans of {few} beams became {options.beams}, each the nearest by angle")
+    reach = found["range_max"][found["range_max"] > 0]
+    if len(reach) and float(reach.min()) < options.lidar.range_max * (1 - 1e-6):
+        notes.append(
+            f"{topic.name}: the scanner sees to {reach.min():.2f} m (range_max); where nothing came back, the dataset "
+            f"has {options.lidar.range_max:g} m all the same"
+        )
     return resampled_scans(
         found["ranges"],
         {name: found[name] for name in geometry},

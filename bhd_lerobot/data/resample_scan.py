@@ -11,23 +11,27 @@ from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import DatasetError
 
 Array = NDArray[np.float64]
+_GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max")
 
 
-def clean_ranges(ranges: NDArray[np.floating], lidar: LidarSpec, range_min: float) -> Array:
+def clean_ranges(ranges: NDArray[np.floating], lidar: LidarSpec, range_min: float, range_max: float = np.inf) -> Array:
     """Return ranges as the dataset has them.
 
     No return is 0, infinity, not a number or a negative value in drivers of real scanners; it becomes the maximum
-    range. Minus infinity is ROS's word for something too near. What is nearer than the scanner can see, or farther,
-    reads its nearest or farthest range.
+    range, as does what is beyond the range that the scanner says it has: by ROS's rule such a reading is none. Minus
+    infinity is ROS's word for something too near. What is nearer than the scanner can see, or farther, reads its
+    nearest or farthest range.
 
     Args:
         ranges: as they came [m].
         lidar: the scanner that the dataset is of.
         range_min: of the scanner that measured [m].
+        range_max: of the same; one that is not positive is none.
     """
     values = np.asarray(ranges, np.float64)
+    beyond = values > (range_max if range_max > 0 else np.inf)
     near = np.isneginf(values) | ((values > 0) & (values < max(range_min, lidar.range_min)))
-    nothing = ~np.isfinite(values) | (values <= 0)
+    nothing = ~np.isfinite(values) | (values <= 0) | beyond
     return np.where(near, lidar.range_min, np.where(nothing, lidar.range_max, np.minimum(values, lidar.range_max)))
 
 
@@ -87,7 +91,7 @@ def resampled_scans(
 
     Args:
         ranges: of n scans, shape (n, m), or n arrays of different lengths.
-        geometry: ``angle_min``, ``angle_increment`` [rad] and ``range_min`` [m] of each, shape (n,).
+        geometry: ``angle_min``, ``angle_increment`` [rad], ``range_min`` and ``range_max`` [m] of each, shape (n,).
         lidar: the scanner that the dataset is of.
         beams: how many are wanted.
         rotation: of the scanner in the robot, a rotation matrix, shape (3, 3).
@@ -99,12 +103,12 @@ def resampled_scans(
     n = len(ranges)
     result = np.empty((n, beams))
     lengths = np.array([len(one) for one in ranges], np.int64)
-    keys = np.stack([lengths, geometry["angle_min"], geometry["angle_increment"], geometry["range_min"]], axis=1)
+    keys = np.stack([lengths, *(geometry[name] for name in _GEOMETRY)], axis=1)
     turn = tuple(rotation.reshape(-1).tolist())
     kinds, which = np.unique(keys, axis=0, return_inverse=True)
     partial = 0
     reason: DatasetError | None = None
-    for kind, (count, angle_min, increment, range_min) in enumerate(kinds):
+    for kind, (count, angle_min, increment, range_min, range_max) in enumerate(kinds):
         rows = np.flatnonzero(which.reshape(-1) == kind)
         if count < 1 or not np.isfinite([angle_min, increment]).all() or (increment == 0 and beams > 1):
             result[rows] = np.nan
@@ -119,7 +123,7 @@ def resampled_scans(
             result[rows] = np.nan
             continue
         block = _without_holes(np.stack([np.asarray(ranges[row], np.float64) for row in rows]))
-        result[rows] = clean_ranges(block[:, beam], lidar, float(range_min))
+        result[rows] = clean_ranges(block[:, beam], lidar, float(range_min), float(range_max))
     if reason is not None and 2 * partial > n:
         raise reason
     return result

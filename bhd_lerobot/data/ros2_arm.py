@@ -5,7 +5,8 @@ from typing import Any, override
 
 import numpy as np
 
-from bhd_lerobot.data.ros2_cdr import decode, encode
+from bhd_lerobot.data.ros2_cdr import encode
+from bhd_lerobot.data.ros2_cdr_read import decode
 from bhd_lerobot.data.ros2_parts import WXYZ, XYZ, Array, Frames, Part, header
 from bhd_lerobot.errors import DatasetError
 

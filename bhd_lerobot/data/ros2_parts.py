@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.data import ros2_types as types
-from bhd_lerobot.data.ros2_cdr import decode, encode
+from bhd_lerobot.data.ros2_cdr import encode
+from bhd_lerobot.data.ros2_cdr_read import decode
 from bhd_lerobot.errors import DatasetError
 
 Array = NDArray[np.float64]

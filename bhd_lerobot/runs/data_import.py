@@ -7,8 +7,9 @@ from pathlib import Path
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.data.bag_dataset import ImportReport, RobotImport
+from bhd_lerobot.data.bag_find import check_distinct, find_bags
 from bhd_lerobot.data.bag_headers import is_ours
-from bhd_lerobot.data.bag_read import Bag, find_bags
+from bhd_lerobot.data.bag_read import Bag
 from bhd_lerobot.data.bag_restore import restore
 from bhd_lerobot.data.bag_robot import import_robot
 from bhd_lerobot.data.bag_tracks import TrackOptions
@@ -61,7 +62,7 @@ def add_to(commands: Commands) -> None:
 def _run(options: argparse.Namespace) -> int:
     require_rosbags()
     bags = [bag for path in options.bags for bag in find_bags(path.expanduser())]
-    _check_bags(bags)
+    check_distinct(bags)
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()
     if root.exists():
         raise DatasetExistsError(f"{root} exists already. Remove it, or choose another --root.")
@@ -78,15 +79,6 @@ def _run(options: argparse.Namespace) -> int:
         report = import_robot(bags, root, options.repo_id, _wanted(options))
     _tell(report, bags)
     return 0
-
-
-def _check_bags(bags: list[Bag]) -> None:
-    seen: set[Path] = set()
-    for bag in bags:
-        place = bag.path.resolve()
-        if place in seen:
-            raise ConfigError(f"{bag.path} is named twice; its episodes would be in the dataset twice.")
-        seen.add(place)
 
 
 _PLAIN = ("task", "imu", "scan_frame", "scan_yaw", "odom_frame", "max_age", "command_timeout", "outcome")

@@ -11,7 +11,7 @@ from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
-from bhd_lerobot.data.bag_read import find_bags
+from bhd_lerobot.data.bag_find import find_bags
 from bhd_lerobot.errors import DatasetError
 from tests.data.bag_support import STORE, drive, write
 
@@ -51,7 +51,7 @@ def check(path: Path, messages, *, problems: int = 0, whole: bool = True) -> int
         assert (read[topic].received.tolist(), read[topic].data) == (times[:count], data[:count])
         assert topics[topic].count == count if topic in topics else not count
         assert count == len(times) or not whole
-        assert list(bag.payloads(topic)) == data[:count]
+        assert [payload for _, payload in bag.payloads(topic)] == data[:count]
     assert len(bag.problems) == problems, bag.problems
     return total
 

@@ -17,6 +17,9 @@ STRAIGHT = tuple(np.eye(3).reshape(-1).tolist())
 LIDAR = turtlebot3_burger().lidar
 assert LIDAR is not None
 
+GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max")
+REACH = {"range_min": np.array([0.12]), "range_max": np.array([3.5])}
+
 steps = st.lists(st.integers(1, 900), min_size=1, max_size=40)
 
 
@@ -132,7 +135,7 @@ def world(angle):
 def test_scanners_of_every_kind_become_ours_by_angle(count, angle_min, sign, beams):
     step = sign * 2 * np.pi / (count - 1 if count == 361 else count)
     angle = angle_min + step * np.arange(count)
-    geometry = {"angle_min": np.array([angle_min]), "angle_increment": np.array([step]), "range_min": np.array([0.12])}
+    geometry = {"angle_min": np.array([angle_min]), "angle_increment": np.array([step])} | REACH
     found = resampled_scans(
         world(angle)[None], geometry, lidar=LIDAR, beams=beams, rotation=np.eye(3), topic="/scan"
     )  # fmt: skip
@@ -158,7 +161,7 @@ def test_a_scanner_that_does_not_see_all_around_is_refused():
 
 
 def test_a_scan_that_is_none_counts_as_lost():
-    geometry = {name: np.array([0.0, 0.1, np.nan]) for name in ("angle_min", "angle_increment", "range_min")}
+    geometry = {name: np.array([0.0, 0.1, np.nan]) for name in GEOMETRY}
     ranges = np.empty(3, object)
     ranges[:] = [np.ones(4), np.ones(0), np.ones(4)]
     found = resampled_scans(ranges, geometry, lidar=LIDAR, beams=4, rotation=np.eye(3), topic="/scan")
@@ -169,7 +172,8 @@ def scans(rows, **changes):
     """Resample scans of a beam for each degree; the n-th has what `changes` say of it."""
     n = len(rows)
     geometry = {
-        "angle_min": np.zeros(n), "angle_increment": np.full(n, np.radians(1.0)), "range_min": np.full(n, 0.12)
+        "angle_min": np.zeros(n), "angle_increment": np.full(n, np.radians(1.0)), "range_min": np.full(n, 0.12),
+        "range_max": np.full(n, 3.5)
     } | changes  # fmt: skip
     return resampled_scans(rows, geometry, lidar=LIDAR, beams=360, rotation=np.eye(3), topic="/scan")
 

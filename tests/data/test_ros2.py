@@ -10,7 +10,8 @@ from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.data import ros2_types as types
 from bhd_lerobot.data.bag_episode import scan_stream
 from bhd_lerobot.data.ros2_base import ScanPart
-from bhd_lerobot.data.ros2_cdr import decode, encode
+from bhd_lerobot.data.ros2_cdr import encode
+from bhd_lerobot.data.ros2_cdr_read import decode
 from bhd_lerobot.data.ros2_parts import Frames, header, header_stamps
 from bhd_lerobot.data.ros2_split import parts_of
 from bhd_lerobot.errors import ConfigError, DatasetError
