@@ -8,7 +8,7 @@ from bhd_lerobot.data import layout
 from bhd_lerobot.data.hub_errors import hub_errors, require_token
 from bhd_lerobot.data.remote import Item, RemoteFile, check_repo_id, in_order, largest_first, listed, refuse_damaged
 from bhd_lerobot.data.remote_pool import run_all
-from bhd_lerobot.errors import TransferError
+from bhd_lerobot.errors import ConfigError, TransferError
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -97,6 +97,17 @@ class HubDataset:
                 return None
             return bytes(answer.content)
 
+    def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
+        """Refuse: the Hub names a file by what is in it.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError(
+            f"{self.name} is on the Hub, which makes the checksums from the contents itself; there is nothing to "
+            "verify. Leave --verify out."
+        )
+
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Download files of the listed commit.
 
@@ -183,17 +194,21 @@ class HubDataset:
                 "and the Hub would leave them out. Change that file there; nothing was changed."
             )
         removals = [CommitOperationDelete(path) for path in deleted]
-        operations = [*additions, *removals]
+        operations: list[CommitOperationAdd | CommitOperationDelete] = [*removals, *additions]
+        if len(operations) > _COMMIT_SIZE and layout.INFO in self._listed:
+            # A reader who comes between two commits finds no dataset; better than one that is of two versions. What
+            # arrives with the last commit must be a new operation: the client leaves out what it has seen there.
+            operations = [one for one in operations if one.path_in_repo != layout.INFO]
+            content = by_path[layout.INFO].content if layout.INFO in by_path else self._info()
+            operations = [CommitOperationDelete(layout.INFO), *operations, CommitOperationAdd(layout.INFO, content)]
         count = -(-len(operations) // _COMMIT_SIZE)
         parent = self.commit
         for number in range(count):
             check()
-            # Removals in the first commit, with what replaces them only if all fit into one.
-            chunk = (removals + additions)[number * _COMMIT_SIZE : (number + 1) * _COMMIT_SIZE]
             part = f", part {number + 1} of {count}" if count > 1 else ""
             info = self._api.create_commit(
                 self.name,
-                chunk,
+                operations[number * _COMMIT_SIZE : (number + 1) * _COMMIT_SIZE],
                 commit_message=f"Dataset{part}",
                 repo_type="dataset",
                 revision=self._branch,
@@ -201,6 +216,13 @@ class HubDataset:
             )
             parent = info.oid
         self.commit = parent
+
+    def _info(self) -> bytes:
+        """Return the `meta/info.json` of the listed commit, which stays as it is while others change."""
+        content = self.read(layout.INFO)
+        if content is None:
+            raise TransferError(f"Could not upload the dataset to {self.name}: its {layout.INFO} is gone.")
+        return content
 
     def _commit_of(self, tag: str | None) -> str | None:
         return next((one.target_commit for one in self._list_refs().tags if one.name == tag), None)

@@ -17,7 +17,13 @@ from bhd_lerobot.errors import ConfigError, TransferError
 CARD = "README.md"
 PICTURE = "preview.png"
 SUBSET = "meta/bhd_subset.json"
-"""Says that a folder holds the files of some episodes only. It is never uploaded."""
+"""Says which episodes of a dataset were asked for, and whether the folder holds all files. It is never uploaded."""
+
+MANIFEST = "bhd_files.json"
+"""The list of files with size and checksum beside a dataset below a URL; no part of the dataset."""
+
+LISTED = "xxh128"
+"""How the checksums in that list are made."""
 
 _CHUNK = 1 << 24
 """Bytes that are read at once. After each read a thread waits for the others, which download: a few ms each time."""
@@ -33,7 +39,7 @@ class RemoteFile:
         size: its bytes.
         digest: its checksum in hexadecimal; None if the place knows none.
         algorithm: how the checksum is made: `sha256`; `git`, the name that git gives to the content; or `xxh128`, which
-            takes a tenth of the time and finds damage, though no malice.
+            takes a tenth of the time and finds damage, though no malice: of files that a push noted in its own list.
     """
 
     size: int
@@ -83,6 +89,14 @@ class Remote(Protocol):
     def read(self, path: str) -> bytes | None:
         """Return the content of a small file; None if there is none."""
 
+    def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
+        """Return listed files with the checksum of what lies there now, which is read for it.
+
+        Raises:
+            ConfigError: the place makes the checksums from the contents itself, so there is nothing to verify.
+            TransferError: a file cannot be read.
+        """
+
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Copy files into a folder, each of which is then the listed one, to the last byte.
 
@@ -105,24 +119,39 @@ class Remote(Protocol):
 
 def digest(content: Path | bytes, algorithm: str) -> str:
     """Return the checksum of some content, as `RemoteFile` names them."""
-    hasher: Any
+    if isinstance(content, bytes):
+        hasher = _hasher(algorithm, len(content))
+        hasher.update(content)
+        return str(hasher.hexdigest())
+    size = content.stat().st_size
+    with open(content, "rb", buffering=0) as file:
+        return stream_digest(file, size, algorithm)
+
+
+class Readable(Protocol):
+    """An open file."""
+
+    def readinto(self, buffer: memoryview, /) -> int | None:
+        """Read what comes next into a buffer; return how many bytes that was."""
+
+
+def stream_digest(file: Readable, size: int, algorithm: str) -> str:
+    """Return the checksum of an open file of so many bytes, which are read in pieces."""
+    hasher = _hasher(algorithm, size)
+    buffer = memoryview(bytearray(max(1, min(_CHUNK, size))))
+    while count := file.readinto(buffer):
+        hasher.update(buffer[:count])
+    return str(hasher.hexdigest())
+
+
+def _hasher(algorithm: str, size: int) -> Any:
     if algorithm == "git":
-        size = len(content) if isinstance(content, bytes) else content.stat().st_size
-        hasher = hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
-    elif algorithm == "xxh128":
+        return hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
+    if algorithm == LISTED:
         import xxhash
 
-        hasher = xxhash.xxh3_128()
-    else:
-        hasher = hashlib.sha256()
-    if isinstance(content, bytes):
-        hasher.update(content)
-    else:
-        with open(content, "rb", buffering=0) as file:
-            buffer = memoryview(bytearray(max(1, min(_CHUNK, content.stat().st_size))))
-            while count := file.readinto(buffer):
-                hasher.update(buffer[:count])
-    return str(hasher.hexdigest())
+        return xxhash.xxh3_128()
+    return hashlib.sha256()
 
 
 def refuse_overlap(root: Path, remote: Remote) -> None:

@@ -1,6 +1,7 @@
 """The dataset on this machine while it is copied: whole, finalised, and the same until the copy is complete."""
 
 import os
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -9,7 +10,8 @@ from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock
-from bhd_lerobot.data.remote import SUBSET, Item, is_recorded, listed
+from bhd_lerobot.data.remote import MANIFEST, SUBSET, Item, is_recorded, listed
+from bhd_lerobot.data.remote_subset import read_subset
 from bhd_lerobot.data.state import DatasetState, load_state
 from bhd_lerobot.errors import DatasetError, DatasetLockedError
 
@@ -77,7 +79,7 @@ def open_local(root: Path) -> Iterator[LocalDataset]:
 
 
 def _refuse_subset(root: Path) -> None:
-    if (root / SUBSET).exists():
+    if (root / SUBSET).exists() and not read_subset(root).is_whole:
         raise DatasetError(
             f"{root} holds some episodes of a dataset only: it was pulled with --episodes or --outcome. Pull all of "
             "it first, or make a dataset of its own of these episodes."
@@ -103,9 +105,23 @@ def _files(state: DatasetState, stamps: dict[str, Any]) -> tuple[list[str], list
             "with `cp -rL`, and take the copy."
         )
     left_out = sorted(name for name in stamps if is_recorded(name) and name not in needed)
-    skipped = {*left_out, SUBSET}
+    skipped = {*left_out, SUBSET, MANIFEST}
     names = [name for name in sorted(stamps) if name not in skipped and name.split("/")[0] not in _TEMPORARY]
+    _refuse_links_outside(state.root, names)
     return names, left_out
+
+
+def _refuse_links_outside(root: Path, names: list[str]) -> None:
+    """Refuse to publish a file that is not of the dataset: nobody sees in a listing that it is only linked there."""
+    whole = root.resolve()
+    for name in names:
+        path = root / name
+        if path.is_symlink() and not (target := path.resolve()).is_relative_to(whole):
+            raise DatasetError(
+                f"{path} is a link to {target}, outside of the dataset, and a copy of that file would be sent. Remove "
+                f"the link; or, if the file belongs to the dataset, make a copy with `cp -rL {shlex.quote(str(root))} "
+                "COPY` and take that."
+            )
 
 
 def _stamps(root: Path) -> dict[str, tuple[int, ...]]:

@@ -1,15 +1,27 @@
 """Copy a dataset to the Hub or below a URL: what differs, and nothing else."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.assemble import EDITS
 from bhd_lerobot.data.card import is_generated
 from bhd_lerobot.data.edits import edits_of
-from bhd_lerobot.data.remote import CARD, PICTURE, Item, Remote, RemoteFile, is_recorded, refuse_overlap, total
+from bhd_lerobot.data.remote import (
+    CARD,
+    LISTED,
+    MANIFEST,
+    PICTURE,
+    Item,
+    Remote,
+    RemoteFile,
+    is_recorded,
+    refuse_overlap,
+    total,
+)
+from bhd_lerobot.data.remote_info import parse_info
 from bhd_lerobot.data.remote_local import LocalDataset, open_local
 from bhd_lerobot.data.remote_pool import run_all
 from bhd_lerobot.data.state import DatasetState
@@ -29,7 +41,8 @@ class Card:
     picture: bytes | None = None
 
 
-type MakeCard = Callable[[DatasetState], Card]
+type MakeCard = Callable[[DatasetState, bool], Card]
+"""Makes a card of a dataset, given whether there is a picture already that a person put there."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +58,7 @@ class PushReport:
         deleted: files that belonged to no episode any more and were removed there.
         left_out: files on this machine that belong to no episode and were not sent.
         kept_card: whether a card that somebody edited was left as it is.
+        kept_picture: whether a picture that somebody put there was left as it is.
     """
 
     name: str
@@ -55,6 +69,7 @@ class PushReport:
     deleted: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     kept_card: bool = False
+    kept_picture: bool = False
 
 
 def push(
@@ -64,6 +79,7 @@ def push(
     make_card: MakeCard | None = None,
     replace_card: bool = False,
     replace: bool = False,
+    verify: bool = False,
 ) -> PushReport:
     """Make a remote dataset the same as the one on this machine.
 
@@ -76,10 +92,11 @@ def push(
         make_card: generates a card; None sends none but the user's own.
         replace_card: overwrite a card at the remote place that a person wrote.
         replace: overwrite a dataset at the remote place that is another one, or has more episodes.
+        verify: read what lies at the remote place and compare that, instead of what is listed about it.
 
     Raises:
         DatasetExistsError: there is another dataset, or one with more episodes, and `replace` is false.
-        ConfigError: both are the same folder.
+        ConfigError: both are the same folder, or the place needs no verifying.
         DatasetError: the dataset is not whole and finalised, is in use, or was changed meanwhile.
         TransferError: the place cannot be reached or does not let this user write; what was sent is not sent again.
     """
@@ -87,15 +104,17 @@ def push(
     with open_local(Path(root)) as local:
         there = remote.files()
         if not replace and layout.INFO in there:
-            _refuse_another(local, remote)
-        cards, kept_card = _cards(local, remote, make_card, replace_card, is_there=CARD in there)
+            _refuse_another(local, remote, there)
+        cards, kept = _cards(local, remote, make_card, replace_card, there)
         items = [item for item in local.items if item.path not in (CARD, PICTURE)] + cards
         try:
+            if verify:
+                there |= remote.verified([one.path for one in items if _may_be(one, there.get(one.path))])
             changed = _changed(items, there)
         except OSError as error:
             raise DatasetError(f"{root} cannot be read: {error}.") from error
         wanted = {item.path for item in items}
-        ours = (layout.STATS, layout.TASKS, layout.IDENTITY, EDITS)
+        ours = (layout.STATS, layout.TASKS, layout.IDENTITY, EDITS, MANIFEST)
         deleted = sorted(path for path in there if path not in wanted and (is_recorded(path) or path in ours))
         remote.send(changed, deleted, local.check_unchanged)
         return PushReport(
@@ -106,36 +125,44 @@ def push(
             kept=len(items) - len(changed),
             deleted=deleted,
             left_out=local.left_out,
-            kept_card=kept_card,
+            kept_card=CARD in kept,
+            kept_picture=PICTURE in kept,
         )
 
 
-def _refuse_another(local: LocalDataset, remote: Remote) -> None:
+def _may_be(item: Item, file: RemoteFile | None) -> bool:
+    return file is not None and file.size == item.size
+
+
+def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, RemoteFile]) -> None:
     """Refuse to overwrite what this dataset is no later version of; a store keeps no history.
 
     Raises:
         DatasetExistsError: what lies there has other columns, another rate or robot or format, or more episodes, though
-            none was deleted here.
+            none was deleted here; or it is no dataset of this format at all.
     """
-    info = local.state.info
+    if next(item for item in local.items if item.path == layout.INFO).is_like(there[layout.INFO]):
+        return  # whatever became of it there since: this dataset is what was put there
     try:
-        there = json.loads(remote.read(layout.INFO) or b"{}")
-        columns = {key: feature["dtype"] for key, feature in there["features"].items()}
-        told = (columns, there["fps"], there.get("robot_type"), str(there["codebase_version"])[:2])
-        episodes = int(there["total_episodes"])
-    except (ValueError, KeyError, TypeError, AttributeError):
-        told, episodes = ({}, None, None, ""), 0
-    own = {key: feature["dtype"] for key, feature in info["features"].items()}
-    if told != (own, info["fps"], info.get("robot_type"), str(info["codebase_version"])[:2]):
+        found = parse_info(remote.read(layout.INFO), remote.name)
+    except DatasetError as error:
+        raise DatasetExistsError(f"{error} Choose another place, or give up what lies there with --replace.") from error
+    if _kind(found) != _kind(local.state.info):
         raise DatasetExistsError(
             f"{remote.name} is another dataset: it has other columns, another rate, robot or format than {local.root}. "
             "Choose another place, or give up what lies there with --replace."
         )
+    episodes = found["total_episodes"]
     if episodes > local.state.num_episodes and not any(edit.get("edit") == "delete" for edit in edits_of(local.root)):
         raise DatasetExistsError(
             f"{remote.name} has {episodes} episodes, {local.root} has {local.state.num_episodes} and none was deleted "
             "from it: it is an older one, or another. Pull that one, or give it up with --replace."
         )
+
+
+def _kind(info: Mapping[str, Any]) -> tuple[Any, ...]:
+    columns = {key: feature["dtype"] for key, feature in info["features"].items()}
+    return columns, info["fps"], info.get("robot_type"), str(info["codebase_version"])[:2]
 
 
 def _changed(items: Sequence[Item], there: Mapping[str, RemoteFile]) -> list[Item]:
@@ -150,22 +177,36 @@ def _changed(items: Sequence[Item], there: Mapping[str, RemoteFile]) -> list[Ite
 
 
 def _cards(
-    local: LocalDataset, remote: Remote, make_card: MakeCard | None, replace: bool, *, is_there: bool
-) -> tuple[list[Item], bool]:
-    """Return the card and its picture as files to send, and whether a person's card is left as it is there."""
+    local: LocalDataset,
+    remote: Remote,
+    make_card: MakeCard | None,
+    replace: bool,
+    there: Mapping[str, RemoteFile],
+) -> tuple[list[Item], set[str]]:
+    """Return the card and its picture as files to send, and which of both are a person's there and left as they are."""
     own = {item.path: item for item in local.items if item.path in (CARD, PICTURE)}
     mine = (local.root / CARD).read_bytes() if CARD in own else b""
     is_mine = bool(mine) and not is_generated(_text(mine))
-    theirs = remote.read(CARD) if is_there and not replace else None
+    theirs = remote.read(CARD) if CARD in there and not replace else None
     if theirs is not None and not is_generated(_text(theirs)) and not (is_mine and theirs == mine):
-        return [], True
+        return [], {CARD}
     if is_mine:
-        return list(own.values()), False
+        return list(own.values()), set()
+    # A generated card and its picture come together. A picture alone is a person's, at either end.
+    picture = own.get(PICTURE) if CARD not in own else None
+    is_theirs = PICTURE in there and CARD not in there and not replace and there[PICTURE].algorithm != LISTED
+    kept = {PICTURE} if is_theirs and not (picture and picture.is_like(there[PICTURE])) else set()
     if make_card is None:
-        return [], False
-    card = make_card(local.state)
-    contents = {CARD: card.text.encode(), PICTURE: card.picture}
-    return [Item(path, content, len(content)) for path, content in contents.items() if content is not None], False
+        return [picture] if picture and not kept else [], kept if picture else set()
+    card = make_card(local.state, picture is not None or bool(kept))
+    items = [Item(CARD, text := card.text.encode(), len(text))]
+    if kept:
+        return items, kept
+    if picture is not None:
+        return [*items, picture], set()
+    if card.picture is not None:
+        items.append(Item(PICTURE, card.picture, len(card.picture)))
+    return items, set()
 
 
 def _text(content: bytes) -> str:

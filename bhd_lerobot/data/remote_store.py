@@ -5,26 +5,29 @@ the same by. `meta/info.json` is written last and removed first, so that there i
 """
 
 import contextlib
-import errno
 import json
-import re
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import uuid
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.data import layout
-from bhd_lerobot.data.remote import Item, RemoteFile, digest, largest_first, refuse_damaged
+from bhd_lerobot.data.remote import (
+    LISTED,
+    MANIFEST,
+    Item,
+    RemoteFile,
+    digest,
+    largest_first,
+    refuse_damaged,
+    stream_digest,
+)
+from bhd_lerobot.data.remote_errors import store_errors
 from bhd_lerobot.data.remote_pool import WORKERS, run_all
-from bhd_lerobot.errors import BhdError, ConfigError, TransferError
-
-MANIFEST = "bhd_files.json"
-"""The list of files with size and checksum; not a part of the dataset."""
-
-_EXTRAS = {"s3": "lerobot_robot_bhd[s3]", "s3a": "lerobot_robot_bhd[s3]", "gs": "gcsfs", "gcs": "gcsfs"}
-_EXTRAS |= {"az": "adlfs", "abfs": "adlfs", "abfss": "adlfs", "sftp": "paramiko", "ssh": "paramiko"}
+from bhd_lerobot.data.remote_url import LOCAL, open_place, shown
+from bhd_lerobot.errors import TransferError
 
 _FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", "webhdfs", "webdav", "dbfs"}
 """Where folders must be made first. To make the folder of an object store's object may mean to make a bucket."""
@@ -32,8 +35,8 @@ _FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", 
 _NOTED_BYTES = 64e6
 """Bytes that are sent before the list is written: about as much is sent again after a kill."""
 
-ALGORITHM = "xxh128"
-"""Checksum in the list of files."""
+_PART = ".bhd-part"
+"""Ends the temporary names of files that are being written."""
 
 
 class StoreDataset:
@@ -52,36 +55,18 @@ class StoreDataset:
             storage_options: what fsspec's file system takes: keys, endpoint; else its environment variables count.
 
         Raises:
-            ConfigError: an unknown protocol, or a URL without a folder.
-            TransferError: what serves this protocol is not installed.
+            ConfigError: an unknown protocol, or a URL that is no place for a dataset.
+            TransferError: what serves this protocol is not installed, or cannot be reached.
         """
-        import fsspec  # type: ignore[import-untyped]
-        from fsspec.core import url_to_fs  # type: ignore[import-untyped]
-
-        protocol, _, path = url.partition("://")
-        # What is shown, and kept in files: without a password, which may hold any character.
-        self.name = re.sub(r"(://)[^@]*:.*@", r"\1", url.rstrip("/"))
-        if "::" in url:
-            raise ConfigError(f"{url} is a chain of file systems. Name the one where the dataset is to lie.")
-        if protocol in ("http", "https", "data", "hf", "lerobot"):
-            raise ConfigError(f"{url} cannot be written to or listed. Name a folder, or a dataset as user/name.")
-        if not path.strip("/"):
-            raise ConfigError(f"{url} names no folder. Give one, for example {protocol}://bucket/folder.")
-        try:
-            self._fs, self._root = url_to_fs(url.rstrip("/"), **(storage_options or {}))
-        except ImportError as error:
-            package = _EXTRAS.get(protocol, "")
-            remedy = f" Install it: pip install '{package}'" if package else ""
-            raise TransferError(f"What serves {protocol}:// is not installed ({error}).{remedy}") from error
-        except ValueError as error:
-            known = ", ".join(sorted(str(one) for one in fsspec.available_protocols()))
-            raise ConfigError(f"{url} cannot be used: {error}. Known protocols: {known}.") from error
+        self.name = shown(url)
+        self._fs, self._root = open_place(url, storage_options)
         kinds = self._fs.protocol if isinstance(self._fs.protocol, tuple) else (self._fs.protocol,)
         self._has_folders = not _FOLDERS.isdisjoint(kinds)
-        self.folder: Path | None = Path(self._root) if not {"file", "local"}.isdisjoint(kinds) else None
+        self.folder: Path | None = Path(self._root) if not LOCAL.isdisjoint(kinds) else None
         # Others, such as FTP, have one connection for all threads.
-        self._workers = WORKERS if self._fs.async_impl or not {"file", "local", "memory"}.isdisjoint(kinds) else 1
+        self._workers = WORKERS if self._fs.async_impl or not {*LOCAL, "memory"}.isdisjoint(kinds) else 1
         self._known: dict[str, RemoteFile] = {}
+        self._is_noted = True  # whether the list there says what is known
         self._there: dict[str, RemoteFile] = {}
 
     def files(self) -> dict[str, RemoteFile]:
@@ -97,7 +82,14 @@ class StoreDataset:
             except (FileNotFoundError, NotADirectoryError):
                 found = {}  # a folder or a prefix that nobody wrote to yet; a missing bucket fails when it is written
             root = self._fs._strip_protocol(self._root).rstrip("/")
-            sizes = {name[len(root) :].lstrip("/"): int(about["size"] or 0) for name, about in found.items()}
+            sizes = {
+                name[len(root) :].removeprefix("/"): int(about["size"] or 0)
+                for name, about in found.items()
+                if about.get("type") != "directory"
+            }
+            # Consoles of object stores make folders by empty objects whose names end in a slash, or have no name at all
+            # below the root; and a kill leaves files under their temporary names.
+            sizes = {path: size for path, size in sizes.items() if path[-1:] not in ("", "/") and not _is_part(path)}
             self._known = self._read_manifest() if MANIFEST in sizes else {}
         sizes.pop(MANIFEST, None)
         self._there = {}
@@ -114,6 +106,26 @@ class StoreDataset:
                 return bytes(self._fs.cat_file(self._at(path)))
             except FileNotFoundError:
                 return None
+
+    def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
+        """Return listed files with the checksum of what lies there now, which is read for it.
+
+        Raises:
+            TransferError: a file cannot be read.
+        """
+        found: dict[str, RemoteFile] = {}
+
+        def read(path: str) -> None:
+            size = self._there[path].size
+            with self._fs.open(self._at(path), "rb") as file:
+                found[path] = RemoteFile(size, stream_digest(file, size, LISTED), LISTED)
+
+        with store_errors(self.name, "read"):
+            run_all(read, largest_first(paths, self._there), self._workers)
+        self._there |= found
+        self._is_noted = self._is_noted and all(self._known.get(path) == file for path, file in found.items())
+        self._known |= found
+        return found
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Copy files into a folder.
@@ -138,7 +150,7 @@ class StoreDataset:
         Raises:
             TransferError: not all was written. What was is not sent again; there is no `meta/info.json` then.
         """
-        if not items and not deleted:
+        if not items and not deleted and self._is_noted:
             return
         by_path = {item.path: item for item in items}
         info = by_path.pop(layout.INFO, None)
@@ -153,7 +165,7 @@ class StoreDataset:
             stale = {*by_path, *deleted} & self._known.keys()
             for path in stale:
                 del self._known[path]  # before it is overwritten: it must never be taken for what it was
-            if stale:
+            if stale or not self._is_noted:
                 self._write_manifest()
             if deleted:
                 run_all(self._remove, deleted, self._workers)
@@ -203,75 +215,53 @@ class StoreDataset:
         self._write_manifest()
 
     def _put_one(self, item: Item) -> None:
-        if isinstance(item.content, Path):
+        if self.folder is not None:
+            self._replace_file(Path(self._at(item.path)), item.content)
+        elif isinstance(item.content, Path):
             self._fs.put_file(str(item.content), self._at(item.path))
         else:
             self._fs.pipe_file(self._at(item.path), item.content)
 
+    def _replace_file(self, target: Path, content: Path | bytes) -> None:
+        """Write a file beside its place, and let it take the place: another name that the old one has keeps that."""
+        part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}{_PART}")
+        try:
+            if isinstance(content, Path):
+                self._fs.put_file(str(content), str(part))
+            else:
+                self._fs.pipe_file(str(part), content)
+            part.replace(target)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+
     def _keep_info(self) -> Item:
-        content = self._fs.cat_file(self._at(layout.INFO))
-        return Item(layout.INFO, bytes(content), len(content))
+        content = bytes(self._fs.cat_file(self._at(layout.INFO)))
+        item = Item(layout.INFO, content, len(content))
+        if not item.is_like(self._there[layout.INFO]):
+            raise TransferError(
+                f"Could not upload the dataset to {self.name}: its {layout.INFO} is not what was written there. "
+                "Something else wrote it, or it was damaged: push with --verify, which mends that."
+            )
+        return item
 
     def _read_manifest(self) -> dict[str, RemoteFile]:
         try:
             listed = json.loads(self._fs.cat_file(self._at(MANIFEST)))
             return {
-                path: RemoteFile(int(one["size"]), str(one[ALGORITHM]), ALGORITHM)
-                for path, one in listed["files"].items()
+                path: RemoteFile(int(one["size"]), str(one[LISTED]), LISTED) for path, one in listed["files"].items()
             }
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             return {}  # a kill left half of it: nothing is known, so everything is compared by sending it again
 
     def _write_manifest(self) -> None:
-        listed = {path: {"size": one.size, ALGORITHM: one.digest} for path, one in sorted(self._known.items())}
-        self._fs.pipe_file(self._at(MANIFEST), json.dumps({"format": 1, "files": listed}, indent=1).encode())
+        listed = {path: {"size": one.size, LISTED: one.digest} for path, one in sorted(self._known.items())}
+        content = json.dumps({"format": 1, "files": listed}, indent=1).encode()
+        self._put_one(Item(MANIFEST, content, len(content)))
+        self._is_noted = True
 
     def _at(self, path: str) -> str:
         return f"{self._root.rstrip('/')}/{path}"
-
-
-@contextmanager
-def store_errors(url: str, action: str) -> Iterator[None]:
-    """Turn what goes wrong between this machine and a store into a `TransferError`."""
-    try:
-        yield
-    except BhdError:
-        raise
-    except Exception as error:  # of fsspec, of the store's own client: each has its own tree
-        raise TransferError(f"Could not {action} {url}: {_explain(error)}") from error
-
-
-def _explain(error: BaseException) -> str:
-    kind, text = type(error).__name__, " ".join(str(error).split())[:300].rstrip(".")
-    for holds, meaning in (
-        (
-            "Credentials" in kind or "Unable to locate credentials" in text,
-            "no credentials were found ({}). For S3 set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile.",
-        ),
-        (
-            "EndpointConnection" in kind or isinstance(error, ConnectionError) or "Could not connect" in text,
-            "the store cannot be reached ({}). Check the connection, and AWS_ENDPOINT_URL for a store of your own.",
-        ),
-        (
-            isinstance(error, FileNotFoundError),
-            "it does not exist ({}). Check the name; a bucket must be made first.",
-        ),
-        (
-            isinstance(error, PermissionError),
-            "no permission ({}). The key may be wrong or have expired, or may not be used for this.",
-        ),
-        (
-            isinstance(error, TimeoutError) or "Timeout" in kind,
-            "the store did not answer in time ({}). Check the connection.",
-        ),
-        (
-            isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
-            "the disk is full ({}). Free some space on it.",
-        ),
-    ):
-        if holds:
-            return meaning.format(text or kind)
-    return f"{text or 'no reason given'} ({kind})."
 
 
 def _matters(path: str) -> bool:
@@ -279,5 +269,10 @@ def _matters(path: str) -> bool:
     return path.startswith(("data/", "videos/", "meta/"))
 
 
+def _is_part(path: str) -> bool:
+    name = path.rpartition("/")[2]
+    return name.startswith(".") and name.endswith(_PART)
+
+
 def _about(item: Item) -> RemoteFile:
-    return RemoteFile(item.size, digest(item.content, ALGORITHM), ALGORITHM)
+    return RemoteFile(item.size, digest(item.content, LISTED), LISTED)

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.disk import to_json
 from bhd_lerobot.data.remote import SUBSET
 from bhd_lerobot.data.state import corrupt
 from bhd_lerobot.errors import DatasetError
@@ -38,9 +39,9 @@ def files_of(root: Path, episodes: Sequence[int]) -> set[str]:
     try:
         info = json.loads((root / layout.INFO).read_bytes())
         rows = [row for path in _tables(root) for row in _rows(path)]
-    except (OSError, ValueError) as error:
+        by_index = {row["episode_index"]: row for row in rows}
+    except (OSError, ValueError, KeyError) as error:
         raise corrupt(root / layout.INFO, error) from error
-    by_index = {row["episode_index"]: row for row in rows}
     unknown = [episode for episode in episodes if episode not in by_index]
     if unknown:
         raise DatasetError(
@@ -51,19 +52,41 @@ def files_of(root: Path, episodes: Sequence[int]) -> set[str]:
     for key, feature in info["features"].items():
         if feature["dtype"] == "video":
             patterns[f"videos/{key}"] = (info.get("video_path") or layout.VIDEO_PATH).replace("{video_key}", key)
-    return {
-        pattern.format(chunk_index=row[f"{kind}/chunk_index"], file_index=row[f"{kind}/file_index"])
-        for row in (by_index[episode] for episode in episodes)
-        for kind, pattern in patterns.items()
-    }
-
-
-def read_subset(root: Path) -> list[int]:
-    """Return the episodes whose files a folder holds, as `SUBSET` says; none if that cannot be read."""
     try:
-        return [int(one) for one in json.loads((root / SUBSET).read_bytes())["episodes"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
+        return {
+            pattern.format(chunk_index=row[f"{kind}/chunk_index"], file_index=row[f"{kind}/file_index"])
+            for row in (by_index[episode] for episode in episodes)
+            for kind, pattern in patterns.items()
+        }
+    except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
+        raise corrupt(root / "meta/episodes", f"it does not say which files hold an episode ({error!r})") from error
+
+
+@dataclass(frozen=True)
+class SubsetNote:
+    """What `SUBSET` says.
+
+    Attributes:
+        episodes: the episodes that were asked for, ascending.
+        is_whole: whether the folder holds all files of the dataset nevertheless.
+    """
+
+    episodes: list[int]
+    is_whole: bool
+
+
+def read_subset(root: Path) -> SubsetNote:
+    """Return what `SUBSET` says; no episode and not whole if it is not there or cannot be read."""
+    try:
+        note = json.loads((root / SUBSET).read_bytes())
+        return SubsetNote(sorted(int(one) for one in note["episodes"]), note.get("whole") is True)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        return SubsetNote([], False)
+
+
+def subset_note(source: str, note: SubsetNote) -> bytes:
+    """Return the content of `SUBSET` for a dataset that came from somewhere."""
+    return to_json({"source": source, "episodes": note.episodes, "whole": note.is_whole})
 
 
 def _tables(root: Path) -> list[Path]:

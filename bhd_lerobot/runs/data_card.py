@@ -47,12 +47,18 @@ class CardOptions:
     tags: Sequence[str] = ()
 
 
-def make_card(state: DatasetState, options: CardOptions) -> Card:
-    """Return the card of a dataset; the same one whenever it is asked for the same dataset."""
+def make_card(state: DatasetState, options: CardOptions, *, has_picture: bool = False) -> Card:
+    """Return the card of a dataset; the same one whenever it is asked for the same dataset.
+
+    Args:
+        state: the dataset.
+        options: what it says besides.
+        has_picture: a person put a picture beside the dataset: the card shows that one, and none is drawn.
+    """
     from huggingface_hub import constants
 
     summary = dataset_info(state.root)
-    picture = draw(summary, state)
+    picture = (b"", "A picture of the dataset") if has_picture else draw(summary, state)
     facts = CardFacts(
         title=(options.repo_id or options.url).rstrip("/").rpartition("/")[2],
         summary=summary,
@@ -70,7 +76,7 @@ def make_card(state: DatasetState, options: CardOptions) -> Card:
         licence=options.licence,
         tags=options.tags,
     )
-    return Card(compose(facts), None if picture is None else picture[0])
+    return Card(compose(facts), None if picture is None or has_picture else picture[0])
 
 
 def draw(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, str] | None:

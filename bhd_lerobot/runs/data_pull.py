@@ -1,15 +1,28 @@
 """`bhd-data pull`: a dataset from the Hub, or from below a URL."""
 
 import argparse
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.remote import check_repo_id, counted, is_url, megabytes
+from bhd_lerobot.data.remote_url import check_url, shown
 from bhd_lerobot.errors import ConfigError, DatasetWriteError, TransferError
 from bhd_lerobot.runs.data_command import Commands, add_command
-from bhd_lerobot.runs.data_transfer import command_line, prompt_interrupt, quiet_bars, split_list, storage_options
+from bhd_lerobot.runs.data_transfer import (
+    command_line,
+    folder_of,
+    for_urls,
+    prompt_interrupt,
+    quiet_bars,
+    refuse_empty,
+    repeat_line,
+    split_list,
+    storage_options,
+    tell_of_folder,
+)
 from bhd_lerobot.runs.episode_list import parse_episodes, short
 
 if TYPE_CHECKING:
@@ -28,22 +41,16 @@ def add_to(commands: Commands) -> None:
     command.add_argument("--outcome", help="only the files of episodes that ended so, such as success")
     command.add_argument("--min_score", type=float, help="only the files of episodes with at least this score, 0 to 1")
     command.add_argument("--replace", action="store_true", help="give up another or a changed dataset that is there")
+    command.add_argument(
+        "--verify", action="store_true", help="of a URL: read what is there also of files that are here, and compare"
+    )
     command.add_argument("--storage_options", help="options of the URL's file system, JSON")
+    command.set_defaults(parser=command)
 
 
 def _run(options: argparse.Namespace) -> int:
     source, root = _places(options)
-    again = command_line(
-        "pull",
-        [source],
-        root=root,
-        revision=options.revision,
-        episodes=options.episodes,
-        outcome=options.outcome,
-        min_score=options.min_score,
-        replace=options.replace,
-        storage_options=options.storage_options,
-    )
+    again = repeat_line(options, source, root=root)
     options.stopped = f"{root} is as it was, and what arrived is not fetched again. Go on with:\n  {again}"
     with prompt_interrupt(options.stopped):
         report = pull_dataset(
@@ -52,6 +59,7 @@ def _run(options: argparse.Namespace) -> int:
             revision=options.revision,
             select=_selection(options),
             replace=options.replace,
+            verify=options.verify,
             storage=options.storage_options,
             again=again,
         )
@@ -66,6 +74,7 @@ def pull_dataset(
     revision: str | None = None,
     select: "Select | None" = None,
     replace: bool = False,
+    verify: bool = False,
     storage: str | None = None,
     again: str | None = None,
 ) -> "PullReport":
@@ -77,6 +86,7 @@ def pull_dataset(
         revision: branch, tag or commit of the Hub; the one that stock LeRobot takes if None.
         select: chooses the episodes, given a folder with the metadata; None means all.
         replace: give up another or a changed dataset that is there.
+        verify: read what lies below a URL also of files that are here, and compare contents.
         storage: options of the URL's file system, JSON.
         again: the command to repeat.
 
@@ -90,7 +100,7 @@ def pull_dataset(
     quiet_bars()
     remote = StoreDataset(source, storage_options(storage)) if is_url(source) else HubDataset(source, revision)
     try:
-        return pull(remote, root, select=select, replace=replace)
+        return pull(remote, root, select=select, replace=replace, verify=verify)
     except (TransferError, DatasetWriteError) as error:
         again = again or command_line("pull", [source], root=root, revision=revision)
         raise type(error)(
@@ -108,16 +118,21 @@ def tell(report: "PullReport", source: str) -> str:
         )
     else:
         lines.append(f"  nothing to fetch: all {report.kept} files are there")
+    if report.by_size:
+        files = "1 file was" if report.by_size == 1 else f"{report.by_size} files were"
+        lines.append(
+            f"  {files} compared by size only, because no checksums are listed at {shown(source)}; --verify compares "
+            "contents"
+        )
     if report.episodes is not None:
-        chosen = short(report.episodes)
-        name = "me/some" if is_url(source) else source
-        lines[0] = f"{report.root}: {len(report.episodes)} of {report.total_episodes} episodes: {chosen}"
-        if report.is_whole:
-            lines.append("  the files that hold them hold all the others, too")
+        count = "1 episode" if len(report.episodes) == 1 else f"{len(report.episodes)} episodes"
+        lines[0] = f"{report.root}: {count} of {report.total_episodes}: {short(report.episodes)}"
+        others = f"all {report.total_episodes}" if report.is_whole else "others, too"
+        label = source if not is_url(source) else report.root.name
+        words = ["bhd-train", f"--dataset.repo_id={label}", f"--dataset.root={report.root}"]
         lines += [
-            "  Name them where you load it:",
-            f"    bhd-train --dataset.repo_id={name} --dataset.root={report.root} --dataset.episodes="
-            f'"{report.episodes if len(report.episodes) <= 20 else "[...]"}"',
+            f"  a file holds many episodes: those that are here hold {others}. Name yours where you load them:",
+            f'    {shlex.join(words)} --dataset.episodes="{report.episodes}"',
         ]
     if report.problem:
         lines.append(f"  it came as it is there, and is not sound: {report.problem}")
@@ -148,16 +163,19 @@ def _selection(options: argparse.Namespace) -> "Select | None":
 
 
 def _places(options: argparse.Namespace) -> tuple[str, Path]:
+    refuse_empty(options)
     source = options.source or options.repo_id
     if source is None or (options.source and options.repo_id):
         raise ConfigError("Say where from, once: bhd-data pull user/name, or bhd-data pull s3://bucket/dir --root=DIR.")
     if is_url(source):
+        check_url(source)
         if options.root is None:
             raise ConfigError(f"Say where to: bhd-data pull {source} --root=DIR.")
         if options.revision is not None:
             raise ConfigError(f"{source} is a URL: it has no revisions. Leave --revision out.")
-    else:
-        check_repo_id(source)
-        if options.storage_options is not None:
-            raise ConfigError("--storage_options is for URLs, not for the Hub.")
-    return source, Path(options.root).expanduser() if options.root else default_root(source)
+        return source, folder_of(options.root)
+    check_repo_id(source)
+    for_urls(options)
+    root = folder_of(options.root) if options.root else default_root(source)
+    tell_of_folder(source, root)
+    return source, root

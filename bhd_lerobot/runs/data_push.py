@@ -1,16 +1,27 @@
 """`bhd-data push`: a dataset to the Hub, or below a URL."""
 
 import argparse
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.remote import check_repo_id, counted, is_url, listed, megabytes
+from bhd_lerobot.data.remote_url import check_url
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.runs.data_command import Commands, add_command
-from bhd_lerobot.runs.data_transfer import command_line, prompt_interrupt, quiet_bars, split_list, storage_options
+from bhd_lerobot.runs.data_transfer import (
+    command_line,
+    folder_of,
+    for_urls,
+    prompt_interrupt,
+    quiet_bars,
+    refuse_empty,
+    repeat_line,
+    split_list,
+    storage_options,
+    tell_of_folder,
+)
 
 if TYPE_CHECKING:
     from bhd_lerobot.data.remote_push import PushReport
@@ -26,33 +37,29 @@ def add_to(commands: Commands) -> None:
     command.add_argument("--branch", "--revision", help="branch to write to; it is made if it does not exist")
     command.add_argument("--tag", help="a further tag for what is pushed")
     seen = command.add_mutually_exclusive_group()
-    seen.add_argument("--private", dest="private", action="store_const", const=True, help="a repository for you alone")
-    seen.add_argument("--public", dest="private", action="store_const", const=False, help="a repository for everybody")
+    seen.add_argument("--private", action="store_true", help="a repository for you alone")
+    seen.add_argument("--public", action="store_true", help="a repository for everybody")
     command.add_argument("--tags", help="tags of the card, separated by commas")
     command.add_argument("--licence", "--license", default="apache-2.0", help="licence of the card")
-    command.add_argument("--no-card", action="store_true", help="send no card but one that lies in the folder")
-    command.add_argument("--replace-card", action="store_true", help="overwrite a card there that somebody edited")
+    command.add_argument(
+        "--no_card", "--no-card", action="store_true", help="send no card but one that lies in the folder"
+    )
+    command.add_argument(
+        "--replace_card", "--replace-card", action="store_true", help="overwrite a card there that somebody edited"
+    )
     command.add_argument(
         "--replace", action="store_true", help="overwrite a dataset there that is another one, or has more episodes"
     )
+    command.add_argument(
+        "--verify", action="store_true", help="of a URL: read what is there, and compare that instead of the list of it"
+    )
     command.add_argument("--storage_options", help="options of the URL's file system, JSON")
+    command.set_defaults(parser=command)
 
 
 def _run(options: argparse.Namespace) -> int:
     root, target = _places(options)
-    again = command_line(
-        "push",
-        [root, target],
-        branch=options.branch,
-        tag=options.tag,
-        private=options.private is True,
-        public=options.private is False,
-        tags=split_list(options.tags),
-        licence=None if options.licence == "apache-2.0" else options.licence,
-        **{"no-card": options.no_card, "replace-card": options.replace_card},
-        replace=options.replace,
-        storage_options=options.storage_options,
-    )
+    again = repeat_line(options, root, target)
     options.stopped = left_by_interrupt(root, again)
     with prompt_interrupt(options.stopped):
         report = push_dataset(
@@ -60,12 +67,13 @@ def _run(options: argparse.Namespace) -> int:
             target,
             branch=options.branch,
             tag=options.tag,
-            private=options.private,
+            private=True if options.private else False if options.public else None,
             tags=split_list(options.tags),
             licence=options.licence,
             card=not options.no_card,
             replace_card=options.replace_card,
             replace=options.replace,
+            verify=options.verify,
             storage=options.storage_options,
             again=again,
         )
@@ -85,6 +93,7 @@ def push_dataset(
     card: bool = True,
     replace_card: bool = False,
     replace: bool = False,
+    verify: bool = False,
     storage: str | None = None,
     again: str | None = None,
 ) -> "PushReport":
@@ -101,6 +110,7 @@ def push_dataset(
         card: whether a card is made.
         replace_card: overwrite a card that a person edited.
         replace: overwrite a dataset there that is another one, or has more episodes.
+        verify: read what lies below a URL and compare that, instead of the list of it.
         storage: options of the URL's file system, JSON.
         again: the command to repeat.
 
@@ -110,14 +120,16 @@ def push_dataset(
     from bhd_lerobot.data.hub import HubDataset
     from bhd_lerobot.data.remote_push import Card, push
     from bhd_lerobot.data.remote_store import StoreDataset
+    from bhd_lerobot.data.remote_url import shown
     from bhd_lerobot.data.state import DatasetState
 
-    def make(state: DatasetState) -> Card:
+    def make(state: DatasetState, has_picture: bool) -> Card:
         from bhd_lerobot.runs.data_card import CardOptions, make_card
 
         named = None if is_url(target) else target
-        shown = re.sub(r"//[^/@]*@", "//", target)  # without a password
-        return make_card(state, CardOptions(named, "" if named else shown, licence, tags))
+        return make_card(
+            state, CardOptions(named, "" if named else shown(target), licence, tags), has_picture=has_picture
+        )
 
     again = again or push_command(root, target, private=private is True, tags=tags)
     quiet_bars()
@@ -127,7 +139,14 @@ def push_dataset(
             if is_url(target)
             else HubDataset(target, branch, private=private, tag=tag, create=True)
         )
-        return push(root, remote, make_card=make if card else None, replace_card=replace_card, replace=replace)
+        return push(
+            root,
+            remote,
+            make_card=make if card else None,
+            replace_card=replace_card,
+            replace=replace,
+            verify=verify,
+        )
     except ConfigError:
         raise
     except BhdError as error:
@@ -168,7 +187,9 @@ def tell(report: "PushReport") -> str:
     if report.left_out:
         lines.append(f"  not sent, because no episode needs them: {listed(report.left_out)}")
     if report.kept_card:
-        lines.append("  its README.md was edited by somebody and is left as it is; --replace-card writes a new one")
+        lines.append("  its README.md was edited by somebody and is left as it is; --replace_card writes a new one")
+    if report.kept_picture:
+        lines.append("  its preview.png was put there by somebody and is left as it is; --replace_card overwrites it")
     return "\n".join(lines)
 
 
@@ -178,6 +199,7 @@ def _places(options: argparse.Namespace) -> tuple[Path, str]:
     Raises:
         ConfigError: one is missing, or named twice.
     """
+    refuse_empty(options)
     places = list(options.places)
     if places and options.root is None and not is_url(places[0]):
         options.root = places.pop(0)
@@ -185,17 +207,20 @@ def _places(options: argparse.Namespace) -> tuple[Path, str]:
         options.repo_id = places.pop(0)
     if places:
         raise ConfigError(f"{' '.join(places)} is too much; give the folder and one target.")
-    if options.repo_id is None:
+    target = options.repo_id
+    if target is None:
         raise ConfigError(
             "Say where to: bhd-data push ROOT user/name for the Hub, or bhd-data push ROOT s3://bucket/dir for a URL."
         )
-    if not is_url(options.repo_id):
-        check_repo_id(options.repo_id)
-        if options.storage_options is not None:
-            raise ConfigError("--storage_options is for URLs, not for the Hub.")
-    elif options.branch or options.tag or options.private is not None:
-        raise ConfigError(f"{options.repo_id} is a URL: it has no branches, tags or privacy of its own.")
-    if options.root is None and is_url(options.repo_id):
-        raise ConfigError("Name the folder of the dataset first: bhd-data push ROOT URL.")
-    root = Path(options.root).expanduser() if options.root else default_root(options.repo_id)
-    return root, options.repo_id
+    if is_url(target):
+        check_url(target)
+        if options.branch or options.tag or options.private or options.public:
+            raise ConfigError(f"{target} is a URL: it has no branches, tags or privacy of its own.")
+        if options.root is None:
+            raise ConfigError("Name the folder of the dataset first: bhd-data push ROOT URL.")
+        return folder_of(options.root), target
+    check_repo_id(target)
+    for_urls(options)
+    root = folder_of(options.root) if options.root else default_root(target)
+    tell_of_folder(target, root)
+    return root, target

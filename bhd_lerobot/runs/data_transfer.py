@@ -1,5 +1,7 @@
 """What `bhd-data push` and `bhd-data pull` share: places, commands to repeat, and an end that comes at once."""
 
+import argparse
+import contextlib
 import json
 import os
 import shlex
@@ -8,6 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -26,6 +29,78 @@ def command_line(command: str, places: Sequence[object], **options: Any) -> str:
         elif value not in (None, False, "", []):
             words.append(f"--{name}={','.join(map(str, value)) if isinstance(value, list) else value}")
     return shlex.join(words)
+
+
+def repeat_line(options: argparse.Namespace, *places: object, **others: object) -> str:
+    """Return the command that repeats what was asked for.
+
+    Args:
+        options: what was asked for, with the `parser` that read it; values that are its defaults are left out.
+        places: what stands behind the command's name, whichever way it was given.
+        others: options that say a place, likewise.
+    """
+    parser: argparse.ArgumentParser = options.parser
+    asked = {name: value for name, value in vars(options).items() if value != parser.get_default(name)}
+    wishes = {name: value for name, value in asked.items() if name not in _PLACES}
+    return command_line(options.command, places, **others, **wishes)
+
+
+_PLACES = {"command", "places", "source", "root", "repo_id"}
+
+
+def refuse_empty(options: argparse.Namespace) -> None:
+    """Refuse an option without a value: it is a variable of the shell that was not set, more often than a wish.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    for name, value in vars(options).items():
+        if value == "" or (isinstance(value, list) and "" in value):
+            said = f"--{name}" if name not in ("places", "source") else "A name"
+            raise ConfigError(f"{said} is empty. Say what is meant, or leave it out.")
+
+
+def folder_of(text: str) -> Path:
+    """Return the folder that is meant.
+
+    Raises:
+        ConfigError: no folder can have this name, or nobody may look at it.
+    """
+    try:
+        folder = Path(text).expanduser()
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            folder.stat()
+    except (OSError, ValueError, RuntimeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        shown = text if len(text) < 200 else f"{text[:100]}... ({len(text)} characters)"
+        raise ConfigError(f"{shown!r} cannot be the folder of a dataset: {reason}. Name another one.") from error
+    return folder
+
+
+def tell_of_folder(name: str, root: Path) -> None:
+    """Say that a name is one on the Hub if it looks like a folder here, because folders are written the same way.
+
+    Args:
+        name: the name on the Hub.
+        root: the folder of the dataset here, which is not meant.
+    """
+    folder = Path(name).absolute()
+    if folder.parent.is_dir() and folder != root.absolute():
+        print(f"{name} is taken for a name on the Hub. The folder here would be file://{folder}", file=sys.stderr)
+
+
+def for_urls(options: argparse.Namespace) -> None:
+    """Refuse what means something for a URL only, where a name on the Hub was given.
+
+    Raises:
+        ConfigError: there is such an option.
+    """
+    if options.storage_options is not None:
+        raise ConfigError("--storage_options is for URLs, not for the Hub.")
+    if options.verify:
+        raise ConfigError(
+            "--verify is for URLs. The Hub makes its checksums from the contents itself, so they are always compared."
+        )
 
 
 def storage_options(text: str | None) -> dict[str, Any]:

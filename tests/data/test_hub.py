@@ -325,28 +325,28 @@ def card(text: str = "# made\n") -> Card:
 
 
 def test_a_generated_card_is_renewed_and_a_persons_is_kept(hub: HubServer, root: Path) -> None:
-    send(root, make_card=lambda state: card())
+    send(root, make_card=lambda state, has_picture: card())
     assert stored(hub)["preview.png"] == b"picture"
-    assert not send(root, make_card=lambda state: card("# made anew\n")).kept_card
+    assert not send(root, make_card=lambda state, has_picture: card("# made anew\n")).kept_card
     assert b"anew" in stored(hub)["README.md"]
     edited = stored(hub)["README.md"].replace(b"anew", b"by hand")
     assert not is_generated(edited.decode())
     hub.dataset("me/d").objects.clear()
     files = hub.dataset("me/d").files()
     files["README.md"].content = edited
-    report = send(root, make_card=lambda state: card("# third\n"))
+    report = send(root, make_card=lambda state, has_picture: card("# third\n"))
     assert report.kept_card
     assert stored(hub)["README.md"] == edited
-    assert not send(root, make_card=lambda state: card("# third\n"), replace_card=True).kept_card
+    assert not send(root, make_card=lambda state, has_picture: card("# third\n"), replace_card=True).kept_card
     assert b"third" in stored(hub)["README.md"]
 
 
 def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path) -> None:
-    send(root, make_card=lambda state: card())
+    send(root, make_card=lambda state, has_picture: card())
     (root / "README.md").write_text("# my own\n")
-    assert not send(root, make_card=lambda state: card("# second\n")).kept_card
+    assert not send(root, make_card=lambda state, has_picture: card("# second\n")).kept_card
     assert stored(hub)["README.md"] == b"# my own\n"
-    assert not send(root, make_card=lambda state: card("# third\n")).kept_card  # it is the same
+    assert not send(root, make_card=lambda state, has_picture: card("# third\n")).kept_card  # it is the same
     (root / "README.md").write_text("# my own, newer\n")
     assert send(root).kept_card  # the one there is a person's, too
     assert stored(hub)["README.md"] == b"# my own\n"

@@ -122,7 +122,7 @@ def test_an_edited_card_is_kept_and_that_is_said(hub: HubServer, lesson: Path, c
     card = hub.dataset("me/d").files()["README.md"]
     card.content = card.content.replace(b"# d", b"# A fine dataset")
     assert data.main(["push", str(lesson), "me/d"]) == 0
-    assert "README.md was edited by somebody and is left as it is; --replace-card" in capsys.readouterr().out
+    assert "README.md was edited by somebody and is left as it is; --replace_card" in capsys.readouterr().out
     assert "# A fine dataset" in text_of(hub, "me/d")
     assert data.main(["push", str(lesson), "me/d", "--replace-card"]) == 0
     assert "# A fine dataset" not in text_of(hub, "me/d")
@@ -143,10 +143,10 @@ def test_some_episodes_by_number_and_by_outcome(hub: HubServer, lesson: Path, tm
     capsys.readouterr()
     assert data.main(["pull", "me/d", f"--root={tmp_path / 'a'}", "--episodes=0,3-4"]) == 0
     said = capsys.readouterr().out
-    assert "3 of 6 episodes: 0,3-4" in said
+    assert "3 episodes of 6: 0,3-4" in said
     assert '--dataset.episodes="[0, 3, 4]"' in said
     assert data.main(["pull", "me/d", f"--root={tmp_path / 'b'}", "--outcome=success", "--min_score=0.3"]) == 0
-    assert "2 of 6 episodes: 4-5" in capsys.readouterr().out
+    assert "2 episodes of 6: 4-5" in capsys.readouterr().out
     assert data.main(["pull", "me/d", f"--root={tmp_path / 'c'}", "--outcome=fault"]) == 2
     assert "No episode of me/d is left after filtering" in capsys.readouterr().err
     assert not [one for one in tmp_path.iterdir() if "c" in one.name]
@@ -218,7 +218,7 @@ def test_ctrl_c_ends_a_stalled_upload_at_once(hub: HubServer, lesson: Path) -> N
         gate.set()
     assert process.returncode == 130
     assert f"Stopped; the dataset at {lesson} is unchanged" in error
-    assert f"bhd-data push {lesson} me/d --no-card" in error
+    assert f"bhd-data push {lesson} me/d --no_card" in error
     assert "Traceback" not in error
     assert list(hub.dataset("me/d").files()) == [".gitattributes"]
 

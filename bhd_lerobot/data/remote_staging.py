@@ -1,0 +1,128 @@
+"""The folder beside a dataset in which a download comes together, and how it takes the dataset's place."""
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+from bhd_lerobot.data import layout
+from bhd_lerobot.data.assemble import EDITS
+from bhd_lerobot.data.remote import MANIFEST, SUBSET, is_recorded
+from bhd_lerobot.errors import DatasetError
+
+_MARKER = ".bhd-pull"
+"""In folders beside the target that this program made, and may remove."""
+
+
+class Staging:
+    """A folder beside a dataset.
+
+    Attributes:
+        folder: where files come together; they stay there if an attempt fails.
+        is_new: whether no attempt before left one.
+    """
+
+    def __init__(self, root: Path) -> None:
+        """Make the folder, or take up that of an attempt before; mend what a kill between two renames left.
+
+        Args:
+            root: the dataset.
+
+        Raises:
+            DatasetError: something else lies where the folder must be.
+        """
+        self._root = root
+        self.folder = root.with_name(f".{root.name}.pull")
+        self._old = root.with_name(f".{root.name}.old")
+        for folder in (self.folder, self._old):
+            is_empty = folder.is_dir() and not any(folder.iterdir())
+            if folder.exists() and not is_empty and not (folder / _MARKER).exists():
+                raise DatasetError(
+                    f"{folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
+                    "there. Move it, or choose another --root."
+                )
+        if self._old.is_dir() and not root.exists():
+            self._old.rename(root)
+            (root / _MARKER).unlink(missing_ok=True)
+        self.is_new = not self.folder.exists()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / _MARKER).touch()
+
+    def take(self, path: str) -> None:
+        """Link a file of the dataset into the folder."""
+        _link(self._root / path, self.folder / path)
+
+    def drop(self) -> None:
+        """Remove the folder and all that is in it."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def drop_if_empty(self) -> None:
+        """Remove the folder if nothing came."""
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+
+    def show(self, wanted: set[str], note: bytes | None) -> None:
+        """Let the folder become the dataset; what belongs to no dataset comes along from the one before.
+
+        Args:
+            wanted: the files that the dataset is to have.
+            note: content of `SUBSET`; no such file if None.
+        """
+        root, folder = self._root, self.folder
+        shutil.rmtree(folder / ".cache", ignore_errors=True)
+        _remove_others(folder, wanted)
+        if note is not None:
+            (folder / SUBSET).write_bytes(note)
+        if root.is_dir() and any(root.iterdir()):
+            for path in _foreign(root, wanted):
+                _link(root / path, folder / path)
+            shutil.rmtree(self._old, ignore_errors=True)
+            (root / _MARKER).touch()
+            root.rename(self._old)
+            folder.rename(root)
+            shutil.rmtree(self._old)
+        else:
+            folder.rename(root)
+        (root / _MARKER).unlink(missing_ok=True)
+
+
+def _link(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if source.is_symlink():
+        target.symlink_to(os.readlink(source))
+        return
+    if source.is_dir():
+        target.mkdir(exist_ok=True)
+        target.chmod(source.stat().st_mode & 0o7777)
+        return
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
+def _foreign(root: Path, wanted: Iterable[str]) -> list[str]:
+    """Return what in a folder belongs to no dataset, folders before what is in them: notes, for example, or `.git`."""
+    ours = {*wanted, _MARKER, SUBSET, MANIFEST, EDITS, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY}
+    found: list[str] = []
+    for place, folders, files in os.walk(root):
+        inside = Path(place).relative_to(root)
+        folders[:] = [name for name in folders if (inside / name).as_posix() != ".cache/huggingface"]
+        # A link to a folder is a thing of its own, and an empty folder may mean something to who made it.
+        names = [*files, *(name for name in folders if _is_kept(root / inside / name))]
+        found += [(inside / name).as_posix() for name in names]
+    return [path for path in found if path not in ours and not is_recorded(path)]
+
+
+def _is_kept(folder: Path) -> bool:
+    return folder.is_symlink() or not any(folder.iterdir())
+
+
+def _remove_others(folder: Path, wanted: set[str]) -> None:
+    """Remove what an attempt for another version left."""
+    for path in sorted(folder.rglob("*"), reverse=True):
+        if path.is_file() and path.relative_to(folder).as_posix() not in {*wanted, _MARKER}:
+            path.unlink()
+        elif path.is_dir() and not any(path.iterdir()):
+            path.rmdir()
