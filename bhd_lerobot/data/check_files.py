@@ -21,6 +21,7 @@ from bhd_lerobot.data import layout
 from bhd_lerobot.data.findings import Findings, few, one_line
 from bhd_lerobot.data.parquet_rescue import is_cut_off
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
+from bhd_lerobot.data.state import no_dataset, repair_with_info
 from bhd_lerobot.errors import DatasetError
 
 _COPY = "Restore it from a copy, or try bhd-data repair."
@@ -103,18 +104,23 @@ def read_files(root: Path, findings: Findings) -> Files:
 def _read_info(root: Path) -> dict[str, Any]:
     path = root / layout.INFO
     if not path.is_file():
-        found = "has no meta/info.json" if root.is_dir() else "does not exist"
-        raise DatasetError(f"{root} is not a LeRobot dataset: it {found}.")
+        raise no_dataset(root)
     try:
         info = json.loads(path.read_text(encoding="utf-8"))
         missing = [key for key in _NEEDED if key not in info]
     except (OSError, ValueError, TypeError) as error:
-        raise DatasetError(f"{path} cannot be read, and nothing can be checked without it: {error}. {_COPY}") from error
+        raise DatasetError(
+            f"{path} cannot be read, and nothing can be checked without it: {error}. {repair_with_info(root)}"
+        ) from error
     if not isinstance(info, dict) or missing or not isinstance(info["features"], dict):
-        raise DatasetError(f"{path} has no {few(missing) or 'features'}; nothing can be checked without. {_COPY}")
+        raise DatasetError(
+            f"{path} has no {few(missing) or 'features'}; nothing can be checked without. {repair_with_info(root)}"
+        )
     for key in _COUNTS:
         if isinstance(info[key], bool) or not isinstance(info[key], int) or info[key] < 0:
-            raise DatasetError(f"{path} has {info[key]!r} as {key}; it must be a whole number from 0. {_COPY}")
+            raise DatasetError(
+                f"{path} has {info[key]!r} as {key}; it must be a whole number from 0. {repair_with_info(root)}"
+            )
     if not str(info["codebase_version"]).startswith("v3."):
         raise DatasetError(
             f"{root} has dataset format {info['codebase_version']}; this program reads v3.x. LeRobot converts older "

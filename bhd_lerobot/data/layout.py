@@ -56,3 +56,11 @@ def recorded_files(root: Path) -> set[str]:
     """
     patterns = ("data/chunk-*/file-*.parquet", "meta/episodes/chunk-*/file-*.parquet", "videos/*/chunk-*/file-*.mp4")
     return {path.relative_to(root).as_posix() for pattern in patterns for path in root.glob(pattern)}
+
+
+def aside_of(root: Path) -> Path:
+    """Return a new place beside `root` for its damaged files."""
+    number = 1
+    while (aside := root.with_name(f"{root.name}.damaged-{number}")).exists():
+        number += 1
+    return aside

@@ -1,6 +1,6 @@
 """Complete or drop what an interrupted recording left behind."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -12,12 +12,22 @@ from bhd_lerobot.data.disk import Disk, RootLock, write_errors
 from bhd_lerobot.data.exchange import roll_forward
 from bhd_lerobot.data.fix import compute_stats
 from bhd_lerobot.data.parquet_rescue import is_cut_off, is_parquet
+from bhd_lerobot.data.repair_info import adopt_info, give_back
 from bhd_lerobot.data.salvage import salvage
 from bhd_lerobot.data.salvage_films import whole_frames
 from bhd_lerobot.data.salvage_told import Told
 from bhd_lerobot.data.schema import Schema
-from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots, read_json, slot_of
-from bhd_lerobot.errors import DatasetCorruptError, DatasetError
+from bhd_lerobot.data.state import (
+    REPAIR_MAY_HELP,
+    DatasetState,
+    corrupt,
+    load_state,
+    no_dataset,
+    ordered_slots,
+    read_json,
+    slot_of,
+)
+from bhd_lerobot.errors import DatasetCorruptError
 
 
 @dataclass(frozen=True)
@@ -31,6 +41,7 @@ class RepairReport:
         completed: steps that had been decided before the interruption and were completed.
         dropped: files of unfinished episodes that were removed, relative to the root.
         lost: what of another program's wreck could not be recovered, and why.
+        hints: what may be so about it.
         aside: where its damaged files lie now; None if none were damaged.
     """
 
@@ -40,6 +51,7 @@ class RepairReport:
     completed: tuple[str, ...] = ()
     dropped: tuple[str, ...] = ()
     lost: tuple[str, ...] = ()
+    hints: tuple[str, ...] = ()
     aside: Path | None = None
 
     def __bool__(self) -> bool:
@@ -48,33 +60,39 @@ class RepairReport:
 
     def __str__(self) -> str:
         """Return the report for a terminal."""
-        lines = [f"{self.root}: {self.episodes} episodes, {self.frames} frames"]
+        empty = "" if self.episodes else ": it is empty"
+        lines = [f"{self.root}: {self.episodes} episodes, {self.frames} frames{empty}"]
         lines += [f"  completed: {item}" for item in self.completed]
         lines += [f"  dropped: {item}" for item in self.dropped]
         lines += [f"  lost: {item}" for item in self.lost]
         lines += ["  lost: nothing"] if self.aside is not None and not self.lost else []
+        lines += [f"  note: {item}" for item in self.hints]
         lines += [f"  the damaged files are in {self.aside}"] if self.aside is not None else []
         return "\n".join(lines if self else [*lines, "  nothing to do"])
 
 
-def repair(root: Path | str) -> RepairReport:
+def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
     """Mend a dataset, check every file to the last page, and leave it compact and with statistics.
 
     Args:
         root: the dataset.
+        info: another recording with the same robot and cameras, or its `meta/info.json`: if the dataset's own is lost.
 
     Raises:
         DatasetLockedError: it is being recorded at this moment.
         DatasetCorruptError: a file of a saved episode is damaged; nothing was dropped then.
         DatasetError: there is no dataset at `root`.
+        ConfigError: `info` is not needed, cannot be read or describes other data.
         DatasetWriteError: the disk refuses the repaired files.
     """
     root = Path(root)
     if not root.is_dir():
-        raise DatasetError(f"{root} is not a LeRobot dataset: it {'is a file' if root.exists() else 'does not exist'}.")
+        raise no_dataset(root)
     lock = RootLock(root)
     try:
         disk = Disk()
+        if info is not None:
+            return _repair_with(root, Path(info), disk)
         is_ours = (root / layout.IDENTITY).exists()
         if (root / layout.INFO).is_file() and (not is_ours or went_on(root)):
             return _repair_foreign(root, disk)
@@ -87,14 +105,35 @@ def repair(root: Path | str) -> RepairReport:
                 done = (*report.completed, what)
                 report = RepairReport(root, report.episodes, report.frames, done, report.dropped)
         return report
+    except DatasetCorruptError as error:
+        # Whoever is told to try `repair` has done that now.
+        raise DatasetCorruptError(str(error).replace(REPAIR_MAY_HELP, "")) from error
     finally:
         lock.release()
 
 
-def _repair_foreign(root: Path, disk: Disk) -> RepairReport:
+def _repair_with(root: Path, donor: Path, disk: Disk) -> RepairReport:
+    """Mend a dataset whose `info.json` is lost.
+
+    Frames that belong to no episode are recovered then, not dropped: nothing says any more which were saved.
+    """
+    consequence = "Its files are as they were."
+    with write_errors("repair the dataset", root, consequence):
+        roll_forward(root, disk)
+        adopted, kept = adopt_info(root, donor, disk)
+    try:
+        report = _repair_foreign(root, disk, adopted)
+    except BaseException:
+        with write_errors("repair the dataset", root, consequence):
+            give_back(root, kept, disk)
+        raise
+    return report if kept is None or report.aside is not None else replace(report, aside=kept.parents[1])
+
+
+def _repair_foreign(root: Path, disk: Disk, *completed: str) -> RepairReport:
     """Mend what another program wrote: nothing if all of it can be read, and else everything that is whole."""
     with write_errors("repair the dataset", root, "Its files are as they were."):
-        completed = ("an edit that was interrupted",) if roll_forward(root, disk) else ()
+        completed += ("an edit that was interrupted",) if roll_forward(root, disk) else ()
         disk.remove_tree(root / layout.STAGING)  # of an attempt that was interrupted
     try:
         state = load_state(root)
@@ -111,7 +150,9 @@ def _repair_foreign(root: Path, disk: Disk) -> RepairReport:
             *completed,
             f"{rescued.episodes} whole episodes were recovered, with new statistics. What was wrong: {wrong}",
         )
-        return RepairReport(root, rescued.episodes, rescued.frames, done, (), rescued.lost, rescued.aside)
+        return RepairReport(
+            root, rescued.episodes, rescued.frames, done, (), rescued.lost, rescued.hints, rescued.aside
+        )
     if state.rows and not _has_stats(root):
         with write_errors("repair the dataset", root, "Its files are as they were."):
             completed = (*completed, compute_stats(state, disk))

@@ -7,7 +7,6 @@ all of its frames are there in all of its columns and films. Everything else of 
 """
 
 import contextlib
-import copy
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,20 +15,20 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data import exchange, layout
 from bhd_lerobot.data.disk import Disk, to_json, write_errors
-from bhd_lerobot.data.meta_files import MEBIBYTE, PARQUET_OPTIONS, tasks_table, write_meta
+from bhd_lerobot.data.findings import few
+from bhd_lerobot.data.meta_files import tasks_table, write_meta
 from bhd_lerobot.data.parquet_rescue import rescue
+from bhd_lerobot.data.salvage_columns import lost_cameras, misfit
 from bhd_lerobot.data.salvage_films import Films, Found
+from bhd_lerobot.data.salvage_rows import info_of, rows_of, tasks_of, write_data
 from bhd_lerobot.data.salvage_stats import stats_of
 from bhd_lerobot.data.salvage_told import Told
-from bhd_lerobot.data.state import Row, corrupt, read_json, read_tasks, slot_columns
+from bhd_lerobot.data.state import corrupt, read_json, repair_with_info
 from bhd_lerobot.errors import DatasetCorruptError, DatasetLockedError, UnsupportedDatasetError
-
-_LOST_TASK = "(the instruction was lost)"
 
 
 @dataclass(frozen=True)
@@ -40,12 +39,14 @@ class Salvage:
         episodes: whole episodes that were recovered.
         frames: their frames.
         lost: what was lost, and why, a line each.
+        hints: what may be so, a line each.
         aside: where the damaged files lie now.
     """
 
     episodes: int
     frames: int
     lost: tuple[str, ...]
+    hints: tuple[str, ...]
     aside: Path
 
 
@@ -62,26 +63,41 @@ def salvage(root: Path, disk: Disk) -> Salvage:
     """
     check_unused(root)
     info = _info_of(root)
+    if wrong := misfit(root, info):
+        raise DatasetCorruptError(
+            f"{root / layout.INFO} describes other data than those of {root}: {wrong}. Perhaps it is another "
+            f"recording's. {repair_with_info(root)}"
+        )
     lost: list[str] = []
+    hints: list[str] = []
     told = Told(root, lost)
     found, is_torn = _frames(root, info, lost)
     films = Films(root, info, told.rows)
     kept = films.assign(found, lost, is_torn=is_torn)
     if not kept:
+        if cameras := lost_cameras(root, info):
+            lost.append(
+                f"{layout.INFO} describes {few(cameras)}, of which there is no film and no picture. If it is another "
+                f"recording's: {repair_with_info(root)}"
+            )
         reasons = "".join(f"\n  {line}" for line in lost)
         raise DatasetCorruptError(f"No whole episode of {root} can be recovered; nothing was changed.{reasons}")
     numbers = {one.number for one in found}
     lost += [f"episode {number}: its frames are gone" for number in sorted(told.rows.keys() - numbers)]
-    missing = int(info.get("total_episodes") or 0) - len(kept)
-    if missing > 0 and not lost:
-        lost.append(f"{missing} episodes that info.json counts: no file has a trace of them")
+    counted = info.get("total_episodes")
+    if isinstance(counted, int) and counted > len(kept) and not lost:
+        # It may be a copy of another recording's, so this is no loss.
+        hints.append(
+            f"{layout.INFO} counted {counted} episodes. No other file has a trace of more than {len(kept)}; if it is a "
+            "copy of another recording's, its counts mean nothing"
+        )
     with write_errors("recover the dataset", root, "The damaged files are as they were."):
         aside = _keep_aside(root, disk)
         new = exchange.begin(root, disk)
-        tasks, known = _tasks(root, kept, told, lost)
-        rows = _rows(kept, tasks, known)
-        described = _info(info, kept, len(tasks))
-        _write_data(kept, rows, described, new, disk)
+        tasks, known = tasks_of(root, kept, told, lost)
+        rows = rows_of(kept, tasks, known)
+        described = info_of(info, kept, len(tasks))
+        write_data(kept, rows, described, new, disk)
         films.write(kept, rows, described, new, disk)
         told.complete(kept, rows)
         stats = stats_of((one.table for one in kept), described["features"], new, rows, told.stats_of(kept))
@@ -97,7 +113,7 @@ def salvage(root: Path, disk: Disk) -> Salvage:
         disk.remove_tree(root / layout.STAGING)
         for folder in ("images", *(path.name for path in root.glob("tmp*") if path.is_dir())):
             disk.remove_tree(root / folder)  # of films that were being made; they are in `aside`
-    return Salvage(len(kept), sum(one.table.num_rows for one in kept), tuple(lost), aside)
+    return Salvage(len(kept), sum(one.table.num_rows for one in kept), tuple(lost), tuple(hints), aside)
 
 
 def _info_of(root: Path) -> dict[str, Any]:
@@ -111,8 +127,7 @@ def _info_of(root: Path) -> dict[str, Any]:
         reason = str(error.__cause__ or error)
     raise DatasetCorruptError(
         f"{root / layout.INFO} is corrupt: {reason}. It says what the columns are, without which nothing can be read. "
-        "Copy the meta/info.json of another recording with the same robot and cameras there, and repeat: its counts "
-        "do not matter. Nothing was changed."
+        f"{repair_with_info(root)}"
     )
 
 
@@ -153,12 +168,8 @@ def _frames(root: Path, info: dict[str, Any], lost: list[str]) -> tuple[list[Fou
     """Return the episodes whose frames are whole, in order, and whether some frames are missing behind them."""
     found: list[Found] = []
     is_torn = False
-    schema = _schema(root, info)
-    shapes = {
-        key: feature["shape"]
-        for key, feature in info["features"].items()
-        if len(feature["shape"]) > 1 and feature["dtype"] not in ("image", "video")
-    }
+    schema = schema_of(root, info)
+    shapes = shapes_of(info)
     for path in sorted((root / "data").glob("chunk-*/file-*.parquet")):
         name = path.relative_to(root).as_posix()
         try:
@@ -192,7 +203,21 @@ def _frames(root: Path, info: dict[str, Any], lost: list[str]) -> tuple[list[Fou
     return found, is_torn
 
 
-def _schema(root: Path, info: dict[str, Any]) -> pa.Schema:
+def shapes_of(info: dict[str, Any]) -> dict[str, Sequence[int]]:
+    """Return the shapes of columns of nested lists, by name."""
+    return {
+        key: feature["shape"]
+        for key, feature in info["features"].items()
+        if len(feature["shape"]) > 1 and feature["dtype"] not in ("image", "video")
+    }
+
+
+def schema_of(root: Path, info: dict[str, Any]) -> pa.Schema:
+    """Return the columns of the data files, as `info.json` describes them.
+
+    Raises:
+        DatasetCorruptError: it does not.
+    """
     from lerobot.datasets.feature_utils import get_hf_features_from_features
 
     try:
@@ -209,102 +234,9 @@ def _episodes(table: pa.Table) -> Iterator[tuple[int, pa.Table]]:
         yield int(numbers[start]), table.slice(start, end - start)
 
 
-def _tasks(root: Path, kept: Sequence[Found], told: Told, lost: list[str]) -> tuple[list[str], dict[int, int]]:
-    """Return the instructions that are used, and the new number of each old one."""
-    used = sorted({int(index) for one in kept for index in pc.unique(one.table["task_index"]).to_pylist()})
-    try:
-        sentences = dict(enumerate(read_tasks(root / layout.TASKS)))
-    except DatasetCorruptError as error:
-        sentences = {}
-        for one in kept:
-            # Where an episode has one instruction, its number and its words are both there.
-            words = told.rows.get(one.number, {}).get("tasks") or []
-            numbers = pc.unique(one.table["task_index"]).to_pylist()
-            if len(words) == len(numbers) == 1:
-                sentences[int(numbers[0])] = words[0]
-        if set(used) - sentences.keys():
-            lost.append(f"{layout.TASKS}: the words of some instructions ({error})")
-    texts: dict[str, int] = {}
-    known: dict[int, int] = {}
-    for index in used:
-        known[index] = texts.setdefault(sentences.get(index, f"{_LOST_TASK} {index}"), len(texts))
-    return list(texts), known
-
-
-def _rows(kept: list[Found], tasks: Sequence[str], known: dict[int, int]) -> list[Row]:
-    """Return the rows of the new dataset, and number the frames of the episodes accordingly."""
-    rows: list[Row] = []
-    start = 0
-    for index, one in enumerate(kept):
-        length = one.table.num_rows
-        told = np.array([known[int(task)] for task in one.table["task_index"].to_numpy()])
-        numbered = {
-            "episode_index": np.full(length, index),
-            "index": np.arange(start, start + length),
-            "task_index": told,
-        }
-        for name, values in numbered.items():
-            place = one.table.schema.get_field_index(name)
-            column = pa.array(values, one.table.schema.types[place])
-            one.table = one.table.set_column(place, one.table.schema.field(place), column)
-        sentences = [tasks[task] for task in dict.fromkeys(told.tolist())]
-        rows.append(
-            {
-                "episode_index": index,
-                "tasks": sentences,
-                "length": length,
-                "dataset_from_index": start,
-                "dataset_to_index": start + length,
-            }
-        )
-        start += length
-    return rows
-
-
-def _info(info: dict[str, Any], kept: Sequence[Found], tasks: int) -> dict[str, Any]:
-    described = copy.deepcopy(info)
-    return described | {
-        "total_episodes": len(kept),
-        "total_frames": sum(one.table.num_rows for one in kept),
-        "total_tasks": tasks,
-        "splits": {"train": f"0:{len(kept)}"},
-        "chunks_size": info.get("chunks_size") or layout.CHUNKS_SIZE,
-        "data_files_size_in_mb": info.get("data_files_size_in_mb") or layout.DATA_FILES_SIZE_IN_MB,
-        "video_files_size_in_mb": info.get("video_files_size_in_mb") or layout.VIDEO_FILES_SIZE_IN_MB,
-        "data_path": layout.DATA_PATH,
-    }
-
-
-def _write_data(kept: Sequence[Found], rows: Sequence[Row], info: dict[str, Any], new: Path, disk: Disk) -> None:
-    limit = info["data_files_size_in_mb"] * MEBIBYTE
-    slot: layout.Slot | None = None
-    writer: pq.ParquetWriter | None = None
-    try:
-        for one, row in zip(kept, rows, strict=True):
-            if writer is None or (new / layout.data_file(slot or (0, 0))).stat().st_size >= limit:
-                if writer is not None:
-                    writer.close()
-                slot = layout.next_slot(slot, info["chunks_size"])
-                target = new / layout.data_file(slot)
-                disk.make_folder(target.parent)
-                disk.write(target, b"")
-                writer = pq.ParquetWriter(target, kept[0].table.schema, **PARQUET_OPTIONS)
-            writer.write_table(_as(kept[0].table.schema, one.table))
-            row.update(slot_columns("data", slot or (0, 0)))
-    finally:
-        if writer is not None:
-            writer.close()
-
-
-def _as(schema: pa.Schema, table: pa.Table) -> pa.Table:
-    return table if table.schema.equals(schema, check_metadata=True) else table.cast(schema)
-
-
 def _keep_aside(root: Path, disk: Disk) -> Path:
     """Link every file into a new folder beside the dataset."""
-    number = 1
-    while (aside := root.with_name(f"{root.name}.damaged-{number}")).exists():
-        number += 1
+    aside = layout.aside_of(root)
     for path in sorted(root.rglob("*")):
         if path.is_file() and layout.STAGING not in path.relative_to(root).parts:
             disk.make_folder((aside / path.relative_to(root)).parent)

@@ -16,9 +16,7 @@ from bhd_lerobot.data import layout
 from bhd_lerobot.data.layout import Slot
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError
 
-_REMEDY = (
-    "Restore this file from a copy (or from the Hub), or see what `bhd-data repair` can recover; nothing was changed."
-)
+REPAIR_MAY_HELP = ", or see what `bhd-data repair` can recover"
 
 Row = dict[str, Any]
 """One row of ``meta/episodes``, without the statistics."""
@@ -92,7 +90,31 @@ def ordered_slots(rows: Iterable[Row], kind: str) -> dict[Slot, list[Row]]:
 
 def corrupt(path: Path, reason: object) -> DatasetCorruptError:
     """Return the error for a file that cannot be trusted."""
-    return DatasetCorruptError(f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}. {_REMEDY}")
+    remedy = f"Restore this file from a copy (or from the Hub){REPAIR_MAY_HELP}; nothing was changed."
+    if path.as_posix().endswith(layout.INFO):
+        remedy = repair_with_info(path.parents[1])
+    return DatasetCorruptError(f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}. {remedy}")
+
+
+def repair_with_info(root: Path) -> str:
+    """Return what to do if `info.json` cannot be used, in words."""
+    return (
+        "Restore this file from a copy (or from the Hub), or take that of another recording with the same robot and cameras, "
+        f"whose counts do not matter: `bhd-data repair {root} --info OTHER`. Nothing was changed."
+    )
+
+
+def no_dataset(root: Path) -> DatasetError:
+    """Return the error for a place without a ``meta/info.json``."""
+    if not root.is_dir():
+        found = "is a file" if root.exists() else "is a broken link" if root.is_symlink() else "does not exist"
+        return DatasetError(f"{root} is not a LeRobot dataset: it {found}.")
+    said = f"{root} is not a LeRobot dataset: it has no meta/info.json."
+    if (root / "data").is_dir() or (root / "meta").is_dir():
+        return DatasetError(f"{said} {repair_with_info(root)}")
+    inside = sorted(path.parents[1].name for path in root.glob(f"*/{layout.INFO}"))
+    told = f" It holds some; name one: {', '.join(inside[:6])}{', …' if len(inside) > 6 else ''}." if inside else ""
+    return DatasetError(said + told)
 
 
 def load_state(root: Path, *, films: bool = True) -> DatasetState:
@@ -109,8 +131,7 @@ def load_state(root: Path, *, films: bool = True) -> DatasetState:
         DatasetCorruptError: a file is missing, unreadable or contradicts the others; the message names it.
     """
     if not (root / layout.INFO).is_file():
-        found = "has no meta/info.json" if root.is_dir() else "is a file" if root.exists() else "does not exist"
-        raise DatasetError(f"{root} is not a LeRobot dataset: it {found}.")
+        raise no_dataset(root)
     info = read_json(root / layout.INFO)
     for key in ("codebase_version", "features", "fps", "total_episodes", "total_frames", "total_tasks"):
         if key not in info:
@@ -233,7 +254,10 @@ def _check_files(state: DatasetState, films: bool) -> None:
             raise corrupt(path, f"episode {row['episode_index']} does not start at frame {start}")
         start += row["length"]
     if start != state.info["total_frames"]:
-        raise corrupt(state.root / layout.INFO, f"it counts {state.info['total_frames']} frames; episodes have {start}")
+        raise DatasetCorruptError(
+            f"{state.root / layout.INFO} counts {state.info['total_frames']} frames; its episodes have {start}. "
+            f"`bhd-data check {state.root} --fix` counts anew. Nothing was changed."
+        )
     for slot, rows in ordered_slots(state.rows, "data").items():
         path = state.root / layout.data_file(slot)
         wanted = sum(row["length"] for row in rows)

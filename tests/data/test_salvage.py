@@ -21,7 +21,7 @@ from bhd_lerobot.data.disk import Disk
 from bhd_lerobot.data.edits import edits_of, keep
 from bhd_lerobot.data.mark import mark
 from bhd_lerobot.data.repair import repair, settle
-from bhd_lerobot.errors import DatasetCorruptError, DatasetLockedError, DatasetWriteError
+from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError, DatasetWriteError
 from tests.data.edit_support import Episode, assert_sound, content
 from tests.data.kill_support import KillServer
 
@@ -208,16 +208,97 @@ def test_nothing_left_changes_nothing(lerobot: KillServer, tmp_path: Path) -> No
         repair(root)
     assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
     (root / "meta/info.json").write_text("{")
-    with pytest.raises(DatasetCorruptError, match=r"Copy the meta/info\.json of another recording"):
+    with pytest.raises(DatasetCorruptError, match=rf"bhd-data repair {root} --info OTHER"):
         repair(root)
 
 
-def test_info_of_another_recording_helps(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
+@pytest.mark.parametrize("by", ["folder", "file", "hand"])
+@pytest.mark.parametrize("episodes", [1, 9])
+def test_info_of_another_recording_helps(
+    lerobot: KillServer, truth: dict, tmp_path: Path, by: str, episodes: int
+) -> None:
+    """Whatever it counts: that is no loss of this one."""
     root = recorded(lerobot, tmp_path / "d", "none", 4, "saved")
-    another = recorded(lerobot, tmp_path / "another", "none", 1)
-    shutil.copy(another / "meta/info.json", root / "meta/info.json")
-    assert repair(root).episodes == 4
+    another = recorded(lerobot, tmp_path / "another", "none", episodes)
+    info = root / "meta/info.json"
+    info.write_text("{")
+    with pytest.raises(DatasetCorruptError, match=f"repair {root} --info OTHER"):
+        repair(root)
+    if by == "hand":
+        shutil.copy(another / "meta/info.json", info)
+        report = repair(root)
+        assert len(report.hints) == (episodes > 4)
+    else:
+        report = repair(root, another if by == "folder" else another / "meta/info.json")
+        assert report.hints == ()
+        assert (tmp_path / "d.damaged-1/meta/info.json").read_text() == "{"
+    assert (report.episodes, report.lost) == (4, ())
     assert [e.columns for e in content(root)] == [e.columns for e in truth["none"][:4]]
+    assert_sound(root)
+    assert not repair(root)
+
+
+def changed_info(source: Path, target: Path, change: dict[str, Any], fps: int = 10) -> Path:
+    """Write an `info.json` with other features; those that are None are left out."""
+    info = json.loads((source / "meta/info.json").read_text())
+    features = {key: one for key, one in {**info["features"], **change}.items() if one is not None}
+    target.write_text(json.dumps({**info, "features": features, "fps": fps}))
+    return target
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"action": None}, "it does not describe action"),
+        ({"force": {"dtype": "float32", "shape": [1], "names": None}}, "it describes force, which is not there"),
+        ({"action": {"dtype": "float32", "shape": [7], "names": None}}, "action has 7 numbers, and it has 2"),
+        ({CAMERA: None}, f"it does not describe {CAMERA}"),
+        ({}, "it says 25 frames a second, and the timestamps say 10"),
+        ({"note": None}, "no frame of 1 data files can be read"),  # text is in no statistics
+    ],
+)
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_info_of_another_robot_is_the_suspect(
+    lerobot: KillServer, tmp_path: Path, change: dict[str, Any], told: str, by_hand: bool
+) -> None:
+    root = recorded(lerobot, tmp_path / "d", "film", 2, "saved")
+    donor = changed_info(root, tmp_path / "other.json", change, fps=10 if change else 25)
+    if by_hand:
+        if not change or "note" in change:
+            return  # nobody can tell then
+        shutil.copy(donor, root / "meta/info.json")
+    else:
+        (root / "meta/info.json").unlink()
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    with pytest.raises(DatasetCorruptError if by_hand else ConfigError) as error:
+        repair(root, None if by_hand else donor)
+    assert told in str(error.value)
+    assert str(root / "meta/info.json" if by_hand else donor) in str(error.value)
+    assert "--info" in str(error.value)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    assert not (tmp_path / "d.damaged-1").exists()
+
+
+def test_info_of_another_is_given_back_if_nothing_can_be_recovered(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "film", 2, "saved")
+    donor = changed_info(root, tmp_path / "other.json", {})
+    shutil.rmtree(root / "videos")
+    for break_it in (lambda path: path.write_text("{"), Path.unlink):
+        break_it(root / "meta/info.json")
+        before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        with pytest.raises(DatasetCorruptError, match="No whole episode"):
+            repair(root, donor)
+        assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+        assert not (tmp_path / "d.damaged-1").exists()
+
+
+def test_a_camera_that_never_was_is_the_suspect(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+    (root / "meta/stats.json").unlink()
+    camera = {"observation.images.rear": {"dtype": "video", "shape": [32, 48, 3], "names": None}}
+    changed_info(root, root / "meta/info.json", camera)
+    with pytest.raises(DatasetCorruptError, match=r"describes observation\.images\.rear, of which there is no film"):
+        repair(root)
 
 
 def test_a_full_disk_leaves_the_wreck_as_it_was(
