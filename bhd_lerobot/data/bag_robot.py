@@ -3,23 +3,24 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.data import bag_checksum
 from bhd_lerobot.data import features as keys
+from bhd_lerobot.data.bag_breaks import stretches
+from bhd_lerobot.data.bag_columns import frame_columns, told_silence
 from bhd_lerobot.data.bag_dataset import ImportReport, RobotImport, all_or_nothing
-from bhd_lerobot.data.bag_images import decode_image
-from bhd_lerobot.data.bag_read import Bag, Picker
+from bhd_lerobot.data.bag_film import CAMERA, Film
+from bhd_lerobot.data.bag_read import Bag
 from bhd_lerobot.data.bag_tracks import Track, read_tracks, seconds
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.resample import CLOCK_STEP_NS, NANO, STEP_BACK_NS, Grid, clock_jumps, grids, newest
-from bhd_lerobot.data.ros2_base import GYRO, ODOMETRY, TWIST
+from bhd_lerobot.data.resample import NANO, Grid, grids
+from bhd_lerobot.data.ros2_base import ODOMETRY
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.tasks.task import Event
 
@@ -39,9 +40,10 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
     """
     report = ImportReport(Path(root) if root is not None else default_root(repo_id))
     recorder: DatasetRecorder | None = None
+    seen: dict[tuple[int, ...], Path] = {}
     with all_or_nothing(report.root) as made:
         for bag in bags:
-            robot_bag = _RobotBag(bag, wanted)
+            robot_bag = _RobotBag(bag, wanted, seen)
             for episode in robot_bag.episodes():
                 if recorder is None:
                     features = _features(wanted, robot_bag.image_shapes())
@@ -86,11 +88,14 @@ class _Episode:
 class _RobotBag:
     """One bag, all of it but pictures in memory."""
 
-    def __init__(self, bag: Bag, wanted: RobotImport) -> None:
+    def __init__(self, bag: Bag, wanted: RobotImport, seen: dict[tuple[int, ...], Path]) -> None:
         self.notes: list[str] = []
+        self._seen = seen
         self._bag, self._wanted = bag, wanted
         self._tracks = read_tracks(bag, wanted.tracks, self.notes)
-        self._pictures = {role: Picker(bag, one.topic) for role, one in self._tracks.items() if _is_camera(role)}
+        self._films = [
+            Film(bag, role, track, self.notes) for role, track in self._tracks.items() if role.startswith(CAMERA)
+        ]
         self._begin = min(int(track.times.min()) for track in self._tracks.values())
         self._check_clocks()
 
@@ -112,18 +117,21 @@ class _RobotBag:
             )
 
     def episodes(self) -> Iterator[_Episode]:
-        """Yield the episodes in order."""
+        """Yield the episodes in order.
+
+        Raises:
+            DatasetError: the pose that is to be observed jumps all the time.
+        """
         wanted = self._wanted
-        every = list(self._tracks.values())
-        step = CLOCK_STEP_NS if wanted.tracks.stamps == "receive" else STEP_BACK_NS
-        jumps = clock_jumps([track.times for track in every], [track.order for track in every], step)
-        bounds = [0, *jumps.tolist(), np.iinfo(np.int64).max]
-        if len(jumps):
-            self.notes.append(f"the clock jumped back {len(jumps)} times; each time a new episode begins")
-        for number, (first, end) in enumerate(pairwise(bounds)):
-            tracks = {
-                role: track.part((track.order >= first) & (track.order < end)) for role, track in self._tracks.items()
-            }
+        parts = stretches(
+            self._tracks,
+            stamps=wanted.tracks.stamps,
+            max_speed=wanted.max_speed if set(ODOMETRY) & set(wanted.observation_names) else None,
+            max_gap_s=wanted.max_gap_s,
+            notes=self.notes,
+        )
+        for part in parts:
+            tracks = {role: track.part(part.mask(track)) for role, track in self._tracks.items()}
             sensors = {role: track for role, track in tracks.items() if role != "cmd"}
             self._tell_gaps(sensors)
             for grid in grids(
@@ -131,15 +139,15 @@ class _RobotBag:
                 wanted.fps,
                 max_age_ns=round(wanted.max_age_s * NANO),
                 max_gap_ns=round(wanted.max_gap_s * NANO),
-                why="clock" if number else "start",
+                why=part.why,
             ):
                 lasts = (len(grid.times) - 1) / wanted.fps
                 if lasts >= wanted.min_episode_s:
                     yield _Episode(grid, tracks)
                 else:
                     self.notes.append(
-                        f"a stretch of {lasts:.2f} s, {seconds(int(grid.times[0]) - self._begin)} after the start, is "
-                        "shorter than --min_episode_s and was left out"
+                        f"a stretch of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
+                        "was left out"
                     )
 
     def _tell_gaps(self, sensors: Mapping[str, Track]) -> None:
@@ -155,119 +163,51 @@ class _RobotBag:
 
     def image_shapes(self) -> dict[str, tuple[int, int, int]]:
         """Return the shapes of the cameras' pictures by name."""
-        return {
-            role.removeprefix("camera/"): self._picture(role, 0).shape  # type: ignore[misc]
-            for role in self._pictures
-        }
+        return {film.name: film.shape() for film in self._films}
 
     def save(self, episode: _Episode, recorder: DatasetRecorder) -> int:
-        """Save an episode and return its number of frames."""
-        columns = self._columns(episode)
+        """Save an episode and return its number of frames.
+
+        Raises:
+            DatasetError: its pictures cannot be decoded, or it was saved before.
+        """
         times = episode.grid.times
+        ages = episode.grid.ages.max(axis=0)
         writer = recorder.begin_episode()
         try:
+            for film in self._films:
+                shown = film.write(episode.tracks[film.role], times, writer)
+                ages = np.maximum(ages, times - shown)
+            columns = frame_columns(self._wanted, episode.tracks, times, ages)
+            self._refuse_again(int(times[0]), columns)
             writer.set_columns(columns)
-            for role in self._pictures:
-                track = episode.tracks[role]
-                for place in track.values[newest(track.times, times), 0].astype(np.intp).tolist():
-                    key = f"{keys.OBSERVATION_IMAGES}.{role.removeprefix('camera/')}"
-                    writer.add_image(key, self._picture(role, place))
             recorder.save(writer, task=self._wanted.task, metadata=self._metadata(episode, columns))
         except BaseException:
             writer.discard()
             raise
-        self._tell_silence(columns, int(times[0]))
-        late = int(columns[keys.LATE].sum())
-        if late:
+        begin = self._after_start(episode.grid)
+        if silence := told_silence(self._wanted, columns):
+            self.notes.append(f"{begin}: {silence}")
+        if late := int(columns[keys.LATE].sum()):
             self.notes.append(
-                f"{late} of {len(times)} frames of the episode {seconds(int(times[0]) - self._begin)} after the start "
-                f"have a reading older than {self._wanted.max_age_s:g} s; control.late is true in them"
+                f"{begin}: {late} of {len(times)} frames of the episode have a reading older than "
+                f"{self._wanted.max_age_s:g} s; control.late is true in them"
             )
         return len(times)
 
-    # --- what is in a frame ------------------------------------------------------------------------------------------
+    def _refuse_again(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Refuse a drive that is in another bag, too: one that was copied, or converted to another storage.
 
-    def _columns(self, episode: _Episode) -> dict[str, NDArray[Any]]:
-        wanted, times = self._wanted, episode.grid.times
-        n = len(times)
-        age = episode.grid.ages.max(axis=0)
-        asked, command_age = self._commands(episode.tracks["cmd"], times)
-        heard = command_age >= 0
-        applied = np.clip(asked, -np.array(wanted.max_speed), wanted.max_speed)
-        over = (applied != asked).any(axis=1)
-        done = np.arange(n) == n - 1
-        ended = Event.NOTHING if wanted.outcome is None else Event[wanted.outcome.upper()]
-        return {
-            keys.OBSERVATION_STATE: self._state(episode),
-            keys.ACTION: asked.astype(np.float32),
-            keys.APPLIED_ACTION: applied.astype(np.float32),
-            keys.TIME: (times - times[0]) / NANO,
-            keys.AGE: (age / NANO).astype(np.float32),
-            keys.COMMAND_AGE: (np.where(heard, command_age, 0) / NANO).astype(np.float32),
-            keys.LATENESS: np.zeros(n, np.float32),
-            keys.OVERRUNS: np.zeros(n, np.int64),
-            keys.SKIPPED: np.zeros(n, np.int64),
-            keys.INFERENCE_TIME: np.zeros(n, np.float32),
-            keys.LATE: age > round(wanted.max_age_s * NANO),
-            keys.LIMITS: np.where(over, int(Limit.VELOCITY), 0),
-            keys.WATCHDOG: np.where(heard, 0, int(Watchdog.COMMAND_AGE)),
-            keys.MODE: np.where(heard, int(Mode.TRACKING), int(Mode.HOLD)),
-            keys.REWARD: np.zeros(n, np.float32),
-            keys.SUCCESS: done & (ended == Event.SUCCESS),
-            keys.DONE: done,
-            keys.EVENT: np.where(done, int(ended), 0),
-        }
-
-    def _commands(self, track: Track, times: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the command in force at the end of each frame, shape (n, 2), and its age then [ns]; 0 and -1 if none.
-
-        An action is what was asked for over the frame that an observation begins. What answers the observation comes
-        after it: the command in force when the observation was taken is the answer to the one before.
+        Raises:
+            DatasetError: it is. No two drives have the same numbers at the same nanosecond.
         """
-        ends = times + round(NANO / self._wanted.fps)
-        place = np.searchsorted(track.times, ends, side="left") - 1
-        known = np.maximum(place, 0)
-        if not len(track.times):
-            return np.zeros((len(times), len(TWIST))), np.full(len(times), -1, np.int64)
-        age = np.where(place < 0, -1, ends - track.times[known])
-        timeout = self._wanted.command_timeout_s
-        if np.isfinite(timeout):
-            age = np.where(age > round(timeout * NANO), -1, age)
-        order = [TWIST.index(name) for name in self._wanted.action_names]
-        return np.where(age[:, None] >= 0, track.values[known], 0.0)[:, order], age
-
-    def _tell_silence(self, columns: Mapping[str, NDArray[Any]], begin: int) -> None:
-        """Tell how many frames have no command, and whether the robot drove in them."""
-        silent = columns[keys.MODE] == int(Mode.HOLD)
-        if not silent.any():
-            return
-        names = list(self._wanted.observation_names)
-        speeds = columns[keys.OBSERVATION_STATE][:, [names.index(name) for name in TWIST]]
-        moving = int((silent & (np.abs(speeds) > _MOVES).any(axis=1)).sum())
-        drove = (
-            f", though the robot moved in {moving} of them: --command_timeout=inf is for robots that go on with the "
-            "last command"
-            if moving
-            else ""
-        )
-        self.notes.append(
-            f"{int(silent.sum())} of {len(silent)} frames of the episode {seconds(begin - self._begin)} after the "
-            f"start have no command that is younger than {self._wanted.command_timeout_s:g} s; their action is 0{drove}"
-        )
-
-    def _state(self, episode: _Episode) -> NDArray[np.float32]:
-        times, tracks = episode.grid.times, episode.tracks
-
-        def at(role: str) -> NDArray[np.float64]:
-            return tracks[role].values[newest(tracks[role].times, times)]
-
-        scan, odom = at("scan"), at("odom")
-        columns = dict(zip(TWIST, odom[:, :2].T, strict=True))
-        columns |= dict(zip(ODOMETRY, _since_start(odom[:, 2:]).T, strict=True))
-        columns |= {f"scan_{beam:03d}.pos": scan[:, beam] for beam in range(scan.shape[1])}
-        if "imu" in tracks:
-            columns |= dict(zip(GYRO, at("imu").T, strict=True))
-        return np.stack([columns[name] for name in self._wanted.observation_names], axis=1).astype(np.float32)
+        numbers = (start, *(bag_checksum.of_column(columns[key]) for key in (keys.OBSERVATION_STATE, keys.ACTION)))
+        if numbers in self._seen:
+            raise DatasetError(
+                f"{self._seen[numbers]} and {self._bag.path} hold the same drive: the same numbers at "
+                f"{start / NANO:.3f} s. It would be in the dataset twice; leave one of them out."
+            )
+        self._seen[numbers] = self._bag.path
 
     def _metadata(self, episode: _Episode, columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         outcome = self._wanted.outcome
@@ -281,21 +221,5 @@ class _RobotBag:
         told = {} if outcome is None else {"outcome": outcome, "success": outcome == Event.SUCCESS.cause}
         return {"source": json.dumps(source), **told}
 
-    def _picture(self, role: str, place: int) -> NDArray[np.uint8]:
-        track = self._tracks[role]
-        return decode_image(track.topic, track.msgtype, self._pictures[role].get(place))
-
-
-_MOVES = 0.01
-"""[m/s, rad/s] A robot that is slower stands."""
-
-
-def _is_camera(role: str) -> bool:
-    return role.startswith("camera/")
-
-
-def _since_start(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return poses x, y, yaw in the frame of the first one, shape (n, 3)."""
-    x, y, yaw = (pose - pose[0]).T
-    cos, sin = np.cos(pose[0, 2]), np.sin(pose[0, 2])
-    return np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1)
+    def _after_start(self, grid: Grid) -> str:
+        return f"{seconds(int(grid.times[0]) - self._begin)} after the start"

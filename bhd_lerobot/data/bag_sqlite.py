@@ -87,6 +87,7 @@ class SqliteFile:
         """Yield topic, receive time [ns], and where its bytes lie: a buffer, first and last; as they were written."""
         self.problems = []
         count = 0
+        self._connection.text_factory = bytes  # of a damaged row, bytes may be taken for a text
         try:
             for channel, received, data in self._connection.execute(
                 "SELECT topic_id, timestamp, data FROM messages ORDER BY id"

@@ -1,8 +1,7 @@
 """The topics of a robot's bag as tracks: when something was measured, and what; sorted by time, judged one by one."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from bhd_lerobot.data import bag_frames as frames
 from bhd_lerobot.data.bag_read import Bag, Messages, Topic
 from bhd_lerobot.data.bag_sound import sound_messages
 from bhd_lerobot.data.bag_wanted import TYPES, static_topics, told_publishers, wanted_topic
-from bhd_lerobot.data.resample import STEP_BACK_NS, Times, clock_jumps, message_times, sane
+from bhd_lerobot.data.resample import Times, message_times, sane
 from bhd_lerobot.data.resample_scan import resampled_scans
 from bhd_lerobot.data.ros2_base import BareTwistPart, GyroPart, TwistPart, odometry
 from bhd_lerobot.data.ros2_cdr_read import decode
@@ -57,7 +56,7 @@ class Track:
         times: when they happened [ns], shape (n,).
         order: their places in the bag, shape (n,).
         values: numbers of each, shape (n, d); of a camera, its place in the bag, shape (n, 1).
-        restarts: places in the bag at which the headers' clock has begun anew, shape (k,).
+        stamps: of their headers [ns], shape (n,); None if they have none.
     """
 
     topic: str
@@ -65,13 +64,18 @@ class Track:
     times: Times
     order: Times
     values: Array
-    restarts: Times = field(default_factory=lambda: np.zeros(0, np.int64))
+    stamps: Times | None
 
     def part(self, mask: NDArray[np.bool_]) -> "Track":
         """Return some of its messages, sorted by time; those of the same time stay in their order."""
         rows = np.flatnonzero(mask)
-        rows = rows[np.argsort(self.times[rows], kind="stable")]
-        return Track(self.topic, self.msgtype, self.times[rows], self.order[rows], self.values[rows])
+        return self.rows(rows[np.argsort(self.times[rows], kind="stable")])
+
+    def rows(self, rows: NDArray[np.intp]) -> "Track":
+        """Return some of its messages, in this order."""
+        times = self.times[rows]
+        stamps = times if self.stamps is self.times else None if self.stamps is None else self.stamps[rows]
+        return Track(self.topic, self.msgtype, times, self.order[rows], self.values[rows], stamps)
 
 
 def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, Track]:
@@ -113,22 +117,11 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
         if not finite.all():
             what = "are no scan of a whole turn" if role == "scan" else "with values that are not finite"
             notes.append(f"{topic.name}: {int((~finite).sum())} of {len(finite)} messages {what}, left out")
-        track = Track(topic.name, topic.msgtype, times[finite], found.order[finite], values[finite])
+        track = Track(topic.name, topic.msgtype, times, found.order, values, stamps).rows(np.flatnonzero(finite))
         if not len(track.times):
             raise DatasetError(f"{bag.path}: no message of {topic.name} has finite values.")
-        if stamps is not None and times is not stamps and role != "cmd":
-            track = dataclasses.replace(track, restarts=_restarts(topic.name, stamps[finite], track.order, notes))
         tracks[role] = track
     return tracks
-
-
-def _restarts(topic: str, stamps: Times, order: Times, notes: list[str]) -> Times:
-    """Return where the clock of the headers begins anew, as when a simulation is restarted."""
-    jumps = clock_jumps([stamps], [order], STEP_BACK_NS)
-    if len(jumps) <= max(1, len(stamps) // 100):
-        return jumps
-    notes.append(f"{topic}: the header stamps go back {len(jumps)} times, which no restart explains; they are not used")
-    return np.zeros(0, np.int64)
 
 
 def _stamps(topic: Topic, messages: Messages) -> Times | None:

@@ -92,6 +92,11 @@ def drive(
     return sorted(messages, key=lambda message: message[1])
 
 
+def changed(messages: list[Message], topic: str, make: Callable[[int], Any], since: int = 0) -> list[Message]:
+    """Return messages of which those of a topic are made anew, by their time, from some time on."""
+    return [(name, at, make(at) if name == topic and at >= since else message) for name, at, message in messages]
+
+
 def without(topic: str) -> Callable[[Message], bool]:
     return lambda message: message[0] != topic
 

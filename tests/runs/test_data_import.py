@@ -13,30 +13,12 @@ from bhd_lerobot.robots.turtlebot3_simulation import observation_names
 from bhd_lerobot.runs import data
 from tests.data import bag_support as bags
 from tests.data.bag_support import NANO, START, drive, without, write
-
-TASK = "--task=Drive around."
+from tests.runs.import_support import TASK, imported, refused, run
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
     return write(tmp_path_factory.mktemp("real") / "plain", drive())
-
-
-def run(source, root, *arguments):
-    """Import and return the status."""
-    return data.main(["import", str(source), "--repo_id=t/t", f"--root={root}", TASK, *arguments])
-
-
-def imported(source, root, *arguments):
-    assert run(source, root, *arguments) == 0
-    return dataset_info(root)
-
-
-def refused(source, root, capsys, *arguments):
-    """Import, which must be refused; return what is said."""
-    assert run(source, root, *arguments) == 2
-    assert not root.exists()
-    return capsys.readouterr().err
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -329,7 +311,7 @@ def test_several_bags_become_several_episodes(tmp_path, plain):
     folder = tmp_path / "drives"
     folder.mkdir()
     for index in range(2):
-        write(folder / f"drive_{index}", drive(seed=index))
+        write(folder / f"drive_{index}", drive(seed=index + 1))
     info = imported(folder, tmp_path / "d")
     assert [json.loads(one.metadata["source"])["bag"] for one in info.episodes] == ["drive_0", "drive_1"]
     arguments = ["import", str(plain), str(folder), "--repo_id=t/t", f"--root={tmp_path / 'e'}", TASK]
@@ -440,7 +422,7 @@ def test_a_dataset_that_is_there_stays(tmp_path, plain, capsys):
 def test_a_bag_that_is_named_twice_is_refused(tmp_path, plain, capsys):
     arguments = ["import", str(plain), f"{plain}/../plain", "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
     assert data.main(arguments) == 2
-    assert "named twice" in capsys.readouterr().err
+    assert "must not be named twice" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("source", ["mcap", "sqlite3", "ours"])

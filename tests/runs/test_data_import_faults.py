@@ -1,0 +1,300 @@
+"""Import of bags in which something went wrong: on the robot, in the recorder, or in what was named."""
+
+import itertools
+import json
+import shutil
+import sqlite3
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from bhd_lerobot.data.inspect import dataset_info
+from bhd_lerobot.data.read import read_episode
+from bhd_lerobot.runs import data
+from tests.data import bag_support as bags
+from tests.data.bag_support import NANO, START, STORE, changed, drive, write
+from tests.runs.import_support import TASK, imported, refused, run
+
+
+@pytest.fixture(scope="module")
+def messages():
+    return drive(seconds=4)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory, messages):
+    return write(tmp_path_factory.mktemp("faults") / "plain", messages)
+
+
+def places(root):
+    """Return of each episode why it began, and when."""
+    told = [json.loads(one.metadata["source"]) for one in dataset_info(root).episodes]
+    return [(one["why"], (one["start_ns"] - START) / NANO) for one in told]
+
+
+# --- single messages that cannot be read -------------------------------------------------------------------------
+
+
+def shorten(bag, topic, places):
+    """Cut messages of a topic of an SQLite bag short."""
+    with sqlite3.connect(bag / f"{bag.name}.db3") as file:
+        rows = file.execute(
+            "SELECT m.id FROM messages m JOIN topics t ON t.id = m.topic_id WHERE t.name = ? ORDER BY m.id", (topic,)
+        ).fetchall()
+        for place in places:
+            file.execute("UPDATE messages SET data = substr(data, 1, 40) WHERE id = ?", rows[place])
+    return len(rows)
+
+
+@pytest.mark.parametrize("topic", ["/scan", "/odom", "/cmd_vel"])
+def test_a_short_message_counts_as_lost_and_is_told(tmp_path, messages, capsys, topic):
+    bag = write(tmp_path / "bag", messages, "sqlite3")
+    short = [7] if topic == "/scan" else [1, 7]
+    total = shorten(bag, topic, short)
+    info = imported(bag, tmp_path / "d")
+    told = f"bag: {len(short)} of the {total} messages of {topic} cannot be read, and are left out as if they had"
+    assert f"damaged: {told}" in capsys.readouterr().err
+    (problem,) = json.loads(info.episodes[0].metadata["source"])["problems"]
+    assert problem.startswith(told)
+    # Just as if the messages had never come.
+    numbers = itertools.count()
+    rest = [one for one in messages if one[0] != topic or next(numbers) not in short]
+    imported(write(tmp_path / "rest", rest), tmp_path / "r")
+    ours, theirs = read_episode(tmp_path / "d", 0), read_episode(tmp_path / "r", 0)
+    for key, values in theirs.items():
+        assert np.array_equal(values, ours[key]), key
+
+
+def test_a_topic_that_is_mostly_unreadable_is_refused_with_the_numbers(tmp_path, messages, capsys):
+    bag = write(tmp_path / "bag", messages, "sqlite3")
+    total = shorten(bag, "/odom", range(0, 60, 3))
+    error = refused(bag, tmp_path / "d", capsys)
+    assert f"20 of the {total} messages of /odom cannot be read, which is more than 10%" in error
+    assert "nav_msgs/msg/Odometry: it ends after 40 bytes" in error
+
+
+def test_a_row_without_bytes_or_time_does_not_end_the_bag(tmp_path, messages, capsys):
+    bag = write(tmp_path / "bag", messages, "sqlite3")
+    with sqlite3.connect(bag / "bag.db3") as file:
+        numbers = dict(file.execute("SELECT name, id FROM topics"))
+        first = "(SELECT id FROM messages WHERE topic_id = ? LIMIT 1 OFFSET 5)"
+        file.execute(f"UPDATE messages SET data = 7 WHERE id = {first}", (numbers["/odom"],))
+        file.execute(f"UPDATE messages SET timestamp = 'soon' WHERE id = {first}", (numbers["/scan"],))
+    info = imported(bag, tmp_path / "d")
+    error = capsys.readouterr().err
+    assert "1 of the 80 messages of /odom cannot be read" in error
+    assert "1 messages that cannot be decompressed, or have no possible time" in error
+    assert info.frames > 30
+
+
+# --- topics ------------------------------------------------------------------------------------------------------
+
+
+def test_a_topic_of_two_types_matters_only_if_it_is_read(tmp_path, capsys):
+    with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {}
+        for number, (topic, received, message) in enumerate(drive(seconds=4)):
+            both = [(topic, message)]
+            if topic == "/odom":
+                both.append(("/chatter", bags.twist(1, 1) if number % 2 else bags.header(received, "x")))
+            for name, one in both:
+                key = name, one.__msgtype__
+                if key not in connections:
+                    connections[key] = writer.add_connection(*key, typestore=STORE)
+                writer.write(connections[key], received, STORE.serialize_cdr(one, one.__msgtype__))
+    assert len(imported(tmp_path / "bag", tmp_path / "d").episodes) == 1
+    error = refused(tmp_path / "bag", tmp_path / "e", capsys, "--cmd=/chatter")
+    assert "/chatter" in error
+    assert "std_msgs/msg/Header" in error
+
+
+def test_other_commands_and_other_publishers_are_told(tmp_path, messages, capsys, plain):
+    imported(plain, tmp_path / "a")
+    assert "/cmd_vel" not in capsys.readouterr().err
+    more = [("/cmd_vel_nav", at, message) for topic, at, message in messages if topic == "/cmd_vel"]
+    imported(write(tmp_path / "two_topics", sorted([*messages, *more], key=lambda one: one[1])), tmp_path / "b")
+    error = capsys.readouterr().err
+    assert "commands on other topics, too: /cmd_vel_nav (40). The action is of /cmd_vel alone (40)" in error
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    def profile(depth):
+        times = QosTime(0, 0)
+        return Qos(
+            QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, QosDurability.VOLATILE, times, times,
+            QosLiveliness.AUTOMATIC, times, False,
+        )  # fmt: skip
+
+    for name, offered, told in (
+        ("profiles", [[profile(1), profile(10)]], "/cmd_vel had 2 publishers when the recording began. Which of them"),
+        ("connections", [[profile(1)], [profile(10)]], "/cmd_vel has messages of 2 connections (20 and 20)"),
+    ):
+        with Writer(tmp_path / name, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            known, count = {}, 0
+            for topic, received, message in messages:
+                kind = message.__msgtype__
+                count += topic == "/cmd_vel"
+                key = topic, count % len(offered) if topic == "/cmd_vel" else 0
+                if key not in known:
+                    profiles = offered[key[1]] if topic == "/cmd_vel" else [profile(5)]
+                    known[key] = writer.add_connection(topic, kind, typestore=STORE, offered_qos_profiles=profiles)
+                writer.write(known[key], received, STORE.serialize_cdr(message, kind))
+        imported(tmp_path / name, tmp_path / f"d_{name}")
+        assert told in capsys.readouterr().err
+        ours, theirs = read_episode(tmp_path / "a", 0), read_episode(tmp_path / f"d_{name}", 0)
+        assert np.array_equal(ours["action"], theirs["action"])
+
+
+# --- restarts ----------------------------------------------------------------------------------------------------
+
+
+def reset_odometry(at, *, dx=0.0, turn=0.0):
+    """Return odometry that starts from another pose."""
+    message = bags.odometry(at - 5 * 10**6)
+    pose = message.pose.pose
+    pose.position.x += dx
+    w, z = pose.orientation.w, pose.orientation.z
+    pose.orientation.w = float(w * np.cos(turn / 2) - z * np.sin(turn / 2))
+    pose.orientation.z = float(z * np.cos(turn / 2) + w * np.sin(turn / 2))
+    return message
+
+
+@pytest.mark.parametrize("reset", [{"dx": -3.0}, {"turn": 2.5}])
+def test_an_odometry_that_starts_anew_begins_an_episode(tmp_path, messages, capsys, reset):
+    late = START + 2 * NANO
+    bag = write(tmp_path / "bag", changed(messages, "/odom", lambda at: reset_odometry(at, **reset), since=late))
+    imported(bag, tmp_path / "d", "--odometry", "--beams=36")
+    error = capsys.readouterr().err
+    assert "/odom: the pose jumped by" in error
+    assert "a new episode begins" in error
+    (first, _), (second, began) = places(tmp_path / "d")
+    assert (first, second) == ("start", "reset")
+    assert 2.0 <= began <= 2.3
+    names = dataset_info(tmp_path / "d").features["observation.state"]["names"]
+    columns = [names.index(name) for name in ("x.pos", "y.pos", "theta.pos")]
+    for episode in range(2):
+        pose = read_episode(tmp_path / "d", episode)["observation.state"][:, columns]
+        assert pose[0].tolist() == [0, 0, 0]
+        assert np.abs(np.diff(pose, axis=0)).max() < 0.1
+    # Without the pose in the observation nothing jumps.
+    assert len(imported(bag, tmp_path / "e").episodes) == 1
+
+
+def test_a_drive_without_a_reset_stays_whole(tmp_path, messages, capsys):
+    fast = [one for number, one in enumerate(messages) if one[0] != "/odom" or number % 5 == 0]  # 4 Hz, and jittered
+    imported(write(tmp_path / "bag", fast), tmp_path / "d", "--odometry", "--beams=36", "--max_age=0.9")
+    assert "jumped" not in capsys.readouterr().err
+    assert places(tmp_path / "d")[0][0] == "start"
+    assert len(places(tmp_path / "d")) == 1
+
+
+def test_a_pose_that_jumps_all_the_time_is_refused(tmp_path, messages, capsys):
+    jumping = changed(messages, "/odom", lambda at: reset_odometry(at, dx=float(at // 10**8 % 2)))
+    error = refused(write(tmp_path / "bag", jumping), tmp_path / "d", capsys, "--odometry", "--beams=36")
+    assert "in 80 messages, farther than a robot with the limits 0.22 m/s" in error
+    assert "--odometry" in error
+
+
+def test_a_simulation_that_starts_anew_begins_an_episode(tmp_path, messages, capsys):
+    late, back = START + 2 * NANO, 60 * NANO  # the recorder's clock goes on
+    anew = changed(messages, "/odom", lambda at: bags.odometry(at - back), since=late)
+    anew = changed(anew, "/scan", lambda at: bags.scan(at - back), since=late)
+    imported(write(tmp_path / "bag", anew), tmp_path / "d")
+    error = capsys.readouterr().err
+    assert "its header stamps jumped back 1 times, as when a simulation or a driver is restarted" in error
+    (first, _), (second, began) = places(tmp_path / "d")
+    assert (first, second) == ("start", "clock")
+    assert 2.0 <= began <= 2.3
+
+
+def test_stamps_of_two_clocks_are_no_restart(tmp_path, messages, capsys):
+    mixed = changed(messages, "/odom", lambda at: bags.odometry(at if at % 3 else 0))
+    assert len(imported(write(tmp_path / "bag", mixed), tmp_path / "d").episodes) == 1
+    assert "which no restart explains" in capsys.readouterr().err
+
+
+# --- the same drive twice ----------------------------------------------------------------------------------------
+
+
+def test_the_same_drive_is_not_imported_twice(tmp_path, plain, messages, capsys):
+    (tmp_path / "link").symlink_to(plain)
+    (tmp_path / "hard.mcap").hardlink_to(plain / "plain.mcap")
+    for other in (plain / "plain.mcap", tmp_path / "link", tmp_path / "hard.mcap", plain.parent):
+        arguments = ["import", str(plain), str(other), "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
+        assert data.main(arguments) == 2
+        error = capsys.readouterr().err
+        assert "are the same recording: both have the file" in error
+        assert str(plain) in error
+    shutil.copytree(plain, tmp_path / "copy")
+    for other in (tmp_path / "copy", write(tmp_path / "converted", messages, "sqlite3")):
+        arguments = ["import", str(plain), str(other), "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
+        assert data.main(arguments) == 2
+        error = capsys.readouterr().err
+        assert f"{plain} and {other} hold the same drive" in error
+        assert not (tmp_path / "d").exists()
+
+
+# --- what a bag is recorded with ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
+def test_compressed_messages_without_metadata_are_read_and_told(tmp_path, messages, plain, capsys, storage):
+    writer = Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin[storage])
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        known = {}
+        for topic, received, message in messages:
+            kind = message.__msgtype__
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(known[topic], received, STORE.serialize_cdr(message, kind))
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    imported(tmp_path / "bag", tmp_path / "d")
+    assert "its messages are compressed one by one (compression_mode: MESSAGE)" in capsys.readouterr().err
+    imported(plain, tmp_path / "e")
+    ours, theirs = read_episode(tmp_path / "d", 0), read_episode(tmp_path / "e", 0)
+    assert all(np.array_equal(values, theirs[key]) for key, values in ours.items())
+
+
+def test_messages_of_an_unknown_compression_are_named(tmp_path, messages, capsys):
+    bag = write(tmp_path / "bag", messages, "sqlite3")
+    with sqlite3.connect(bag / "bag.db3") as file:
+        file.execute("UPDATE messages SET data = CAST(X'04224D18' || data AS BLOB)")
+    error = refused(bag, tmp_path / "d", capsys)
+    assert "it begins with '04 22 4d 18'" in error
+    assert "ros2 bag convert" in error
+    text = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(
+        text.replace("compression_mode: ''", "compression_mode: MESSAGE").replace(
+            "compression_format: ''", "compression_format: lz4"
+        )
+    )
+    assert "are compressed with 'lz4'; only zstd can be read" in refused(bag, tmp_path / "d", capsys)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_without_messages_is_refused(tmp_path, capsys, storage):
+    with Writer(tmp_path / "none", version=8, storage_plugin=StoragePlugin[storage.upper()]):
+        pass
+    with Writer(tmp_path / "silent", version=8, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        writer.add_connection("/scan", "sensor_msgs/msg/LaserScan", typestore=STORE)
+    assert "no topic /scan" in refused(tmp_path / "none", tmp_path / "d", capsys)
+    assert "no message of /scan" in refused(tmp_path / "silent", tmp_path / "d", capsys)
+
+
+def test_a_robot_in_a_namespace(tmp_path, messages, plain, capsys):
+    types = bags.T
+    still = types["geometry_msgs/msg/TransformStamped"](
+        header=bags.header(START, "tb3_1/base_link"),
+        child_frame_id="tb3_1/laser",
+        transform=types["geometry_msgs/msg/Transform"](
+            translation=bags.Vector(x=0.0, y=0.0, z=0.1), rotation=bags.Quaternion(x=0.0, y=0.0, z=1.0, w=0.0)
+        ),
+    )
+    named = changed(messages, "/scan", lambda at: bags.scan(at - 5 * 10**6, frame="tb3_1/laser"))
+    named = changed(named, "/odom", lambda at: bags.odometry(at, child="tb3_1/base_footprint"))
+    named = [("/tf_static", START, types["tf2_msgs/msg/TFMessage"](transforms=[still])), *named]
+    named = [(f"/tb3_1{topic}", at, message) for topic, at, message in named]
+    topics = [f"--{role}=/tb3_1/{topic}" for role, topic in (("scan", "scan"), ("odom", "odom"), ("cmd", "cmd_vel"))]
+    assert run(write(tmp_path / "bag", named), tmp_path / "d", *topics) == 0
+    assert "turned by 180.0 degrees, from /tf_static" in capsys.readouterr().err
