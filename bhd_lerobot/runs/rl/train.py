@@ -5,15 +5,13 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, field
-from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from rich.console import Console
 from rich.markup import escape
@@ -23,8 +21,9 @@ from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.runs import configuration
 from bhd_lerobot.runs.rl import checkpoint as checkpoints
-from bhd_lerobot.runs.rl.config import CONFIG_NAME, RlConfig, encode, parse_rl
+from bhd_lerobot.runs.rl.config import RlConfig, parse_rl
 from bhd_lerobot.runs.rl.features import ActionUnits, FeatureStack
+from bhd_lerobot.runs.rl.folder import remove_empty, run_folder, write_config
 from bhd_lerobot.runs.rl.log import PLOT_NAME, Episodes, RlProgress, Row, draw_curve
 from bhd_lerobot.runs.rl.parts import RlParts, make_parts
 from bhd_lerobot.runs.rl.shaping import Shaping
@@ -84,7 +83,7 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
         BhdError: the configuration cannot be honoured, or training failed. Checkpoints saved before are intact.
     """
     require_sb3()
-    folder = _run_folder(config)
+    folder = run_folder(config)
     threads = torch.get_num_threads()
     if config.threads is not None:
         torch.set_num_threads(config.threads)
@@ -99,7 +98,7 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
     finally:
         torch.set_num_threads(threads)
         if not config.resume:
-            _remove_empty(folder)
+            remove_empty(folder)
 
 
 class _Run:
@@ -186,7 +185,7 @@ class _Run:
             raise ConfigError(
                 f"The run has done {result.step} of {config.steps} steps. To go on, set more with --steps."
             )
-        _write_config(config, result.output_dir)
+        write_config(config, result.output_dir)
         self._file, self._parts, self._env = MetricsFile(metrics, rows), parts, env
         result.rows = self._file.rows
         self._judged = result.step
@@ -289,43 +288,6 @@ class _Run:
 
 def _text(row: Row) -> str:
     return f"score {row['val_score']:.4f}, success {row['val_success']:.3f}, return {row['val_return']:.4f}"
-
-
-def _run_folder(config: RlConfig) -> Path:
-    if config.output_dir is None:
-        config.output_dir = f"outputs/train/{datetime.now():%Y-%m-%d/%H-%M-%S}_ppo_{config.robot.type}"
-    folder = Path(config.output_dir).expanduser()
-    try:
-        is_there = folder.exists()
-    except OSError as error:  # a name that is too long
-        raise ConfigError(f"The run folder {folder} cannot be used: {error.strerror}. Set --output_dir.") from error
-    if is_there and not config.resume:
-        raise ConfigError(
-            f"The output folder {folder} exists. Set another --output_dir, or continue its run with "
-            f"--resume=true --config_path={folder}."
-        )
-    if config.resume and not folder.is_dir():
-        raise ConfigError(f"There is no run to resume in {folder}.")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f".{CONFIG_NAME}.part").touch()
-        (folder / f".{CONFIG_NAME}.part").unlink()
-    except OSError as error:
-        raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
-    return folder
-
-
-def _write_config(config: RlConfig, folder: Path) -> None:
-    """Write the resolved configuration; that of a run which cannot be resumed with another one stays as it was."""
-    values = {**encode(config), "resume": False}
-    text = yaml.safe_dump(json.loads(json.dumps(values)), sort_keys=False, default_flow_style=None, width=110)
-    (folder / CONFIG_NAME).write_text(text, encoding="utf-8")
-
-
-def _remove_empty(folder: Path) -> None:
-    """Remove the folder of a run that failed before it wrote anything, so that it can be started again."""
-    with suppress(OSError):
-        folder.rmdir()
 
 
 def main(arguments: Sequence[str]) -> int:
