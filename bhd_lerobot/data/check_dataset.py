@@ -73,6 +73,8 @@ def check_dataset(
     findings = Findings()
     files = read_files(Path(root), findings)
     robot = files.info.get("robot_type")
+    if not files.info["total_episodes"]:
+        findings.warning("counts", layout.INFO, "the dataset is empty: it has no episodes", "Record some.")
     values = ValueCheck(files, findings, limits_of(robot if isinstance(robot, str) else None))
     values.run()
     if videos:

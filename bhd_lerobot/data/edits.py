@@ -16,7 +16,7 @@ from bhd_lerobot.data.creation import build_root, refuse_inside
 from bhd_lerobot.data.disk import Disk, RootLock, write_errors
 from bhd_lerobot.data.identity import FORMAT
 from bhd_lerobot.data.picks import Pick
-from bhd_lerobot.data.state import DatasetState, load_state
+from bhd_lerobot.data.state import DatasetState, load_state, no_dataset
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError
 
 
@@ -241,11 +241,11 @@ def opened(roots: Sequence[Path]) -> Iterator[list[DatasetState]]:
         states = []
         for root in roots:
             if not root.is_dir():
-                raise DatasetError(f"{root} is not a LeRobot dataset: it does not exist.")
+                raise no_dataset(root)
             stack.callback(RootLock(root).release)
             state = load_state(root)
             if not state.rows:
-                raise DatasetError(f"{root} has no episodes.")
+                raise DatasetError(f"{root} is empty: it has no episodes.")
             states.append(state)
         yield states
 

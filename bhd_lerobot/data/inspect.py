@@ -6,6 +6,7 @@ from typing import Any
 
 from bhd_lerobot.data.episode_table import PREFIX
 from bhd_lerobot.data.state import load_state
+from bhd_lerobot.errors import DatasetError
 
 
 @dataclass(frozen=True)
@@ -94,3 +95,13 @@ def dataset_info(root: Path | str) -> DatasetSummary:
         size=sum((root / name).stat().st_size for name in files),
         compact=not state.without_stats,
     )
+
+
+def check_not_empty(summary: DatasetSummary) -> None:
+    """Check that there is an episode.
+
+    Raises:
+        DatasetError: there is none.
+    """
+    if not summary.episodes:
+        raise DatasetError(f"{summary.root} is empty: it has no episodes.")

@@ -15,7 +15,7 @@ from bhd_lerobot.data.picks import Pick
 from bhd_lerobot.data.schema import as_numpy
 from bhd_lerobot.data.state import DatasetState, Row, ordered_slots, read_frames, slot_of
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
-from bhd_lerobot.tasks.task import OUTCOMES, Event
+from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
 
 _SAID = "said afterwards"
 _COLUMNS: Mapping[str, pa.DataType] = {"outcome": pa.string(), "success": pa.bool_()}
@@ -46,7 +46,8 @@ def mark(
         note: why; for the log.
 
     Raises:
-        ConfigError: nothing is said, or an unknown outcome or impossible frames.
+        ConfigError: nothing is said, or an unknown outcome, one that the task or robot cannot have, or impossible
+            frames.
         DatasetLockedError: the dataset is being recorded.
         DatasetError: there is no such episode or no sound, finalised dataset, the dataset has no column for it, or the
             disk refuses; it is then as it was.
@@ -59,12 +60,37 @@ def mark(
         raise ConfigError("Say which episodes to mark.")
     with opened([Path(root)]) as (state,):
         check_episodes(state, episodes)
+        for row in [state.rows[episode] for episode in episodes] if outcome is not None else []:
+            if outcome not in (possible := possible_outcomes(state, row)):
+                raise ConfigError(
+                    f"Episode {row['episode_index']} of {state.root} cannot have ended with {outcome!r}: "
+                    f"{_what(state, row)}. Valid: {', '.join(possible)}."
+                )
         changes = _Changes(state, outcome, intervention, clear_interventions)
         meant = set(episodes)
         picks = [changes.pick(row) if row["episode_index"] in meant else Pick(state, row) for row in state.rows]
         edit = {"edit": "mark", "episodes": changes.log, **({"note": note} if note else {})}
         types = _COLUMNS if outcome is not None and "outcome" not in state.metadata_types else {}
         return rewrite(state, picks, edit, state.identity, types)
+
+
+def possible_outcomes(state: DatasetState, row: Row) -> tuple[str, ...]:
+    """Return what an episode can have ended with, by its task and its robot; everything if nobody knows these."""
+    return outcomes_of(_task_of(state, row), state.info.get("robot_type"))
+
+
+def _task_of(state: DatasetState, row: Row) -> str | None:
+    """Return the type of an episode's task; None if nobody has said it."""
+    try:
+        told = json.loads(row.get("bhd/task") or "null") or (state.identity or {})["recording"]["task"]
+        return str(told["type"])
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def _what(state: DatasetState, row: Row) -> str:
+    told = {"its robot is": state.info.get("robot_type"), "its task": _task_of(state, row)}
+    return ", ".join(f"{what} {name}" for what, name in told.items() if name)
 
 
 class _Changes:

@@ -14,7 +14,7 @@ type Run = Callable[[argparse.Namespace], int]
 
 
 def add_command(
-    commands: Commands, name: str, help_text: str, run: Run, *, names_dataset: bool = True
+    commands: Commands, name: str, help_text: str, run: Run, *, names_dataset: bool = True, takes_several: bool = False
 ) -> argparse.ArgumentParser:
     """Add a command.
 
@@ -24,6 +24,7 @@ def add_command(
         help_text: one line.
         run: what carries it out. Where Ctrl-C does not leave everything as it was, set the default ``stopped``.
         names_dataset: whether it is told one dataset, as a folder or by name; `root_of` reads it.
+        takes_several: whether it may be told more than one folder; `roots_of` reads them.
 
     Returns:
         Its parser, for its own arguments.
@@ -31,18 +32,34 @@ def add_command(
     command = commands.add_parser(name, help=help_text, description=help_text)
     command.set_defaults(run=run, stopped="nothing was changed")
     if names_dataset:
-        command.add_argument("root", nargs="?", type=Path, help="folder of the dataset")
-        command.add_argument("--root", dest="root_option", type=Path, help="the same, as an option")
-        command.add_argument("--repo_id", help="name of the dataset, to find it in LeRobot's default place")
+        text = "folder of the dataset" + ("; several may be named" if takes_several else "")
+        command.add_argument("root", metavar="ROOT", nargs="*" if takes_several else "?", type=Path, help=text)
+        command.add_argument("--root", dest="root_option", metavar="ROOT", type=Path, help="the same, as an option")
+        text = "instead of the folder: the dataset's name, user/name, in LeRobot's default place"
+        command.add_argument("--repo_id", metavar="NAME", help=text)
         command.set_defaults(usage_error=command.error)
     return command
 
 
 def root_of(options: argparse.Namespace) -> Path:
-    """Return the folder of the dataset that was named; end with a usage error if none was."""
-    root: Path | None = options.root or options.root_option
-    if root is not None:
-        return root.expanduser()
-    if options.repo_id is None:
-        options.usage_error("name the dataset: its folder, or --repo_id")
-    return default_root(options.repo_id)
+    """Return the folder of the dataset that was named; end with a usage error if none was, or more than one."""
+    return roots_of(options)[0]
+
+
+def roots_of(options: argparse.Namespace) -> list[Path]:
+    """Return the folders of the datasets that were named; end with a usage error if none was, or in several ways."""
+    folders = options.root if isinstance(options.root, list) else [options.root] if options.root is not None else []
+    named = {
+        "ROOT": " ".join(map(str, folders)) if folders else None,
+        "--root": options.root_option,
+        "--repo_id": options.repo_id,
+    }
+    given = {option: value for option, value in named.items() if value is not None}
+    if len(given) != 1:
+        told = " and ".join(f"{option} {value}" for option, value in given.items())
+        options.usage_error(
+            f"name the dataset, in one way: its folder (ROOT or --root), or --repo_id; got {told or 'none'}"
+        )
+    if options.repo_id is not None:
+        return [default_root(options.repo_id)]
+    return [folder.expanduser() for folder in folders or [options.root_option]]

@@ -5,7 +5,7 @@ import random
 from pathlib import Path
 
 from bhd_lerobot.data.edits import delete, keep, merge, split
-from bhd_lerobot.data.inspect import dataset_info
+from bhd_lerobot.data.inspect import check_not_empty, dataset_info
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.runs.data_command import Commands, add_command, root_of
 from bhd_lerobot.runs.episode_list import parse_episodes
@@ -15,28 +15,36 @@ def add_to(commands: Commands) -> None:
     """Add the four commands."""
     text = "one dataset of the episodes of several, which stay as they are"
     command = add_command(commands, "merge", text, _merge, names_dataset=False)
-    command.add_argument("roots", nargs="+", type=Path, help="folders of the datasets, in order")
-    command.add_argument("--output", type=Path, required=True, help="folder of the new dataset")
+    command.add_argument("roots", metavar="ROOT", nargs="+", type=Path, help="folders of the datasets, in order")
+    command.add_argument("--output", metavar="FOLDER", type=Path, required=True, help="folder of the new dataset")
 
     text = "a dataset of some episodes of another, which stays as it is"
     command = add_command(commands, "filter", text, _filter)
-    command.add_argument("--episodes", help="among these only, for example 0,3,5-9")
-    command.add_argument("--outcome", default="all", help="with these outcomes, for example success or stuck,timeout")
-    command.add_argument("--min_score", type=float, help="with at least this score, 0 to 1")
+    command.add_argument("--episodes", metavar="LIST", help="among these only, for example 0,3,5-9")
+    text = "with these outcomes, for example success or stuck,timeout; all is every outcome"
+    command.add_argument("--outcome", metavar="NAMES", help=text)
+    command.add_argument("--min_score", metavar="SCORE", type=float, help="with at least this score, 0 to 1")
     command.add_argument("--exclude_late", action="store_true", help="without those that have too many late frames")
-    command.add_argument("--output", type=Path, required=True, help="folder of the new dataset")
+    command.add_argument("--output", metavar="FOLDER", type=Path, required=True, help="folder of the new dataset")
 
     text = "remove episodes from a dataset, in place; the others are numbered anew"
     command = add_command(commands, "delete", text, _delete)
-    command.add_argument("--episodes", required=True, help="which, for example 0,3,5-9")
+    command.add_argument("--episodes", metavar="LIST", required=True, help="which, for example 0,3,5-9")
 
     text = "several datasets of the episodes of one, which stays as it is"
     command = add_command(commands, "split", text, _split)
     command.add_argument(
-        "--parts", required=True, help="names and shares, such as train=0.8,val=0.2, or episodes: train=0-7;val=8,9"
+        "--parts",
+        metavar="PARTS",
+        required=True,
+        help="names and shares, such as train=0.8,val=0.2, or episodes: train=0-7;val=8,9",
     )
-    command.add_argument("--shuffle_seed", type=int, help="deal the episodes out in an order drawn with this seed")
-    command.add_argument("--output", type=Path, required=True, help="folder in which the new datasets come to lie")
+    command.add_argument(
+        "--shuffle_seed", metavar="SEED", type=int, help="deal the episodes out in an order drawn with this seed"
+    )
+    command.add_argument(
+        "--output", metavar="FOLDER", type=Path, required=True, help="folder in which the new datasets come to lie"
+    )
 
 
 def _merge(options: argparse.Namespace) -> int:
@@ -46,12 +54,17 @@ def _merge(options: argparse.Namespace) -> int:
 
 def _filter(options: argparse.Namespace) -> int:
     root = root_of(options)
-    dataset_info(root)  # says what is wrong before LeRobot looks for it on the Hub
+    if options.episodes is None and options.outcome is None and options.min_score is None and not options.exclude_late:
+        raise ConfigError(
+            "filter needs to know which episodes are wanted: --episodes 0,3,5-9, --outcome success, --min_score 0.5 or "
+            "--exclude_late. With --outcome all it copies them all."
+        )
+    check_not_empty(dataset_info(root))  # says what is wrong before LeRobot looks for it on the Hub
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata  # seconds to import
 
     from bhd_lerobot.data.selection import EpisodeFilter
 
-    wanted = EpisodeFilter(options.outcome.split(","), options.min_score, options.exclude_late)
+    wanted = EpisodeFilter((options.outcome or "all").split(","), options.min_score, options.exclude_late)
     named = parse_episodes(options.episodes) if options.episodes is not None else None
     episodes = wanted.select(LeRobotDatasetMetadata(root.name, root=root), named)
     print(keep(root, episodes, options.output.expanduser()))
@@ -66,7 +79,9 @@ def _delete(options: argparse.Namespace) -> int:
 
 def _split(options: argparse.Namespace) -> int:
     root = root_of(options)
-    parts = parts_of(options.parts, len(dataset_info(root).episodes), options.shuffle_seed)
+    summary = dataset_info(root)
+    check_not_empty(summary)
+    parts = parts_of(options.parts, len(summary.episodes), options.shuffle_seed)
     for report in split(root, parts, options.output.expanduser()):
         print(report)
     return 0

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +15,8 @@ from rich.table import Table
 from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.inspect import DatasetSummary, dataset_info
-from bhd_lerobot.runs.data_command import Commands, add_command, root_of
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.runs.data_command import Commands, add_command, roots_of
 from bhd_lerobot.runs.timing_report import timing_of
 from bhd_lerobot.runs.timing_tables import fitting, ms
 
@@ -22,43 +24,84 @@ from bhd_lerobot.runs.timing_tables import fitting, ms
 def add_to(commands: Commands) -> None:
     """Add `info`."""
     help_text = "what is in a dataset: features, and outcome and timing of every episode; changes nothing"
-    command = add_command(commands, "info", help_text, _run)
-    command.add_argument("--json", action="store_true", help="print everything as JSON")
+    command = add_command(commands, "info", help_text, _run, takes_several=True)
+    how = command.add_mutually_exclusive_group()
+    how.add_argument("--short", action="store_true", help="a line for each dataset")
+    how.add_argument("--json", action="store_true", help="everything as JSON; of several datasets, a list")
 
 
 def _run(options: argparse.Namespace) -> int:
-    info(root_of(options), Console(), options.json)
+    roots = roots_of(options)
+    if options.short:
+        return short(roots)
+    if options.json:
+        told = [_plain(dataset_info(root)) for root in roots]
+        print(json.dumps(told if len(told) > 1 else told[0], indent=1))
+        return 0
+    for root in roots:
+        info(root, Console())
     return 0
 
 
-def info(root: Path, console: Console, as_json: bool = False) -> None:
+def short(roots: Sequence[Path]) -> int:
+    """Print a line for each dataset; return the exit status: 2 if one of them is none, after all were told."""
+    status = 0
+    for root in roots:
+        try:
+            print(_line(dataset_info(root)))
+        except DatasetError as error:
+            print(f"error: {error}", file=sys.stderr)
+            status = 2
+    return status
+
+
+def _line(summary: DatasetSummary) -> str:
+    parts = [
+        str(summary.robot_type),
+        *_amount(summary),
+        f"{summary.size / 1e6:.1f} MB",
+        *([_outcomes(summary)] if _outcomes(summary) else []),
+        *([] if summary.compact else ["not finalised"]),
+    ]
+    return f"{summary.root}: {', '.join(parts)}"
+
+
+def _amount(summary: DatasetSummary) -> list[str]:
+    if not summary.episodes:
+        return ["empty: no episodes"]
+    seconds = summary.frames / summary.fps
+    return [f"{len(summary.episodes)} episodes", f"{summary.frames} frames", f"{seconds:.0f} s"]
+
+
+def _outcomes(summary: DatasetSummary) -> str:
+    outcomes = Counter(str(e.metadata["outcome"]) for e in summary.episodes if "outcome" in e.metadata)
+    return ", ".join(f"{name} {count}" for name, count in outcomes.most_common())
+
+
+def info(root: Path, console: Console) -> None:
     """Print what is in a dataset.
 
     Raises:
         DatasetError: there is none, or a file cannot be read.
     """
     summary = dataset_info(root)
-    if as_json:
-        print(json.dumps(_plain(summary), indent=1))
-        return
     state = "finalised" if summary.compact else "not finalised: an interrupted recording; `bhd-data repair` finishes it"
-    table = Table(title=str(summary.root), title_justify="left", show_header=False)
-    table.add_row("robot", f"{summary.robot_type}, {summary.fps} frames/s")
-    table.add_row("episodes", f"{len(summary.episodes)}, {summary.frames} frames, {summary.frames / summary.fps:.0f} s")
+    table = Table(title=escape(str(summary.root)), title_justify="left", show_header=False)
+    table.add_row("robot", escape(f"{summary.robot_type}, {summary.fps} frames/s"))
+    table.add_row("content", ", ".join(_amount(summary)))
     table.add_row("files", f"{summary.files}, {summary.size / 1e6:.1f} MB, {state}")
-    table.add_row("tasks", "; ".join(summary.tasks))
+    table.add_row("tasks", escape("; ".join(summary.tasks)))
     for part in ("brain", "task"):
         if part in summary.recording:
             chosen = summary.recording[part]
-            table.add_row(part, ", ".join(f"{key} {value}" for key, value in chosen.items()))
+            table.add_row(part, escape(", ".join(f"{key} {value}" for key, value in chosen.items())))
     if "seed" in summary.recording:
         table.add_row("seed", f"{summary.recording['seed']} ({summary.recording.get('split')})")
     timings = [timing_of(episode) for episode in summary.episodes]
     if any(timings):
         table.add_row("timing", _timing([t for t in timings if t is not None]))
-    outcomes = Counter(str(e.metadata["outcome"]) for e in summary.episodes if "outcome" in e.metadata)
-    if outcomes:
-        table.add_row("outcomes", ", ".join(f"{name} {count}" for name, count in outcomes.most_common()))
+    if outcomes := _outcomes(summary):
+        table.add_row("outcomes", escape(outcomes))
     console.print(table)
     features = Table(title="Features", title_justify="left")
     for heading in ("key", "type", "shape", "meaning"):
@@ -67,11 +110,13 @@ def info(root: Path, console: Console, as_json: bool = False) -> None:
         # Units stand in square brackets, which rich would take for markup.
         features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), escape(meaning_of(key, feature)))
     console.print(features)
+    if not summary.episodes:
+        return
     episodes = Table(title="Episodes", title_justify="left")
     columns = _episode_columns(summary, timings)
     told = len({episode.task for episode in summary.episodes}) > 1
     # At least a few words of the instruction, if it is told; it wraps.
-    shown = fitting(columns, console.width - 33 * told) if summary.episodes else columns
+    shown = fitting(columns, console.width - 33 * told)
     for heading, _ in shown:
         episodes.add_column(heading, justify="left" if heading == "outcome" else "right", no_wrap=True)
     if told:

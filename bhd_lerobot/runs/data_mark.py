@@ -13,11 +13,13 @@ def add_to(commands: Commands) -> None:
     """Add `mark`."""
     text = "say how episodes ended or where somebody intervened; what was said before stays in meta/edits.jsonl"
     command = add_command(commands, "mark", text, _run)
-    command.add_argument("--episodes", required=True, help="which, for example 0,3,5-9")
-    command.add_argument("--outcome", help=f"how they ended: {', '.join(OUTCOMES)}")
-    command.add_argument("--intervention", help="first and last frame in which somebody intervened, such as 20-35")
+    command.add_argument("--episodes", metavar="LIST", required=True, help="which, for example 0,3,5-9")
+    text = f"how they ended: {', '.join(OUTCOMES)}; of the robots and tasks of this package, what they can end with"
+    command.add_argument("--outcome", metavar="NAME", help=text)
+    text = "first and last frame in which somebody intervened, such as 20-35"
+    command.add_argument("--intervention", metavar="FIRST-LAST", help=text)
     command.add_argument("--clear_interventions", action="store_true", help="take back all interventions")
-    command.add_argument("--note", default="", help="why; for the log")
+    command.add_argument("--note", metavar="TEXT", default="", help="why; for the log")
 
 
 def _run(options: argparse.Namespace) -> int:

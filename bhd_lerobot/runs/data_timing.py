@@ -19,9 +19,10 @@ def add_to(commands: Commands) -> None:
     help_text = "how punctual a recording was: tables and a picture; changes nothing"
     command = add_command(commands, "timing", help_text, _run)
     command.add_argument("--json", action="store_true", help="print everything as JSON")
-    command.add_argument("--episode", type=int, help="this episode only")
+    command.add_argument("--episode", metavar="NUMBER", type=int, help="this episode only")
     command.add_argument(
         "--output",
+        metavar="FILE",
         type=Path,
         help="picture, PNG, PDF or SVG; outputs/timing/NAME.png if nothing, and none with --json",
     )

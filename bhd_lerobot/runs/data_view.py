@@ -8,6 +8,7 @@ import webbrowser
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.runs.data_command import Commands, add_command, root_of
@@ -19,17 +20,18 @@ def add_to(commands: Commands) -> None:
     """Add `view`."""
     help_text = "look at a dataset in a browser: films, scan, plots, outcomes; Ctrl-C ends it"
     command = add_command(commands, "view", help_text, _run)
-    command.add_argument("--port", type=int, default=PORT, help=f"on 127.0.0.1; 0 for any free one; default {PORT}")
+    command.add_argument(
+        "--port", metavar="PORT", type=int, default=PORT, help=f"on 127.0.0.1; 0 for any free one; default {PORT}"
+    )
     command.add_argument("--no-browser", action="store_true", help="print the address only")
 
 
 def _run(options: argparse.Namespace) -> int:
-    view(root_of(options), Console(), port=options.port, open_browser=not options.no_browser)
-    return 0
+    return view(root_of(options), Console(), port=options.port, open_browser=not options.no_browser)
 
 
-def view(root: Path, console: Console, *, port: int = PORT, open_browser: bool = True) -> None:
-    """Serve the page of a dataset until Ctrl-C or SIGTERM.
+def view(root: Path, console: Console, *, port: int = PORT, open_browser: bool = True) -> int:
+    """Serve the page of a dataset until Ctrl-C or SIGTERM; return the exit status that says which.
 
     Args:
         root: the dataset.
@@ -54,13 +56,16 @@ def view(root: Path, console: Console, *, port: int = PORT, open_browser: bool =
     dataset = ViewedDataset(root)
 
     def ready(address: str) -> None:
-        console.print(f"{root}: {dataset.state.num_episodes} episodes at {address}", soft_wrap=True, highlight=False)
+        episodes = dataset.state.num_episodes
+        told = f"{episodes} episodes" if episodes else "empty, no episodes yet,"
+        console.print(f"{escape(str(root))}: {told} at {address}", soft_wrap=True, highlight=False)
         console.print("Ctrl-C ends it.")
         if open_browser and _has_display():
             webbrowser.open(address)
 
-    asyncio.run(serve(dataset, port, ready))
+    ended_by = asyncio.run(serve(dataset, port, ready))
     console.print("Ended.")
+    return 128 + ended_by
 
 
 def _has_display() -> bool:

@@ -40,6 +40,27 @@ OUTCOMES = tuple(event.cause for event in Event if event not in (Event.NOTHING, 
 """The events that an episode can end with, by name."""
 
 
+_NEVER: dict[str, tuple[Event, ...]] = {
+    "avoid": (Event.WRONG_OBJECT, Event.DROPPED, Event.UNREACHABLE),
+    "navigate": (Event.WRONG_OBJECT, Event.DROPPED),
+    "turtlebot3": (Event.WRONG_OBJECT, Event.DROPPED),
+    "reach": (Event.WRONG_OBJECT, Event.DROPPED, Event.STUCK),
+    "pick": (Event.STUCK,),
+}
+"""What cannot happen in a task, or to a robot: a base holds nothing, and only a base gets stuck."""
+
+
+def outcomes_of(task: str | None, robot: str | None) -> tuple[str, ...]:
+    """Return what an episode can end with, by name, whoever says so.
+
+    Args:
+        task: the task's type; None if it is not known.
+        robot: the robot's type; None if it is not known.
+    """
+    never = {event.cause for name in (task, robot) if name is not None for event in _NEVER.get(name, ())}
+    return tuple(name for name in OUTCOMES if name not in never)
+
+
 def episode_seed(seed: int, episode: int, split: Split) -> int:
     """Return the seed of an episode, a whole number below 2**63.
 

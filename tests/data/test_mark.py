@@ -1,18 +1,21 @@
 """What is said afterwards is everywhere where it belongs, and nothing else changes."""
 
+import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bhd_lerobot import tasks
 from bhd_lerobot.data.edits import edits_of
 from bhd_lerobot.data.inspect import dataset_info
 from bhd_lerobot.data.mark import mark
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.data.repair import repair
 from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.tasks.task import OUTCOMES, Event
+from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
 from tests.data import support
 from tests.data.edit_support import assert_sound, content, record, stack, steps_of
 from tests.data.kill_support import KillServer
@@ -171,3 +174,50 @@ def test_bad_requests_change_nothing(tmp_path: Path) -> None:
             mark(root, **wanted)
     assert content(root) == before
     assert edits_of(root) == []
+
+
+@pytest.mark.parametrize(
+    ("robot", "task", "impossible", "possible"),
+    [
+        ("turtlebot3", "avoid", ("dropped", "wrong_object", "unreachable"), ("stuck", "collision", "failure")),
+        ("turtlebot3", "navigate", ("dropped", "wrong_object"), ("unreachable", "stuck")),
+        ("turtlebot3", None, ("dropped",), ("stuck", "unreachable")),
+        ("ur5", "reach", ("stuck", "dropped"), ("unreachable", "collision")),
+        ("ur5", "pick", ("stuck",), ("dropped", "wrong_object", "unreachable")),
+        ("toy", None, (), ("stuck", "dropped")),
+    ],
+)
+def test_what_a_robot_or_a_task_cannot_end_with_is_refused(tmp_path, robot, task, impossible, possible) -> None:
+    recording = {"task": {"type": task}} if task else {}
+    with DatasetRecorder.create(
+        "t/t", 10, support.FEATURES, robot_type=robot, root=tmp_path / "d", recording=recording
+    ) as recorder:
+        support.record(recorder)
+    before = (tmp_path / "d/meta/info.json").stat().st_mtime_ns
+    for outcome in impossible:
+        with pytest.raises(ConfigError, match=f"cannot have ended with '{outcome}'.*Valid: success, ") as error:
+            mark(tmp_path / "d", [0], outcome=outcome)
+        valid = str(error.value).partition("Valid: ")[2].rstrip(".").split(", ")
+        assert set(valid) == set(outcomes_of(task, robot))
+        assert set(possible) <= set(valid)
+    assert (tmp_path / "d/meta/info.json").stat().st_mtime_ns == before
+    mark(tmp_path / "d", [0], outcome=possible[0])
+
+
+def test_of_a_mixture_each_episode_has_its_own_task(tmp_path) -> None:
+    with DatasetRecorder.create(
+        "t/t", 10, support.FEATURES, robot_type="ur5", root=tmp_path / "d", recording={}
+    ) as recorder:
+        for number, task in enumerate(("reach", "pick")):
+            writer = support.fill(recorder.begin_episode(), number)
+            recorder.save(writer, task="do it", metadata={"outcome": "success", "task": json.dumps({"type": task})})
+    mark(tmp_path / "d", [1], outcome="dropped")
+    with pytest.raises(ConfigError, match=r"Episode 0 of .* cannot have ended with 'dropped'"):
+        mark(tmp_path / "d", [1, 0], outcome="dropped")
+
+
+def test_no_task_ends_with_what_is_said_to_be_impossible() -> None:
+    for path in Path(tasks.__path__[0]).glob("*.py"):
+        named = {Event[name].cause for name in re.findall(r"\bEvent\.([A-Z_]+)\b", path.read_text())}
+        if path.stem in ("avoid", "navigate", "reach", "pick"):
+            assert named - {"nothing"} <= set(outcomes_of(path.stem, None))

@@ -1,10 +1,12 @@
 """bhd-data: what it shows, and what it says about what is broken."""
 
+import argparse
 import json
 import shutil
 
 import pytest
 
+from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.runs import data
 from tests.runs.support import run_record
 
@@ -34,6 +36,71 @@ def test_info_as_json_holds_everything(recorded, capsys):
         assert len(episode["metadata"]["initial_state"]) > 20
         assert set(json.loads(episode["metadata"]["versions"])) == {"bhd_lerobot", "lerobot", "mujoco", "numpy"}
     assert summary["recording"]["brain"]["type"] == "avoidance"
+
+
+def test_info_of_several_datasets(recorded, tmp_path, capsys):
+    other = tmp_path / "[b]other"  # square brackets are not markup
+    run_record(other, dataset__num_episodes=1, robot__beams=18)
+    assert data.main(["info", "--short", str(recorded), str(other)]) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"{recorded}: turtlebot3, 3 episodes, 90 frames, 9 s, ")
+    assert first.endswith(" MB, timeout 3")
+    assert second.startswith(f"{other}: turtlebot3, 1 episodes, 30 frames, 3 s, ")
+    # One that is none does not hide the others.
+    assert data.main(["info", str(tmp_path / "none"), str(recorded), "--short"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == first + "\n"
+    assert "does not exist" in captured.err
+    assert data.main(["info", "--json", str(recorded), str(other)]) == 0
+    assert [one["root"] for one in json.loads(capsys.readouterr().out)] == [str(recorded), str(other)]
+    assert data.main(["info", str(other), str(recorded)]) == 0
+    told = capsys.readouterr().out
+    assert str(other) in told.replace("\n", "")
+    assert told.count("Features") == 2
+
+
+def test_an_empty_dataset_is_called_empty(tmp_path, capsys):
+    features = {"action": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
+    root = tmp_path / "d"
+    DatasetRecorder.create("t/none", 10, features, robot_type="toy", root=root, recording={}).finalize()
+    new = ["--output", str(tmp_path / "new")]
+    for status, command in (
+        *((0, ["info"]), (0, ["info", "--short"]), (0, ["check"]), (0, ["repair"]), (1, ["check", "--strict"])),
+        *((2, ["timing"]), (2, ["filter", "--outcome", "all", *new]), (2, ["split", "--parts", "a=0.5", *new])),
+        *((2, ["delete", "--episodes", "0"]), (2, ["mark", "--episodes", "0", "--outcome", "failure"])),
+    ):
+        assert data.main([command[0], str(root), *command[1:]]) == status
+        captured = capsys.readouterr()
+        assert "empty" in captured.out + captured.err, command
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_dataset_is_named_in_one_way(recorded, capsys, monkeypatch):
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(recorded.parent))
+    for arguments in (["--repo_id", "d"], ["--root", str(recorded)], [str(recorded)]):
+        assert data.main(["repair", *arguments]) == 0
+    capsys.readouterr()
+    for arguments in (
+        [str(recorded), "--repo_id", "t/t"],
+        [str(recorded), "--root", "x"],
+        ["--root", "x", "--repo_id", "t/t"],
+        [],
+    ):
+        with pytest.raises(SystemExit) as stop:
+            data.main(["repair", *arguments])
+        assert stop.value.code == 2
+        error = capsys.readouterr().err
+        assert "name the dataset, in one way: its folder (ROOT or --root), or --repo_id" in error
+        assert all(one in error for one in arguments)
+
+
+def test_help_names_every_value_by_what_it_is():
+    """Not by the name that the program has for it, such as ROOT_OPTION."""
+    (commands,) = (one for one in data._parser()._actions if isinstance(one, argparse._SubParsersAction))
+    for name in ["info", "timing", "check", "repair", "mark", "merge", "filter", "delete", "split", "view"]:
+        for action in commands.choices[name]._actions:
+            assert action.nargs == 0 or (action.metavar and action.help), f"{name}: {action.dest}"
+            assert "_" not in str(action.metavar)
 
 
 def test_repair_of_a_sound_dataset_has_nothing_to_do(recorded, capsys):

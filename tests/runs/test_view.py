@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aiohttp import web
 
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.data.disk import RootLock
@@ -22,7 +23,7 @@ from bhd_lerobot.data.read import read_episode
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.data.state import load_state
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError
-from bhd_lerobot.runs import data
+from bhd_lerobot.runs import data, data_view
 from bhd_lerobot.runs.view.dataset import ViewedDataset, stamp_of
 from bhd_lerobot.runs.view.groups import MAX_LINES, names_of, scan_of, sections, unit_of
 from bhd_lerobot.runs.view.guard import TOKEN_HEADER, is_loopback
@@ -487,14 +488,15 @@ def test_a_film_that_is_not_there_is_missing_and_nothing_else_is(base, tmp_path,
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
-def test_the_command_serves_opens_a_browser_and_ends_with_ctrl_c(base, capsys, monkeypatch) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_serves_opens_a_browser_and_ends_with_a_signal(base, capsys, monkeypatch, number) -> None:
     seen = []
 
     def look(url: str) -> bool:
         def visit() -> None:
             with urllib.request.urlopen(url, timeout=20) as answer:
                 seen.append((url, answer.status, answer.read()))
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
 
         threading.Thread(target=visit).start()
         return True
@@ -502,7 +504,7 @@ def test_the_command_serves_opens_a_browser_and_ends_with_ctrl_c(base, capsys, m
     monkeypatch.setattr(webbrowser, "open", look)
     monkeypatch.setenv("DISPLAY", ":7")
     former = signal.getsignal(signal.SIGINT)
-    assert data.main(["view", str(base), "--port", "0"]) == 0
+    assert data.main(["view", str(base), "--port", "0"]) == 128 + number
     assert signal.getsignal(signal.SIGINT) is former
     ((url, status, page),) = seen
     assert status == 200
@@ -510,6 +512,20 @@ def test_the_command_serves_opens_a_browser_and_ends_with_ctrl_c(base, capsys, m
     told = capsys.readouterr().out
     assert f"2 episodes at {url}" in told
     assert url.startswith("http://127.0.0.1:")
+
+
+def test_ctrl_c_before_the_address_ends_in_the_same_way(base, capsys, monkeypatch) -> None:
+    start = web.TCPSite.start
+
+    async def interrupted(site: web.TCPSite) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        await start(site)
+
+    monkeypatch.setattr(web.TCPSite, "start", interrupted)
+    assert data.main(["view", str(base), "--port", "0", "--no-browser"]) == 130
+    monkeypatch.setattr(data_view, "Console", lambda: os.kill(os.getpid(), signal.SIGINT))
+    assert data.main(["view", str(base), "--port", "0", "--no-browser"]) == 130
+    assert "Stopped" in capsys.readouterr().err
 
 
 def test_a_port_in_use_is_named_with_the_remedy(base, capsys) -> None:

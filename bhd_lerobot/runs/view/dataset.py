@@ -16,6 +16,7 @@ from bhd_lerobot.data import features as keys
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock
 from bhd_lerobot.data.episode_table import PREFIX
+from bhd_lerobot.data.mark import possible_outcomes
 from bhd_lerobot.data.state import DatasetState, Row, corrupt, load_state, slot_of
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.runs.view.episode import packed_episode
@@ -198,10 +199,16 @@ def _summary(state: DatasetState, stamp: str) -> dict[str, Any]:
         "cameras": [_camera(key, feature) for key, feature in state.info["features"].items() if _is_film(feature)],
         "unfinished": (state.root / layout.STAGING).exists(),
         "tasks": list(tasks),
-        "outcomes": list(OUTCOMES),
+        "outcomes": _possible(state),
         "takes_interventions": keys.EVENT in state.info["features"],
         "episodes": columns,
     }
+
+
+def _possible(state: DatasetState) -> list[str]:
+    """Return the outcomes that some episode can be marked with, in their usual order."""
+    possible = {name for row in state.rows for name in possible_outcomes(state, row)}
+    return [name for name in OUTCOMES if name in possible]
 
 
 def _row(state: DatasetState, index: int) -> Row:

@@ -39,8 +39,8 @@ def application(dataset: ViewedDataset) -> web.Application:
     return app
 
 
-async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None]) -> None:
-    """Serve the page until SIGINT or SIGTERM.
+async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None]) -> signal.Signals:
+    """Serve the page until SIGINT or SIGTERM; return which it was.
 
     Args:
         dataset: what is shown.
@@ -52,9 +52,17 @@ async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None])
     """
     runner = web.AppRunner(application(dataset), access_log=None, shutdown_timeout=0.5)
     await runner.setup()
-    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    loop = asyncio.get_running_loop()
+    stop: asyncio.Future[signal.Signals] = loop.create_future()
     signals = (signal.SIGINT, signal.SIGTERM)
+
+    def end(number: signal.Signals) -> None:
+        if not stop.done():
+            stop.set_result(number)
+
     try:
+        for one in signals:
+            loop.add_signal_handler(one, end, one)
         try:
             await web.TCPSite(runner, HOST, port).start()
         except OSError as error:
@@ -62,10 +70,8 @@ async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None])
                 f"--port {port}: nothing can be served there on {HOST} ({error.strerror or error}). "
                 "Choose another port, or --port 0 for any that is free."
             ) from error
-        for one in signals:
-            loop.add_signal_handler(one, stop.set)
         ready(f"http://{HOST}:{runner.addresses[0][1]}/")
-        await stop.wait()
+        return await stop
     finally:
         for one in signals:
             loop.remove_signal_handler(one)
