@@ -54,6 +54,28 @@ class Film:
         assert reason is not None
         raise reason
 
+    def blind(self, track: Track, times: Times) -> int:
+        """Return how many frames at the beginning of an episode have no picture that can be decoded.
+
+        Args:
+            track: the camera's messages in the stretch in which the episode lies, sorted by time.
+            times: of the frames [ns].
+
+        Raises:
+            DatasetError: none of the first pictures can.
+        """
+        reason: DatasetError | None = None
+        rows, first = np.unique(newest(track.times, times), return_index=True)
+        for row, frame in zip(rows[:_TRIED].tolist(), first.tolist(), strict=False):
+            try:
+                self._decode(int(track.values[row, 0]))
+            except DatasetError as error:
+                reason = reason or error
+            else:
+                return int(frame)
+        assert reason is not None
+        raise reason
+
     def write(self, track: Track, times: Times, writer: EpisodeWriter) -> Times:
         """Add the picture of each frame to an episode; return when they were taken [ns], shape (frames,).
 
@@ -61,34 +83,38 @@ class Film:
         is there in its place, and its age says so.
 
         Args:
-            track: the camera's messages in the stretch in which the episode lies, sorted by time.
-            times: of the frames [ns].
+            track: as in `blind`.
+            times: of the frames [ns]; the first one has a picture that can be decoded.
             writer: the episode.
 
         Raises:
-            DatasetError: the first one cannot be decoded, or too many cannot.
+            DatasetError: too many cannot be decoded.
         """
         rows = newest(track.times, times)
+        total = len(np.unique(rows))
         image: NDArray[np.uint8] | None = None
-        shown, broken, reason, before = rows.copy(), set[int](), "", -1
+        shown, broken, reason, before, good = rows.copy(), 0, "", -1, -1
         for frame, row in enumerate(rows.tolist()):
             if row != before:
                 try:
                     image = self._decode(int(track.values[row, 0]))
                     good = row
                 except DatasetError as error:
-                    broken.add(row)
+                    broken += 1
                     reason = reason or str(error)
-                    if image is None or len(broken) > max(1, MOST * len(set(rows.tolist()))):
-                        raise
+                    if image is None or broken > max(1, MOST * total):
+                        raise DatasetError(
+                            f"{broken} of {total} pictures of an episode cannot be decoded, which is more than "
+                            f"{MOST:.0%}: too many to go on without them. The first: {reason}"
+                        ) from error
                 before = row
             assert image is not None
             shown[frame] = good
             writer.add_image(f"{keys.OBSERVATION_IMAGES}.{self.name}", image)
         if broken:
             self._notes.append(
-                f"{track.topic}: {len(broken)} of {len(set(rows.tolist()))} pictures cannot be decoded; the one before "
-                f"is there in their place. The first: {reason}"
+                f"{track.topic}: {broken} of {total} pictures of an episode cannot be decoded; the one before is there "
+                f"in their place. The first: {reason}"
             )
         return track.times[shown]
 

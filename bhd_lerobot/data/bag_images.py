@@ -16,6 +16,10 @@ from bhd_lerobot.errors import DatasetError
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _JPEG_QUALITY = 95
+# What image_transport writes of an rgb8 picture. It decodes with OpenCV, into blue, green, red; by the last word it
+# knows that red and blue have to change places.
+_FORMAT = "rgb8; jpeg compressed bgr8"
+_COLOURS = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of PIL with 8 bits
 # encoding of a raw image -> its type, channels, and where red, green and blue are in it
 _RAW = {
     "rgb8": (np.uint8, 3, (0, 1, 2)),
@@ -68,7 +72,7 @@ def encode_image(frames: Frames, frame_id: str, image: NDArray[np.uint8], *, com
 
         file = io.BytesIO()
         Image.fromarray(image).save(file, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
-        fields |= {"format": "rgb8; jpeg compressed rgb8", "data": np.frombuffer(file.getvalue(), np.uint8)}
+        fields |= {"format": _FORMAT, "data": np.frombuffer(file.getvalue(), np.uint8)}
         return encode(COMPRESSED, fields, 1)[0]
     height, width, _ = image.shape
     fields |= {"height": height, "width": width, "encoding": "rgb8", "step": 3 * width, "data": image.reshape(1, -1)}
@@ -82,13 +86,7 @@ def decode_image(topic: str, msgtype: str, message: bytes) -> NDArray[np.uint8]:
         DatasetError: it has an encoding that is not known, or is damaged.
     """
     if msgtype == COMPRESSED:
-        from PIL import Image
-
-        data = decode(msgtype, [message], ("data",))["data"][0]
-        try:
-            return np.asarray(Image.open(io.BytesIO(data.tobytes())).convert("RGB"))
-        except (OSError, ValueError) as error:
-            raise DatasetError(f"A picture of {topic} cannot be decoded: {error}.") from error
+        return _decompressed(topic, message)
     found = {path: values[0] for path, values in decode(msgtype, [message], _FIELDS).items()}
     encoding = found["encoding"]
     if encoding not in _RAW:
@@ -98,10 +96,32 @@ def decode_image(topic: str, msgtype: str, message: bytes) -> NDArray[np.uint8]:
     dtype, channels, order = _RAW[encoding]
     height, width, step = int(found["height"]), int(found["width"]), int(found["step"])
     data = found["data"]
-    if len(data) != height * step or step < width * channels:
+    if not height * width or len(data) != height * step or step < width * channels:
         raise DatasetError(f"A picture of {topic} has {len(data)} bytes, which is not {height} x {width} {encoding}.")
     rows = data.view(dtype).reshape(height, step)[:, : width * channels].reshape(height, width, channels)
     return np.ascontiguousarray(rows[:, :, order])
+
+
+def _decompressed(topic: str, message: bytes) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    found = {path: values[0] for path, values in decode(COMPRESSED, [message], ("format", "data")).items()}
+    what = f"{found['format']!r}, {len(found['data'])} bytes"
+    try:
+        image = Image.open(io.BytesIO(found["data"].tobytes()))
+        if image.mode in _COLOURS:
+            return np.asarray(image.convert("RGB"))
+    except Image.UnidentifiedImageError as error:
+        raise DatasetError(
+            f"A picture of {topic} ({what}) is neither JPEG nor PNG, and cannot be decoded. Of compressed depth "
+            "nothing is made."
+        ) from error
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise DatasetError(f"A picture of {topic} ({what}) cannot be decoded: {error}.") from error
+    raise DatasetError(
+        f"The pictures of {topic} ({what}) have more than 8 bits (mode {image.mode}), as of a depth camera; valid: "
+        "JPEG and PNG in colour or grey."
+    )
 
 
 _FIELDS = ("encoding", "height", "width", "step", "data")

@@ -171,8 +171,8 @@ class _RobotBag:
         Raises:
             DatasetError: its pictures cannot be decoded, or it was saved before.
         """
-        times = episode.grid.times
-        ages = episode.grid.ages.max(axis=0)
+        episode = self._with_pictures(episode)
+        times, ages = episode.grid.times, episode.grid.ages.max(axis=0)
         writer = recorder.begin_episode()
         try:
             for film in self._films:
@@ -194,6 +194,17 @@ class _RobotBag:
                 f"{self._wanted.max_age_s:g} s; control.late is true in them"
             )
         return len(times)
+
+    def _with_pictures(self, episode: _Episode) -> _Episode:
+        """Return an episode from the frame on at which every camera has a picture that can be decoded."""
+        grid = episode.grid
+        blind = max((film.blind(episode.tracks[film.role], grid.times) for film in self._films), default=0)
+        if blind:
+            self.notes.append(
+                f"{self._after_start(grid)}: the episode begins {blind} frames later, with the first picture that can "
+                "be decoded"
+            )
+        return _Episode(Grid(grid.times[blind:], grid.ages[:, blind:], grid.why), episode.tracks)
 
     def _refuse_again(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
         """Refuse a drive that is in another bag, too: one that was copied, or converted to another storage.

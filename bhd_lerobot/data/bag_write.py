@@ -16,6 +16,7 @@ from bhd_lerobot.errors import ConfigError, DatasetExistsError, unknown_name
 
 FORMATS = ("mcap", "sqlite3")
 _VERSION: Literal[8] = 8  # of rosbag2's metadata: the newest whose quality of service Humble reads, too
+_FOREVER = (9223372036, 854775807)  # [s, ns] 2^63 - 1 ns, which ROS 2 takes for no limit
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class BagWriter:
     def _connect(self, stream: Stream) -> Any:
         from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-        forever = QosTime(2147483647, 4294967295)
+        forever = QosTime(*_FOREVER)
         durability = QosDurability.TRANSIENT_LOCAL if stream.latched else QosDurability.VOLATILE
         profile = Qos(
             QosHistory.KEEP_LAST, 1 if stream.latched else 10, QosReliability.RELIABLE, durability,

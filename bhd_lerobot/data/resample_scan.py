@@ -30,7 +30,7 @@ def clean_ranges(ranges: NDArray[np.floating], lidar: LidarSpec, range_min: floa
     """
     values = np.asarray(ranges, np.float64)
     beyond = values > (range_max if range_max > 0 else np.inf)
-    near = np.isneginf(values) | ((values > 0) & (values < max(range_min, lidar.range_min)))
+    near = np.isneginf(values) | ((values > 0) & (values < np.fmax(range_min, lidar.range_min)))
     nothing = ~np.isfinite(values) | (values <= 0) | beyond
     return np.where(near, lidar.range_min, np.where(nothing, lidar.range_max, np.minimum(values, lidar.range_max)))
 

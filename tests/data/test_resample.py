@@ -123,6 +123,16 @@ def test_ranges_without_a_return_read_the_maximum_and_what_is_too_near_the_minim
     assert clean_ranges(np.array([0.2]), LIDAR, 0.25) == [near]
 
 
+@pytest.mark.parametrize(("range_min", "range_max"), [(0.0, 2.0), (np.nan, 2.0), (0.12, 2.0)])
+def test_what_a_scanner_says_beyond_its_range_is_no_return(range_min, range_max):
+    """By ROS's rule such a reading is none: some drivers write range_max + 1 where nothing came back."""
+    raw = np.array([0.0, 0.05, 1.9, 2.0, 2.1, 3.0, np.inf], np.float32)
+    far, near = LIDAR.range_max, LIDAR.range_min
+    assert clean_ranges(raw, LIDAR, range_min, range_max) == pytest.approx([far, near, 1.9, 2.0, far, far, far])
+    for unset in (0.0, -1.0, np.nan, np.inf):
+        assert clean_ranges(raw[4:6], LIDAR, 0.12, unset) == pytest.approx([2.1, 3.0])
+
+
 def world(angle):
     """Return a distance for every direction."""
     return 1.5 + 0.5 * np.cos(angle) + 0.3 * np.sin(2 * angle)

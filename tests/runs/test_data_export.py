@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
+import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -218,6 +220,49 @@ def test_rosbags_reads_it_with_the_embedded_definitions(turtlebot3, tmp_path, st
                 if one.ext.offered_qos_profiles[0].durability == QosDurability.TRANSIENT_LOCAL
             }
             assert latched == {"/tf_static", "/bhd/episode"}
+
+
+@pytest.mark.parametrize("robot", ["turtlebot3", "ur5"])
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_the_metadata_say_what_ros_asks_for(request, tmp_path, robot, storage):
+    bags = export(request.getfixturevalue(robot), tmp_path / "bags", "--one_bag", f"--format={storage}")
+    told = yaml.safe_load((bags / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert (told["version"], told["storage_identifier"]) == (8, storage)
+    for one in told["topics_with_message_count"]:
+        topic = one["topic_metadata"]
+        (profile,) = yaml.safe_load(topic["offered_qos_profiles"])  # a text in version 8
+        latched = topic["name"] in ("/tf_static", "/bhd/episode")
+        assert (profile["durability"], profile["depth"]) == ((1, 1) if latched else (2, 10))
+        assert (profile["history"], profile["reliability"]) == (1, 1)
+        forever = {"sec": 9223372036, "nsec": 854775807}
+        assert [profile[key] for key in ("deadline", "lifespan", "liveliness_lease_duration")] == [forever] * 3
+        assert re.fullmatch(r"RIHS01_[0-9a-f]{64}", topic["type_description_hash"])
+    # As ROS 2 computes it.
+    hashes = {one["topic_metadata"]["type"]: one["topic_metadata"]["type_description_hash"]
+              for one in told["topics_with_message_count"]}  # fmt: skip
+    if robot == "turtlebot3":
+        known = "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828"
+        assert hashes["sensor_msgs/msg/LaserScan"] == known
+
+
+@pytest.mark.parametrize("robot", ["turtlebot3", "ur5"])
+def test_every_frame_is_in_one_tree(request, tmp_path, robot):
+    bags = export(request.getfixturevalue(robot), tmp_path / "bags", "--episodes=0")
+    topics = decoded(bags / "episode_000000/episode_000000.mcap")
+    transforms = [one for name in ("/tf", "/tf_static") for _, message in topics[name] for one in message.transforms]
+    parents = {}
+    for one in transforms:
+        turn = one.transform.rotation
+        assert turn.x**2 + turn.y**2 + turn.z**2 + turn.w**2 == pytest.approx(1)
+        assert parents.setdefault(one.child_frame_id, one.header.frame_id) == one.header.frame_id
+    (root,) = set(parents.values()) - parents.keys()
+    assert root == {"turtlebot3": "odom", "ur5": "base"}[robot]
+    used = {message.header.frame_id for name, sent in topics.items() if not name.startswith(("/bhd", "/tf"))
+            for _, message in sent}  # fmt: skip
+    assert used - {""} <= {root, *parents}
+    # Nothing is sent before the transform that places it.
+    begin = min(stamp(one) for one in transforms)
+    assert all(stamp(message) >= begin for _, message in topics["/scan"])
 
 
 def test_the_same_dataset_gives_the_same_bytes(turtlebot3, tmp_path):

@@ -1,5 +1,6 @@
 """Import of bags in which something went wrong: on the robot, in the recorder, or in what was named."""
 
+import io
 import itertools
 import json
 import shutil
@@ -7,6 +8,7 @@ import sqlite3
 
 import numpy as np
 import pytest
+from PIL import Image
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from bhd_lerobot.data.inspect import dataset_info
@@ -298,3 +300,63 @@ def test_a_robot_in_a_namespace(tmp_path, messages, plain, capsys):
     topics = [f"--{role}=/tb3_1/{topic}" for role, topic in (("scan", "scan"), ("odom", "odom"), ("cmd", "cmd_vel"))]
     assert run(write(tmp_path / "bag", named), tmp_path / "d", *topics) == 0
     assert "turned by 180.0 degrees, from /tf_static" in capsys.readouterr().err
+
+
+# --- pictures and scanners ---------------------------------------------------------------------------------------
+
+
+def jpegs(count=40):
+    """Return compressed pictures at 10 Hz, each brighter than the one before."""
+    messages = []
+    for number in range(count):
+        file = io.BytesIO()
+        Image.fromarray(np.full((16, 24, 3), 5 * number, np.uint8)).save(file, "JPEG")
+        at = START + number * NANO // 10
+        message = bags.T["sensor_msgs/msg/CompressedImage"](
+            header=bags.header(at, "camera"), format="jpeg", data=np.frombuffer(file.getvalue(), np.uint8)
+        )
+        messages.append(("/image", at + 10**6, message))
+    return messages
+
+
+def test_pictures_that_are_lost_are_as_old_as_those_in_their_place(tmp_path, messages, capsys):
+    whole, arguments = jpegs(), ["--camera=front=/image", "--beams=36", "--max_age=0.25"]
+    bag = write(tmp_path / "whole", sorted([*messages, *whole], key=lambda one: one[1]))
+    imported(bag, tmp_path / "w", *arguments)
+    capsys.readouterr()
+    pictures = jpegs()
+    for place in (0, 1, 2, 20):
+        pictures[place][2].data = pictures[place][2].data[:100]  # the camera stumbled; its message is whole
+    bag = write(tmp_path / "bag", sorted([*messages, *pictures], key=lambda one: one[1]))
+    imported(bag, tmp_path / "d", *arguments)
+    error = capsys.readouterr().err
+    assert "pictures of an episode cannot be decoded; the one before is there in their place" in error
+    (_, begin), (_, began) = places(tmp_path / "w")[0], places(tmp_path / "d")[0]
+    skipped = round((began - begin) * 10)
+    assert 1 <= skipped <= 3
+    assert f"the episode begins {skipped} frames later, with the first picture that can be decoded" in error
+    ours, theirs = read_episode(tmp_path / "d", 0), read_episode(tmp_path / "w", 0)
+    older = ours["control.age"] - theirs["control.age"][skipped:]
+    assert (older >= 0).all()
+    assert (older > 0.01).sum() == 1  # where nothing else is as old
+    assert np.array_equal(ours["observation.state"], theirs["observation.state"][skipped:])
+    for place in range(3, 40, 3):
+        pictures[place][2].data = pictures[place][2].data[:100]
+    bag = write(tmp_path / "broken", sorted([*messages, *pictures], key=lambda one: one[1]))
+    error = refused(bag, tmp_path / "e", capsys, *arguments)
+    assert "pictures of an episode cannot be decoded, which is more than 10%" in error
+
+
+def test_a_scanner_of_shorter_reach_is_told(tmp_path, messages, capsys):
+    def short(at):
+        message = bags.scan(at - 5 * 10**6)
+        message.range_min, message.range_max = 0.0, 2.0
+        message.ranges[[0, 90, 180]] = np.inf, np.nan, 3.0
+        return message
+
+    imported(write(tmp_path / "bag", changed(messages, "/scan", short)), tmp_path / "d")
+    assert "/scan: the scanner sees to 2.00 m (range_max)" in capsys.readouterr().err
+    scan = read_episode(tmp_path / "d", 0)["observation.state"][:, 2:]
+    assert (scan[:, [0, 180]] == 3.5).all()
+    assert (scan[:, 90] < 2.0).all()  # a hole of one beam is what its neighbour is
+    assert scan[scan != 3.5].max() <= 2.0
