@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from bhd_lerobot.errors import ClusterError
 from bhd_lerobot.runs import cluster_remote
-from bhd_lerobot.runs.cluster import free_places, tell_machines
+from bhd_lerobot.runs.cluster import free_places, size_of, tell_crowd, tell_machines
 from bhd_lerobot.runs.cluster_config import RayConfig
 from bhd_lerobot.runs.cluster_job import Job
 from bhd_lerobot.runs.cluster_task import Call, Task, Worker, cause_of, error_of
@@ -45,6 +45,7 @@ class Crew:
         self._workers: list[Worker] = []
         self._calls: dict[Any, Call] = {}
         self._lost_early = 0
+        self._is_crowd_told = False
         self._failed: tuple[int, BaseException] | None = None  # from this task on there are no results, and why
         self._told: Counter[str] = Counter()
         self._facts: dict[str, str] = {}
@@ -76,6 +77,10 @@ class Crew:
         self._done: dict[int, Any] = {}
         self._failed = None
         self._wanted = self.workers_for(len(tasks))
+        crowd = "" if self._is_crowd_told else tell_crowd(self._config, self._wanted)
+        if crowd:
+            self._console.print(escape(crowd), soft_wrap=True, highlight=False)
+            self._is_crowd_told = True
         self._idle_since = time.monotonic()
         self._dismiss(lambda worker: bool(worker.tasks))  # what a run before left undone is not wanted any more
         for worker in self._workers:
@@ -102,8 +107,8 @@ class Crew:
         places = free_places(self._config)
         if not places:
             raise ClusterError(
-                f"No machine of the cluster has {self._size()} for a worker. There is: {tell_machines()}. Lower "
-                "--ray.cpus_per_worker or --ray.gpus_per_worker, or add a machine."
+                f"No machine of the cluster has {size_of(self._config)} for a worker. There is: {tell_machines()}. "
+                "Lower --ray.cpus_per_worker or --ray.gpus_per_worker, or add a machine."
             )
         return max(1, min(self._config.num_workers or places, tasks))
 
@@ -129,10 +134,6 @@ class Crew:
         """Raise what a worker raised, if it was before this task."""
         if self._failed is not None and number >= self._failed[0]:
             raise self._failed[1]
-
-    def _size(self) -> str:
-        gpus = self._config.gpus_per_worker
-        return f"{self._config.cpus_per_worker} CPUs" + (f" and {gpus:g} GPUs" if gpus else "")
 
     def _step(self, limit: int) -> None:
         """Keep all workers busy with tasks up to a number, and take in what was answered."""
@@ -248,8 +249,8 @@ class Crew:
         elif now - self._idle_since > self._config.timeout_s:
             raise ClusterError(
                 f"No worker could be started within {self._config.timeout_s:g} s (ray.timeout_s): each asks for "
-                f"{self._size()}, which others perhaps use. There is: {tell_machines()}. See `ray status`; what was "
-                "saved is there, go on with --resume=true."
+                f"{size_of(self._config)}, which others perhaps use. There is: {tell_machines()}. See `ray "
+                "status`; what was saved is there, go on with --resume=true."
             )
 
     def _check_facts(self, worker: Worker, facts: dict[str, str]) -> None:

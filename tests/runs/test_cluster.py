@@ -13,7 +13,6 @@ import threading
 import time
 from importlib import metadata
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,8 +20,8 @@ from rich.console import Console
 
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.data.video import count_frames
-from bhd_lerobot.errors import ActionError, ClusterError, ConfigError
-from bhd_lerobot.runs import cluster_loop, cluster_remote
+from bhd_lerobot.errors import ActionError, ClusterError
+from bhd_lerobot.runs import cluster_loop
 from bhd_lerobot.runs import evaluate as evaluate_module
 from bhd_lerobot.runs import record as record_module
 from bhd_lerobot.runs.cluster_config import RayConfig
@@ -406,6 +405,16 @@ def test_workers_that_no_machine_has_room_for_are_refused(cluster):
     assert "No machine of the cluster has 64 CPUs" in str(error)
 
 
+def test_how_many_workers_run_at_a_time_is_told_if_more_were_asked_for(cluster):
+    got, printed, error = run_crew(cluster, [fakes.ECHO] * 6, num_workers=5)
+    assert (got, error) == (list(range(6)), None)
+    assert "ray.num_workers is 5, and the cluster has room for 2 of 1 CPU: 2 run at a time." in printed
+    assert printed.count("1 CPUs and 0 GPUs") == 2  # the machines that have room, by name
+    # Nobody is told about workers that there is nothing to do for.
+    assert "at a time" not in run_crew(cluster, [fakes.ECHO] * 2, num_workers=5)[1]
+    assert "at a time" not in run_crew(cluster, [fakes.ECHO] * 6)[1]
+
+
 def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(cluster):
     import ray
 
@@ -431,85 +440,3 @@ def test_the_run_stops_when_it_is_told_to(cluster):
     assert len(got) < 1000
     raylets = {machine.all_processes["raylet"][0].process.pid for machine in cluster.spare}
     wait_until(lambda: not workers_of(raylets), "the end of the workers")
-
-
-# --- what is refused before there is a dataset ------------------------------------------------------------------------
-
-
-def test_a_machine_without_our_package_can_say_so(tmp_path):
-    cloudpickle = pytest.importorskip("ray.cloudpickle")
-    cloudpickle.register_pickle_by_value(cluster_remote)
-    try:
-        (tmp_path / "worker").write_bytes(cloudpickle.dumps(cluster_remote.RemoteWorker))
-    finally:
-        cloudpickle.unregister_pickle_by_value(cluster_remote)
-    program = (
-        "import sys; sys.modules['bhd_lerobot'] = None\n"
-        "import importlib.util, pickle; importlib.util.find_spec = lambda name: None\n"
-        "worker = pickle.load(open(sys.argv[1], 'rb'))()\n"
-        "print(worker.describe(('numpy', 'no_such_package'))['facts'])\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path / "worker")], capture_output=True, text=True, check=True
-    )
-    facts = eval(done.stdout)  # what was printed by the line above
-    assert facts["numpy"] == metadata.version("numpy")
-    assert facts["no_such_package"] == facts["source of bhd_lerobot"] == "not installed"
-
-
-def test_options_that_a_cluster_cannot_honour_are_refused(tmp_path):
-    pytest.importorskip("ray")
-    for wrong, message in (
-        ({"robot__clock": "realtime"}, "robot.clock is 'realtime'"),
-        ({"estop_key": "true"}, "estop_key is true"),
-        ({"engine": "dask"}, "Unknown engine 'dask'"),
-        ({"engine": "local", "ray__num_workers": 2}, "engine is 'local'"),
-        ({"ray__address": "ray://head:10001"}, "Ray's client"),
-        ({"ray__address": "head"}, "host:port"),
-        ({"ray__address": "head:123456"}, "host:port"),
-        ({"ray__num_workers": 0}, "ray.num_workers is 0"),
-        ({"ray__gpus_per_worker": 1.5}, "ray.gpus_per_worker is 1.5"),
-        ({"ray__timeout_s": 0}, "ray.timeout_s is 0"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            run_record(tmp_path / "data", **{"engine": "ray", **wrong})
-    assert not (tmp_path / "data").exists()
-
-
-def test_without_ray_the_command_to_install_it_is_told(tmp_path, monkeypatch):
-    from bhd_lerobot.runs import cluster_config
-
-    monkeypatch.setattr(cluster_config, "importlib", SimpleNamespace(util=SimpleNamespace(find_spec=lambda _: None)))
-    with pytest.raises(ConfigError, match=r"pip install 'lerobot_robot_bhd\[ray\]'"):
-        run_record(tmp_path / "data", engine="ray")
-
-
-def test_a_cluster_that_is_not_there_is_told_soon(tmp_path, monkeypatch):
-    import socket
-
-    pytest.importorskip("ray")
-    from bhd_lerobot.runs import cluster as cluster_module
-
-    monkeypatch.setattr(cluster_module, "_KNOCK_S", 0.3)
-    with socket.create_server(("127.0.0.1", 0)) as mute, socket.create_server(("127.0.0.1", 0)) as other:
-
-        def answer() -> None:
-            connection, _ = other.accept()
-            with connection:
-                connection.recv(100)
-                connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
-
-        threading.Thread(target=answer, daemon=True).start()
-        with socket.create_server(("127.0.0.1", 0)) as closed:
-            nobody = closed.getsockname()[1]
-        for address, message in (
-            (f"127.0.0.1:{nobody}", "cannot be reached"),
-            (f"127.0.0.1:{mute.getsockname()[1]}", "does not answer"),
-            (f"127.0.0.1:{other.getsockname()[1]}", "is no Ray cluster"),
-            ("no-such-host.invalid:6379", "cannot be reached"),
-        ):
-            with pytest.raises(ClusterError, match=message) as error:
-                run_record(tmp_path / "data", engine="ray", ray__address=address)
-            assert address in str(error.value)
-            assert "ray start --head" in str(error.value)
-    assert not (tmp_path / "data").exists()
