@@ -3,9 +3,11 @@
 The same files go to the same server on this machine and come back: to a Hub, beside `upload_folder` and
 `snapshot_download`; and to an S3-compatible store and a folder, beside fsspec's `put` and `get`. Ours checks the
 dataset before, compares it with a snapshot after, knows what is there already, and verifies the checksum of every file
-that comes. They run in turns, each in a place of its own; the first of each is not counted. Both clients of the Hub use
-HTTP, without Xet. Cards are left out: the bare clients make none. A folder on this machine has no goal: the system
-copies files within its own memory, faster than anybody reads them for a checksum.
+that comes. Each turn is A B B A, each push in a place of its own; the first turn is not counted. The servers are
+processes of their own and keep everything in memory, and files here are in memory, too, where there is room. The
+data are large, because each side has a start of some hundredths of a second that says nothing about its speed. Both
+clients of the Hub use HTTP, without Xet. Cards are left out: the bare clients make none. A folder on this machine has
+no goal: the system copies files within its own memory, faster than anybody reads them for a checksum.
 """
 
 import argparse
@@ -75,11 +77,12 @@ def took(move: Turn, folder: Path, name: str) -> float:
 
 
 @contextmanager
-def child(*arguments: str, folder: Path | None = None) -> Iterator[str]:
+def child(*arguments: str, folder: Path | None = None, **variables: str) -> Iterator[str]:
     """Run a server in a process of its own until the end of the block; yields the first line that it prints."""
     process = subprocess.Popen(
         [sys.executable, *arguments],
         cwd=folder,
+        env={**os.environ, **variables},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -146,7 +149,8 @@ def s3() -> Iterator[dict[str, Turn]]:
     """Run an S3-compatible store on this machine; yields the moves."""
     import fsspec  # type: ignore[import-untyped]
 
-    with child("-c", _MOTO) as url:
+    memory = {"MOTO_S3_DEFAULT_KEY_BUFFER_SIZE": str(1 << 30)}  # else it puts large objects into temporary files
+    with child("-c", _MOTO, **memory) as url:
         os.environ |= {
             "AWS_ENDPOINT_URL": url,
             "AWS_ACCESS_KEY_ID": "key",
@@ -159,21 +163,30 @@ def s3() -> Iterator[dict[str, Turn]]:
 
 
 def measure(moves: dict[str, Turn], root: Path, folder: Path, turns: int) -> dict[str, list[float]]:
-    """Return how long each move took, turn by turn [s]; who begins alternates."""
+    """Return how long the moves took, turn by turn [s].
+
+    In a turn each of two moves twice, in the order A B B A, so that what grows steadily, such as the server's memory,
+    weighs on both alike; who is A alternates. The first turn is not counted.
+    """
     times: dict[str, list[float]] = {"push": [], "bare push": [], "pull": [], "bare pull": []}
     for turn in range(turns + 1):
+        one, other = ("", "bare ") if turn % 2 else ("bare ", "")
         for way in ("push", "pull"):
-            names = [way, f"bare {way}"]
-            for name in names if turn % 2 else reversed(names):
-                place = f"{name.split()[0] if name == way else 'bare'}{turn}".replace("pull", "push")
-                here = root if way == "push" else folder / f"{place}_here"
+            spent = {"": 0.0, "bare ": 0.0}
+            for number, who in enumerate((one, other, other, one)):
+                place = f"{who.strip() or 'ours'}{turn}"
+                here = root if way == "push" else folder / "here"
+                if way == "push" and number >= 2:
+                    moves["forget"](root, place)  # what it pushed before, so that all of it is sent again
                 os.sync()  # what was written before is not paid for now
-                times[name].append(took(moves[name], here, place))
+                spent[who] += took(moves[f"{who}{way}"], here, place)
                 if way == "pull":
                     _same(root, here)
                     shutil.rmtree(here)
-        for place in (f"push{turn}", f"bare{turn}"):
-            moves["forget"](root, place)
+            for who, seconds in spent.items():
+                times[f"{who}{way}"].append(seconds / 2)
+        for who in ("ours", "bare"):
+            moves["forget"](root, f"{who}{turn}")
     return {name: values[1:] for name, values in times.items()}
 
 
@@ -197,17 +210,25 @@ def _load_client() -> ModuleType:
     return module
 
 
+def _shelf(megabytes: int) -> Path | None:
+    """Return a folder in memory, so that no disk is measured; None for the usual place."""
+    memory = Path("/dev/shm")
+    has_room = memory.is_dir() and shutil.disk_usage(memory).free > 5e6 * megabytes
+    return memory if has_room else None
+
+
 def main() -> int:
     """Print what was measured; return 1 if the goal was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--megabytes", type=int, default=200)
-    parser.add_argument("--files", type=int, default=8, help="about so many data files")
+    parser.add_argument("--megabytes", type=int, default=400)
+    parser.add_argument("--files", type=int, default=16, help="about so many data files")
     parser.add_argument("--turns", type=int, default=7)
+    parser.add_argument("--folder", type=Path, help="where files lie here; in memory, if there is room for them")
     parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
     options = parser.parse_args()
     results: dict[str, Any] = {"goal": GOAL}
     met = True
-    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+    with tempfile.TemporaryDirectory(dir=options.folder or _shelf(options.megabytes)) as name, ExitStack() as stack:
         folder = Path(name)
         size = record(folder / "data", options.megabytes, options.files)
         results["bytes"] = size

@@ -65,6 +65,8 @@ class StoreDataset:
         self.folder: Path | None = Path(self._root) if not LOCAL.isdisjoint(kinds) else None
         # Others, such as FTP, have one connection for all threads.
         self._workers = WORKERS if self._fs.async_impl or not {*LOCAL, "memory"}.isdisjoint(kinds) else 1
+        # Those that are asynchronous do all downloads in one thread: ours wait for it, or make checksums meanwhile.
+        self._fetchers = 2 * WORKERS if self._fs.async_impl else self._workers
         self._known: dict[str, RemoteFile] = {}
         self._is_noted = True  # whether the list there says what is known
         self._there: dict[str, RemoteFile] = {}
@@ -142,7 +144,7 @@ class StoreDataset:
             part.replace(folder / path)
 
         with store_errors(self.name, "download"):
-            run_all(fetch_one, largest_first(paths, self._there), self._workers)
+            run_all(fetch_one, largest_first(paths, self._there), self._fetchers)
 
     def send(self, items: Sequence[Item], deleted: Sequence[str], check: Callable[[], None]) -> None:
         """Write files and remove others; the list of files after each batch, and `meta/info.json` last.
