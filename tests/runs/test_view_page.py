@@ -15,7 +15,6 @@ import pytest
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.runs.view.packing import unpack
 from tests.data.loader_support import FRONT, PHOTO, WRIST, images, length, record_ours, record_stock
-from tests.runs.support import run_record
 from tests.runs.view_support import Served, served
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -36,22 +35,6 @@ def browser() -> Iterator[Any]:
         chromium = playwright.chromium.launch(executable_path=found, args=list(ARGUMENTS))
         yield chromium
         chromium.close()
-
-
-@pytest.fixture(scope="module")
-def base(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("page") / "base"
-    small = {"robot__camera": "true", "robot__camera_width": 64, "robot__camera_height": 48, "n_envs": 2}
-    run_record(root, **small, dataset__num_episodes=3, dataset__episode_time_s=2, seed=4)
-    return root
-
-
-@pytest.fixture(scope="module")
-def arm(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("page") / "arm"
-    kinds = {"robot__type": "ur5", "brain__type": "pick", "task__type": "pick", "robot__beams": None}
-    run_record(root, **kinds, dataset__num_episodes=2, dataset__episode_time_s=20, n_envs=2, seed=4)
-    return root
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from aiohttp import web
 
 from bhd_lerobot.runs.view.dataset import ViewedDataset
 from bhd_lerobot.runs.view.guard import TOKEN_HEADER
+from bhd_lerobot.runs.view.packing import unpack
 from bhd_lerobot.runs.view.server import HOST, application
 
 
@@ -49,6 +51,13 @@ class Served:
             f"/api/episodes/{index}/mark", method="POST", body=what, headers={TOKEN_HEADER: self.token(), **headers}
         )
         return status, content
+
+
+def episode(server: Served, index: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return what the page is sent of an episode."""
+    status, _, content = server.ask(f"/api/episodes/{index}")
+    assert status == 200, content
+    return unpack(content)
 
 
 @contextmanager
