@@ -102,7 +102,8 @@ def _state(wanted: RobotImport, tracks: Mapping[str, Track], times: Times) -> ND
 
     scan, odom = at("scan"), at("odom")
     columns = dict(zip(TWIST, odom[:, :2].T, strict=True))
-    columns |= dict(zip(ODOMETRY, _since_start(odom[:, 2:]).T, strict=True))
+    if wanted.tracks.pose:
+        columns |= dict(zip(ODOMETRY, _since_start(odom[:, 2:]).T, strict=True))
     columns |= {f"scan_{beam:03d}.pos": scan[:, beam] for beam in range(scan.shape[1])}
     if "imu" in tracks:
         columns |= dict(zip(GYRO, at("imu").T, strict=True))

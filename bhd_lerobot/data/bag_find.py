@@ -95,7 +95,7 @@ def _without_metadata(path: Path, files: list[Path], problem: str) -> Bag:
             f"{path} has no usable metadata.yaml, and files of two storages: {there}. They may be the same recording "
             "twice; name the one that is to be imported."
         )
-    return Bag(path, plain, problems=problems)
+    return Bag(path, _filled(path, plain, problems), problems=problems)
 
 
 def _listed(path: Path, names: list[str], files: list[Path], problems: list[str]) -> list[Path]:
@@ -122,7 +122,17 @@ def _listed(path: Path, names: list[str], files: list[Path], problems: list[str]
             f"{path.name}: {', '.join(more)} is not in metadata.yaml, and is not read; name the file itself to import "
             "it, too"
         )
-    return _in_order(path, listed, problems)
+    return _in_order(path, _filled(path, listed, problems), problems)
+
+
+def _filled(path: Path, files: list[Path], problems: list[str]) -> list[Path]:
+    """Return files without those that have not a single byte, as after a power cut; all if none has."""
+    filled = [file for file in files if file.stat().st_size]
+    if not filled or len(filled) == len(files):
+        return files
+    empty = ", ".join(file.name for file in files if file not in filled)
+    problems.append(f"{path.name}: {empty} is empty, and left out")
+    return filled
 
 
 def _in_order(path: Path, listed: list[Path], problems: list[str]) -> list[Path]:

@@ -1,5 +1,6 @@
 """Qualities of service that a recorder wrote of a topic: one for each publisher that there was."""
 
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -13,8 +14,14 @@ def offered(profiles: Any) -> int:
             the channels of MCAP files; a list in version 9. What is no such thing says nothing.
     """
     if isinstance(profiles, str):
-        try:
-            profiles = yaml.safe_load(profiles)
-        except yaml.YAMLError:
-            return 0
+        return _listed(profiles)
+    return len(profiles) if isinstance(profiles, list) else 0
+
+
+@lru_cache(maxsize=256)  # a bag has few that differ, and YAML is slow
+def _listed(text: str) -> int:
+    try:
+        profiles = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return 0
     return len(profiles) if isinstance(profiles, list) else 0

@@ -3,7 +3,6 @@
 import contextlib
 import shutil
 import tempfile
-from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -70,24 +69,6 @@ class Messages:
         return Messages(self.received[mask], self.order[mask], self.sizes[mask], data)
 
 
-class _Collected:
-    """Messages of a topic while they are read."""
-
-    def __init__(self, size: int | None) -> None:
-        self.size = size  # of what is kept of each; all if None
-        self.received, self.order, self.sizes, self.data = array("q"), array("q"), array("q"), list[bytes]()
-
-    def add(self, received: int, place: int, payload: bytes) -> None:
-        self.received.append(received)
-        self.order.append(place)
-        self.sizes.append(len(payload))
-        self.data.append(payload if self.size is None else payload[: self.size])
-
-    def messages(self) -> Messages:
-        received, order, sizes = (np.array(one, np.int64) for one in (self.received, self.order, self.sizes))
-        return Messages(received, order, sizes, self.data)
-
-
 @dataclass
 class Bag:
     """A bag.
@@ -151,10 +132,11 @@ class Bag:
         Raises:
             DatasetError: a file cannot be read at all.
         """
-        found = {name: _Collected(_HEAD_BYTES if name in heads else None) for name in (*topics, *heads)}
-        walk = _Walk(self, found)
+        rows: dict[str, list[tuple[int, int, int, bytes]]] = {name: [] for name in (*topics, *heads)}
+        walk = _Walk(self, rows)
         for name, received, place, payload in walk.messages():
-            found[name].add(received, place, payload)
+            kept = payload[:_HEAD_BYTES] if name in heads else payload
+            rows[name].append((received, place, len(payload), kept))
         problems = walk.problems
         if walk.lost:
             problems.append(
@@ -168,7 +150,7 @@ class Bag:
         if self.expected is not None and walk.total < self.expected and not problems:
             problems.append(f"{self.path.name}: its metadata count {self.expected} messages; it has {walk.total}")
         self._note(problems)
-        return {name: one.messages() for name, one in found.items()}
+        return {name: _messages(found) for name, found in rows.items()}
 
     def payloads(self, topic: str) -> Iterator[tuple[int, bytes]]:
         """Yield the messages of a topic that `read` has: their places among all messages of the bag, and all bytes."""
@@ -182,6 +164,11 @@ class Bag:
         for path in self.files:
             with _plain(path) as plain, contextlib.closing(FILES[plain.suffix](plain)) as file:
                 yield file
+
+
+def _messages(rows: list[tuple[int, int, int, bytes]]) -> Messages:
+    received, order, sizes, data = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return Messages(np.array(received, np.int64), np.array(order, np.int64), np.array(sizes, np.int64), list(data))
 
 
 class _Walk:
@@ -201,28 +188,30 @@ class _Walk:
 
     def messages(self) -> Iterator[tuple[str, int, int, bytes]]:
         """Yield topic, receive time [ns], place among all messages, and bytes."""
+        total = 0
         for file in self._bag._open():
             names: dict[int, str] = {}
             for channel, received, buffer, first, last in file.messages():
-                self.total += 1
-                name = names.get(channel)
-                if name is None:
+                total += 1
+                if channel not in names:
                     told = file.channels.get(channel, ("",))[0]
-                    name = names[channel] = told if told in self._wanted else ""
+                    names[channel] = told if told in self._wanted else ""
+                name = names[channel]
                 if not name:
                     continue
                 payload = bytes(buffer[first:last])
-                if payload.startswith(_ZSTD):  # a serialised message never does
+                if payload[:4] == _ZSTD:  # a serialised message never begins so
                     self.packed += 1
                     try:
                         payload = zstd().decompress(payload)
                     except Exception:  # of whichever zstd there is
                         self.lost += 1
                         continue
-                if not 0 <= received < _END_OF_TIME:
+                if 0 <= received < _END_OF_TIME:
+                    yield name, received, total, payload
+                else:
                     self.lost += 1
-                    continue
-                yield name, received, self.total, payload
+            self.total = total
             self.problems += file.problems
 
 

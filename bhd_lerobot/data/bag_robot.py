@@ -20,9 +20,10 @@ from bhd_lerobot.data.bag_tracks import Track, read_tracks, seconds
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.data.resample import NANO, Grid, grids
-from bhd_lerobot.data.ros2_base import ODOMETRY
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.tasks.task import Event
+
+_TOLD = 8  # sentences in an error; a damaged bag may give hundreds
 
 
 def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wanted: RobotImport) -> ImportReport:
@@ -63,7 +64,7 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
             report.notes += [f"{bag.path.name}: {note}" for note in robot_bag.notes]
         if recorder is None:
             sensors = ", ".join(topic for role, topic in wanted.topics.items() if role != "cmd")
-            told = "; ".join([*report.notes, *report.problems])
+            told = "; ".join([*report.problems, *report.notes][:_TOLD])
             raise DatasetError(
                 f"No episode of {wanted.min_episode_s:g} s or more came out of {', '.join(str(b.path) for b in bags)}: "
                 f"there is no such time in which {sensors} were heard at least every {wanted.max_gap_s:g} s. {told}"
@@ -126,7 +127,7 @@ class _RobotBag:
         parts = stretches(
             self._tracks,
             stamps=wanted.tracks.stamps,
-            max_speed=wanted.max_speed if set(ODOMETRY) & set(wanted.observation_names) else None,
+            max_speed=wanted.max_speed if wanted.tracks.pose else None,
             max_gap_s=wanted.max_gap_s,
             notes=self.notes,
         )

@@ -34,6 +34,7 @@ class TrackOptions:
         stamps: ``"auto"``, ``"header"`` or ``"receive"``.
         scan_frame, odom_frame: frames that the user says are the scanner's and the base's.
         scan_yaw: angle of the scanner in the robot [rad], if the user says it.
+        pose: whether the odometry's pose is wanted, beside its speeds.
     """
 
     topics: Mapping[str, str]
@@ -44,6 +45,7 @@ class TrackOptions:
     scan_frame: str | None = None
     odom_frame: str | None = None
     scan_yaw: float | None = None
+    pose: bool = False
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,8 @@ def _values(role: str, topic: Topic, messages: Messages, reading: _Reading) -> A
     if role == "odom":
         children = decode(topic.msgtype, data, ("child_frame_id",))["child_frame_id"].tolist()
         frames.check_base_frame(topic.name, frames.the_frame(topic.name, children), reading.options.odom_frame)
-        return np.concatenate(odometry(data), axis=1)
+        speeds, pose = odometry(data)
+        return np.concatenate([speeds, pose], axis=1) if reading.options.pose else speeds
     if role == "cmd":
         kind = BareTwistPart if topic.msgtype == BareTwistPart.msgtype else TwistPart
         return kind(topic.name, ()).decode(data)

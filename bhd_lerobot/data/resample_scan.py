@@ -12,6 +12,7 @@ from bhd_lerobot.errors import DatasetError
 
 Array = NDArray[np.float64]
 _GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max")
+_WIDEST = np.radians(10.0)  # between a beam of ours and the one it is made of; a few beams are no view all around
 
 
 def clean_ranges(ranges: NDArray[np.floating], lidar: LidarSpec, range_min: float, range_max: float = np.inf) -> Array:
@@ -67,7 +68,8 @@ def nearest_beams(sweep: Sweep, beams: int, rotation: tuple[float, ...], topic: 
     wanted = 2 * np.pi * np.arange(beams) / beams
     away = np.abs((measured[None] - wanted[:, None] + np.pi) % (2 * np.pi) - np.pi)
     nearest = away.argmin(axis=1)
-    far = away.min(axis=1) > max(2 * np.pi / beams, 1.5 * abs(angle_increment)) + 1e-9
+    reach = max(2 * np.pi / beams, min(1.5 * abs(angle_increment), _WIDEST))
+    far = away.min(axis=1) > reach + 1e-9
     if far.any():
         seen = np.degrees(abs(angle_increment) * (count - 1))
         raise DatasetError(

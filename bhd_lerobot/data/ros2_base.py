@@ -89,7 +89,10 @@ class OdometryPart(Part):
 
 
 def odometry(messages: Sequence[bytes]) -> tuple[Array, Array]:
-    """Return forward speeds and yaw rates, shape (n, 2), and x, y and unwrapped yaw, shape (n, 3)."""
+    """Return forward speeds and yaw rates, shape (n, 2), and x, y and unwrapped yaw, shape (n, 3).
+
+    The yaw of a quaternion that was never set, all zeros, is not a number.
+    """
     pose, twist = "pose.pose.", "twist.twist."
     paths = [f"{twist}linear.x", f"{twist}angular.z", f"{pose}position.x", f"{pose}position.y"]
     turns = [f"{pose}orientation.{axis}" for axis in WXYZ]
@@ -98,6 +101,7 @@ def odometry(messages: Sequence[bytes]) -> tuple[Array, Array]:
     flat = (x == 0) & (y == 0)
     # Half the angle is precise also where a yaw of exactly zero, or one with its sign, has to come back.
     yaw = np.where(flat, 2 * np.arctan2(z, w), np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    yaw[(w == 0) & flat & (z == 0)] = np.nan
     speed, turn, east, north = (found[path] for path in paths)
     return np.stack([speed, turn], axis=1), np.stack([east, north, _unwrapped(yaw)], axis=1)
 

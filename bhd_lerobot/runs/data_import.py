@@ -154,6 +154,7 @@ def _wanted(options: argparse.Namespace) -> RobotImport:
             scan_frame=options.scan_frame,
             odom_frame=options.odom_frame,
             scan_yaw=options.scan_yaw,
+            pose=options.odometry,
         ),
         max_speed=body.limits.velocity,
         max_age_s=max_age,

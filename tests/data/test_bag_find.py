@@ -91,6 +91,14 @@ def test_a_file_that_is_not_listed_is_told(split, messages):
     assert "drive_2.mcap is not in metadata.yaml, and is not read" in found.problems[0]
 
 
+def test_an_empty_file_of_a_recording_is_left_out_and_told(split, messages):
+    bag = split(["drive_0.mcap", "drive_1.mcap", "drive_2.mcap", "drive_3.mcap"])
+    (bag / "drive_3.mcap").touch()
+    check(bag, messages, "drive_3.mcap is empty")
+    (bag / "metadata.yaml").unlink()
+    check(bag, messages, "no metadata.yaml", "drive_3.mcap is empty")
+
+
 def test_metadata_that_list_nothing_or_no_list_are_told(split, messages):
     bag = split([])
     check(bag, messages, "metadata.yaml lists no file")

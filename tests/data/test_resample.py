@@ -170,6 +170,12 @@ def test_a_scanner_that_does_not_see_all_around_is_refused():
         nearest_beams(Sweep(271, -np.radians(135), np.radians(1)), 360, STRAIGHT, "/scan")
 
 
+@pytest.mark.parametrize("count", [1, 2, 8, 17])
+def test_a_few_beams_are_no_view_all_around(count):
+    with pytest.raises(DatasetError, match="have no beam within reach of"):
+        nearest_beams(Sweep(count, 0.0, 2 * np.pi / count), 360, STRAIGHT, "/scan")
+
+
 def test_a_scan_that_is_none_counts_as_lost():
     geometry = {name: np.array([0.0, 0.1, np.nan]) for name in GEOMETRY}
     ranges = np.empty(3, object)

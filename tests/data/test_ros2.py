@@ -85,6 +85,19 @@ def test_constants_of_the_messages_are_those_of_the_program(definition, prefix, 
     assert values == {int(one) for one in enum if prefix == "" or int(one)}
 
 
+@pytest.mark.parametrize(
+    ("names", "velocity"), [(["b_joint", "a_joint"], [1.0, 2.0]), (["a_joint", "b_joint"], []), (["a_joint"], [1.0])]
+)
+def test_joints_in_another_order_or_without_speeds_are_not_taken_for_ours(names, velocity):
+    (part,) = parts_of("observation.state", ["a.pos", "b.pos", "a.vel", "b.vel"], "ur5", lidar=None)
+    values = np.array([[1.0, 2.0, 3.0, 4.0]])
+    frames = Frames(0, np.array([0]), np.array([10**18]))
+    assert np.array_equal(part.decode(part.encode(frames, values)), values)
+    fields = {"header": header(frames.stamps), "name": names, "position": values[:, : len(names)], "velocity": velocity}
+    with pytest.raises(DatasetError, match=r"joint"):
+        part.decode(encode(JOINTS, fields, 1))
+
+
 def test_of_an_unknown_robot_everything_is_plain_numbers():
     names = ["x.vel", "theta.vel", "shoulder.pos"]
     (part,) = parts_of("observation.state", names, "so100", lidar=None)

@@ -190,6 +190,19 @@ def test_a_drive_without_a_reset_stays_whole(tmp_path, messages, capsys):
     assert len(places(tmp_path / "d")) == 1
 
 
+def test_a_pose_that_was_never_set_matters_only_where_it_is_observed(tmp_path, messages, capsys):
+    def unset(at):
+        message = bags.odometry(at - 5 * 10**6)
+        message.pose.pose.position.x = float("nan")
+        message.pose.pose.orientation.w = message.pose.pose.orientation.z = 0.0
+        return message
+
+    bag = write(tmp_path / "bag", changed(messages, "/odom", unset))
+    assert len(imported(bag, tmp_path / "d").episodes) == 1
+    assert "not finite" not in capsys.readouterr().err
+    assert "no message of /odom has finite values" in refused(bag, tmp_path / "e", capsys, "--odometry")
+
+
 def test_a_pose_that_jumps_all_the_time_is_refused(tmp_path, messages, capsys):
     jumping = changed(messages, "/odom", lambda at: reset_odometry(at, dx=float(at // 10**8 % 2)))
     error = refused(write(tmp_path / "bag", jumping), tmp_path / "d", capsys, "--odometry", "--beams=36")
