@@ -19,7 +19,7 @@ from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.check_dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.data.check_values import Limits
 from bhd_lerobot.data.fix import fix
-from bhd_lerobot.runs.data_command import Commands, add_command, root_of
+from bhd_lerobot.runs.data_command import Commands, Terminal, add_command, root_of
 
 # No option of a robot changes its limits, and its configuration takes seconds to import.
 _BODIES: dict[str | None, Callable[[], Arm | MobileBase]] = {"turtlebot3": turtlebot3_burger, "ur5": ur5}
@@ -43,7 +43,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.fix:
         for line in fix(root, check_dataset(root, limits_of, videos=videos).findings):
             print(f"fixed {line}", file=sys.stderr if options.json else sys.stdout)
-    return check(root, Console(), as_json=options.json, is_strict=options.strict, videos=videos)
+    return check(root, Terminal(), as_json=options.json, is_strict=options.strict, videos=videos)
 
 
 def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, videos: bool) -> int:

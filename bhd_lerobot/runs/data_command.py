@@ -4,6 +4,8 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from rich.console import Console
+
 from bhd_lerobot.data.identity import default_root
 
 type Commands = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -11,6 +13,18 @@ type Commands = argparse._SubParsersAction[argparse.ArgumentParser]
 
 type Run = Callable[[argparse.Namespace], int]
 """Carries a command out and returns the exit status."""
+
+
+class Terminal(Console):
+    """Where a command prints. One that is read no longer, as of ``| head -1``, is for the program to mind."""
+
+    def on_broken_pipe(self) -> None:
+        """Do not end with status 1, which says something else of some commands.
+
+        Raises:
+            BrokenPipeError: always.
+        """
+        raise BrokenPipeError
 
 
 def add_command(

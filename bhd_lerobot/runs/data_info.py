@@ -16,7 +16,7 @@ from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.inspect import DatasetSummary, dataset_info
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.runs.data_command import Commands, add_command, roots_of
+from bhd_lerobot.runs.data_command import Commands, Terminal, add_command, roots_of
 from bhd_lerobot.runs.timing_report import timing_of
 from bhd_lerobot.runs.timing_tables import fitting, ms
 
@@ -39,7 +39,7 @@ def _run(options: argparse.Namespace) -> int:
         print(json.dumps(told if len(told) > 1 else told[0], indent=1))
         return 0
     for root in roots:
-        info(root, Console())
+        info(root, Terminal())
     return 0
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.runs.data_command import Commands, add_command, root_of
+from bhd_lerobot.runs.data_command import Commands, Terminal, add_command, root_of
 from bhd_lerobot.runs.timing_report import load_timing
 from bhd_lerobot.runs.timing_tables import print_timing
 
@@ -30,7 +30,7 @@ def add_to(commands: Commands) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     output = options.output.expanduser() if options.output is not None else None
-    timing(root_of(options), Console(), options.episode, output, options.json)
+    timing(root_of(options), Terminal(), options.episode, output, options.json)
     return 0
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.runs.data_command import Commands, add_command, root_of
+from bhd_lerobot.runs.data_command import Commands, Terminal, add_command, root_of
 
 PORT = 8766
 
@@ -27,7 +27,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    return view(root_of(options), Console(), port=options.port, open_browser=not options.no_browser)
+    return view(root_of(options), Terminal(), port=options.port, open_browser=not options.no_browser)
 
 
 def view(root: Path, console: Console, *, port: int = PORT, open_browser: bool = True) -> int:

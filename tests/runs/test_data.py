@@ -2,13 +2,20 @@
 
 import argparse
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.runs import data
 from tests.runs.support import run_record
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +145,18 @@ def test_no_dataset_and_no_argument(tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         data.main(["info"])
     assert stop.value.code == 2
+
+
+@pytest.mark.parametrize("arguments", [["info"], ["info", "--json"], ["check"]])
+def test_output_that_nobody_reads_ends_the_command_without_a_word(recorded, arguments):
+    command = [sys.executable, "-m", "bhd_lerobot.runs.data", *arguments, str(recorded)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run(
+            command, env=environment, stdout=writing, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, check=False
+        )
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
