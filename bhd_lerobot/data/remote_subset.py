@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import to_json
 from bhd_lerobot.data.remote import SUBSET
+from bhd_lerobot.data.remote_info import parse_info
 from bhd_lerobot.data.state import corrupt
 from bhd_lerobot.errors import DatasetError
 
@@ -37,12 +38,15 @@ def files_of(root: Path, episodes: Sequence[int]) -> set[str]:
         DatasetCorruptError: the metadata cannot be read.
     """
     try:
-        info = json.loads((root / layout.INFO).read_bytes())
+        info = parse_info((root / layout.INFO).read_bytes(), str(root))
         rows = [row for path in _tables(root) for row in _rows(path)]
         by_index = {row["episode_index"]: row for row in rows}
     except (OSError, ValueError, KeyError) as error:
         raise corrupt(root / layout.INFO, error) from error
     unknown = [episode for episode in episodes if episode not in by_index]
+    if lost := [episode for episode in unknown if 0 <= episode < info["total_episodes"]]:
+        reason = f"info.json counts {info['total_episodes']} episodes, but {lost[0]} is missing"
+        raise corrupt(root / "meta/episodes", reason)
     if unknown:
         raise DatasetError(
             f"There is no episode {', '.join(map(str, unknown[:5]))}; the dataset has {len(by_index)}, from 0 to "

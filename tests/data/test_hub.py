@@ -1,49 +1,29 @@
 """Datasets to a Hub on this machine and back, through the real client: what moves, what shows, what goes wrong."""
 
-import shutil
-import threading
+import json
 from pathlib import Path
 
 import pytest
 
 from bhd_lerobot.data import hub as hub_module
-from bhd_lerobot.data import layout, remote_pull
-from bhd_lerobot.data.card import is_generated, sign
-from bhd_lerobot.data.disk import RootLock
+from bhd_lerobot.data import layout
 from bhd_lerobot.data.hub import HubDataset
 from bhd_lerobot.data.remote_pull import pull
-from bhd_lerobot.data.remote_push import Card, PushReport, push
+from bhd_lerobot.data.remote_push import push
 from bhd_lerobot.data.remote_subset import files_of
 from bhd_lerobot.data.source import local_metadata
 from bhd_lerobot.errors import (
     ConfigError,
-    DatasetCorruptError,
     DatasetError,
     DatasetExistsError,
-    DatasetLockedError,
-    DatasetWriteError,
     TransferError,
 )
 from tests.data import support
 from tests.hub_server.client import real_client
-from tests.hub_server.fixtures import EPISODES, content
+from tests.hub_server.fixtures import EPISODES, content, send, stored
 from tests.hub_server.server import Fault, HubServer
 
 pytest_plugins = ["tests.hub_server.fixtures"]
-
-
-@pytest.fixture
-def root(many_files: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(many_files, tmp_path / "d"))
-
-
-def send(root: Path, branch: str | None = None, **options: object) -> PushReport:
-    return push(root, HubDataset("me/d", branch, create=True), **options)  # type: ignore[arg-type]
-
-
-def stored(hub: HubServer, revision: str = "main") -> dict[str, bytes]:
-    files = hub.dataset("me/d").files(revision)
-    return {path: blob.content for path, blob in files.items() if path != ".gitattributes"}
 
 
 def test_what_comes_back_is_what_was_recorded(hub: HubServer, root: Path, tmp_path: Path) -> None:
@@ -247,230 +227,6 @@ def test_two_who_push_at_once_do_not_mix(hub: HubServer, root: Path, monkeypatch
         push(root, remote)
 
 
-def test_a_dataset_that_changes_during_the_upload_is_not_shown(hub: HubServer, root: Path) -> None:
-    gate = threading.Event()
-    hub.faults = [Fault("^PUT", wait=gate)]
-
-    def change() -> None:
-        path = root / layout.STATS
-        path.write_bytes(path.read_bytes() + b" ")
-        gate.set()
-
-    timer = threading.Timer(0.3, change)
-    timer.start()
-    with pytest.raises(DatasetError, match=r"changed by another program.*meta/stats\.json"):
-        send(root)
-    timer.join()
-    assert stored(hub) == {}
-    send(root)
-    assert stored(hub) == content(root)
-
-
-def test_a_dataset_in_use_is_refused(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    lock = RootLock(root)
-    with pytest.raises(DatasetLockedError, match="in use"):
-        send(root)
-    lock.release()
-    send(root)
-    shutil.rmtree(tmp_path / "d")
-    pull(HubDataset("me/d"), root)
-    lock = RootLock(root)
-    with pytest.raises(DatasetLockedError):
-        pull(HubDataset("me/d"), root)
-    lock.release()
-
-
-def test_a_recording_is_refused_until_it_is_finalised(hub: HubServer, tmp_path: Path) -> None:
-    recorder = support.create(tmp_path / "d")
-    support.record(recorder)
-    with pytest.raises(DatasetLockedError, match="in use"):
-        send(tmp_path / "d")
-    recorder._lock.release()  # as after a kill
-    with pytest.raises(DatasetError, match=r"not finalised.*bhd-data repair"):
-        send(tmp_path / "d")
-    recorder.finalize()
-    send(tmp_path / "d")
-    assert stored(hub) == content(tmp_path / "d")
-
-
-def test_damaged_and_empty_datasets_are_refused(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    next((root / "data").rglob("*.parquet")).unlink()
-    with pytest.raises(DatasetCorruptError, match="parquet"):
-        send(root)
-    support.create(tmp_path / "empty").finalize()
-    with pytest.raises(DatasetError, match="no episode"):
-        send(tmp_path / "empty")
-    with pytest.raises(DatasetError, match="does not exist"):
-        send(tmp_path / "none")
-    assert not hub.repositories
-
-
-def test_hidden_files_and_leftovers_stay_here(hub: HubServer, root: Path) -> None:
-    (root / ".cache").mkdir()
-    (root / ".cache" / "x").write_text("x")
-    (root / "notes.md").write_text("mine")
-    leftover = root / "data/chunk-000/file-077.parquet"
-    leftover.write_bytes(b"x")
-    report = send(root)
-    assert report.left_out == ["data/chunk-000/file-077.parquet"]
-    assert "notes.md" in stored(hub)
-    assert not [path for path in stored(hub) if path.startswith(".") or "077" in path]
-
-
-# --- cards
-
-
-def card(text: str = "# made\n") -> Card:
-    return Card(sign(text), b"picture")
-
-
-def test_a_generated_card_is_renewed_and_a_persons_is_kept(hub: HubServer, root: Path) -> None:
-    send(root, make_card=lambda state, has_picture: card())
-    assert stored(hub)["preview.png"] == b"picture"
-    assert not send(root, make_card=lambda state, has_picture: card("# made anew\n")).kept_card
-    assert b"anew" in stored(hub)["README.md"]
-    edited = stored(hub)["README.md"].replace(b"anew", b"by hand")
-    assert not is_generated(edited.decode())
-    hub.dataset("me/d").objects.clear()
-    files = hub.dataset("me/d").files()
-    files["README.md"].content = edited
-    report = send(root, make_card=lambda state, has_picture: card("# third\n"))
-    assert report.kept_card
-    assert stored(hub)["README.md"] == edited
-    assert not send(root, make_card=lambda state, has_picture: card("# third\n"), replace_card=True).kept_card
-    assert b"third" in stored(hub)["README.md"]
-
-
-def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path) -> None:
-    send(root, make_card=lambda state, has_picture: card())
-    (root / "README.md").write_text("# my own\n")
-    assert not send(root, make_card=lambda state, has_picture: card("# second\n")).kept_card
-    assert stored(hub)["README.md"] == b"# my own\n"
-    assert not send(root, make_card=lambda state, has_picture: card("# third\n")).kept_card  # it is the same
-    (root / "README.md").write_text("# my own, newer\n")
-    assert send(root).kept_card  # the one there is a person's, too
-    assert stored(hub)["README.md"] == b"# my own\n"
-
-
-# --- subsets and targets
-
-
-def test_some_episodes_bring_only_their_files_and_load(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    send(root)
-    target = tmp_path / "e"
-    hub.reset()
-    report = pull(HubDataset("me/d"), target, select=lambda folder: [0, 1])
-    assert report.episodes == [0, 1]
-    data = {path for path in content(target) if path.startswith(("data/", "videos/"))}
-    assert data == files_of(root, [0, 1]) < {path for path in content(root) if path.startswith(("data/", "videos/"))}
-    hub.reset()
-    dataset = LeRobotDataset("t/t", root=target, episodes=[0, 1], video_backend="pyav")
-    assert len(dataset) == support.length(0) + support.length(1)
-    assert dataset[len(dataset) - 1][support.CAMERA].shape == (3, 32, 48)
-    assert not hub.requests
-    with pytest.raises(DatasetError, match="some episodes of a dataset only"):
-        send(target)
-    # More of them are added; all of them make it whole.
-    assert pull(HubDataset("me/d"), target, select=lambda folder: [5]).episodes == [0, 1, 5]
-    assert not any(path in line for path in data for line in hub.asked("^GET .*/resolve/"))
-    assert pull(HubDataset("me/d"), target).episodes is None
-    assert content(target) == content(root)
-    assert support.verify(target, EPISODES, video=True) == EPISODES
-
-
-def test_episodes_that_do_not_exist(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    send(root)
-    with pytest.raises(DatasetError, match=r"no episode 6.*from 0 to 5"):
-        pull(HubDataset("me/d"), tmp_path / "e", select=lambda folder: [6])
-    assert list(tmp_path.iterdir()) == [root]
-
-
-def test_a_changed_dataset_is_not_overwritten_unless_that_is_said(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    send(root)
-    target = tmp_path / "e"
-    pull(HubDataset("me/d"), target)
-    (target / "notes.txt").write_text("mine")
-    (target / layout.STATS).write_text("{}")
-    before = content(target)
-    with pytest.raises(DatasetExistsError, match=r"meta/stats\.json.*--replace"):
-        pull(HubDataset("me/d"), target)
-    assert content(target) == before
-    hub.reset()
-    report = pull(HubDataset("me/d"), target, replace=True)
-    assert report.fetched == [layout.STATS]
-    assert content(target) == content(root) | {"notes.txt": b"mine"}
-
-
-def test_folders_that_are_no_place_for_a_dataset(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    send(root)
-    (tmp_path / "file").write_text("x")
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "thesis.tex").write_text("x")
-    (tmp_path / "empty").mkdir()
-    for name in ("file", "full"):
-        with pytest.raises(DatasetExistsError, match="Choose another folder"):
-            pull(HubDataset("me/d"), tmp_path / name)
-    pull(HubDataset("me/d"), tmp_path / "empty")
-    assert content(tmp_path / "empty") == content(root)
-    with pytest.raises(DatasetWriteError, match=r"not a folder|Not a directory"):
-        pull(HubDataset("me/d"), tmp_path / "file" / "below")
-
-
-def test_a_kill_between_the_renames_is_mended(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    send(root)
-    target = tmp_path / "e"
-    pull(HubDataset("me/d"), target)
-    (target / ".bhd-pull").touch()
-    target.rename(tmp_path / ".e.old")
-    assert pull(HubDataset("me/d"), target).fetched == []
-    assert content(target) == content(root)
-
-
-@pytest.mark.parametrize("name", [".e.old", ".e.pull"])
-def test_folders_of_others_in_its_way_are_left_alone(hub: HubServer, root: Path, tmp_path: Path, name: str) -> None:
-    send(root)
-    (tmp_path / name).mkdir()
-    (tmp_path / name / "thesis.txt").write_text("years")
-    with pytest.raises(DatasetError, match="is in the way"):
-        pull(HubDataset("me/d"), tmp_path / "e")
-    assert (tmp_path / name / "thesis.txt").read_text() == "years"
-    assert not (tmp_path / "e").exists()
-
-
-def test_a_folder_behind_a_link_is_not_taken_for_gone(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    """What is not seen must not be removed at the other end."""
-    copied = Path(shutil.copytree(root, tmp_path / "copied"))
-    send(root)
-    before = HubDataset("me/d").files()
-    (copied / "videos").rename(tmp_path / "big")
-    (copied / "videos").symlink_to(tmp_path / "big")
-    with pytest.raises(DatasetError, match="behind a link"):
-        send(copied)
-    assert HubDataset("me/d").files() == before
-
-
-def test_a_full_disk_is_seen_before_and_during(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
-    send(root)
-    usage = shutil.disk_usage(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(remote_pull.shutil, "disk_usage", lambda path: usage._replace(free=100))
-        with pytest.raises(TransferError, match=r"MB are missing.*0.0 MB free"):
-            pull(HubDataset("me/d"), tmp_path / "e")
-
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("huggingface_hub.file_download.http_get", full)
-        with pytest.raises(TransferError, match=r"No space left on device.*Free some space"):
-            pull(HubDataset("me/d"), tmp_path / "e")
-    assert not (tmp_path / "e").exists()
-    pull(HubDataset("me/d"), tmp_path / "e")
-    assert content(tmp_path / "e") == content(root)
-
-
 def test_damage_on_the_way_is_noticed(hub: HubServer, root: Path, tmp_path: Path) -> None:
     send(root)
     blob = next(blob for path, blob in hub.dataset("me/d").files().items() if path.startswith("data/"))
@@ -492,9 +248,6 @@ def test_names() -> None:
     for wrong in ("d", "me/d/e", "me/", "/d", "me/d.git", "me/a--b", "me/a..b", "../d", "me/a b", ""):
         with pytest.raises(ConfigError, match="user/name"):
             HubDataset(wrong)
-
-
-# --- loading by name
 
 
 def test_loading_by_name_downloads_only_the_wanted_episodes(
@@ -531,55 +284,6 @@ def test_a_tag_of_a_release_does_not_move(hub: HubServer, root: Path) -> None:
     assert stored(hub) == stored(hub, "one") != content(root)
 
 
-def test_what_is_not_sound_there_comes_as_it_is_and_that_is_said(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    send(root)
-    files = dict(hub.dataset("me/d").files())
-    lost = next(path for path in files if path.startswith("videos/"))
-    del files[lost]
-    commit = hub.dataset("me/d").add("torn", files)
-    report = pull(HubDataset("me/d", commit), tmp_path / "e")
-    assert lost in report.problem
-    blob = files[layout.INFO]
-    files[layout.INFO] = type(blob)(blob.content.replace(b"v3.0", b"v2.1"), lfs=False)
-    hub.dataset("me/d").add("old", files)
-    hub.reset()
-    with pytest.raises(DatasetError, match=r"format v2\.1"):
-        pull(HubDataset("me/d", "old"), tmp_path / "f")
-    assert not hub.asked("GET .*/resolve/.*/data/")  # said before everything was fetched
-
-
-def test_what_belongs_to_no_dataset_survives_an_exchange(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    """A dataset under version control, with links and folders of its own."""
-    send(root)
-    target = tmp_path / "e"
-    pull(HubDataset("me/d"), target)
-    (target / ".git/refs/tags").mkdir(parents=True)
-    (target / ".git/HEAD").write_text("ref")
-    (target / ".cache/app").mkdir(parents=True)
-    (target / ".cache/app/x").write_text("x")
-    (target / "plots").symlink_to(tmp_path)
-    (target / "gone").symlink_to("nowhere")
-    with support.resume(root, video=True) as recorder:
-        support.record(recorder, video=True)
-    send(root)
-    assert pull(HubDataset("me/d"), target, replace=True).fetched
-    assert (target / ".git/refs/tags").is_dir()
-    assert (target / ".git/HEAD").read_text() == "ref"
-    assert (target / ".cache/app/x").read_text() == "x"
-    assert (target / "plots").is_symlink()
-    assert (target / "gone").is_symlink()
-    assert not (target / ".bhd-pull").exists()
-
-
-def test_a_folder_that_is_no_dataset_is_never_replaced(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    send(root)
-    (tmp_path / "e/data/chunk-000").mkdir(parents=True)
-    (tmp_path / "e/data/chunk-000/file-777.parquet").write_text("mine")
-    with pytest.raises(DatasetExistsError, match="is no dataset"):
-        pull(HubDataset("me/d"), tmp_path / "e", replace=True)
-    assert (tmp_path / "e/data/chunk-000/file-777.parquet").read_text() == "mine"
-
-
 def test_what_the_repository_ignores_is_told(hub: HubServer, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from huggingface_hub import HfApi
 
@@ -593,3 +297,101 @@ def test_what_the_repository_ignores_is_told(hub: HubServer, root: Path, monkeyp
     with pytest.raises(TransferError, match=r"\.gitignore names"):
         send(root)
     assert layout.INFO not in HubDataset("me/d").files()
+
+
+def versions(hub: HubServer) -> list[dict[str, bytes]]:
+    """Return what a reader of the repository could ever find, oldest first."""
+    return [
+        {path: blob.content for path, blob in files.items() if path != ".gitattributes"}
+        for files in hub.dataset("me/d").commits.values()
+    ]
+
+
+def longer(root: Path) -> None:
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+
+
+@pytest.mark.parametrize("after", [0, 1, 2])
+def test_a_push_of_several_commits_that_fails_leaves_no_mixture(
+    hub: HubServer, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int
+) -> None:
+    """Whatever commit a reader looks at: with an info.json it is one of the two datasets, to the last byte."""
+    send(root)
+    old = content(root)
+    longer(root)
+    monkeypatch.setattr(hub_module, "_COMMIT_SIZE", 2)
+    hub.faults = [Fault("/commit/", times=-1, after=after)]
+    with pytest.raises(TransferError, match="connection was lost"):
+        send(root)
+    assert [found for found in versions(hub) if layout.INFO in found] == [old]
+    assert (layout.INFO in stored(hub)) == (after == 0)
+    if after:
+        with pytest.raises(TransferError, match=r"no meta/info\.json"):
+            pull(HubDataset("me/d", "main"), tmp_path / "e")
+    pull(HubDataset("me/d"), tmp_path / "f")  # by its tag, as LeRobot does
+    assert content(tmp_path / "f") == old
+    hub.faults = []
+    send(root)
+    assert stored(hub) == content(root)
+    assert [found for found in versions(hub) if layout.INFO in found] == [old, content(root)]
+
+
+def test_an_info_that_stays_the_same_is_gone_between_the_commits_too(hub: HubServer, root: Path, monkeypatch) -> None:
+    """The client leaves a file out of a commit that it has seen there, which must not lose this one."""
+    send(root)
+    monkeypatch.setattr(hub_module, "_COMMIT_SIZE", 2)
+    for number in range(4):
+        (root / f"notes_{number}.md").write_text("mine")
+    send(root)
+    assert [layout.INFO in found for found in versions(hub)] == [False, True, False, False, True]
+    assert stored(hub) == content(root)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        b"[]",
+        b"3",
+        b"\xff\xfe\x00",
+        b"",
+        b"[" * 100_000,
+        b'{"codebase_version": "v3.0"}',
+        b'{"codebase_version": "v3.0", "features": [], "fps": 10}',
+        b'{"codebase_version": "v3.0", "features": {"a": 1}, "fps": 10}',
+        ("fps", "ten"),
+        ("fps", True),
+        ("total_episodes", "6"),
+        ("total_episodes", None),
+        ("total_frames", 1.5),
+        ("total_episodes", float("inf")),
+        ("data_path", 3),
+        ("robot_type", ["a"]),
+        ("codebase_version", 3.0),
+    ],
+)
+def test_an_info_of_another_shape_is_told(hub: HubServer, root: Path, tmp_path: Path, broken) -> None:
+    send(root)
+    info = hub.dataset("me/d").files()[layout.INFO]
+    info.content = (
+        broken if isinstance(broken, bytes) else json.dumps({**json.loads(info.content), broken[0]: broken[1]}).encode()
+    )
+    hub.reset()
+    for select in (None, lambda folder: [0]):
+        with pytest.raises(DatasetError, match=r"me/d (is no LeRobot dataset: .*info\.json|has dataset format 3\.0)"):
+            pull(HubDataset("me/d"), tmp_path / "e", select=select)
+    assert not hub.asked("GET .*/resolve/.*/data/")
+    assert list(tmp_path.iterdir()) == [root]
+    with pytest.raises(DatasetExistsError, match=r"me/d .*--replace"):
+        send(root)
+    send(root, replace=True)
+    assert stored(hub) == content(root)
+
+
+def test_the_hub_needs_no_verifying(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nothing to verify"):
+        send(root, verify=True)
+    send(root)
+    with pytest.raises(ConfigError, match="nothing to verify"):
+        pull(HubDataset("me/d"), tmp_path / "e", verify=True)
+    assert list(tmp_path.iterdir()) == [root]

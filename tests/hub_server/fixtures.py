@@ -1,13 +1,17 @@
 """Fixtures around the Hub of the tests; a test module takes them by `pytest_plugins`."""
 
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.hub import HubDataset
+from bhd_lerobot.data.remote_push import PushReport, push
 from tests.data import support
 from tests.hub_server.client import real_client
 from tests.hub_server.server import HubServer
@@ -46,6 +50,23 @@ def many_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 support.record(recorder, video=True)
     assert len(list((root / "data").rglob("*.parquet"))) > 1
     return root
+
+
+@pytest.fixture
+def root(many_files: Path, tmp_path: Path) -> Path:
+    """A copy of that dataset, which may be changed: `d` in the test's own folder."""
+    return Path(shutil.copytree(many_files, tmp_path / "d"))
+
+
+def send(root: Path, branch: str | None = None, **options: Any) -> PushReport:
+    """Push a dataset to the place that the tests use."""
+    return push(root, HubDataset("me/d", branch, create=True), **options)
+
+
+def stored(hub: HubServer, revision: str = "main") -> dict[str, bytes]:
+    """Return every file there but the one that the Hub makes."""
+    files = hub.dataset("me/d").files(revision)
+    return {path: blob.content for path, blob in files.items() if path != ".gitattributes"}
 
 
 def content(root: Path) -> dict[str, bytes]:
