@@ -24,7 +24,7 @@ from bhd_lerobot.data.bag_images import COMPRESSED, IMAGE, decode_image
 from bhd_lerobot.data.bag_read import Bag, Picker
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.ros2_base import BareTwistPart, ScanPart
+from bhd_lerobot.data.ros2_base import BareTwistPart, OdometryPart, ScanPart
 from bhd_lerobot.data.ros2_cdr_read import decode
 from bhd_lerobot.data.ros2_parts import NANO, Part, head_stamps, header_stamps, own_topic
 from bhd_lerobot.data.ros2_split import PARTS
@@ -213,7 +213,7 @@ class _BagEpisodes:
         for one in topics:
             part = PARTS[one["kind"]](one["topic"], tuple(one["names"]))
             rows = self._places(part.topic, self._part_stamps(part), at, held=isinstance(part, ScanPart))
-            values = self._part_values(part)[rows]
+            values = self._part_values(part, rows)
             whole = len(topics) == 1 and len(part) == size
             result[:, range(size) if whole and not place else [place[name] for name in part.names]] = values
         return result[:, 0] if size == 1 else result
@@ -225,10 +225,13 @@ class _BagEpisodes:
             self._stamps[part.topic] = messages.received if bare else header_stamps(part.msgtype, messages.data)
         return self._stamps[part.topic]
 
-    def _part_values(self, part: Part) -> NDArray[Any]:
+    def _part_values(self, part: Part, rows: NDArray[np.intp]) -> NDArray[Any]:
+        messages = self._messages[part.topic].data
+        if isinstance(part, OdometryPart):  # its yaw is unwrapped, and another episode's turns are not this one's
+            return part.decode([messages[row] for row in rows])
         if part.topic not in self._values:
-            self._values[part.topic] = part.decode(self._messages[part.topic].data)
-        return self._values[part.topic]
+            self._values[part.topic] = part.decode(messages)
+        return self._values[part.topic][rows]
 
     def _texts(self, key: str, at: NDArray[np.int64]) -> NDArray[Any]:
         topic = own_topic(key)

@@ -18,8 +18,10 @@ from rosbags.interfaces import QosDurability
 
 from bhd_lerobot.control.forward_kinematics import ForwardKinematics
 from bhd_lerobot.data import bag_write
+from bhd_lerobot.data.features import dataset_features
 from bhd_lerobot.data.inspect import dataset_info
 from bhd_lerobot.data.read import read_episode
+from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.data.state import load_state
 from bhd_lerobot.runs import data
 from bhd_lerobot.runs.data_export import robot_view
@@ -97,6 +99,28 @@ def test_a_dataset_comes_back_to_the_bit_and_is_sound(request, tmp_path, robot, 
     assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
     same_dataset(root, tmp_path / "back")
     assert data.main(["check", str(tmp_path / "back")]) == 0
+
+
+@pytest.mark.parametrize("layout", [[], ["--one_bag"]])
+def test_episodes_that_turn_round_come_back_whatever_the_one_before_did(tmp_path, layout):
+    features = dataset_features(
+        ["x.vel", "theta.vel", "x.pos", "y.pos", "theta.pos"], ["x.vel", "theta.vel"], {}, ["q"]
+    )
+    root, frames = tmp_path / "d", 50
+    with DatasetRecorder.create("t/t", 10, features, robot_type="turtlebot3", root=root) as recorder:
+        for end in (4.0, -9.0, 20.0):
+            columns = {
+                key: np.zeros((frames, *one["shape"]) if one["shape"] != (1,) else frames, one["dtype"])
+                for key, one in features.items()
+            }
+            columns["observation.state"][:, 4] = np.linspace(0, end, frames)
+            columns["control.time"] = np.arange(frames) / 10
+            writer = recorder.begin_episode()
+            writer.set_columns(columns)
+            recorder.save(writer, task="turn", metadata={})
+    bags = export(root, tmp_path / "bags", *layout)
+    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
+    same_dataset(root, tmp_path / "back")
 
 
 @pytest.mark.parametrize("compressed", [[], ["--compressed_images"]])
