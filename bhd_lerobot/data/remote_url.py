@@ -1,5 +1,6 @@
 """URLs as a place for datasets: which ones can be one, and what serves them."""
 
+import os
 import re
 import sys
 import traceback
@@ -84,7 +85,7 @@ def check_url(url: str) -> None:
     if protocol in LOCAL and not path.startswith("/"):
         # fsspec would take it from the working folder, wherever that is: not the same place the next time.
         rest = path.removeprefix("localhost/") if path.startswith("localhost/") else ""
-        whole = Path("/", rest) if rest else Path(path).absolute()
+        whole = Path("/", rest) if rest else Path(os.path.abspath(os.path.expanduser(path)))
         raise ConfigError(f"{name} is not a whole path. Write {protocol}://{whole}.")
     if protocol in _BUCKETS and path.startswith("/"):
         raise ConfigError(f"{name} names no bucket. Give one, for example {_example(protocol)}.")

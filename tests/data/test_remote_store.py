@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import fsspec
@@ -10,67 +9,22 @@ import pytest
 
 from bhd_lerobot.data import layout, remote_store
 from bhd_lerobot.data.edits import delete
+from bhd_lerobot.data.remote import MANIFEST
 from bhd_lerobot.data.remote_pull import pull
 from bhd_lerobot.data.remote_push import push
-from bhd_lerobot.data.remote_store import MANIFEST, StoreDataset
+from bhd_lerobot.data.remote_store import StoreDataset
+from bhd_lerobot.data.remote_subset import read_subset
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError
 from tests.data import support
+from tests.data.store_fixtures import KEYS, stored, use_s3
 from tests.hub_server.fixtures import content
 
-EPISODES = 3
-KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("recorded") / "d"
-    with support.create(root, video=True) as recorder:
-        for _ in range(EPISODES):
-            support.record(recorder, video=True)
-    return root
+pytest_plugins = ["tests.data.store_fixtures"]
 
 
 @pytest.fixture
-def root(recorded: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(recorded, tmp_path / "d"))
-
-
-@pytest.fixture(scope="module")
-def s3_url() -> Iterator[str]:
-    """An S3-compatible store with one bucket; yields its address."""
-    from moto.server import ThreadedMotoServer
-
-    server = ThreadedMotoServer(port=0)
-    server.start()
-    host, port = server.get_host_and_port()
-    yield f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"
-    server.stop()
-
-
-@pytest.fixture(params=["memory", "file", "s3"])
-def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    if request.param == "file":
-        return f"file://{tmp_path}/there/d"
-    if request.param == "memory":
-        fsspec.filesystem("memory").store.clear()
-        return "memory://bucket/there/d"
-    use_s3(request.getfixturevalue("s3_url"), monkeypatch)
-    s3 = fsspec.filesystem("s3")
-    if s3.exists("bucket"):
-        s3.rm("bucket", recursive=True)
-    s3.mkdir("bucket")
-    return "s3://bucket/there/d"
-
-
-def use_s3(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {**KEYS, "AWS_ENDPOINT_URL": address}.items():
-        monkeypatch.setenv(name, value)
-    fsspec.filesystem("s3").clear_instance_cache()
-
-
-def stored(url: str) -> dict[str, bytes]:
-    store = StoreDataset(url)
-    return {path: store.read(path) or b"" for path in store.files()}
+def root(few_files: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(few_files, tmp_path / "d"))
 
 
 def test_what_comes_back_is_what_was_recorded(root: Path, url: str, tmp_path: Path) -> None:
@@ -213,6 +167,7 @@ def test_some_episodes(root: Path, url: str, tmp_path: Path) -> None:
     push(root, StoreDataset(url))
     report = pull(StoreDataset(url), tmp_path / "e", select=lambda folder: [1])
     assert (report.episodes, report.is_whole) == ([1], True)  # one file holds them all
+    assert read_subset(tmp_path / "e").episodes == [1]
     (tmp_path / "e" / layout.STATS).write_text("{}")
     with pytest.raises(DatasetExistsError):
         pull(StoreDataset(url), tmp_path / "e")
@@ -240,13 +195,6 @@ def test_places_that_do_not_exist(root: Path, s3_url: str, tmp_path: Path, monke
     for url in ("s3://nobucket/d", f"file://{tmp_path}/nowhere", "memory://nowhere/d"):
         with pytest.raises(TransferError, match="no LeRobot dataset"):
             pull(StoreDataset(url), tmp_path / "e")
-    for wrong, words in (
-        ("foo://b/d", "Protocol not known"),
-        ("s3://", "names no folder"),
-        ("http://127.0.0.1/d", "cannot be written"),
-    ):
-        with pytest.raises(ConfigError, match=words):
-            StoreDataset(wrong)
 
 
 def test_no_store_and_no_credentials(root: Path, monkeypatch) -> None:
@@ -275,8 +223,6 @@ def test_a_dataset_is_not_copied_onto_itself(root: Path, tmp_path: Path) -> None
         with pytest.raises(ConfigError, match="the same folder"):
             pull(StoreDataset(f"file://{root}"), target, replace=True)
     assert content(root) == before
-    with pytest.raises(ConfigError, match="a chain"):
-        StoreDataset("simplecache::s3://bucket/d")
 
 
 def test_what_is_not_installed_is_named(monkeypatch) -> None:
@@ -356,15 +302,3 @@ def test_an_older_copy_does_not_replace_a_longer_one(root: Path, url: str, tmp_p
     delete(longer, [0])
     push(longer, StoreDataset(url))
     assert stored(url) == content(longer)
-
-
-@pytest.mark.parametrize(
-    ("url", "shown"),
-    [
-        ("memory://user:pass/wo@rd@host/d", "memory://host/d"),
-        ("memory://bucket/a@b/d", "memory://bucket/a@b/d"),
-        ("memory://bucket/d/", "memory://bucket/d"),
-    ],
-)
-def test_a_password_is_not_shown(url: str, shown: str) -> None:
-    assert StoreDataset(url).name == shown

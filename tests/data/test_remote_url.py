@@ -1,0 +1,77 @@
+"""URLs that are no place for a dataset, each with a sentence that says why."""
+
+from pathlib import Path
+
+import pytest
+
+from bhd_lerobot.data.remote_store import StoreDataset
+from bhd_lerobot.errors import BhdError, ConfigError, TransferError
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("foo://b/d", r"Protocol not known: foo\. Known protocols: .*s3"),
+        ("S3://b/d", "Protocol not known: S3"),
+        ("s3://", "names no folder.*s3://bucket/folder"),
+        ("s3:///d", "names no bucket"),
+        ("s3:////", "names no folder"),
+        ("ftp://", "names no folder"),
+        ("file://", "names no folder.*file:///folder"),
+        ("file:///", "names no folder"),
+        ("://b/d", "names no protocol"),
+        ("http://127.0.0.1/d", "cannot be written"),
+        ("zip://d.zip", "no place for a dataset"),
+        ("zip://", "no place for a dataset"),
+        ("reference://a/b", "no place for a dataset"),
+        ("simplecache::s3://bucket/d", "a chain"),
+        ("memory://b/a\0b", "characters in it that no URL has"),
+        ("memory://b/a\nb", "characters in it that no URL has"),
+        ("webdav+x://b/d", "Protocol not known"),
+    ],
+)
+def test_urls_that_are_no_place(url: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        StoreDataset(url)
+    assert "\0" not in str(caught.value)
+
+
+def test_a_path_that_is_not_whole_is_refused_with_the_one_that_is(tmp_path: Path, monkeypatch) -> None:
+    """It would be another place from another working folder."""
+    monkeypatch.chdir(tmp_path)
+    for url in ("file://rel/d", "local://rel/d", "file://./rel/d"):
+        with pytest.raises(ConfigError, match=f"not a whole path.*://{tmp_path}/rel/d"):
+            StoreDataset(url)
+    with pytest.raises(ConfigError, match=r"not a whole path. Write file:///data/d\."):
+        StoreDataset("file://localhost/data/d")
+    with pytest.raises(ConfigError, match=f"Write file://{Path.home()}/d"):
+        StoreDataset("file://~/d")
+    assert StoreDataset(f"file://{tmp_path}/d").folder == tmp_path / "d"
+
+
+def test_what_cannot_be_reached_is_told_without_a_traceback(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(TransferError, match="cannot be reached"):
+        StoreDataset("ftp://127.0.0.1:9/d")
+    with pytest.raises(BhdError, match=r"cannot be used|not installed|cannot be reached"):
+        StoreDataset("hdfs://127.0.0.1:9/d")
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_options_that_a_file_system_does_not_know(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--storage_options"):
+        StoreDataset("ftp://127.0.0.1:9/d", {"nonsense": 1, "port": "x"})
+
+
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("memory://user:pass/wo@rd@host/d", "memory://host/d"),
+        ("memory://bucket/a@b/d", "memory://bucket/a@b/d"),
+        ("memory://bucket/d/", "memory://bucket/d"),
+    ],
+)
+def test_a_password_is_not_shown(url: str, shown: str) -> None:
+    assert StoreDataset(url).name == shown
+    with pytest.raises(ConfigError) as caught:
+        StoreDataset(url.replace("memory", "foo"))
+    assert "pass" not in str(caught.value)
