@@ -66,7 +66,7 @@ def _folder(path: Path) -> Bag | None:
         mode = str(told.get("compression_mode") or "").lower()
         kind = str(told.get("compression_format") or "").lower()
         publishers = publishers_of(told.get("topics_with_message_count"))
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, UnicodeDecodeError) as error:
+    except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         if not files:
             raise DatasetError(f"{metadata} cannot be read ({reason[:200]}), and there is no bag file.") from error
