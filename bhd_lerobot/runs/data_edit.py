@@ -101,11 +101,16 @@ def parts_of(text: str, total: int, shuffle_seed: int | None = None) -> dict[str
     named: dict[str, str] = {}
     separator = ";" if ";" in text else ","
     for part in text.split(separator):
-        name, equals, value = part.strip().partition("=")
+        name, equals, value = (piece.strip() for piece in part.partition("="))
         if not equals or not name or "/" in name or name.startswith(".") or name in named:
             raise ConfigError(
                 f"{part!r} in --parts={text} is not one name and its part. Write train=0.8,val=0.2 or "
                 "'train=0-7;val=8,9', each name once."
+            )
+        if separator == "," and value in ("0", "1"):
+            raise ConfigError(
+                f"{part.strip()!r} in --parts={text} may be a share or an episode. Write {name}={value}.0 for the "
+                f"share, {name}={value}-{value} for the episode."
             )
         named[name] = value
     if separator == ";" or not any("." in value for value in named.values()):
@@ -116,6 +121,8 @@ def parts_of(text: str, total: int, shuffle_seed: int | None = None) -> dict[str
         raise ConfigError(f"--parts={text} mixes shares and episodes, or has a share that is no number.") from None
     if not all(0 < share <= 1 for share in shares.values()) or sum(shares.values()) > 1 + 1e-9:
         raise ConfigError(f"The shares in --parts={text} must be above 0, and at most 1 together.")
+    if shuffle_seed is not None and shuffle_seed < 0:
+        raise ConfigError(f"--shuffle_seed is {shuffle_seed}; seeds start at 0.")
     order = list(range(total))
     if shuffle_seed is not None:
         random.Random(shuffle_seed).shuffle(order)

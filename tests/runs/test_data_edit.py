@@ -73,6 +73,10 @@ def test_check_with_fix(recorded: Path, tmp_path: Path, capsys) -> None:
         (["delete", "R", "--episodes", "9"], "no episode 9"),
         (["delete", "R", "--episodes", "x"], "names no episode"),
         (["delete", "R", "--episodes", "5-1"], "runs backwards; write 1-5"),
+        (["delete", "R", "--episodes", "0-99999999999"], "at most 1000000"),
+        (["filter", "R", "--episodes", "0-2,1", "--output", "X"], "Episode 1 is named twice"),
+        (["split", "R", "--parts", "a=1", "--output", "X"], "Write a=1.0 for the share, a=1-1 for the episode"),
+        (["split", "R", "--parts", "a=0.5", "--shuffle_seed", "-1", "--output", "X"], "seeds start at 0"),
         (["split", "R", "--parts", "a=0.7,b=0.7", "--output", "X"], "at most 1 together"),
         (["split", "R", "--parts", "a=0.01", "--output", "X"], "would have no episode"),
         (["split", "R", "--parts", "a,b", "--output", "X"], "not one name and its part"),
@@ -98,7 +102,7 @@ def test_episode_lists_come_back() -> None:
     for text, numbers in (("0", [0]), ("0,3,5-7", [0, 3, 5, 6, 7]), ("[1, 2]", [1, 2]), ("4 6", [4, 6])):
         assert parse_episodes(text) == numbers
         assert parse_episodes(short(numbers)) == numbers
-    for text in ("", "a", "1-", "-1", "1.5"):
+    for text in ("", "a", "1-", "-1", "1.5", "²", "1-2-3", "1;2", "9" * 13):
         with pytest.raises(ConfigError, match="names no episode"):
             parse_episodes(text)
 
@@ -110,3 +114,7 @@ def test_shares_are_dealt_out_completely() -> None:
         assert parts == parts_of("a=0.5,b=0.3,c=0.2", total, shuffle_seed=4)
     assert parts_of("a=0.5,b=0.5", 100, 1) != parts_of("a=0.5,b=0.5", 100, 2)
     assert parts_of("a=0.5", 10) == {"a": [0, 1, 2, 3, 4]}
+    assert parts_of(" a = 0.5, ü= 0.5 ", 4) == {"a": [0, 1], "ü": [2, 3]}
+    assert parts_of("a=1-1", 4) == {"a": [1]}
+    assert parts_of("a=1;b=0", 4) == {"a": [1], "b": [0]}
+    assert parts_of("a=1.0", 2) == {"a": [0, 1]}
