@@ -50,8 +50,7 @@ def check_identity(
     """
     if state.identity is None:
         raise DatasetMismatchError(
-            f"{state.root} was not recorded by this program, or not all of it (it has no meta/bhd.json). Record into "
-            "another root."
+            f"{state.root} was not recorded by this program (it has no meta/bhd.json). Record into another root."
         )
     if state.identity.get("format") != FORMAT:
         raise DatasetMismatchError(
