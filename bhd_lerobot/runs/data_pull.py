@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.remote import check_repo_id, counted, is_url, megabytes
 from bhd_lerobot.data.remote_url import check_url, shown
-from bhd_lerobot.errors import ConfigError, DatasetWriteError, TransferError
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetWriteError, TransferError
 from bhd_lerobot.runs.data_command import Commands, add_command
 from bhd_lerobot.runs.data_transfer import (
     command_line,
@@ -157,7 +157,15 @@ def _selection(options: argparse.Namespace) -> "Select | None":
     def select(folder: Path) -> Sequence[int]:
         from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-        return wanted.select(LeRobotDatasetMetadata("bhd/pull", root=folder), episodes)
+        try:
+            return wanted.select(LeRobotDatasetMetadata("bhd/pull", root=folder), episodes)
+        except BhdError:
+            raise
+        except Exception as error:  # LeRobot believes what it reads, whoever wrote it
+            raise DatasetError(
+                f"The metadata of the dataset cannot be read, so no episode can be chosen ({error!r}). Pull all of "
+                "it, without --outcome and --min_score, and look at it with bhd-data check."
+            ) from error
 
     return select
 

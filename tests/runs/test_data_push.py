@@ -23,6 +23,7 @@ from bhd_lerobot.errors import TransferError
 from bhd_lerobot.runs import data
 from bhd_lerobot.runs import record as record_module
 from bhd_lerobot.runs.data_check import limits_of
+from bhd_lerobot.runs.data_transfer import repeat_line
 from bhd_lerobot.runs.eval_statistics import wilson
 from tests.hub_server.fixtures import content
 from tests.hub_server.server import Fault, HubServer
@@ -138,20 +139,6 @@ def test_a_url(recorded: Path, tmp_path: Path, capsys) -> None:
     assert content(tmp_path / "e").items() >= content(recorded).items()
 
 
-def test_some_episodes_by_number_and_by_outcome(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
-    assert data.main(["push", str(lesson), "me/d"]) == 0
-    capsys.readouterr()
-    assert data.main(["pull", "me/d", f"--root={tmp_path / 'a'}", "--episodes=0,3-4"]) == 0
-    said = capsys.readouterr().out
-    assert "3 episodes of 6: 0,3-4" in said
-    assert '--dataset.episodes="[0, 3, 4]"' in said
-    assert data.main(["pull", "me/d", f"--root={tmp_path / 'b'}", "--outcome=success", "--min_score=0.3"]) == 0
-    assert "2 episodes of 6: 4-5" in capsys.readouterr().out
-    assert data.main(["pull", "me/d", f"--root={tmp_path / 'c'}", "--outcome=fault"]) == 2
-    assert "No episode of me/d is left after filtering" in capsys.readouterr().err
-    assert not [one for one in tmp_path.iterdir() if "c" in one.name]
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -165,6 +152,18 @@ def test_some_episodes_by_number_and_by_outcome(hub: HubServer, lesson: Path, tm
         (["push", "ROOT", "memory://b/d", "--storage_options={"], "is not JSON"),
         (["push", "memory://b/d"], "Name the folder"),
         (["push", "nowhere", "me/a"], "does not exist"),
+        (["push", "", "me/a"], "A name is empty"),
+        (["push", "ROOT", "me/a", "--tag="], "--tag is empty"),
+        (["push", "a\0b", "me/a"], "cannot be the folder"),
+        (["push", "~nobodyatall/d", "me/a"], "cannot be the folder"),
+        (["push", "ROOT", "me/a", "--verify"], "--verify is for URLs"),
+        (["push", "ROOT", "ftp://"], "names no folder"),
+        (["push", "ROOT", "zip://d.zip"], "no place for a dataset"),
+        (["push", "ROOT", "s3://"], "names no folder"),
+        (["push", "ROOT", "s3:///d"], "names no bucket"),
+        (["push", "ROOT", "foo://b/d"], "Protocol not known"),
+        (["push", "ROOT", "file://rel/d"], "is not a whole path. Write file:///"),
+        (["push", "ROOT", "ftp://127.0.0.1:9/d"], "cannot be reached"),
         (["pull"], "Say where from"),
         (["pull", "me/a", "--repo_id=me/b"], "Say where from, once"),
         (["pull", "memory://b/d"], "Say where to"),
@@ -172,6 +171,13 @@ def test_some_episodes_by_number_and_by_outcome(hub: HubServer, lesson: Path, tm
         (["pull", "me/a", "--root=x", "--episodes=all"], "such as 0,3,5-9"),
         (["pull", "me/a", "--root=x", "--outcome=good"], "Unknown outcome 'good'"),
         (["pull", "me/a", "--root=x", "--min_score=2"], "from 0 to 1"),
+        (["pull", "me/a", "--root="], "--root is empty"),
+        (["pull", ""], "A name is empty"),
+        (["pull", "me/a", "--root=a\0b"], "cannot be the folder"),
+        (["pull", "me/a", f"--root={'x' * 5000}"], "File name too long"),
+        (["pull", "me/a", "--root=x", "--verify"], "--verify is for URLs"),
+        (["pull", "gs:///d", "--root=x"], "names no bucket"),
+        (["pull", "file://rel/d", "--root=x"], "is not a whole path"),
     ],
 )
 @pytest.mark.usefixtures("hub")
@@ -180,6 +186,7 @@ def test_bad_arguments(lesson: Path, empty: Path, capsys, arguments: list[str], 
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert words in error
+    assert "\0" not in error
     assert list(empty.iterdir()) == []
 
 
@@ -306,3 +313,55 @@ def test_streaming_gives_the_same_samples(hub: HubServer, recorded: Path, monkey
         assert seen == set(range(len(reference)))
     assert hub.asked(r"GET /datasets/me/avoid/resolve/.*\.parquet")
     shutil.rmtree(Path(os.environ["HF_LEROBOT_HOME"]) / "hub", ignore_errors=True)
+
+
+def test_a_name_that_looks_like_a_folder_is_told(hub: HubServer, lesson: Path, empty: Path, capsys) -> None:
+    """`store/c3` may be meant as the folder beside this one; nothing in its form says which."""
+    (empty / "store").mkdir()
+    assert data.main(["push", str(lesson), "store/c3"]) == 2
+    error = capsys.readouterr().err
+    assert f"store/c3 is taken for a name on the Hub. The folder here would be file://{empty}/store/c3\n" in error
+    assert "no permission" in error
+    assert data.main(["push", str(lesson), f"file://{empty}/store/c3"]) == 0
+    assert data.main(["pull", "store/c3", "--root=x"]) == 2
+    assert "is taken for a name on the Hub" in capsys.readouterr().err
+    shutil.copytree(lesson, empty / "me" / "d")
+    assert data.main(["push", "me/d", "me/d"]) == 0  # the dataset itself: nobody means to copy it onto itself
+    assert "is taken for" not in capsys.readouterr().err
+
+
+def test_the_command_to_repeat_says_all_that_was_asked_for(tmp_path: Path) -> None:
+    parser = data._parser()
+    for words in (
+        "push A me/d --branch=b --tag=t --private --tags=a,b --licence=mit --no-card --replace-card --replace",
+        "push --root=A --repo_id=me/d --public",
+        "push A s3://b/d --verify --replace --no_card --storage_options={}",
+        "pull me/d --root=A --revision=r --episodes=0,2-4 --outcome=success --min_score=0.5 --replace",
+        "pull --repo_id=me/d --root=A",
+        "pull s3://b/d --root=A --verify --storage_options={}",
+    ):
+        asked = parser.parse_args(words.split())
+        source = asked.repo_id or (asked.places[1] if asked.command == "push" else asked.source)
+        places = {"root": "A"} if asked.command == "pull" else {}
+        line = repeat_line(asked, *([] if places else ["A"]), source, **places)
+        again = vars(parser.parse_args(shlex.split(line)[1:]))
+        ways = ("places", "root", "repo_id", "source")
+        assert {k: v for k, v in again.items() if k not in ways} == {
+            k: v for k, v in vars(asked).items() if k not in ways
+        }
+        assert again.get("places", [again.get("source"), again["root"]]) in (["A", source], [source, "A"])
+
+
+def test_a_picture_of_the_users_is_on_the_card(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
+    mine = Path(shutil.copytree(lesson, tmp_path / "d"))
+    (mine / "preview.png").write_bytes(b"mine")
+    assert data.main(["push", str(mine), "me/d"]) == 0
+    assert hub.dataset("me/d").files()["preview.png"].content == b"mine"
+    assert "![A picture of the dataset](preview.png)" in text_of(hub, "me/d")
+    (mine / "preview.png").unlink()
+    hub.dataset("me/d").files().pop("README.md")
+    capsys.readouterr()
+    assert data.main(["push", str(mine), "me/d"]) == 0
+    assert "its preview.png was put there by somebody and is left as it is; --replace_card" in capsys.readouterr().out
+    assert data.main(["push", str(mine), "me/d", "--replace_card"]) == 0
+    assert hub.dataset("me/d").files()["preview.png"].content.startswith(b"\x89PNG")
