@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bhd_lerobot.data.disk import RootLock
 from bhd_lerobot.data.episode_table import PREFIX
 from bhd_lerobot.data.state import load_state
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import DatasetError, DatasetLockedError
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,17 @@ def dataset_info(root: Path | str) -> DatasetSummary:
         size=sum((root / name).stat().st_size for name in files),
         compact=not state.without_stats,
     )
+
+
+def is_being_written(root: Path) -> bool:
+    """Tell whether a dataset is being recorded, repaired or edited by us at this moment."""
+    try:
+        RootLock(root).release()
+    except DatasetLockedError:
+        return True
+    except OSError:  # there is none, or nobody may look
+        return False
+    return False
 
 
 def check_not_empty(summary: DatasetSummary) -> None:

@@ -19,6 +19,8 @@ from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.check_dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.data.check_values import Limits
 from bhd_lerobot.data.fix import fix
+from bhd_lerobot.data.inspect import is_being_written
+from bhd_lerobot.errors import DatasetLockedError
 from bhd_lerobot.runs.data_command import Commands, Terminal, add_command, root_of
 
 # No option of a robot changes its limits, and its configuration takes seconds to import.
@@ -57,8 +59,14 @@ def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, video
         videos: read the films, too.
 
     Raises:
+        DatasetLockedError: it is being recorded or changed.
         DatasetError: there is no dataset that could be checked.
     """
+    if is_being_written(root):
+        raise DatasetLockedError(
+            f"{root} is being recorded or changed at this moment, so it is neither sound nor not. Check it when "
+            "that has ended."
+        )
     found = check_dataset(root, limits_of, videos=videos)
     is_sound = found.worst < (Severity.WARNING if is_strict else Severity.ERROR)
     if as_json:

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.data import features as keys
-from bhd_lerobot.data.inspect import DatasetSummary, dataset_info
+from bhd_lerobot.data.inspect import DatasetSummary, dataset_info, is_being_written
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.runs.data_command import Commands, Terminal, add_command, roots_of
 from bhd_lerobot.runs.timing_report import timing_of
@@ -61,9 +61,16 @@ def _line(summary: DatasetSummary) -> str:
         *_amount(summary),
         f"{summary.size / 1e6:.1f} MB",
         *([_outcomes(summary)] if _outcomes(summary) else []),
-        *([] if summary.compact else ["not finalised"]),
+        *([_unfinished(summary)] if _unfinished(summary) else []),
     ]
     return f"{summary.root}: {', '.join(parts)}"
+
+
+def _unfinished(summary: DatasetSummary) -> str:
+    """Return why a dataset is not finalised; empty if it is."""
+    if is_being_written(summary.root):
+        return "not finalised: it is being recorded or changed at this moment"
+    return "" if summary.compact else "not finalised: an interrupted recording; `bhd-data repair` finishes it"
 
 
 def _amount(summary: DatasetSummary) -> list[str]:
@@ -85,11 +92,11 @@ def info(root: Path, console: Console) -> None:
         DatasetError: there is none, or a file cannot be read.
     """
     summary = dataset_info(root)
-    state = "finalised" if summary.compact else "not finalised: an interrupted recording; `bhd-data repair` finishes it"
+    state = _unfinished(summary) or "finalised"
     table = Table(title=escape(str(summary.root)), title_justify="left", show_header=False)
     table.add_row("robot", escape(f"{summary.robot_type}, {summary.fps} frames/s"))
     table.add_row("content", ", ".join(_amount(summary)))
-    table.add_row("files", f"{summary.files}, {summary.size / 1e6:.1f} MB, {state}")
+    table.add_row("files", f"{summary.files}, {summary.size / 1e6:.1f} MB, {escape(state)}")
     table.add_row("tasks", escape("; ".join(summary.tasks)))
     for part in ("brain", "task"):
         if part in summary.recording:

@@ -13,6 +13,7 @@ import pytest
 
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.runs import data
+from tests.data import support
 from tests.runs.support import run_record
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -160,3 +161,25 @@ def test_output_that_nobody_reads_ends_the_command_without_a_word(recorded, argu
     finally:
         os.close(writing)
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+
+
+def test_a_recording_that_goes_on_is_no_interrupted_one(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    root = tmp_path / "d"
+    recorder = support.create(root)
+    support.record(recorder)
+    told = "not finalised: it is being recorded or changed at this moment"
+    for command in (["info"], ["info", "--short"]):
+        assert data.main([*command, str(root)]) == 0
+        assert told in capsys.readouterr().out
+    for command in ("check", "repair", "view"):
+        assert data.main([command, str(root)]) == 2
+        assert "being" in capsys.readouterr().err
+    recorder._lock.release()  # as if it had been killed
+    assert data.main(["info", "--short", str(root)]) == 0
+    assert "an interrupted recording; `bhd-data repair` finishes it" in capsys.readouterr().out
+    assert data.main(["repair", str(root)]) == 0
+    assert data.main(["check", str(root)]) == 0
+    capsys.readouterr()
+    assert data.main(["info", "--short", str(root)]) == 0
+    assert "not finalised" not in capsys.readouterr().out
