@@ -25,7 +25,8 @@ _NO_PLACES |= {"simplecache", "filecache", "blockcache", "cached", "generic", "j
 
 def shown(url: str) -> str:
     """Return a URL as it may be printed and kept: without a password, which may hold any character."""
-    return re.sub(r"(://)[^@]*:.*@", r"\1", url.rstrip("/"))
+    protocol, mark, path = url.partition("://")
+    return re.sub(r"(://)[^@]*:.*@", r"\1", f"{protocol}{mark}{path.rstrip('/')}")
 
 
 def open_place(url: str, storage_options: dict[str, Any] | None = None) -> tuple[Any, str]:

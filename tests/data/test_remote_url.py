@@ -13,7 +13,7 @@ from bhd_lerobot.errors import BhdError, ConfigError, TransferError
     [
         ("foo://b/d", r"Protocol not known: foo\. Known protocols: .*s3"),
         ("S3://b/d", "Protocol not known: S3"),
-        ("s3://", "names no folder.*s3://bucket/folder"),
+        ("s3://", "^s3:// names no folder.*s3://bucket/folder"),
         ("s3:///d", "names no bucket"),
         ("s3:////", "names no folder"),
         ("ftp://", "names no folder"),
