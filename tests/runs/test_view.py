@@ -254,7 +254,7 @@ def test_ctrl_c_before_the_address_ends_in_the_same_way(base, capsys, monkeypatc
 
     monkeypatch.setattr(web.TCPSite, "start", interrupted)
     assert data.main(["view", str(base), "--port", "0", "--no-browser"]) == 130
-    monkeypatch.setattr(data_view, "Console", lambda: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr(data_view, "Terminal", lambda: os.kill(os.getpid(), signal.SIGINT))
     assert data.main(["view", str(base), "--port", "0", "--no-browser"]) == 130
     assert "Stopped" in capsys.readouterr().err
 
