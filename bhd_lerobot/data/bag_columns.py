@@ -66,16 +66,14 @@ def told_silence(wanted: RobotImport, columns: Mapping[str, NDArray[Any]]) -> st
     names = list(wanted.observation_names)
     speeds = columns[keys.OBSERVATION_STATE][:, [names.index(name) for name in TWIST]]
     moving = int((silent & (np.abs(speeds) > _MOVES).any(axis=1)).sum())
-    drove = (
-        f", though the robot moved in {moving} of them: --command_timeout=inf is for robots that go on with the last "
-        "command"
-        if moving
-        else ""
-    )
-    return (
-        f"{int(silent.sum())} of {len(silent)} frames of the episode have no command that is younger than "
-        f"{wanted.command_timeout_s:g} s; their action is 0{drove}"
-    )
+    for_ever = np.isinf(wanted.command_timeout_s)
+    lacking = "come before the first command" if for_ever else (
+        f"have no command that is younger than {wanted.command_timeout_s:g} s"
+    )  # fmt: skip
+    drove = f", though the robot moved in {moving} of them" if moving else ""
+    if moving and not for_ever:
+        drove += ": --command_timeout=inf is for robots that go on with the last command"
+    return f"{int(silent.sum())} of {len(silent)} frames of the episode {lacking}; their action is 0{drove}"
 
 
 def _commands(wanted: RobotImport, track: Track, times: Times) -> tuple[Array, Times]:

@@ -16,7 +16,7 @@ def find_bags(path: Path) -> list[Bag]:
     """Return the bag at a path, or the bags in a folder of bags.
 
     Raises:
-        DatasetError: there is none, or a file of one is missing.
+        DatasetError: there is none, a file of one is missing, or files and folders of bags are mixed.
     """
     if path.is_file():
         if _suffix(path) not in FILES:
@@ -24,9 +24,18 @@ def find_bags(path: Path) -> list[Bag]:
         return [Bag(path, [path])]
     if not path.is_dir():
         raise DatasetError(f"There is no bag at {path}: it does not exist.")
-    if bag := _folder(path):
+    bag = _folder(path)
+    if bag and (path / "metadata.yaml").is_file():
         return [bag]
-    inside = [bag for folder in sorted(path.iterdir(), key=_natural) if folder.is_dir() and (bag := _folder(folder))]
+    inside = [found for folder in sorted(path.iterdir(), key=_natural) if folder.is_dir() and (found := _folder(folder))]
+    if bag and inside:
+        raise DatasetError(
+            f"{path} has bag files of its own ({', '.join(file.name for file in bag.files)}) and folders of bags "
+            f"({', '.join(found.path.name for found in inside)}), and nothing says what belongs together. Name the bags "
+            "one by one, or put the files into a folder of their own."
+        )
+    if bag:
+        return [bag]
     if not inside:
         raise DatasetError(
             f"There is no bag at {path}: it has no metadata.yaml, no .mcap and no .db3 file, and no folder that has."

@@ -148,7 +148,7 @@ class _BagEpisodes:
             for key, feature in features.items():
                 if feature["dtype"] == "video":
                     topic = self._image_topic(key)
-                    places = self._places(topic, head_stamps(topic, self._messages[topic].data), observed)
+                    places = self._places(topic, self._head_stamps(topic), observed)
                     pictures = self._pictures.setdefault(topic, Picker(self._bag, topic))
                     for place in self._messages[topic].order[places].tolist():
                         image = decode_image(topic, self._topics[topic].msgtype, pictures.get(place))
@@ -225,6 +225,11 @@ class _BagEpisodes:
             self._stamps[part.topic] = messages.received if bare else header_stamps(part.msgtype, messages.data)
         return self._stamps[part.topic]
 
+    def _head_stamps(self, topic: str) -> NDArray[np.int64]:
+        if topic not in self._stamps:
+            self._stamps[topic] = head_stamps(topic, self._messages[topic].data)
+        return self._stamps[topic]
+
     def _part_values(self, part: Part, rows: NDArray[np.intp]) -> NDArray[Any]:
         messages = self._messages[part.topic].data
         if isinstance(part, OdometryPart):  # its yaw is unwrapped, and another episode's turns are not this one's
@@ -235,9 +240,10 @@ class _BagEpisodes:
 
     def _texts(self, key: str, at: NDArray[np.int64]) -> NDArray[Any]:
         topic = own_topic(key)
-        messages = self._messages[topic]
-        texts = decode(types.TEXT, messages.data, ("text",))["text"]
-        rows = self._places(topic, header_stamps(types.TEXT, messages.data), at, held=True)
+        if topic not in self._values:
+            self._values[topic] = decode(types.TEXT, self._messages[topic].data, ("text",))["text"]
+        texts = self._values[topic]
+        rows = self._places(topic, self._head_stamps(topic), at, held=True)
         values = np.empty(len(at), object)
         values[:] = [json.loads(texts[row]) if key == LANGUAGE else texts[row] for row in rows]
         return values

@@ -131,8 +131,15 @@ class _RobotBag:
             max_gap_s=wanted.max_gap_s,
             notes=self.notes,
         )
+        begin = 0
         for part in parts:
-            tracks = {role: track.part(part.mask(track)) for role, track in self._tracks.items()}
+            # The pose began anew, not the clock: a command from before is still in force.
+            begin = begin if part.why == "reset" else part.first
+            of_commands = part._replace(first=begin)
+            tracks = {
+                role: track.part((of_commands if role == "cmd" else part).mask(track))
+                for role, track in self._tracks.items()
+            }
             sensors = {role: track for role, track in tracks.items() if role != "cmd"}
             self._tell_gaps(sensors)
             for grid in grids(
