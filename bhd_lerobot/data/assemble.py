@@ -30,7 +30,15 @@ from bhd_lerobot.errors import DatasetError, DatasetMismatchError
 EDITS = "meta/edits.jsonl"
 """What was done to a dataset after its recording: one JSON object a line."""
 
-_WRITTEN = ("info.json", "stats.json", "tasks.parquet", "bhd.json", "edits.jsonl", "episodes/chunk-*/file-*.parquet")
+_WRITTEN = (
+    "info.json",
+    "stats.json",
+    "tasks.parquet",
+    "bhd.json",
+    "edits.jsonl",
+    "bhd_subset.json",  # tells what a pull was asked for, which is not so of an edited dataset
+    "episodes/chunk-*/file-*.parquet",
+)
 
 
 def assemble(

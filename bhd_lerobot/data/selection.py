@@ -71,13 +71,13 @@ class EpisodeFilter:
         candidates = checked_episodes(meta, episodes)
         wanted = candidates
         if self.outcomes is not None:
-            values = _metadata(meta, "outcome", "outcome 'all'")
+            values = _metadata(meta, "outcome", "the outcome 'all'")
             wanted = [episode for episode in wanted if values[episode] in self.outcomes]
         if self.min_score is not None:
             scores = _metadata(meta, "score", "no min_score")
             wanted = [episode for episode in wanted if (scores[episode] or 0.0) >= self.min_score]
         if self.exclude_late:
-            timings = _metadata(meta, "timing", "exclude_late false")
+            timings = _metadata(meta, "timing", "exclude_late off")
             wanted = [episode for episode in wanted if not _is_late(json.loads(timings[episode] or "{}"))]
         if not wanted:
             raise DatasetError(self._nothing_left(meta, candidates))
@@ -193,7 +193,7 @@ def _metadata(meta: "LeRobotDatasetMetadata", name: str, remedy: str) -> list[An
     if f"{PREFIX}{name}" not in meta.episodes.column_names:
         raise DatasetError(
             f"{meta.root} has no {PREFIX}{name} for its episodes, because another program recorded it. Filter with "
-            f"{remedy}, or name the episodes with dataset.episodes."
+            f"{remedy}, or give the episodes' numbers."
         )
     return list(meta.episodes[f"{PREFIX}{name}"])
 

@@ -99,8 +99,8 @@ def corrupt(path: Path, reason: object) -> DatasetCorruptError:
 def repair_with_info(root: Path) -> str:
     """Return what to do if `info.json` cannot be used, in words."""
     return (
-        "Restore this file from a copy (or from the Hub), or take that of another recording with the same robot and cameras, "
-        f"whose counts do not matter: `bhd-data repair {root} --info OTHER`. Nothing was changed."
+        "Restore this file from a copy (or from the Hub), or take that of another recording with the same robot and "
+        f"cameras, whose counts do not matter: `bhd-data repair {root} --info OTHER`. Nothing was changed."
     )
 
 

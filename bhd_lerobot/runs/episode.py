@@ -19,7 +19,7 @@ from bhd_lerobot.runs.drivers import DriverLog, flagged
 from bhd_lerobot.runs.episode_images import EpisodeImages, Observer
 from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
 from bhd_lerobot.runs.marks import Marks
-from bhd_lerobot.tasks.task import Event, Task
+from bhd_lerobot.tasks.task import Event, Task, outcomes_of
 
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.
 _BRAIN_STREAM = 2
@@ -57,7 +57,7 @@ class EpisodeLoop:
         self.simulation, self.task, self.brain = simulation, task, brain
         self.tolerance = tolerance or TimingTolerance()
         self.emergency_stop = False
-        self.marks = Marks(simulation.n)
+        self.marks = Marks(simulation.n, outcomes_of(task.name, task.robot_type))
         self._last_frame = -1  # number of the last frame on the wall clock
         self._open_images: Callable[[], Any] | None = None
         self._frames = max(1, round(task.duration_s * simulation.rates.fps))

@@ -1,6 +1,7 @@
 """What a person says while an episode is recorded: it succeeded, it failed, somebody intervenes."""
 
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +25,11 @@ class Marks:
 
     Args:
         n: number of simulations.
+        outcomes: what an episode can end with; see `bhd_lerobot.tasks.task.outcomes_of`.
     """
 
-    def __init__(self, n: int = 1) -> None:
-        self._n = n
+    def __init__(self, n: int = 1, outcomes: Sequence[str] = OUTCOMES) -> None:
+        self._n, self._valid = n, tuple(outcomes)
         self._lock = threading.Lock()
         self._outcomes: dict[int, Event] = {}
         self._driving: set[int] = set()
@@ -36,14 +38,14 @@ class Marks:
         """Say that the running episode ends now, and how.
 
         Args:
-            name: one of `bhd_lerobot.tasks.task.OUTCOMES`, for example ``success``, ``failure`` or ``collision``.
+            name: one of `outcomes`, for example ``success``, ``failure`` or ``collision``.
             simulation: whose episode.
 
         Raises:
             ConfigError: there is no such outcome or simulation.
         """
-        if name not in OUTCOMES:
-            raise ConfigError(unknown_name("outcome", name, OUTCOMES))
+        if name not in self._valid:
+            raise ConfigError(unknown_name("outcome", name, self._valid))
         with self._lock:
             self._outcomes[self._checked(simulation)] = Event[name.upper()]
 

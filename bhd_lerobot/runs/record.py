@@ -39,7 +39,7 @@ from bhd_lerobot.runs.record_report import RecordResult, tell_refusals, tell_sum
 from bhd_lerobot.runs.registry import make_brain, make_robot, make_simulation, make_task
 from bhd_lerobot.runs.resume_advice import instead_of_resuming
 from bhd_lerobot.runs.signals import stop_on_signals
-from bhd_lerobot.tasks.task import Task, episode_seed
+from bhd_lerobot.tasks.task import Task, episode_seed, outcomes_of
 
 _ATTEMPTS = 3  # that an episode gets to be punctual
 
@@ -63,7 +63,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     n = 1 if config.robot.clock == "realtime" or not is_here else min(config.n_envs, config.dataset.num_episodes)
     simulation = make_robot(config.robot, n, config.threads)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
-    marks = Marks(n)
+    marks = Marks(n, outcomes_of(config.task.get_choice_name(type(config.task)), config.robot.type))
     pressed = EstopInputs(simulation.bridge.estop, marks.hear)
     with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)

@@ -73,6 +73,14 @@ def test_wrong_names_are_refused() -> None:
         Marks().outcome(name)
 
 
+def test_an_outcome_that_the_task_cannot_have_is_refused() -> None:
+    simulation = make_simulation(TurtleBot3Config(beams=36), 1)
+    loop = EpisodeLoop(simulation, make_task(AvoidConfig(), 1, 10), GapFollowerBrain(GapFollowerConfig()))
+    with pytest.raises(ConfigError, match="dropped"):
+        loop.marks.outcome("dropped")
+    loop.marks.outcome("stuck")
+
+
 def run(say: dict[tuple[int, int], Any], episodes: int = 3) -> list[Episode]:
     """Run episodes of two simulations and call what is to be said when a simulation has done so many frames."""
     simulation = make_simulation(TurtleBot3Config(beams=36), 2)
