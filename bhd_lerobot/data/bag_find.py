@@ -27,12 +27,13 @@ def find_bags(path: Path) -> list[Bag]:
     bag = _folder(path)
     if bag and (path / "metadata.yaml").is_file():
         return [bag]
-    inside = [found for folder in sorted(path.iterdir(), key=_natural) if folder.is_dir() and (found := _folder(folder))]
+    folders = sorted((inner for inner in path.iterdir() if inner.is_dir()), key=_natural)
+    inside = [found for inner in folders if (found := _folder(inner))]
     if bag and inside:
         raise DatasetError(
             f"{path} has bag files of its own ({', '.join(file.name for file in bag.files)}) and folders of bags "
-            f"({', '.join(found.path.name for found in inside)}), and nothing says what belongs together. Name the bags "
-            "one by one, or put the files into a folder of their own."
+            f"({', '.join(found.path.name for found in inside)}), and nothing says what belongs together. Name the "
+            "bags one by one, or put the files into a folder of their own."
         )
     if bag:
         return [bag]

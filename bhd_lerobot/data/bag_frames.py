@@ -1,6 +1,8 @@
 """Which frames of reference a bag's messages are in, and how the scanner is turned in the robot."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,23 +19,21 @@ BASE_FRAMES = (FOOTPRINT_FRAME, "base_link")
 _DEEPEST = 32  # frames between a sensor and the base
 
 
-def static_frames(messages: Sequence[bytes]) -> Static:
-    """Return what ``/tf_static`` says.
-
-    Raises:
-        DatasetError: a message cannot be read.
-    """
+def static_frames(messages: Sequence[bytes]) -> tuple[Static, int]:
+    """Return what ``/tf_static`` says, and how many of its messages cannot be read."""
     frames: dict[str, tuple[str, Array]] = {}
-    for message in dict.fromkeys(messages):  # a latched message may be there many times
+    lost = 0
+    for message, times in Counter(messages).items():  # a latched message may be there many times
         try:
             transforms = type_store().deserialize_cdr(message, "tf2_msgs/msg/TFMessage").transforms
-        except Exception as error:  # whatever a parser of damaged bytes raises
-            raise DatasetError(f"A message of /tf_static cannot be read: {error}.") from error
+        except Exception:  # whatever a parser of damaged bytes raises
+            transforms = None
+        if transforms is None or not np.isfinite([_quaternion(one) for one in transforms]).all():
+            lost += times
+            continue
         for one in transforms:
-            turn = one.transform.rotation
-            rotation = _matrix(np.array([turn.w, turn.x, turn.y, turn.z]))
-            frames[one.child_frame_id.lstrip("/")] = (one.header.frame_id.lstrip("/"), rotation)
-    return frames
+            frames[one.child_frame_id.lstrip("/")] = (one.header.frame_id.lstrip("/"), _matrix(_quaternion(one)))
+    return frames, lost
 
 
 def the_frame(topic: str, frames: Sequence[str]) -> str:
@@ -108,6 +108,11 @@ def _from_base(frame: str, static: Static) -> Array | None:
 def _last(frame: str) -> str:
     """Return a frame's name without the robot's in front of it."""
     return frame.rsplit("/", 1)[-1]
+
+
+def _quaternion(transform: Any) -> Array:
+    turn = transform.transform.rotation
+    return np.array([turn.w, turn.x, turn.y, turn.z])
 
 
 def _matrix(quaternion: Array) -> Array:

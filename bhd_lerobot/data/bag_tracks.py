@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.data import bag_frames as frames
+from bhd_lerobot.data.bag_doubts import pace, told_pace, told_speeds
 from bhd_lerobot.data.bag_read import Bag, Messages, Topic
 from bhd_lerobot.data.bag_sound import sound_messages
 from bhd_lerobot.data.bag_wanted import TYPES, static_topics, told_publishers, wanted_topic
@@ -97,23 +98,27 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
     notes += told_publishers(topics, {**wanted, **cameras})
     names = {topic.name for topic in wanted.values()} | (static_topics(options.topics["scan"]) & topics.keys())
     messages = bag.read(names, {topic.name for topic in cameras.values()})
-    static = frames.static_frames(
+    static, lost = frames.static_frames(
         [one for name in sorted(static_topics(options.topics["scan"]) & names) for one in messages[name].data]
     )
-    tracks = {}
+    if lost:
+        bag.problems.append(f"{bag.path.name}: {lost} messages of /tf_static cannot be read, and are left out")
+    tracks, paces = {}, {}
     for role, topic in {**wanted, **cameras}.items():
         if not len(messages[topic.name].data):
             damage = "".join(f" Damaged: {problem}." for problem in bag.problems)
             raise DatasetError(f"{bag.path} has no readable message of {topic.name}.{damage}")
         found = sound_messages(bag.path, topic, messages[topic.name], bag.problems)
         stamps = _stamps(topic, found)
+        if stamps is not None and role != "cmd":
+            paces[topic.name] = pace(found.received, stamps)
         times = message_times(found.received, stamps, options.stamps)
         if stamps is not None and options.stamps == "auto" and (wrong := int((~sane(found.received, stamps)).sum())):
             notes.append(
                 f"{topic.name}: {wrong} of {len(times)} header stamps are not within 0.5 s of the reception; the "
                 f"{'headers were' if times is stamps else 'times of reception were'} taken for all of them"
             )
-        values = _values(role, topic, found, _Reading(options, static, notes))
+        values = _values(role, topic, found, _Reading(options, static, lost > 0, notes))
         fits = np.abs(values) < np.finfo(np.float32).max  # the dataset's numbers are float32
         finite = np.logical_and.reduce(fits, axis=1)
         if not finite.all():
@@ -123,6 +128,7 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
         if not len(track.times):
             raise DatasetError(f"{bag.path}: no message of {topic.name} has finite values.")
         tracks[role] = track
+    notes += told_pace(paces)
     return tracks
 
 
@@ -140,6 +146,7 @@ class _Reading:
 
     options: TrackOptions
     static: frames.Static
+    static_lost: bool
     notes: list[str]
 
 
@@ -151,6 +158,9 @@ def _values(role: str, topic: Topic, messages: Messages, reading: _Reading) -> A
         children = decode(topic.msgtype, data, ("child_frame_id",))["child_frame_id"].tolist()
         frames.check_base_frame(topic.name, frames.the_frame(topic.name, children), reading.options.odom_frame)
         speeds, pose = odometry(data)
+        stamps = header_stamps(topic.msgtype, data)  # by which they were measured; of some drivers they are not set
+        measured = stamps if (np.diff(stamps) > 0).all() else messages.received
+        reading.notes.extend(told_speeds(topic.name, measured, speeds, pose))
         return np.concatenate([speeds, pose], axis=1) if reading.options.pose else speeds
     if role == "cmd":
         kind = BareTwistPart if topic.msgtype == BareTwistPart.msgtype else TwistPart
@@ -166,6 +176,11 @@ def _scans(topic: Topic, data: Sequence[bytes], reading: _Reading) -> Array:
     found: dict[str, Any] = decode(topic.msgtype, data, ("ranges", "header.frame_id", *geometry))
     frame = frames.the_frame(topic.name, found["header.frame_id"].tolist())
     rotation, source = frames.scanner_rotation(topic.name, frame, reading.static, options.scan_frame, options.scan_yaw)
+    if reading.static_lost and source not in ("/tf_static", "--scan_yaw"):
+        raise DatasetError(
+            f"Messages of /tf_static cannot be read, and with them may be lost how the scanner of {topic.name} is "
+            "turned. Say where its zero points with --scan_yaw (0 is straight ahead)."
+        )
     if not np.allclose(rotation, np.eye(3), atol=1e-3):
         ahead = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
         over = ", upside down" if rotation[2, 2] < 0 else ""

@@ -12,6 +12,7 @@ from bhd_lerobot.errors import DatasetError
 
 Array = NDArray[np.float64]
 _GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max")
+_MOST = 1.5 * 2 * np.pi  # [rad] of a scan; drivers go on a little after a whole turn, and nothing turns twice
 _WIDEST = np.radians(10.0)  # between a beam of ours and the one it is made of; a few beams are no view all around
 
 
@@ -58,9 +59,14 @@ def nearest_beams(sweep: Sweep, beams: int, rotation: tuple[float, ...], topic: 
         topic: for messages.
 
     Raises:
-        DatasetError: one of ours has none nearby: the scanner does not see all around.
+        DatasetError: one of ours has none nearby: the scanner does not see all around. Or the angles cannot be true.
     """
     count, angle_min, angle_increment = sweep
+    if abs(angle_increment) * (count - 1) > _MOST:
+        raise DatasetError(
+            f"The {count} beams of the scans of {topic} lie {angle_increment:g} rad apart (angle_increment), which is "
+            "more than a whole turn together; the driver may write degrees, or a wrong number."
+        )
     angle = angle_min + angle_increment * np.arange(count)
     matrix = np.reshape(rotation, (3, 3))
     ahead, left, _ = matrix @ np.stack([np.cos(angle), np.sin(angle), np.zeros(count)])
@@ -100,7 +106,7 @@ def resampled_scans(
         topic: for messages.
 
     Raises:
-        DatasetError: most scans do not see all around; single ones that do not are lost.
+        DatasetError: most scans do not see all around, or have impossible angles; single ones that do not are lost.
     """
     n = len(ranges)
     result = np.empty((n, beams))

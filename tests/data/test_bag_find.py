@@ -180,3 +180,14 @@ def test_every_version_of_metadata_is_read(split, messages):
         (bag / "metadata.yaml").write_text(yaml.safe_dump(told))
         check(bag, messages)
         assert find_bags(bag)[0].topics()["/cmd_vel"].publishers == offered(profiles)
+
+
+def test_files_beside_folders_of_bags_are_refused_and_not_forgotten(tmp_path, parts, split, messages):
+    shutil.copytree(parts[0], tmp_path / "drives" / "drive_0")
+    shutil.copy(parts[1] / "drive_1.mcap", tmp_path / "drives" / "more.mcap")
+    with pytest.raises(DatasetError, match=r"more\.mcap\) and folders of bags \(drive_0\)"):
+        find_bags(tmp_path / "drives")
+    # What lies in a bag that says what belongs to it is not asked about.
+    bag = split()
+    shutil.copytree(parts[0], bag / "drive_0")
+    check(bag, messages)

@@ -203,6 +203,16 @@ def test_a_part_of_a_turn_is_a_lost_scan_and_no_free_space():
         scans(np.array([whole, whole[:348], whole[:348]], dtype=object))
 
 
+def test_angles_that_cannot_be_true_are_no_scan():
+    whole = np.full(360, 2.0)
+    step = np.radians([1.0, 1.4, 1.6])  # the second goes on a little after its turn
+    found = scans(np.stack([whole] * 3), angle_increment=step)
+    assert (found[:2] == 2.0).all()
+    assert np.isnan(found[2]).all()
+    with pytest.raises(DatasetError, match=r"360 beams .* lie 1 rad apart"):  # a driver that writes degrees
+        scans(np.stack([whole] * 3), angle_increment=np.ones(3))
+
+
 def test_empty_bins_are_no_free_space():
     """Drivers sort points into bins; one that got none is not a number."""
     scan = np.full(360, 0.5)

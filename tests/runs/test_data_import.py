@@ -234,6 +234,25 @@ def test_a_static_transform_says_how_the_scanner_is_turned(tmp_path, capsys, pla
     assert np.array_equal(theirs, np.roll(ours, 90, axis=1))
 
 
+def test_a_static_transform_that_is_lost_is_asked_for(tmp_path, capsys, plain):
+    quaternion = bags.Quaternion(x=0.0, y=0.0, z=float("nan"), w=1.0)
+    transform = bags.T["geometry_msgs/msg/TransformStamped"](
+        header=bags.header(START, "base_link"),
+        child_frame_id="base_scan",
+        transform=bags.T["geometry_msgs/msg/Transform"](
+            translation=bags.Vector(x=0.0, y=0.0, z=0.1), rotation=quaternion
+        ),
+    )
+    static = ("/tf_static", START, bags.T["tf2_msgs/msg/TFMessage"](transforms=[transform]))
+    bag = write(tmp_path / "bag", [static, *drive()])
+    assert "--scan_yaw (0 is straight ahead)" in refused(bag, tmp_path / "d", capsys)
+    imported(bag, tmp_path / "d", "--scan_yaw=0")
+    assert "1 messages of /tf_static cannot be read" in capsys.readouterr().err
+    imported(plain, tmp_path / "a")
+    ours, theirs = (read_episode(tmp_path / name, 0)["observation.state"] for name in ("a", "d"))
+    assert np.array_equal(ours, theirs)
+
+
 def test_stamps_that_cannot_be_true_are_told_and_the_reception_counts(tmp_path, capsys):
     messages = [
         (topic, at, bags.odometry(at - 1000 * NANO) if topic == "/odom" else message) for topic, at, message in drive()

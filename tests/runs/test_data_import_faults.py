@@ -182,6 +182,23 @@ def test_an_odometry_that_starts_anew_begins_an_episode(tmp_path, messages, caps
     assert len(imported(bag, tmp_path / "e").episodes) == 1
 
 
+def test_a_command_stays_in_force_when_the_pose_starts_anew(tmp_path, messages, capsys):
+    commands = [one for one in messages if one[0] == "/cmd_vel"]
+    once = [one for one in messages if one[0] != "/cmd_vel" or one is commands[0]]
+    late = START + 2 * NANO
+    bag = write(tmp_path / "bag", changed(once, "/odom", lambda at: reset_odometry(at, dx=9.0), since=late))
+    imported(bag, tmp_path / "d", "--odometry", "--beams=36", "--command_timeout=inf")
+    assert [why for why, _ in places(tmp_path / "d")] == ["start", "reset"]
+    actions = np.concatenate([read_episode(tmp_path / "d", episode)["action"] for episode in range(2)])
+    twist = commands[0][2]
+    np.testing.assert_allclose(actions, np.tile([twist.linear.x, twist.angular.z], (len(actions), 1)), rtol=1e-6)
+    # Before the first one there was none.
+    rest = [one for one in once if one[0] != "/cmd_vel"]
+    bag = write(tmp_path / "late", sorted([*rest, ("/cmd_vel", late, twist)], key=lambda one: one[1]))
+    imported(bag, tmp_path / "e", "--command_timeout=inf")
+    assert "come before the first command; their action is 0, though the robot moved" in capsys.readouterr().err
+
+
 def test_a_drive_without_a_reset_stays_whole(tmp_path, messages, capsys):
     fast = [one for number, one in enumerate(messages) if one[0] != "/odom" or number % 5 == 0]  # 4 Hz, and jittered
     imported(write(tmp_path / "bag", fast), tmp_path / "d", "--odometry", "--beams=36", "--max_age=0.9")
