@@ -12,7 +12,7 @@ from bhd_lerobot.data.resample import CLOCK_STEP_NS, NANO, STEP_BACK_NS, Times, 
 from bhd_lerobot.errors import DatasetError
 
 _TOLD = 5  # of the same kind, one by one
-_MIXED = 0.01  # share of messages whose stamps go back, beyond which no restart explains it
+_MIXED = 0.01  # share of messages whose stamps go back, beyond which (and beyond `_TOLD`) no restart explains it
 _ODD = 0.05  # the same of poses that jump
 
 POSE_FACTOR, POSE_SLACK = 1.5, (0.1, 0.3)
@@ -89,7 +89,7 @@ def _restarts(track: Track, stamps: Times, parts: list[Stretch], notes: list[str
     for part in parts:
         mask = part.mask(track)
         places += clock_jumps([stamps[mask]], [track.order[mask]], STEP_BACK_NS).tolist()
-    if len(places) > max(1, _MIXED * len(stamps)):
+    if len(places) > max(_TOLD, _MIXED * len(stamps)):
         notes.append(f"{track.topic}: its header stamps go back {len(places)} times, which no restart explains; unused")
         return []
     if places:

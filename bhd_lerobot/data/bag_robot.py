@@ -24,6 +24,7 @@ from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.tasks.task import Event
 
 _TOLD = 8  # sentences in an error; a damaged bag may give hundreds
+_TOLD_GAPS = 5  # of each sensor, one by one
 
 
 def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wanted: RobotImport) -> ImportReport:
@@ -141,7 +142,7 @@ class _RobotBag:
                 for role, track in self._tracks.items()
             }
             sensors = {role: track for role, track in tracks.items() if role != "cmd"}
-            self._tell_gaps(sensors)
+            self._tell_silences(sensors)
             for grid in grids(
                 [track.times for track in sensors.values()],
                 wanted.fps,
@@ -158,15 +159,41 @@ class _RobotBag:
                         "was left out"
                     )
 
-    def _tell_gaps(self, sensors: Mapping[str, Track]) -> None:
+    def _tell_silences(self, sensors: Mapping[str, Track]) -> None:
+        """Tell where a sensor was silent in a stretch: at its beginning, within it, or at its end."""
         limit = round(self._wanted.max_gap_s * NANO)
+        heard = [track.times for track in sensors.values() if len(track.times)]
+        if not heard:
+            return
+        begin, end = min(int(times[0]) for times in heard), max(int(times[-1]) for times in heard)
         for track in sensors.values():
+            if not len(track.times):
+                if end - begin > limit:  # a restart is seen a moment later by the sensor that is slower
+                    self.notes.append(
+                        f"{track.topic} was not heard in the {seconds(end - begin)} from {seconds(begin - self._begin)} "
+                        "after the start on, which are left out"
+                    )
+                continue
+            first, last = int(track.times[0]), int(track.times[-1])
+            if first - begin > limit:
+                self.notes.append(
+                    f"{track.topic} was first heard {seconds(first - self._begin)} after the start; "
+                    f"{seconds(first - begin)} in which other sensors were heard are left out"
+                )
             steps = np.diff(track.times)
-            for place in np.flatnonzero(steps > limit)[:5].tolist():
+            gaps = np.flatnonzero(steps > limit)
+            for place in gaps[:_TOLD_GAPS].tolist():
                 after = seconds(int(track.times[place]) - self._begin)
                 self.notes.append(
                     f"{track.topic} was silent for {seconds(int(steps[place]))} ({after} after the start), or the "
                     "clock jumped ahead; a new episode begins"
+                )
+            if len(gaps) > _TOLD_GAPS:
+                self.notes.append(f"{track.topic}: {len(gaps) - _TOLD_GAPS} more such silences")
+            if end - last > limit:
+                self.notes.append(
+                    f"{track.topic} was last heard {seconds(last - self._begin)} after the start; "
+                    f"{seconds(end - last)} in which other sensors were heard are left out"
                 )
 
     def image_shapes(self) -> dict[str, tuple[int, int, int]]:

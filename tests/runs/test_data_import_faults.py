@@ -182,6 +182,25 @@ def test_an_odometry_that_starts_anew_begins_an_episode(tmp_path, messages, caps
     assert len(imported(bag, tmp_path / "e").episodes) == 1
 
 
+def test_time_without_a_sensor_is_told_at_both_ends_and_after_a_break(tmp_path, messages, capsys):
+    def heard(topic, first, last):
+        return [one for one in messages if one[0] != topic or first <= (one[1] - START) / NANO <= last]
+
+    imported(write(tmp_path / "dies", heard("/scan", 0, 2)), tmp_path / "a")
+    error = capsys.readouterr().err
+    assert "/scan was last heard 1." in error
+    assert "/odom" not in error
+    imported(write(tmp_path / "late", heard("/odom", 2.5, 9)), tmp_path / "b")
+    assert "/odom was first heard 2.5" in capsys.readouterr().err
+    # After the clock has jumped back there is no scan any more.
+    back = [(topic, at - 3600 * NANO, one) for topic, at, one in messages if topic != "/scan"]
+    imported(write(tmp_path / "break", [*messages, *back]), tmp_path / "c")
+    assert "/scan was not heard in the 3." in capsys.readouterr().err
+    assert len(places(tmp_path / "c")) == 1
+    imported(write(tmp_path / "plain", messages), tmp_path / "d")
+    assert "heard" not in capsys.readouterr().err
+
+
 def test_a_command_stays_in_force_when_the_pose_starts_anew(tmp_path, messages, capsys):
     commands = [one for one in messages if one[0] == "/cmd_vel"]
     once = [one for one in messages if one[0] != "/cmd_vel" or one is commands[0]]
