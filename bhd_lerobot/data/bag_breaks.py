@@ -1,4 +1,4 @@
-"""Where a bag's recording breaks off and begins anew: clocks that go back, drivers and simulations that restart."""
+"""Where a bag's recording breaks off and begins anew: silences, clocks that go back, drivers that restart."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -128,6 +128,49 @@ def _resets(
         )
     notes += told[:_TOLD] + [f"{track.topic}: {len(told) - _TOLD} more such jumps"] * (len(told) > _TOLD)
     return places
+
+
+def told_silences(sensors: Mapping[str, Track], start: int, gap: int) -> list[str]:
+    """Return, in sentences, where a sensor was silent in a stretch: at its beginning, within it, or at its end.
+
+    Args:
+        sensors: tracks of the stretch, sorted by time.
+        start: of the bag [ns].
+        gap: silence that is told [ns].
+    """
+    heard = [track.times for track in sensors.values() if len(track.times)]
+    if not heard:
+        return []
+    begin, end = min(int(times[0]) for times in heard), max(int(times[-1]) for times in heard)
+    notes = []
+    for track in sensors.values():
+        if not len(track.times):
+            if end - begin > gap:  # a restart is seen a moment later by the sensor that is slower
+                notes.append(
+                    f"{track.topic} was not heard in the {seconds(end - begin)} from {seconds(begin - start)} after the "
+                    "start on, which are left out"
+                )
+            continue
+        first, last, steps = int(track.times[0]), int(track.times[-1]), np.diff(track.times)
+        if first - begin > gap:
+            notes.append(
+                f"{track.topic} was first heard {seconds(first - start)} after the start; {seconds(first - begin)} in "
+                "which other sensors were heard are left out"
+            )
+        silent = np.flatnonzero(steps > gap)
+        for place in silent[:_TOLD].tolist():
+            after = seconds(int(track.times[place]) - start)
+            notes.append(
+                f"{track.topic} was silent for {seconds(int(steps[place]))} ({after} after the start), or the clock "
+                "jumped ahead; a new episode begins"
+            )
+        notes += [f"{track.topic}: {len(silent) - _TOLD} more such silences"] * (len(silent) > _TOLD)
+        if end - last > gap:
+            notes.append(
+                f"{track.topic} was last heard {seconds(last - start)} after the start; {seconds(end - last)} in which "
+                "other sensors were heard are left out"
+            )
+    return notes
 
 
 def pose_steps(times: Times, pose: Array) -> tuple[Array, Array, Array]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.data import bag_checksum
 from bhd_lerobot.data import features as keys
-from bhd_lerobot.data.bag_breaks import stretches
+from bhd_lerobot.data.bag_breaks import stretches, told_silences
 from bhd_lerobot.data.bag_columns import frame_columns, told_silence
 from bhd_lerobot.data.bag_dataset import ImportReport, RobotImport, all_or_nothing
 from bhd_lerobot.data.bag_film import CAMERA, Film
@@ -24,7 +24,6 @@ from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.tasks.task import Event
 
 _TOLD = 8  # sentences in an error; a damaged bag may give hundreds
-_TOLD_GAPS = 5  # of each sensor, one by one
 
 
 def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wanted: RobotImport) -> ImportReport:
@@ -142,7 +141,7 @@ class _RobotBag:
                 for role, track in self._tracks.items()
             }
             sensors = {role: track for role, track in tracks.items() if role != "cmd"}
-            self._tell_silences(sensors)
+            self.notes += told_silences(sensors, self._begin, round(wanted.max_gap_s * NANO))
             for grid in grids(
                 [track.times for track in sensors.values()],
                 wanted.fps,
@@ -158,43 +157,6 @@ class _RobotBag:
                         f"a stretch of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
                         "was left out"
                     )
-
-    def _tell_silences(self, sensors: Mapping[str, Track]) -> None:
-        """Tell where a sensor was silent in a stretch: at its beginning, within it, or at its end."""
-        limit = round(self._wanted.max_gap_s * NANO)
-        heard = [track.times for track in sensors.values() if len(track.times)]
-        if not heard:
-            return
-        begin, end = min(int(times[0]) for times in heard), max(int(times[-1]) for times in heard)
-        for track in sensors.values():
-            if not len(track.times):
-                if end - begin > limit:  # a restart is seen a moment later by the sensor that is slower
-                    self.notes.append(
-                        f"{track.topic} was not heard in the {seconds(end - begin)} from {seconds(begin - self._begin)} "
-                        "after the start on, which are left out"
-                    )
-                continue
-            first, last = int(track.times[0]), int(track.times[-1])
-            if first - begin > limit:
-                self.notes.append(
-                    f"{track.topic} was first heard {seconds(first - self._begin)} after the start; "
-                    f"{seconds(first - begin)} in which other sensors were heard are left out"
-                )
-            steps = np.diff(track.times)
-            gaps = np.flatnonzero(steps > limit)
-            for place in gaps[:_TOLD_GAPS].tolist():
-                after = seconds(int(track.times[place]) - self._begin)
-                self.notes.append(
-                    f"{track.topic} was silent for {seconds(int(steps[place]))} ({after} after the start), or the "
-                    "clock jumped ahead; a new episode begins"
-                )
-            if len(gaps) > _TOLD_GAPS:
-                self.notes.append(f"{track.topic}: {len(gaps) - _TOLD_GAPS} more such silences")
-            if end - last > limit:
-                self.notes.append(
-                    f"{track.topic} was last heard {seconds(last - self._begin)} after the start; "
-                    f"{seconds(end - last)} in which other sensors were heard are left out"
-                )
 
     def image_shapes(self) -> dict[str, tuple[int, int, int]]:
         """Return the shapes of the cameras' pictures by name."""
