@@ -98,8 +98,7 @@ def pull(
         DatasetWriteError: this disk refuses the files.
         TransferError: not all of it came; what did is kept, and the next attempt goes on with it.
     """
-    root = Path(root).expanduser()
-    root = root.parent.resolve() / root.name if not root.is_symlink() else root.resolve()
+    root = Path(root).expanduser().resolve()
     refuse_overlap(root, remote)
     with write_errors("pull the dataset", root, "What arrived is kept beside it; the dataset itself was not touched."):
         return _Pull(remote, root, replace, verify).run(select)
@@ -110,6 +109,7 @@ class _Pull:
         self._remote, self._root, self._replace, self._verify = remote, root, replace, verify
         self._fetched: list[str] = []
         self._by_size: set[str] = set()
+        self._is_given_up = False  # what lies at the root, for what comes
 
     def run(self, select: Select | None) -> PullReport:
         there = self._files()
@@ -118,6 +118,7 @@ class _Pull:
         self._staging = Staging(self._root)
         locks = [RootLock(self._staging.folder, self._root)]
         try:
+            self._staging.recover()
             if self._root.is_dir():
                 locks.append(RootLock(self._root))
             if self._verify:
@@ -182,6 +183,7 @@ class _Pull:
         info = parse_info(content, self._remote.name)
         staged = self._staging.folder / layout.INFO
         staged.parent.mkdir(exist_ok=True)
+        staged.unlink(missing_ok=True)  # an attempt before may have linked it to the one of the dataset that is there
         staged.write_bytes(content or b"")
         if is_whole(staged, there[layout.INFO]):
             self._fetched.append(layout.INFO)
@@ -226,12 +228,13 @@ class _Pull:
                 f"{root} holds another dataset, or was changed since it was pulled: {listed(changed)}. Choose another "
                 "folder with --root, or give what is there up with --replace."
             )
+        self._is_given_up = bool(changed)
         return same
 
     def _get(self, paths: Sequence[str], there: Mapping[str, RemoteFile], same: set[str]) -> None:
         """Bring files into the staging folder, from the root or from afar, and check that they are whole."""
         staging = self._staging.folder
-        for path in (one for one in paths if one in same and not (staging / one).exists()):
+        for path in (one for one in paths if one in same):
             self._staging.take(path)
         staged = [path for path in paths if (staging / path).is_file() and path not in same]
         arrived = self._compare(staging, staged, there) | same | set(self._fetched)
@@ -257,7 +260,7 @@ class _Pull:
         except DatasetError as error:
             raise type(error)(str(error).replace(str(self._staging.folder), self._remote.name)) from error
         episodes = set(chosen)
-        if (self._root / SUBSET).is_file():
+        if (self._root / SUBSET).is_file() and not self._is_given_up:  # else the numbers may be those of others
             episodes |= set(read_subset(self._root).episodes)
         files = files_of(self._staging.folder, sorted(episodes))
         lost = files - there.keys()

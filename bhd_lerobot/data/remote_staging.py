@@ -24,7 +24,7 @@ class Staging:
     """
 
     def __init__(self, root: Path) -> None:
-        """Make the folder, or take up that of an attempt before; mend what a kill between two renames left.
+        """Make the folder, or take up that of an attempt before.
 
         Args:
             root: the dataset.
@@ -42,15 +42,19 @@ class Staging:
                     f"{folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
                     "there. Move it, or choose another --root."
                 )
-        if self._old.is_dir() and not root.exists():
-            self._old.rename(root)
-            (root / _MARKER).unlink(missing_ok=True)
         self.is_new = not self.folder.exists()
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / _MARKER).touch()
 
+    def recover(self) -> None:
+        """Mend what a kill between two renames left; who calls it has locked the folder, so nobody is between them."""
+        if self._old.is_dir() and not self._root.exists():
+            self._old.rename(self._root)
+            (self._root / _MARKER).unlink(missing_ok=True)
+
     def take(self, path: str) -> None:
-        """Link a file of the dataset into the folder."""
+        """Link a file of the dataset into the folder, in the place of what an attempt for another version left."""
+        (self.folder / path).unlink(missing_ok=True)
         _link(self._root / path, self.folder / path)
 
     def drop(self) -> None:
@@ -70,6 +74,8 @@ class Staging:
             note: content of `SUBSET`; no such file if None.
         """
         root, folder = self._root, self.folder
+        if root.is_dir():
+            folder.chmod(root.stat().st_mode & 0o7777)  # who may look into it stays the same
         shutil.rmtree(folder / ".cache", ignore_errors=True)
         _remove_others(folder, wanted)
         if note is not None:

@@ -26,7 +26,7 @@ def command_line(command: str, places: Sequence[object], **options: Any) -> str:
     for name, value in options.items():
         if value is True:
             words.append(f"--{name}")
-        elif value not in (None, False, "", []):
+        elif value is not None and value is not False and value not in ("", []):  # 0 is a value
             words.append(f"--{name}={','.join(map(str, value)) if isinstance(value, list) else value}")
     return shlex.join(words)
 

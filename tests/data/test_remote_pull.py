@@ -9,6 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.data import layout, remote_pull
+from bhd_lerobot.data.disk import RootLock
+from bhd_lerobot.data.edits import delete
 from bhd_lerobot.data.hub import HubDataset
 from bhd_lerobot.data.remote import SUBSET
 from bhd_lerobot.data.remote_pull import pull
@@ -17,12 +19,13 @@ from bhd_lerobot.errors import (
     DatasetCorruptError,
     DatasetError,
     DatasetExistsError,
+    DatasetLockedError,
     DatasetWriteError,
     TransferError,
 )
 from tests.data import support
 from tests.hub_server.fixtures import EPISODES, content, send
-from tests.hub_server.server import HubServer
+from tests.hub_server.server import Fault, HubServer
 
 pytest_plugins = ["tests.hub_server.fixtures"]
 
@@ -219,3 +222,65 @@ def test_episodes_whose_files_nobody_names_are_told(hub: HubServer, root: Path, 
             pull(HubDataset("me/d"), tmp_path / "e", select=lambda folder: [0])
         assert pull(HubDataset("me/d"), tmp_path / "all", replace=True).problem
     assert not (tmp_path / "e").exists()
+
+
+def break_off(hub: HubServer, target: Path, path: str) -> None:
+    """Pull over what is there, and fail at one file."""
+    hub.faults = [Fault(f"^(GET|HEAD) .*/resolve/.*/{path}", times=-1, status=403)]
+    with pytest.raises(TransferError):
+        pull(HubDataset("me/d"), target, replace=True)
+    hub.faults = []
+
+
+def test_what_an_attempt_for_another_version_left_gets_into_no_dataset(
+    hub: HubServer, root: Path, tmp_path: Path
+) -> None:
+    send(root)
+    target, old = tmp_path / "e", content(root)
+    commit = hub.dataset("me/d").branches["main"]
+    pull(HubDataset("me/d"), target)
+    (target / layout.STATS).write_text("{}")
+    before = content(target)
+    break_off(hub, target, layout.STATS)  # files of the dataset are linked beside it
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+    send(root)
+    break_off(hub, target, layout.STATS)  # with the info.json of the longer one
+    assert content(target) == before  # not written through a link
+    pull(HubDataset("me/d", commit), target, replace=True)
+    assert content(target) == old
+
+
+def test_episodes_of_a_dataset_that_was_given_up_are_not_asked_for(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    target = tmp_path / "e"
+    pull(HubDataset("me/d"), target, select=lambda folder: [5])
+    target.chmod(0o700)
+    delete(root, [0, 1, 2])
+    send(root)
+    report = pull(HubDataset("me/d"), target, select=lambda folder: [0], replace=True)
+    assert report.episodes == [0]
+    assert target.stat().st_mode & 0o777 == 0o700  # nobody else may look into it now, either
+
+
+def test_a_folder_named_by_dots_is_the_folder(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
+    send(root)
+    pull(HubDataset("me/d"), tmp_path / "e")
+    (tmp_path / "e" / layout.STATS).write_text("{}")
+    monkeypatch.chdir(tmp_path / "e/meta")
+    assert pull(HubDataset("me/d"), "..", replace=True).fetched == [layout.STATS]
+    assert content(tmp_path / "e") == content(root)
+
+
+def test_a_pull_does_not_mend_what_another_one_is_at(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    """Between its two renames there is no folder at the target."""
+    send(root)
+    for name in (".e.pull", ".e.old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / ".bhd-pull").touch()
+    lock = RootLock(tmp_path / ".e.pull")
+    with pytest.raises(DatasetLockedError):
+        pull(HubDataset("me/d"), tmp_path / "e")
+    lock.release()
+    assert not (tmp_path / "e").exists()
+    assert (tmp_path / ".e.old").is_dir()

@@ -339,6 +339,7 @@ def test_the_command_to_repeat_says_all_that_was_asked_for(tmp_path: Path) -> No
         "pull me/d --root=A --revision=r --episodes=0,2-4 --outcome=success --min_score=0.5 --replace",
         "pull --repo_id=me/d --root=A",
         "pull s3://b/d --root=A --verify --storage_options={}",
+        "pull me/d --root=A --min_score=0",
     ):
         asked = parser.parse_args(words.split())
         source = asked.repo_id or (asked.places[1] if asked.command == "push" else asked.source)
