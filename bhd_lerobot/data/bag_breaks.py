@@ -147,8 +147,8 @@ def told_silences(sensors: Mapping[str, Track], start: int, gap: int) -> list[st
         if not len(track.times):
             if end - begin > gap:  # a restart is seen a moment later by the sensor that is slower
                 notes.append(
-                    f"{track.topic} was not heard in the {seconds(end - begin)} from {seconds(begin - start)} after the "
-                    "start on, which are left out"
+                    f"{track.topic} was not heard in the {seconds(end - begin)} from {seconds(begin - start)} after "
+                    "the start on, which are left out"
                 )
             continue
         first, last, steps = int(track.times[0]), int(track.times[-1]), np.diff(track.times)

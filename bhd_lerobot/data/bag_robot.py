@@ -42,6 +42,7 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
     report = ImportReport(Path(root) if root is not None else default_root(repo_id))
     recorder: DatasetRecorder | None = None
     seen: dict[tuple[int, ...], Path] = {}
+    late: list[tuple[int, str]] = []
     with all_or_nothing(report.root) as made:
         for bag in bags:
             robot_bag = _RobotBag(bag, wanted, seen)
@@ -62,6 +63,7 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
                 report.episodes += 1
             report.problems += bag.problems
             report.notes += [f"{bag.path.name}: {note}" for note in robot_bag.notes]
+            late += [(count, bag.path.name) for count in robot_bag.late if count]
         if recorder is None:
             sensors = ", ".join(topic for role, topic in wanted.topics.items() if role != "cmd")
             told = "; ".join([*report.problems, *report.notes][:_TOLD])
@@ -69,6 +71,14 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
                 f"No episode of {wanted.min_episode_s:g} s or more came out of {', '.join(str(b.path) for b in bags)}: "
                 f"there is no such time in which {sensors} were heard at least every {wanted.max_gap_s:g} s. {told}"
             )
+    if late:
+        most, bag_name = max(late)
+        total = sum(count for count, _ in late)
+        report.notes.append(
+            f"{total} of {report.frames} frames, in {len(late)} of {report.episodes} episodes, "
+            f"have a reading older than {wanted.max_age_s:g} s; control.late is true in them (the most in one of "
+            f"{bag_name}: {most})"
+        )
     return report
 
 
@@ -91,6 +101,7 @@ class _RobotBag:
 
     def __init__(self, bag: Bag, wanted: RobotImport, seen: dict[tuple[int, ...], Path]) -> None:
         self.notes: list[str] = []
+        self.late: list[int] = []  # frames of each episode that was saved
         self._seen = seen
         self._bag, self._wanted = bag, wanted
         self._tracks = read_tracks(bag, wanted.tracks, self.notes)
@@ -185,11 +196,7 @@ class _RobotBag:
         begin = self._after_start(episode.grid)
         if silence := told_silence(self._wanted, columns):
             self.notes.append(f"{begin}: {silence}")
-        if late := int(columns[keys.LATE].sum()):
-            self.notes.append(
-                f"{begin}: {late} of {len(times)} frames of the episode have a reading older than "
-                f"{self._wanted.max_age_s:g} s; control.late is true in them"
-            )
+        self.late.append(int(columns[keys.LATE].sum()))
         return len(times)
 
     def _with_pictures(self, episode: _Episode) -> _Episode:

@@ -116,12 +116,14 @@ def test_gaps_are_flagged_or_begin_an_episode(tmp_path, capsys):
     info = imported(source, tmp_path / "d")
     error = capsys.readouterr().err
     assert "/scan was silent for 1." in error
-    assert "older than 0.3 s; control.late is true" in error
+    (told,) = (line for line in error.splitlines() if "older than 0.3 s; control.late is true" in line)
     assert len(info.episodes) == 2
     columns = read_episode(tmp_path / "d", 0)
     late = columns["control.late"]
     assert np.array_equal(late, columns["control.age"] > 0.3)
     assert 1 <= late.sum() <= 3
+    total = late.sum() + read_episode(tmp_path / "d", 1)["control.late"].sum()
+    assert f"{total} of {info.frames} frames, in " in told
     assert columns["control.time"][-1] < 3.3
     assert [json.loads(one.metadata["source"])["why"] for one in info.episodes] == ["start", "gap"]
     assert data.main(["check", str(tmp_path / "d")]) == 0
