@@ -13,7 +13,7 @@ from bhd_lerobot.data.bag_doubts import pace, told_pace, told_speeds
 from bhd_lerobot.data.bag_read import Bag, Messages, Topic
 from bhd_lerobot.data.bag_sound import sound_messages
 from bhd_lerobot.data.bag_wanted import TYPES, static_topics, told_publishers, wanted_topic
-from bhd_lerobot.data.resample import Times, message_times, sane
+from bhd_lerobot.data.resample import Times, apart, message_times, sane
 from bhd_lerobot.data.resample_scan import resampled_scans
 from bhd_lerobot.data.ros2_base import BareTwistPart, GyroPart, TwistPart, odometry
 from bhd_lerobot.data.ros2_cdr_read import decode
@@ -21,6 +21,8 @@ from bhd_lerobot.data.ros2_parts import NANO, head_stamps, header_stamps
 from bhd_lerobot.errors import DatasetError
 
 Array = NDArray[np.float64]
+
+_APART_NS = NANO // 2  # of two topics' clocks: a scan is stamped at its first ray, and a network delays
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
     )
     if lost:
         bag.problems.append(f"{bag.path.name}: {lost} messages of /tf_static cannot be read, and are left out")
-    tracks, paces = {}, {}
+    tracks, paces, clocks = {}, {}, {}
     for role, topic in {**wanted, **cameras}.items():
         if not len(messages[topic.name].data):
             damage = "".join(f" Damaged: {problem}." for problem in bag.problems)
@@ -118,6 +120,7 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
                 f"{topic.name}: {wrong} of {len(times)} header stamps are not within 0.5 s of the reception; the "
                 f"{'headers were' if times is stamps else 'times of reception were'} taken for all of them"
             )
+        clocks[topic.name] = (found.received, times)
         values = _values(role, topic, found, _Reading(options, static, lost > 0, notes))
         fits = np.abs(values) < np.finfo(np.float32).max  # the dataset's numbers are float32
         finite = np.logical_and.reduce(fits, axis=1)
@@ -129,7 +132,24 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
             raise DatasetError(f"{bag.path}: no message of {topic.name} has finite values.")
         tracks[role] = track
     notes += told_pace(paces)
+    _check_one_time(bag, wanted["odom"].name, clocks)
     return tracks
+
+
+def _check_one_time(bag: Bag, reference: str, clocks: Mapping[str, tuple[Times, Times]]) -> None:
+    """Check that the messages of all topics are of one time.
+
+    Raises:
+        DatasetError: they are not: a bare Twist has the recorder's time, and headers may have another computer's.
+    """
+    for topic, clock in clocks.items():
+        ahead = apart(clock, clocks[reference])
+        if abs(ahead) > _APART_NS:
+            raise DatasetError(
+                f"{bag.path}: when they were received together, {topic} is {seconds(abs(ahead))} "
+                f"{'ahead of' if ahead > 0 else 'behind'} {reference}. Their stamps are of different clocks, so "
+                "nothing says which command belongs to which scan; --stamps=receive takes the recorder's for all."
+            )
 
 
 def _stamps(topic: Topic, messages: Messages) -> Times | None:

@@ -57,6 +57,24 @@ def sane(received: Times, stamps: Times, tolerance_ns: int = NANO // 2) -> NDArr
     return (stamps > 0) & (delay <= tolerance_ns) & (delay >= -tolerance_ns // 10)
 
 
+def apart(one: tuple[Times, Times], other: tuple[Times, Times]) -> int:
+    """Return by how much the clock of a topic is ahead of another topic's, if both were heard at the same time [ns].
+
+    What the delay on the way adds or takes is some tenths of a second.
+
+    Args:
+        one: reception and time of its messages [ns], shape (n,) each.
+        other: the same of the other topic.
+    """
+    received, times = (values[np.argsort(other[0], kind="stable")] for values in other)
+    both = (one[0] >= received[0]) & (one[0] <= received[-1])
+    if not both.any():
+        return 0
+    begin = int(received[0])  # small numbers: those since 1970 are too large for a float
+    ahead = np.interp(one[0][both] - begin, received - begin, times - received)
+    return int(np.median(one[1][both] - one[0][both] - ahead))
+
+
 def clock_jumps(times: Sequence[Times], order: Sequence[Times], step_ns: int = STEP_BACK_NS) -> Times:
     """Return where the clock jumped back: places in the bag's order, of the first message after each jump.
 

@@ -8,11 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.data.resample import clock_jumps, grids, message_times, newest
+from bhd_lerobot.data.resample import NANO, apart, clock_jumps, grids, message_times, newest
 from bhd_lerobot.data.resample_scan import Sweep, clean_ranges, nearest_beams, resampled_scans
 from bhd_lerobot.errors import DatasetError
 
 MS = 10**6
+START = 1_700_000_000 * NANO
 STRAIGHT = tuple(np.eye(3).reshape(-1).tolist())
 LIDAR = turtlebot3_burger().lidar
 assert LIDAR is not None
@@ -102,6 +103,21 @@ def test_a_clock_that_jumps_back_is_found_where_it_jumps():
     assert clock_jumps([back, steady[:1]], [order, np.array([19])]).tolist() == [12]
     # Written topic by topic: nothing jumped.
     assert clock_jumps([steady, steady], [np.arange(10), np.arange(10, 20)]).tolist() == []
+
+
+def test_clocks_are_compared_at_the_same_time():
+    rng = np.random.default_rng(0)
+    slow, fast = (START + np.arange(count) * step for count, step in ((40, 200_000_000), (100, 33_000_000)))
+    late = (slow + rng.integers(0, 200_000_000, len(slow)), slow)
+    assert abs(apart(late, (fast, fast))) < 150_000_000
+    assert abs(apart((fast, fast), late)) < 150_000_000
+    hour = 3600 * NANO
+    assert apart((fast, fast + hour), (slow, slow)) == hour
+    assert apart((slow, slow), (fast, fast + hour)) == -hour
+    # Both are of a simulation at half the speed: their delays grow, and are the same at the same time.
+    half = [(at, START + (at - START) // 2) for at in (fast, slow)]
+    assert abs(apart(half[0], half[1])) < 10
+    assert apart((fast, fast), (slow + hour, slow)) == 0  # never heard together
 
 
 def test_stamps_of_headers_count_where_they_are_sane():
