@@ -84,12 +84,20 @@ class HubDataset:
 
     def read(self, path: str) -> bytes | None:
         """Return a file of the listed commit; None if it has none of this name."""
+        return self._read(path, self.commit)
+
+    def former_info(self) -> bytes | None:
+        """Return the `meta/info.json` of the tagged commit: the tag moves when a push of several commits has ended."""
+        commit = self._commit_of(VERSION_TAG) if self._branch == MAIN else None
+        return None if commit is None else self._read(layout.INFO, commit)
+
+    def _read(self, path: str, commit: str | None) -> bytes | None:
         from huggingface_hub import hf_hub_url
         from huggingface_hub.errors import EntryNotFoundError
         from huggingface_hub.utils import build_hf_headers, get_session, hf_raise_for_status
 
         with hub_errors(self.name, f"read {path} of", revision=self.revision):
-            url = hf_hub_url(self.name, path, repo_type="dataset", revision=self.commit)
+            url = hf_hub_url(self.name, path, repo_type="dataset", revision=commit)
             answer = get_session().get(url, headers=build_hf_headers(), timeout=30)
             try:
                 hf_raise_for_status(answer)

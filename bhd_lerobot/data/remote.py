@@ -90,6 +90,9 @@ class Remote(Protocol):
     def read(self, path: str) -> bytes | None:
         """Return the content of a small file; None if there is none."""
 
+    def former_info(self) -> bytes | None:
+        """Return the `meta/info.json` that a push took away which did not end; None if nothing is known of one."""
+
     def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
         """Return listed files with the checksum of what lies there now, which is read for it.
 

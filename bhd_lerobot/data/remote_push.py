@@ -1,5 +1,6 @@
 """Copy a dataset to the Hub or below a URL: what differs, and nothing else."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -103,7 +104,7 @@ def push(
     refuse_overlap(Path(root), remote)
     with open_local(Path(root)) as local:
         there = remote.files()
-        if not replace and layout.INFO in there:
+        if not replace:
             _refuse_another(local, remote, there)
         cards, kept = _cards(local, remote, make_card, replace_card, there)
         items = [item for item in local.items if item.path not in (CARD, PICTURE)] + cards
@@ -138,26 +139,54 @@ def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, Rem
     """Refuse to overwrite what this dataset is no later version of; a store keeps no history.
 
     Raises:
-        DatasetExistsError: what lies there has other columns, another rate or robot or format, or more episodes, though
-            none was deleted here; or it is no dataset of this format at all.
+        DatasetExistsError: what lies there has other columns, another rate or robot or format, or more episodes than
+            were deleted here since; or it is no dataset of this format at all. If a push to there did not end, what was
+            there before it counts.
     """
-    if next(item for item in local.items if item.path == layout.INFO).is_like(there[layout.INFO]):
+    is_shown = layout.INFO in there
+    if is_shown and next(item for item in local.items if item.path == layout.INFO).is_like(there[layout.INFO]):
         return  # whatever became of it there since: this dataset is what was put there
+    content = remote.read(layout.INFO) if is_shown else remote.former_info()
+    if content is None and not is_shown:
+        return
+    name = remote.name if is_shown else f"{remote.name}, before a push to it that did not end,"
     try:
-        found = parse_info(remote.read(layout.INFO), remote.name)
+        found = parse_info(content, name)
     except DatasetError as error:
         raise DatasetExistsError(f"{error} Choose another place, or give up what lies there with --replace.") from error
     if _kind(found) != _kind(local.state.info):
         raise DatasetExistsError(
-            f"{remote.name} is another dataset: it has other columns, another rate, robot or format than {local.root}. "
-            "Choose another place, or give up what lies there with --replace."
+            f"{name} {'is' if is_shown else 'was'} another dataset: it has other columns, another rate, robot or "
+            f"format than {local.root}. Choose another place, or give up what lies there with --replace."
         )
-    episodes = found["total_episodes"]
-    if episodes > local.state.num_episodes and not any(edit.get("edit") == "delete" for edit in edits_of(local.root)):
+    here, episodes = local.state.num_episodes, found["total_episodes"]
+    if episodes <= here:
+        return
+    deleted = _deleted_since(local.root, remote.read(EDITS) if EDITS in there else b"")
+    if episodes > here + deleted:
+        has, remedy = (
+            ("has", "Pull that one, or give it up") if is_shown else ("had", "Repeat that push, or give it up")
+        )
+        since = f"{deleted} {'were' if deleted > 1 else 'was'}" if deleted else "none was"
         raise DatasetExistsError(
-            f"{remote.name} has {episodes} episodes, {local.root} has {local.state.num_episodes} and none was deleted "
-            "from it: it is an older one, or another. Pull that one, or give it up with --replace."
+            f"{name} {has} {episodes} episodes, {local.root} has {here} and {since} deleted from it since: it is an "
+            f"older one, or another. {remedy}, or give it up with --replace."
         )
+
+
+def _deleted_since(root: Path, there: bytes | None) -> int:
+    """Return how many episodes were deleted from a dataset since a copy of it was made.
+
+    Args:
+        root: the dataset.
+        there: the list of edits of the copy.
+    """
+    try:
+        edits, former = edits_of(root), [json.loads(line) for line in (there or b"").splitlines()]
+        known = len(former) if edits[: len(former)] == former else 0
+        return sum(len(edit["episodes"]) for edit in edits[known:] if edit["edit"] == "delete")
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0  # nobody knows, so none
 
 
 def _kind(info: Mapping[str, Any]) -> tuple[Any, ...]:

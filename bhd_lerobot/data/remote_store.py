@@ -5,7 +5,6 @@ the same by. `meta/info.json` is written last and removed first, so that there i
 """
 
 import contextlib
-import json
 import threading
 import uuid
 from collections.abc import Callable, Sequence
@@ -25,6 +24,7 @@ from bhd_lerobot.data.remote import (
     stream_digest,
 )
 from bhd_lerobot.data.remote_errors import store_errors
+from bhd_lerobot.data.remote_manifest import Manifest, parse_manifest
 from bhd_lerobot.data.remote_pool import WORKERS, run_all
 from bhd_lerobot.data.remote_url import LOCAL, open_place, shown
 from bhd_lerobot.errors import TransferError
@@ -36,7 +36,7 @@ _NOTED_BYTES = 64e6
 """Bytes that are sent before the list is written: about as much is sent again after a kill."""
 
 _PART = ".bhd-part"
-"""Ends the temporary names of files that are being written."""
+"""Ends the temporary names of files that are being written, and no other."""
 
 
 class StoreDataset:
@@ -67,7 +67,8 @@ class StoreDataset:
         self._workers = WORKERS if self._fs.async_impl or not {*LOCAL, "memory"}.isdisjoint(kinds) else 1
         # Those that are asynchronous do all downloads in one thread: ours wait for it, or make checksums meanwhile.
         self._fetchers = 2 * WORKERS if self._fs.async_impl else self._workers
-        self._known: dict[str, RemoteFile] = {}
+        self._list = Manifest()
+        self._push = uuid.uuid4().hex
         self._is_noted = True  # whether the list there says what is known
         self._there: dict[str, RemoteFile] = {}
 
@@ -91,12 +92,14 @@ class StoreDataset:
             }
             # Consoles of object stores make folders by empty objects whose names end in a slash, or have no name at all
             # below the root; and a kill leaves files under their temporary names.
-            sizes = {path: size for path, size in sizes.items() if path[-1:] not in ("", "/") and not _is_part(path)}
-            self._known = self._read_manifest() if MANIFEST in sizes else {}
+            sizes = {
+                path: size for path, size in sizes.items() if path[-1:] not in ("", "/") and not path.endswith(_PART)
+            }
+            self._list = self._read_manifest() if MANIFEST in sizes else Manifest()
         sizes.pop(MANIFEST, None)
         self._there = {}
         for path, size in sizes.items():
-            known = self._known.get(path)
+            known = self._list.files.get(path)
             # Where the size is not the one that was written, the checksum will not be either: that is told.
             self._there[path] = RemoteFile(size, None) if known is None else replace(known, size=size)
         return dict(self._there)
@@ -108,6 +111,10 @@ class StoreDataset:
                 return bytes(self._fs.cat_file(self._at(path)))
             except FileNotFoundError:
                 return None
+
+    def former_info(self) -> bytes | None:
+        """Return the `meta/info.json` that was shown last, by the list."""
+        return self._list.info.encode() or None
 
     def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
         """Return listed files with the checksum of what lies there now, which is read for it.
@@ -125,8 +132,8 @@ class StoreDataset:
         with store_errors(self.name, "read"):
             run_all(read, largest_first(paths, self._there), self._workers)
         self._there |= found
-        self._is_noted = self._is_noted and all(self._known.get(path) == file for path, file in found.items())
-        self._known |= found
+        self._is_noted = self._is_noted and all(self._list.files.get(path) == file for path, file in found.items())
+        self._list.files |= found
         return found
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
@@ -150,38 +157,69 @@ class StoreDataset:
         """Write files and remove others; the list of files after each batch, and `meta/info.json` last.
 
         Raises:
-            TransferError: not all was written. What was is not sent again; there is no `meta/info.json` then.
+            TransferError: not all was written, or another push came between. What was written is not sent again; there
+                is no `meta/info.json` then.
         """
         if not items and not deleted and self._is_noted:
             return
         by_path = {item.path: item for item in items}
         info = by_path.pop(layout.INFO, None)
+        touched = {*by_path, *deleted}
         with store_errors(self.name, "upload the dataset to"):
+            if self._read_manifest().push != self._list.push:
+                raise TransferError(f"Another push wrote to {self.name} since this one looked at it. Nothing was sent.")
             is_shown = layout.INFO in self._there
             if is_shown and (deleted or any(path in self._there and _matters(path) for path in by_path)):
                 # A reader who comes now finds no dataset; better than one of two versions.
-                if info is None:
-                    info = self._keep_info()
+                there = bytes(self._fs.cat_file(self._at(layout.INFO)))
+                info = info or self._unchanged(Item(layout.INFO, there, len(there)))
+                self._list.info = there.decode(errors="replace")
                 self._fs.rm_file(self._at(layout.INFO))
                 del self._there[layout.INFO]
-            stale = {*by_path, *deleted} & self._known.keys()
-            for path in stale:
-                del self._known[path]  # before it is overwritten: it must never be taken for what it was
-            if stale or not self._is_noted:
-                self._write_manifest()
-            if deleted:
-                run_all(self._remove, deleted, self._workers)
-            self._put(list(by_path.values()))
-            check()
-            if items and self._read_manifest() != self._known:
-                raise TransferError(
-                    f"Another push wrote to {self.name} at the same time, so what lies there now may be of both. There "
-                    "is no meta/info.json, so nobody takes it for a dataset. Push again, one after the other."
-                )
+            for path in touched & self._list.files.keys():
+                del self._list.files[path]  # before it is overwritten: it must never be taken for what it was
+            for folder in {self._at(path).rpartition("/")[0] for path in (MANIFEST, layout.INFO, *by_path)}:
+                if self._has_folders:
+                    self._fs.makedirs(folder, exist_ok=True)
+            self._write_manifest()
+            try:
+                if deleted:
+                    run_all(self._remove, deleted, self._workers)
+                if by_path:
+                    self._put(list(by_path.values()))
+                check()
+                self._refuse_overtaken()
+            except BaseException:  # Ctrl-C as well
+                with contextlib.suppress(Exception):  # the first one tells more
+                    self._leave(touched)
+                raise
             if info is not None:
-                self._known[layout.INFO] = _about(info)
+                content = info.content if isinstance(info.content, bytes) else info.content.read_bytes()
+                self._list.files[layout.INFO], self._list.info = _about(info), content.decode(errors="replace")
                 self._write_manifest()
                 self._put_one(info)
+
+    def _refuse_overtaken(self) -> None:
+        """Check that no other push wrote the list since this one did.
+
+        Raises:
+            TransferError: one did.
+        """
+        if self._read_manifest().push != self._push:
+            raise TransferError(
+                f"Another push wrote to {self.name} at the same time, so what lies there now may be of both. There is "
+                "no meta/info.json, so nobody takes it for a dataset. Push again, one after the other."
+            )
+
+    def _leave(self, touched: set[str]) -> None:
+        """Note what arrived; or, where another push came, let that one notice, and no file be taken for its own."""
+        found = self._read_manifest()
+        if found.push != self._push:
+            self._remove(layout.INFO)
+            unclear = {*touched, layout.INFO}
+            files = {path: file for path, file in found.files.items() if path not in unclear}
+            self._list, self._push = replace(found, files=files), uuid.uuid4().hex
+        self._write_manifest()
 
     def _remove(self, path: str) -> None:
         # One by one: `rm` takes brackets and stars in a name for a pattern, and removes what it fits.
@@ -189,9 +227,7 @@ class StoreDataset:
             self._fs.rm_file(self._at(path))
 
     def _put(self, items: Sequence[Item]) -> None:
-        """Write files, and note those that arrived, now and then and at the end, also if one fails."""
-        if not items:
-            return
+        """Write files, and note now and then those that arrived."""
         lock, unnoted = threading.Lock(), 0
 
         def put(item: Item) -> None:
@@ -199,21 +235,15 @@ class StoreDataset:
             about = _about(item)
             self._put_one(item)
             with lock:
-                self._known[item.path] = about
+                self._list.files[item.path] = about
                 unnoted += item.size
                 if unnoted > _NOTED_BYTES:
                     unnoted = 0
+                    self._refuse_overtaken()
                     self._write_manifest()
 
-        if self._has_folders:
-            for folder in {self._at(item.path).rpartition("/")[0] for item in items}:
-                self._fs.makedirs(folder, exist_ok=True)
-        try:
-            run_all(put, sorted(items, key=lambda item: (-item.size, item.path)), self._workers)
-        except Exception:
-            with contextlib.suppress(Exception):  # the first one tells more
-                self._write_manifest()
-            raise
+        run_all(put, sorted(items, key=lambda item: (-item.size, item.path)), self._workers)
+        self._refuse_overtaken()
         self._write_manifest()
 
     def _put_one(self, item: Item) -> None:
@@ -237,28 +267,23 @@ class StoreDataset:
             part.unlink(missing_ok=True)
             raise
 
-    def _keep_info(self) -> Item:
-        content = bytes(self._fs.cat_file(self._at(layout.INFO)))
-        item = Item(layout.INFO, content, len(content))
-        if not item.is_like(self._there[layout.INFO]):
+    def _unchanged(self, info: Item) -> Item:
+        if not info.is_like(self._there[layout.INFO]):
             raise TransferError(
                 f"Could not upload the dataset to {self.name}: its {layout.INFO} is not what was written there. "
                 "Something else wrote it, or it was damaged: push with --verify, which mends that."
             )
-        return item
+        return info
 
-    def _read_manifest(self) -> dict[str, RemoteFile]:
+    def _read_manifest(self) -> Manifest:
         try:
-            listed = json.loads(self._fs.cat_file(self._at(MANIFEST)))
-            return {
-                path: RemoteFile(int(one["size"]), str(one[LISTED]), LISTED) for path, one in listed["files"].items()
-            }
-        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-            return {}  # a kill left half of it: nothing is known, so everything is compared by sending it again
+            return parse_manifest(self._fs.cat_file(self._at(MANIFEST)))
+        except FileNotFoundError:
+            return Manifest()
 
     def _write_manifest(self) -> None:
-        listed = {path: {"size": one.size, LISTED: one.digest} for path, one in sorted(self._known.items())}
-        content = json.dumps({"format": 1, "files": listed}, indent=1).encode()
+        self._list.push = self._push
+        content = self._list.to_json()
         self._put_one(Item(MANIFEST, content, len(content)))
         self._is_noted = True
 
@@ -269,11 +294,6 @@ class StoreDataset:
 def _matters(path: str) -> bool:
     """Return whether a file decides what the dataset is: not its card."""
     return path.startswith(("data/", "videos/", "meta/"))
-
-
-def _is_part(path: str) -> bool:
-    name = path.rpartition("/")[2]
-    return name.startswith(".") and name.endswith(_PART)
 
 
 def _about(item: Item) -> RemoteFile:
