@@ -22,7 +22,8 @@ PATIENCE_S = 3.0
 
 def command_line(command: str, places: Sequence[object], **options: Any) -> str:
     """Return a command as the user would type it; options that are None, false or empty are left out."""
-    words = ["bhd-data", command, *(str(place) for place in places)]
+    # A folder that begins with a dash must not be taken for an option.
+    words = ["bhd-data", command, *(f"./{place}" if str(place).startswith("-") else str(place) for place in places)]
     for name, value in options.items():
         if value is True:
             words.append(f"--{name}")

@@ -351,6 +351,7 @@ def test_the_command_to_repeat_says_all_that_was_asked_for(tmp_path: Path) -> No
             k: v for k, v in vars(asked).items() if k not in ways
         }
         assert again.get("places", [again.get("source"), again["root"]]) in (["A", source], [source, "A"])
+    assert repeat_line(parser.parse_args(["push", "--root=-x", "me/d"]), "-x", "me/d") == "bhd-data push ./-x me/d"
 
 
 def test_a_picture_of_the_users_is_on_the_card(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
