@@ -34,7 +34,8 @@ def hub(running_hub: HubServer) -> Iterator[HubServer]:
     with real_client(running_hub) as patch:
         # In the client alone: the tests themselves do wait.
         hasty = SimpleNamespace(**{**vars(time), "sleep": lambda seconds: None})
-        patch.setattr("huggingface_hub.utils._http.time", hasty)
+        for module in ("utils._http", "file_download"):
+            patch.setattr(f"huggingface_hub.{module}.time", hasty)
         yield running_hub
 
 
