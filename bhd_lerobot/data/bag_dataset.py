@@ -1,7 +1,6 @@
 """A dataset that is made of bags: all of it, or nothing."""
 
 import contextlib
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from bhd_lerobot.data.bag_place import complete_or_not
 from bhd_lerobot.data.bag_tracks import TrackOptions
 from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.errors import DatasetWriteError
 
 
 @dataclass
@@ -88,10 +89,21 @@ class RobotImport:
 
 
 @contextlib.contextmanager
-def all_or_nothing(root: Path) -> Iterator[Callable[[DatasetRecorder], DatasetRecorder]]:
-    """Finalise the dataset that is made inside the block; after an exception remove it.
+def all_or_nothing(root: Path) -> Iterator[tuple[Path, Callable[[DatasetRecorder], DatasetRecorder]]]:
+    """Give a path at which a dataset is to be made; finalised, it takes its place at the end of the block.
 
-    Gives a function to be told of the recorder once it is created.
+    After an exception, or a kill at any moment, there is no dataset: one with some of the episodes looks like a
+    recording that was interrupted, and nobody would know that bags are missing.
+
+    Args:
+        root: its place.
+
+    Gives:
+        The path, and a function to be told of the recorder once it is created there.
+
+    Raises:
+        DatasetExistsError: there is something at `root`.
+        DatasetWriteError: it cannot be written.
     """
     recorders: list[DatasetRecorder] = []
 
@@ -99,13 +111,15 @@ def all_or_nothing(root: Path) -> Iterator[Callable[[DatasetRecorder], DatasetRe
         recorders.append(recorder)
         return recorder
 
-    try:
-        yield made
-        for recorder in recorders:
-            recorder.finalize()
-    except BaseException:
-        for recorder in recorders:
-            with contextlib.suppress(Exception):
-                recorder.finalize()  # gives the lock back
-            shutil.rmtree(root, ignore_errors=True)
-        raise
+    with complete_or_not(root, "--root", "import bags", "No dataset was made.") as folder:
+        try:
+            yield folder, made
+            for recorder in recorders:
+                recorder.finalize()
+        except BaseException as error:
+            for recorder in recorders:
+                with contextlib.suppress(Exception):
+                    recorder.finalize()  # gives the lock back
+            if isinstance(error, DatasetWriteError) and isinstance(error.__cause__, OSError):
+                raise error.__cause__ from None  # the recorder's remedies are for a dataset that stays
+            raise

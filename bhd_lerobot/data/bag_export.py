@@ -14,7 +14,8 @@ from bhd_lerobot.data import layout
 from bhd_lerobot.data import ros2_types as types
 from bhd_lerobot.data import ros2_views as views
 from bhd_lerobot.data.bag_episode import EpisodeTopics
-from bhd_lerobot.data.bag_write import BagWriter, new_folder
+from bhd_lerobot.data.bag_place import complete_or_not
+from bhd_lerobot.data.bag_write import BagWriter
 from bhd_lerobot.data.creation import refuse_inside
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.data.state import DatasetState, Row, corrupt, load_state, ordered_slots
@@ -56,7 +57,7 @@ class ExportReport:
 def export_bags(
     root: Path | str, output: Path | str, *, view: views.RobotView, repo_id: str = "", options: ExportOptions
 ) -> ExportReport:
-    """Write episodes of a dataset as bags; all of them, or nothing.
+    """Write episodes of a dataset as bags; all of them, or nothing, also if the process is killed.
 
     Args:
         root: the dataset.
@@ -69,6 +70,7 @@ def export_bags(
         DatasetError: no such dataset or episode.
         ConfigError: `output` lies in the dataset.
         DatasetExistsError: `output` is there already.
+        DatasetWriteError: the bags cannot be written.
         UnsupportedDatasetError: it holds something that no message is made for.
     """
     root, output = Path(root), Path(output)
@@ -85,7 +87,8 @@ def export_bags(
         compressed_images=options.compressed_images,
     )
     report = ExportReport()
-    with new_folder(output) as folder:
+    consequence = "The dataset was not touched; no bag was left behind."
+    with complete_or_not(output, "--output", "write bags", consequence) as folder:
         if options.one_bag:
             with BagWriter(folder, options.storage, topics.custom) as bag:
                 for row, columns in _episodes(state, rows):

@@ -51,12 +51,12 @@ def restore(bags: Sequence[Bag], root: Path | str | None, repo_id: str) -> Impor
     report = ImportReport(Path(root) if root is not None else default_root(repo_id))
     first: dict[str, Any] | None = None
     recorder: DatasetRecorder | None = None
-    with all_or_nothing(report.root) as made:
+    with all_or_nothing(report.root) as (folder, made):
         for bag in bags:
             episodes = _BagEpisodes(bag)
             for episode in episodes.all():
                 if first is None or recorder is None:
-                    first, recorder = episode, made(_create(episode, report.root, repo_id))
+                    first, recorder = episode, made(_create(episode, folder, repo_id))
                 differing = [key for key in _SAME if episode[key] != first[key]]
                 if differing:
                     raise DatasetMismatchError(
@@ -67,6 +67,8 @@ def restore(bags: Sequence[Bag], root: Path | str | None, repo_id: str) -> Impor
                 report.frames += episodes.save(episode, recorder)
                 report.episodes += 1
             report.problems += bag.problems
+        if recorder is None:
+            raise DatasetError("There is no bag to import.")
     return report
 
 

@@ -43,7 +43,7 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
     recorder: DatasetRecorder | None = None
     seen: dict[tuple[int, ...], Path] = {}
     late: list[tuple[int, str]] = []
-    with all_or_nothing(report.root) as made:
+    with all_or_nothing(report.root) as (folder, made):
         for bag in bags:
             robot_bag = _RobotBag(bag, wanted, seen)
             for episode in robot_bag.episodes():
@@ -55,7 +55,7 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
                             wanted.fps,
                             features,
                             robot_type=wanted.robot_type,
-                            root=report.root,
+                            root=folder,
                             recording=wanted.identity(),
                         )
                     )

@@ -1,18 +1,14 @@
-"""rosbag2 folders, which appear complete or not at all."""
+"""rosbag2 folders."""
 
-import contextlib
 import heapq
-import os
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from bhd_lerobot.data.disk import write_errors
 from bhd_lerobot.data.ros2_types import DEFINITIONS, require_rosbags, type_store
-from bhd_lerobot.errors import ConfigError, DatasetExistsError, unknown_name
+from bhd_lerobot.errors import ConfigError, unknown_name
 
 FORMATS = ("mcap", "sqlite3")
 _VERSION: Literal[8] = 8  # of rosbag2's metadata: the newest whose quality of service Humble reads, too
@@ -110,29 +106,3 @@ class BagWriter:
 
 def _order(item: tuple[int, int, Any, bytes]) -> tuple[int, int]:
     return item[0], item[1]
-
-
-@contextlib.contextmanager
-def new_folder(target: Path) -> Iterator[Path]:
-    """Give a folder to be filled, which takes its place when the block ends well.
-
-    Args:
-        target: its place; must not exist, or be an empty folder.
-
-    Raises:
-        DatasetExistsError: something is there.
-        DatasetWriteError: it cannot be written.
-    """
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise DatasetExistsError(f"{target} exists already. Remove it, or choose another --output.")
-    # Inside, the folder has its final name, which rosbag2 gives to the files in it.
-    shell = target.parent / f".{target.name}.{os.getpid()}.partial"
-    with write_errors("write bags", target.parent, "The dataset was not touched; no bag was left behind."):
-        try:
-            (shell / target.name).parent.mkdir(parents=True)
-            yield shell / target.name
-            if target.exists():
-                target.rmdir()
-            (shell / target.name).rename(target)
-        finally:
-            shutil.rmtree(shell, ignore_errors=True)

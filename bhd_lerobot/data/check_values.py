@@ -7,7 +7,6 @@ import math
 from collections import Counter, deque
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,9 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data import layout
-from bhd_lerobot.data.check_files import Files, stats_remedy
+from bhd_lerobot.data.check_files import RESTORE, Files, stats_remedy
 from bhd_lerobot.data.check_frozen import FrozenCheck
+from bhd_lerobot.data.check_stats import Moments, wrong_statistic
 from bhd_lerobot.data.check_steps import StepCheck
 from bhd_lerobot.data.findings import Findings, few, name_of, one_line
 
@@ -29,18 +29,8 @@ _TIMESTAMP_TOLERANCE = 1e-4  # [s] LeRobot's own
 _INDEX = ("index", "episode_index", "frame_index", "timestamp", "task_index")
 _LEAVE = "Leave the episode out (dataset.episodes), or record it again."
 _MOVING = (keys.OBSERVATION_STATE, keys.ACTION)  # what is to change; what a task tells often does not, by design
-_MEAN_TOLERANCE = 1e-3  # of the range
 _LIMIT_TOLERANCE = 0.01  # of the limits' distance: a joint gives way a little at its end
 _LATE_SHARE = 0.01
-
-
-@dataclass
-class _Column:
-    """What is known of one feature, over the files so far."""
-
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    total: NDArray[np.float64]
 
 
 class ValueCheck:
@@ -58,7 +48,7 @@ class ValueCheck:
     def __init__(self, files: Files, findings: Findings, limits: Limits | None = None) -> None:
         self.frames = 0
         self._files, self._findings, self._limits = files, findings, limits or {}
-        self._columns: dict[str, _Column] = {}
+        self._columns: dict[str, Moments] = {}
         self._episodes: list[int] = []
         self._lengths: list[int] = []
         # By feature: how many frames are not finite, and where the first is, for each file.
@@ -111,7 +101,7 @@ class ValueCheck:
                 )
             return file.read(columns=stored)
         except (OSError, pa.ArrowException, ValueError) as error:
-            self._findings.error("files", name, f"it cannot be read: {one_line(error)}", "Restore it from a copy.")
+            self._findings.error("files", name, f"it cannot be read: {one_line(error)}", RESTORE)
             return None
 
     def _check_rows(self, name: str, table: pa.Table, positions: NDArray[np.int64]) -> bool:
@@ -200,19 +190,14 @@ class ValueCheck:
     def _check_column(
         self, key: str, values: NDArray[Any], starts: NDArray[np.int64], lengths: NDArray[np.int64]
     ) -> None:
-        low, high = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
-        if not (np.isfinite(low).all() and np.isfinite(high).all()):  # both of a column with a NaN are NaN
+        found = Moments.of(values)
+        if not (np.isfinite(found.low).all() and np.isfinite(found.high).all()):  # both of a column with a NaN are NaN
             self._note_broken(key, values, starts)
-            finite = np.where(np.isfinite(values), values, 0)
-            low, high, values = finite.min(axis=0), finite.max(axis=0), finite
-        total = values.sum(axis=0, dtype=np.float64)
-        known = self._columns.get(key)
-        if known is None:
-            known = self._columns[key] = _Column(low, high, total)
-        else:
-            np.minimum(known.low, low, out=known.low)
-            np.maximum(known.high, high, out=known.high)
-            known.total += total
+            values = np.where(np.isfinite(values), values, 0)
+            found = Moments.of(values)
+        known = self._columns.setdefault(key, found)
+        if known is not found:
+            known.add(found)
         if key in _MOVING:
             episodes = self._episodes[len(self._episodes) - len(starts) :]
             self._frozen.look(key, values, starts, lengths, episodes)
@@ -241,7 +226,7 @@ class ValueCheck:
             for name, (low, high) in self._limits.get(key, {}).items():
                 self._judge_limit(column, key, name, (low, high))
 
-    def _judge_limit(self, column: _Column, key: str, name: str, limits: tuple[float, float]) -> None:
+    def _judge_limit(self, column: Moments, key: str, name: str, limits: tuple[float, float]) -> None:
         names = self._files.features[key].get("names") or []
         if name not in names:
             return
@@ -262,13 +247,9 @@ class ValueCheck:
                 continue
             if len(self._files.features[key]["shape"]) > 1:
                 continue  # LeRobot's are over other axes
-            span = np.maximum(column.high - column.low, 1e-9)
-            found = {"min": column.low, "max": column.high, "mean": column.total / self.frames}
-            for name, values in found.items():
-                told = known[name]
-                if told.shape != values.shape or (np.abs(told - values) > _MEAN_TOLERANCE * span + 1e-6).any():
-                    self._findings.error("stats", f"{layout.STATS}: {key}", f"{name} is not that of the data", remedy)
-                    break
+            wrong = wrong_statistic(known, column, self.frames, max(self._lengths))
+            if wrong is not None:
+                self._findings.error("stats", f"{layout.STATS}: {key}", f"{wrong} is not that of the data", remedy)
 
 
 def _numbers(column: pa.ChunkedArray) -> NDArray[Any] | None:

@@ -78,7 +78,7 @@ def build_root(
     with write_errors("create the dataset", root, "Nothing was written there."):
         disk.make_folder(root.parent)
         prefix = f".{root.name}.bhd-"
-        _remove_abandoned(root.parent, prefix)
+        remove_abandoned(root.parent, prefix)
         building = Path(tempfile.mkdtemp(prefix=prefix, dir=root.parent))
         lock = RootLock(building, shown_as=root)
         try:
@@ -104,7 +104,7 @@ def refuse_inside(target: Path, source: Path) -> None:
         raise ConfigError(f"{target} lies in {source}, which is to stay as it is. Choose a place beside it.")
 
 
-def _remove_abandoned(parent: Path, prefix: str) -> None:
+def remove_abandoned(parent: Path, prefix: str) -> None:
     """Remove what killed calls left beside the root; folders of living processes are locked."""
     for folder in parent.glob(f"{glob.escape(prefix)}*"):
         with contextlib.suppress(OSError, DatasetLockedError):

@@ -9,13 +9,14 @@ from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.data.bag_dataset import ImportReport, RobotImport
 from bhd_lerobot.data.bag_find import check_distinct, find_bags
 from bhd_lerobot.data.bag_headers import is_ours
+from bhd_lerobot.data.bag_place import refuse_existing
 from bhd_lerobot.data.bag_read import Bag
 from bhd_lerobot.data.bag_restore import restore
 from bhd_lerobot.data.bag_robot import import_robot
 from bhd_lerobot.data.bag_tracks import TrackOptions
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.ros2_types import require_rosbags
-from bhd_lerobot.errors import ConfigError, DatasetExistsError, unknown_name
+from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.runs.data_command import Commands, add_command
 from bhd_lerobot.tasks.task import OUTCOMES
 
@@ -64,8 +65,7 @@ def _run(options: argparse.Namespace) -> int:
     bags = [bag for path in options.bags for bag in find_bags(path.expanduser())]
     check_distinct(bags)
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()
-    if root.exists():
-        raise DatasetExistsError(f"{root} exists already. Remove it, or choose another --root.")
+    refuse_existing(root, "--root")  # before the bags are read, which may take long
     ours = [is_ours(bag.topics()) for bag in bags]
     if any(ours) and not all(ours) and not options.resample:
         raise ConfigError(

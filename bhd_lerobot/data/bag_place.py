@@ -1,0 +1,70 @@
+"""Where bags and the datasets made of them are written: they come to their place complete, or not at all."""
+
+import contextlib
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from bhd_lerobot.data.creation import remove_abandoned
+from bhd_lerobot.data.disk import Disk, RootLock, write_errors
+from bhd_lerobot.errors import DatasetExistsError
+
+
+def refuse_existing(target: Path, option: str) -> Path:
+    """Return the real path of a place where nothing is yet, but perhaps an empty folder.
+
+    What killed attempts left beside it is removed, also if it is taken: the last of them may have got that far.
+
+    Args:
+        target: the place.
+        option: what named it, for the error.
+
+    Raises:
+        DatasetExistsError: something is there.
+    """
+    if target.is_symlink() and not target.exists():
+        raise DatasetExistsError(f"{target} is a link to nothing. Remove it, or choose another {option}.")
+    place = target.resolve()  # a name such as ``new/..`` is no name for a folder beside it
+    remove_abandoned(place.parent, _prefix(place))
+    if place.exists() and not (place.is_dir() and not any(place.iterdir())):
+        raise DatasetExistsError(f"{target} exists already. Remove it, or choose another {option}.")
+    return place
+
+
+@contextlib.contextmanager
+def complete_or_not(target: Path, option: str, action: str, consequence: str) -> Iterator[Path]:
+    """Give a path at which something is to be made, which takes its place in one step when the block ends well.
+
+    It lies in a hidden folder beside the place, locked as long as this process lives. What an exception leaves there is
+    removed at once, what a kill leaves there by the next attempt.
+
+    Args:
+        target: its place; nothing may be there but an empty folder.
+        option: what named it, for the error.
+        action: what is being done, for the error.
+        consequence: what is intact if it fails.
+
+    Raises:
+        DatasetExistsError: something is there, or came there meanwhile.
+        DatasetWriteError: it cannot be written.
+    """
+    disk, shell, lock = Disk(), None, None
+    with write_errors(action, target, consequence):
+        try:
+            place = refuse_existing(target, option)
+            disk.make_folder(place.parent)
+            shell = Path(tempfile.mkdtemp(prefix=_prefix(place), dir=place.parent))
+            lock = RootLock(shell, shown_as=target)
+            yield shell / place.name  # its final name, which rosbag2 gives to the files in it
+            refuse_existing(target, option)
+            disk.move(shell / place.name, place)
+        finally:
+            if shell is not None:
+                shutil.rmtree(shell, ignore_errors=True)
+            if lock is not None:
+                lock.release()
+
+
+def _prefix(place: Path) -> str:
+    return f".{place.name}.bhd-"  # as of datasets that are built beside their place
