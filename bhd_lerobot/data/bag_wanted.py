@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from bhd_lerobot.data.bag_headers import is_ours
 from bhd_lerobot.data.bag_images import COMPRESSED, IMAGE
+from bhd_lerobot.data.bag_other import told_other_robot
 from bhd_lerobot.data.bag_read import Bag, Topic
 from bhd_lerobot.data.ros2_base import BareTwistPart, GyroPart, OdometryPart, ScanPart, TwistPart
 from bhd_lerobot.errors import DatasetError
@@ -36,10 +37,13 @@ def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) ->
         name: of the topic.
 
     Raises:
-        DatasetError: it is missing, empty, of another type, of two types, or not in ROS 2's serialisation.
+        DatasetError: the bag is of another robot, or the topic is missing, empty, of another type, of two types, or
+            not in ROS 2's serialisation.
     """
     option, types = (f"--{role}", TYPES[role])
     if name not in topics or not topics[name].count:
+        if (other := told_other_robot(bag, topics)) is not None:
+            raise DatasetError(other)
         there = ", ".join(f"{one.name} ({one.msgtype}, {one.count})" for one in topics.values()) or "none"
         fitting = [one.name for one in topics.values() if one.msgtype in types and one.count]
         hint = f" Of the right type: {', '.join(fitting)}." if fitting else ""

@@ -398,3 +398,16 @@ def test_nothing_heavy_is_imported_before_it_is_needed():
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.split() == []
+
+
+def test_an_arm_is_not_resampled_as_a_base_and_comes_back_without(ur5, tmp_path, capsys):
+    bags = export(ur5, tmp_path / "bags", "--episodes=0")
+    named = ["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'd'}"]
+    assert data.main([*named, "--resample", "--task=Reach."]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "is of the robot 'ur5'" in error
+    assert "is for bags of a TurtleBot3" in error
+    assert "Leave --resample out" in error
+    assert "--scan" not in error
+    assert os.listdir(tmp_path) == ["bags"]
+    assert data.main(named) == 0

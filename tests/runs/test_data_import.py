@@ -189,6 +189,25 @@ def test_a_bag_without_a_topic_is_refused_with_those_it_has(tmp_path, capsys, mi
         assert part in error
 
 
+def joint_states(*names):
+    state = bags.T["sensor_msgs/msg/JointState"](
+        header=bags.header(START, ""), name=list(names), position=np.zeros(len(names)),
+        velocity=np.zeros(0), effort=np.zeros(0),
+    )  # fmt: skip
+    return [("/joint_states", START, state)]
+
+
+def test_a_bag_of_an_arm_is_said_to_be_one(tmp_path, capsys):
+    arm = write(tmp_path / "arm", joint_states("shoulder_pan_joint", "elbow_joint"))
+    error = refused(arm, tmp_path / "d", capsys)
+    assert "seems to be of an arm: /joint_states has the joints shoulder_pan_joint, elbow_joint, and" in error
+    assert "is for bags of a TurtleBot3" in error
+    base = write(tmp_path / "base", joint_states("wheel_left_joint", "wheel_right_joint"))
+    assert "no topic /scan" in refused(base, tmp_path / "d", capsys)
+    blind = [*joint_states("elbow_joint"), *filter(without("/scan"), drive())]
+    assert "no topic /scan" in refused(write(tmp_path / "blind", blind), tmp_path / "d", capsys)
+
+
 def test_another_topic_can_be_named_and_must_be_of_the_right_type(tmp_path, capsys):
     source = write(tmp_path / "bag", [(f"/tb3{topic}", at, message) for topic, at, message in drive()])
     error = refused(source, tmp_path / "d", capsys)

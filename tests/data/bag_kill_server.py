@@ -1,0 +1,58 @@
+"""Exports and imports bags in forked processes that kill themselves; see `kill_server`, whose jobs it does as well."""
+
+import itertools
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import kill_server  # run as a script, so this folder is on the path
+import mcap.writer  # noqa: F401  as kill_server says
+import rosbags.rosbag2  # noqa: F401
+
+from bhd_lerobot.data import bag_write, disk
+from bhd_lerobot.data.bag_export import ExportOptions, export_bags
+from bhd_lerobot.data.bag_find import find_bags
+from bhd_lerobot.data.bag_restore import restore
+from bhd_lerobot.data.ros2_types import type_store
+from bhd_lerobot.data.ros2_views import RobotView
+
+type_store()
+plain_run = kill_server.run
+
+
+def run(job: dict[str, Any]) -> None:
+    """Export or import, and die before a given change of the disk, or before a given bag is written or closed."""
+    if job.get("edit") not in ("export", "import"):
+        plain_run(job)
+        return
+    steps = itertools.count()
+
+    def before_step(*arguments: object) -> None:
+        if next(steps) == job["die_at"]:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    disk._before_step = before_step
+    for name in ("__enter__", "write", "__exit__"):
+        stepped(name, before_step)
+    target, source = (Path(root) for root in job["roots"])
+    if job["edit"] == "export":
+        export_bags(source, target, view=RobotView(), options=ExportOptions(one_bag=job["one_bag"]))
+    else:
+        restore(find_bags(source), target, "t/t")
+
+
+def stepped(name: str, before_step: Any) -> None:
+    """Let a method of the writer of bags count as a step."""
+    plain = getattr(bag_write.BagWriter, name)
+
+    def method(*arguments: Any) -> Any:
+        before_step()
+        return plain(*arguments)
+
+    setattr(bag_write.BagWriter, name, method)
+
+
+if __name__ == "__main__":
+    kill_server.run = run
+    kill_server.main()
