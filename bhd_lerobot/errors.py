@@ -101,3 +101,10 @@ def unknown_name(kind: str, value: object, choices: Iterable[str]) -> str:
     near = difflib.get_close_matches(str(value), names, n=1, cutoff=0.6)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return f"Unknown {kind} {value!r}.{hint} Valid: {', '.join(names) if names else '(none)'}."
+
+
+def install_extra(extra: str) -> str:
+    """Return how an extra is installed. The package is on no index: its name there could be somebody else's."""
+    return (
+        f"In the folder of this project: `make venv`, or `pip install -e '.[{extra}]'` in an environment of your own."
+    )

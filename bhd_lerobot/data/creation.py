@@ -11,7 +11,7 @@ from typing import Any
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.data.schema import Schema
-from bhd_lerobot.errors import ConfigError, DatasetExistsError, DatasetLockedError
+from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, DatasetLockedError
 
 
 def new_info(fps: int, schema: Schema, robot_type: str) -> dict[str, Any]:
@@ -63,18 +63,18 @@ def build_root(
     """Build a dataset beside its place, rename it, and return the lock on it.
 
     Args:
-        root: where to put it; must not exist.
+        root: where to put it; must not exist, or be an empty folder.
         fill: writes everything into the folder that it is given.
         disk: how to write.
         remedy: what can be done if it exists.
 
     Raises:
         DatasetExistsError: `root` exists.
+        DatasetLockedError: it exists, and is being written.
         DatasetWriteError: it cannot be written.
     """
-    exists = DatasetExistsError(f"{root} exists already. {remedy}, or choose another root.")
-    if root.exists() or root.is_symlink():
-        raise exists
+    if not is_free(root):
+        raise _exists(root, remedy)
     with write_errors("create the dataset", root, "Nothing was written there."):
         disk.make_folder(root.parent)
         prefix = f".{root.name}.bhd-"
@@ -84,14 +84,34 @@ def build_root(
         try:
             building.chmod(0o755)
             fill(building)
-            if root.exists():
-                raise exists
+            if not is_free(root):
+                raise _exists(root, remedy)
             disk.move(building, root)
         except BaseException:
             lock.release()
             shutil.rmtree(building, ignore_errors=True)
             raise
     return lock
+
+
+def is_free(root: Path) -> bool:
+    """Tell whether a dataset can be made at a root: nothing is there, or an empty folder."""
+    if root.is_symlink() or not root.exists():
+        return not root.is_symlink()
+    return root.is_dir() and not any(root.iterdir())
+
+
+def _exists(root: Path, remedy: str) -> DatasetError:
+    """Return what is in the way of a new dataset."""
+    if not root.is_dir():
+        return DatasetExistsError(f"{root} is no folder, but a file or a link to nothing. Choose another root.")
+    try:
+        RootLock(root).release()
+    except DatasetLockedError as error:
+        return error
+    except OSError:  # a folder of somebody else's
+        pass
+    return DatasetExistsError(f"{root} exists already. {remedy}, or choose another root.")
 
 
 def refuse_inside(target: Path, source: Path) -> None:

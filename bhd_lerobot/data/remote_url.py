@@ -12,7 +12,7 @@ from bhd_lerobot.errors import ConfigError, TransferError
 LOCAL = {"file", "local"}
 """Protocols of this machine's own folders."""
 
-_EXTRAS = {"s3": "lerobot_robot_bhd[s3]", "s3a": "lerobot_robot_bhd[s3]", "gs": "gcsfs", "gcs": "gcsfs"}
+_EXTRAS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs"}
 _EXTRAS |= {"az": "adlfs", "abfs": "adlfs", "abfss": "adlfs", "sftp": "paramiko", "ssh": "paramiko"}
 
 _BUCKETS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oci", "oss", "r2"}

@@ -6,7 +6,7 @@ Bags embed the definitions, so that a reader without this package decodes our me
 from functools import cache
 from typing import Any
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, install_extra
 
 FORMAT = 1
 """Version of the messages below; an `Episode` of another one is refused."""
@@ -136,8 +136,7 @@ def require_rosbags() -> None:
         import rosbags.rosbag2  # noqa: F401
     except ImportError as error:
         raise ConfigError(
-            f"ROS 2 bags need the package rosbags, which cannot be imported ({error}). Install it: "
-            "pip install 'lerobot_robot_bhd[ros2]'"
+            f"ROS 2 bags need the package rosbags, which cannot be imported ({error}). {install_extra('ros2')}"
         ) from error
 
 

@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.errors import ConfigError, install_extra, unknown_name
 
 ENGINES = ("local", "ray")
 
@@ -84,8 +84,8 @@ def check_engine(config: Any) -> None:
         )
     if importlib.util.find_spec("ray") is None:
         raise ConfigError(
-            "engine is 'ray', but Ray is not installed. Install it here and on every machine of the cluster: "
-            "pip install 'lerobot_robot_bhd[ray]'"
+            "engine is 'ray', but Ray is not installed. It is needed here and on every machine of the cluster. "
+            + install_extra("ray")
         )
 
 

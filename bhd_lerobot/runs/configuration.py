@@ -187,7 +187,8 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None
     fields = {name: kind for name, kind, _ in options_of(config_class)}
     for key, value in values.items():
         if key not in fields:
-            raise ConfigError(unknown_name("option", f"{prefix}{key}", [f"{prefix}{name}" for name in fields]))
+            valid = [f"{prefix}{name}" for name in fields] + ([] if prefix else [CONFIG_PATH])
+            raise ConfigError(unknown_name("option", f"{prefix}{key}", valid))
         values[key] = _checked(f"{prefix}{key}", value, fields[key])
     for name, kind, default in options_of(config_class):
         if default is dataclasses.MISSING and name not in values:

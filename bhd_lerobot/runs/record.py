@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
+from bhd_lerobot.data.creation import is_free
 from bhd_lerobot.data.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.recorder import DatasetRecorder
@@ -116,6 +117,12 @@ def _run(
         EpisodeSpec(index, episode_seed(config.seed, index, config.split))  # type: ignore[arg-type]
         for index in range(recorder.num_episodes, config.dataset.num_episodes)
     ]
+    if not specs:
+        console.print(
+            f"The dataset has {recorder.num_episodes} episodes already, and {config.dataset.num_episodes} are to be in "
+            "it: nothing is recorded. For more, raise --dataset.num_episodes.",
+            soft_wrap=True,
+        )
     with _progress(console) as progress:
         bar = progress.add_task("recording", total=len(specs), success="", speed="")
         started = time.perf_counter()
@@ -230,7 +237,8 @@ def open_recorder(
         "seed": config.seed,
         "split": config.split,
     }
-    make = DatasetRecorder.resume if config.resume and root.exists() else DatasetRecorder.create
+    goes_on = config.resume and not is_free(root)
+    make = DatasetRecorder.resume if goes_on else DatasetRecorder.create
     return make(
         config.dataset.repo_id,
         config.dataset.fps,

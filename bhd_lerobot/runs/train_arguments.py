@@ -5,6 +5,7 @@ configuration that lies in a checkpoint.
 """
 
 import logging
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +55,7 @@ def parse_train(arguments: Sequence[str]) -> Request:
     if resume:
         if path is None:
             raise ConfigError(f"resume needs --config_path, the {TRAIN_CONFIG_NAME} of a checkpoint or its folder.")
-        checkpoint = resumed_checkpoint(Path(str(path)).expanduser())
+        checkpoint = _resumed(Path(str(path)).expanduser(), overrides.get("output_dir"))
         values = _read_checkpoint(checkpoint)
         values["output_dir"] = str(checkpoint.parent.parent)  # the run may have been moved
     else:
@@ -64,6 +65,19 @@ def parse_train(arguments: Sequence[str]) -> Request:
             values["policy"] = {}
         configuration.set_option(values, key, value)
     return _decoded(values, checkpoint)
+
+
+def _resumed(path: Path, output_dir: Any) -> Path:
+    """Return the checkpoint to go on with; who names the run's folder in another way is told how to name it."""
+    try:
+        return resumed_checkpoint(path)
+    except ConfigError as error:
+        run = None if output_dir is None else Path(str(output_dir)).expanduser()
+        if run is None or not (run / CHECKPOINTS_DIR).is_dir():
+            raise
+        raise ConfigError(
+            f"{error} To go on with the run in {run}: bhd-train --resume=true --config_path={shlex.quote(str(run))}"
+        ) from None
 
 
 def resumed_checkpoint(path: Path) -> Path:

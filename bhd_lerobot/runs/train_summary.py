@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,8 @@ from bhd_lerobot.tasks.config_task import TaskConfig
 
 if TYPE_CHECKING:
     from bhd_lerobot.runs.train import TrainResult
+
+_EXAMPLE_TASKS = {"turtlebot3": "avoid", "ur5": "pick"}
 
 
 def tell_start(console: Console, config: BhdTrainConfig, policy: Any, data: TrainingData, step: int) -> None:
@@ -51,9 +53,9 @@ def tell_summary(console: Console, config: BhdTrainConfig, result: "TrainResult"
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_row("steps", f"{result.step:,} of {config.steps:,} in {result.wall_s:.1f} s")
     if losses:
-        table.add_row("loss", f"{losses[0]:.4g} at first, {losses[-1]:.4g} at the end")
+        table.add_row("loss", _course(losses))
     if held_out:
-        table.add_row("held-out loss", f"{held_out[0]:.4g} at first, {held_out[-1]:.4g} at the end")
+        table.add_row("held-out loss", _course(held_out))
     table.add_row("metrics", escape(str(result.output_dir / METRICS_NAME)))
     table.add_row("curve", escape(str(result.output_dir / PLOT_NAME)))
     if result.checkpoint is not None:
@@ -67,25 +69,38 @@ def tell_summary(console: Console, config: BhdTrainConfig, result: "TrainResult"
         if result.checkpoint is not None:
             lines.append(f"  {resume_command(result.checkpoint)}")
     elif result.checkpoint is not None:
-        lines += ["Evaluate it with:", f"  {evaluate_command(result.contract, str(result.checkpoint))}"]
+        lines += how_to_evaluate(result.contract, str(result.checkpoint))
     for line in lines:
         console.print(escape(line), soft_wrap=True, highlight=False)
 
 
-def evaluate_command(contract: PolicyContract, checkpoint: str) -> str:
-    """Return the command that evaluates a checkpoint on held-out episodes of what it was trained on.
+def _course(losses: Sequence[float]) -> str:
+    if len(losses) == 1:
+        return f"{losses[0]:.4g}, logged once"
+    return f"{losses[0]:.4g} at first, {losses[-1]:.4g} at the end"
 
-    It names the options of robot and task that are not at their defaults: with others the observations or actions do
-    not fit.
+
+def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
+    """Return what to say about evaluating a checkpoint: a line, and a command on held-out episodes of its task.
+
+    The command names the options of robot and task that are not at their defaults: with others the observations or
+    actions do not fit. A dataset that another program recorded does not say its task; then it is one of the robot's.
     """
     path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
     kinds = {str(kind.get_choice_name(kind)): kind for kind in SIMULATED_ROBOTS}
     task = (contract.task or {}).get("type")
-    if contract.robot_type not in kinds or task not in TaskConfig.get_known_choices():
-        return f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={path}"
+    if contract.robot_type not in kinds:
+        rollout = f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={path} --duration=60"
+        return ["Let it drive the robot for a minute with:", f"  {rollout}"]
+    if task not in TaskConfig.get_known_choices():
+        task = _EXAMPLE_TASKS[contract.robot_type]
+        said = f"The dataset does not say its task. Evaluate it in simulation at {task!r}, for example, with:"
+    else:
+        said = "Evaluate it with:"
     options = _options("robot", contract.robot or {}, describe(kinds[contract.robot_type]()))
     asked = _options("task", contract.task or {}, asdict(TaskConfig.get_choice_class(task)()))
-    return f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task}{asked} --brain.path={path}"
+    command = f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task}{asked} --brain.path={path}"
+    return [said, f"  {command}"]
 
 
 def _options(name: str, values: Mapping[str, Any], usual: Mapping[str, Any]) -> str:

@@ -119,7 +119,7 @@ def test_a_yaw_that_goes_on_turning_comes_back_to_the_bit():
 
 def test_without_rosbags_the_command_that_installs_it_is_named(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag2", None)
-    with pytest.raises(ConfigError, match=r"pip install 'lerobot_robot_bhd\[ros2\]'"):
+    with pytest.raises(ConfigError, match=r"pip install -e '\.\[ros2\]'"):
         types.require_rosbags()
 
 

@@ -59,7 +59,7 @@ def test_options_that_a_cluster_cannot_honour_are_refused(tmp_path):
 
 def test_without_ray_the_command_to_install_it_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(cluster_config, "importlib", SimpleNamespace(util=SimpleNamespace(find_spec=lambda _: None)))
-    with pytest.raises(ConfigError, match=r"pip install 'lerobot_robot_bhd\[ray\]'"):
+    with pytest.raises(ConfigError, match=r"pip install -e '\.\[ray\]'"):
         run_record(tmp_path / "data", engine="ray")
 
 

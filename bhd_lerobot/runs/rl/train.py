@@ -18,7 +18,7 @@ from rich.markup import escape
 
 import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.envs.vector import BhdVectorEnv
-from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.errors import BhdError, ConfigError, install_extra
 from bhd_lerobot.runs import configuration
 from bhd_lerobot.runs.rl import checkpoint as checkpoints
 from bhd_lerobot.runs.rl.config import RlConfig, parse_rl
@@ -30,8 +30,6 @@ from bhd_lerobot.runs.rl.shaping import Shaping
 from bhd_lerobot.runs.rl.validation import Level, Validation, level
 from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
 from bhd_lerobot.runs.train_log import METRICS_NAME, MetricsFile, read_metrics
-
-REMEDY = "pip install 'lerobot_robot_bhd[rl]'"
 
 
 @dataclass
@@ -69,7 +67,9 @@ def require_sb3() -> None:
     except ValueError:
         found = False
     if not found:
-        raise ConfigError(f"Reinforcement learning needs stable-baselines3, which is not installed: {REMEDY}")
+        raise ConfigError(
+            f"Reinforcement learning needs stable-baselines3, which is not installed. {install_extra('rl')}"
+        )
 
 
 def train(config: RlConfig, console: Console | None = None) -> RlResult:
