@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bhd_lerobot.data import layout, video
-from bhd_lerobot.data.check_files import Files, read_files
+from bhd_lerobot.data.check_files import RESTORE, Files, read_files
 from bhd_lerobot.data.check_values import Limits, ValueCheck
 from bhd_lerobot.data.episode_table import PREFIX
 from bhd_lerobot.data.findings import Finding, Findings, Severity
@@ -95,11 +95,11 @@ def _check_videos(files: Files, findings: Findings) -> None:
             try:
                 found = video.count_frames(path)
             except OSError as error:
-                findings.error("video", name, f"it cannot be read: {error}", "Restore it from a copy.")
+                findings.error("video", name, f"it cannot be read: {error}", RESTORE)
                 continue
             if found != lengths.sum():
                 what = f"it has {found} frames; its episodes have {lengths.sum()}"
-                findings.error("video", name, what, "Restore it from a copy, or record its episodes again.")
+                findings.error("video", name, what, RESTORE)
             begin = np.array([files.episodes[f"videos/{key}/from_timestamp"][i] for i in positions])
             end = np.array([files.episodes[f"videos/{key}/to_timestamp"][i] for i in positions])
             expected = (np.cumsum(lengths) - lengths) / fps

@@ -18,14 +18,14 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.check_names import check_names
 from bhd_lerobot.data.findings import Findings, few, one_line
-from bhd_lerobot.data.parquet_rescue import is_cut_off
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.data.state import no_dataset, repair_with_info
 from bhd_lerobot.errors import DatasetError
 
 _COPY = "Restore it from a copy, or try bhd-data repair."
-_RECORD = "Restore it from a copy, or record again."
+RESTORE = "Restore it from a copy, or run bhd-data repair, which recovers the episodes that are whole."
 _COUNTS = ("total_episodes", "total_frames", "total_tasks")
 _NEEDED = ("codebase_version", "features", "fps", *_COUNTS)
 _LIGHT = (
@@ -47,6 +47,7 @@ class Files:
         stats: `meta/stats.json`, by feature and name, flat; what is missing there, or no numbers, is not here.
         tasks: how many instructions there are.
         is_ours: whether this package recorded it.
+        has_stats: whether the statistics of every single episode are stored.
     """
 
     root: Path
@@ -55,6 +56,7 @@ class Files:
     stats: dict[str, dict[str, NDArray[np.float64]]] = field(default_factory=dict)
     tasks: int = 0
     is_ours: bool = False
+    has_stats: bool = True
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -96,7 +98,7 @@ def read_files(root: Path, findings: Findings) -> Files:
     _read_tasks(files, findings)
     _read_episodes(files, findings)
     _check_counts(files, findings)
-    _check_names(files, findings)
+    check_names(files, findings)
     _read_stats(files, findings)
     return files
 
@@ -172,6 +174,7 @@ def _read_episodes(files: Files, findings: Findings) -> None:
         try:
             file = pq.ParquetFile(path, page_checksum_verification=True)
             columns = [column for column in file.schema_arrow.names if not column.startswith("stats/")]
+            files.has_stats &= "stats/index/mean" in file.schema_arrow.names
             if len(columns) == len(file.schema_arrow.names) and not files.is_ours:
                 what = "it has no statistics of single episodes, without which nothing can be edited"
                 findings.warning("stats", name, what, stats_remedy(files))
@@ -228,27 +231,6 @@ def _check_counts(files: Files, findings: Findings) -> None:
     if length.sum() != files.info["total_frames"]:
         what = f"it counts {files.info['total_frames']} frames; the episodes have {length.sum()}"
         findings.error("counts", layout.INFO, what, "bhd-data check --fix counts them.")
-
-
-def _check_names(files: Files, findings: Findings) -> None:
-    """Compare the files that there are with those that the episodes name."""
-    wanted = {layout.data_file(slot) for slot in files.slots("data")}
-    for key in files.cameras:
-        wanted |= {layout.video_file(key, slot) for slot in files.slots(f"videos/{key}")}
-    there = {name for name in layout.recorded_files(files.root) if not name.startswith("meta/")}
-    for name in sorted(wanted - there):
-        findings.error("files", name, "it is missing", _RECORD)
-    leftovers = sorted(there - wanted)
-    remedy = "bhd-data repair removes it." if files.is_ours else "Look what it is; it may hold unfinished episodes."
-    torn = [name for name in leftovers if name.endswith(".parquet") and is_cut_off(files.root / name)]
-    if torn:
-        what = "its writer was killed; an episode may be in it, and LeRobot loads nothing while it is there"
-        findings.error("files", few(torn, 3), what, "bhd-data repair recovers what is whole.")
-    elif leftovers:
-        findings.warning("files", few(leftovers, 3), "no saved episode is in it", remedy)
-    if (files.root / layout.STAGING).exists():
-        what = "a recording was interrupted; what it saved is complete, and not yet merged"
-        findings.warning("files", layout.STAGING, what, "bhd-data repair finishes it.")
 
 
 def stats_remedy(files: Files) -> str:

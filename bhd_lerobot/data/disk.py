@@ -158,17 +158,18 @@ class RootLock:
     The lock is taken on the folder itself, so no lock file is left behind for an upload to pick up.
     """
 
-    def __init__(self, root: Path, shown_as: Path | None = None) -> None:
+    def __init__(self, root: Path, shown_as: Path | None = None, *, is_choice: bool = False) -> None:
         """Take the lock.
 
         Args:
             root: an existing folder.
             shown_as: the path to name in an error, if `root` is a temporary one.
+            is_choice: whether another root would do as well, which is said then.
 
         Raises:
             DatasetLockedError: another recorder or repair works on this root.
         """
-        self._root, self._shown_as = root, shown_as or root
+        self._root, self._shown_as, self._is_choice = root, shown_as or root, is_choice
         self._handle: int | None = None
         self.acquire()
 
@@ -182,8 +183,8 @@ class RootLock:
         except BlockingIOError:
             os.close(handle)
             raise DatasetLockedError(
-                f"{self._shown_as} is being written by another recorder or repair. Wait until it ends, or choose "
-                "another root."
+                f"{self._shown_as} is being written by another recorder or repair. Wait until it ends"
+                f"{', or choose another root' if self._is_choice else ''}."
             ) from None
         self._handle = handle
         # The folder may be renamed while it is locked; a second time it is taken under its final name.

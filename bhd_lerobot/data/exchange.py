@@ -11,29 +11,34 @@ from pathlib import Path
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import Disk
 
-_WORK = f"{layout.STAGING}/compact"  # the name that versions before had, so that what they left is found
-_MARKER = f"{_WORK}/ready"
+WORK = Path(layout.STAGING, "compact")  # the name that versions before had, so that what they left is found
+_MARKER = WORK / "ready"
 _FOLDERS = ("videos", "data", "meta")
 
 
 def begin(root: Path, disk: Disk) -> Path:
     """Return the empty place in which the new folders are to be built; a folder that is not built stays as it is."""
-    disk.remove_tree(root / _WORK)
-    return root / _WORK / "new"
+    disk.remove_tree(root / WORK)
+    return root / WORK / "new"
 
 
 def complete(root: Path, disk: Disk) -> None:
     """Put what was built since `begin` in place of the old folders."""
-    disk.write(root / f"{_MARKER}.tmp", b"")
-    disk.move(root / f"{_MARKER}.tmp", root / _MARKER)
+    disk.write(root / WORK / "ready.tmp", b"")
+    disk.move(root / WORK / "ready.tmp", root / _MARKER)
     roll_forward(root, disk)
+
+
+def is_decided(root: Path) -> bool:
+    """Tell whether an exchange was interrupted after it had been decided."""
+    return (root / _MARKER).exists()
 
 
 def roll_forward(root: Path, disk: Disk) -> bool:
     """Complete an exchange that had been decided; return whether there was one."""
-    if not (root / _MARKER).exists():
+    if not is_decided(root):
         return False
-    new, old = root / _WORK / "new", root / _WORK / "old"
+    new, old = root / WORK / "new", root / WORK / "old"
     disk.make_folder(old)
     for name in _FOLDERS:
         if (new / name).exists():
@@ -42,7 +47,7 @@ def roll_forward(root: Path, disk: Disk) -> bool:
                 disk.move(root / name, old / name)
             disk.move(new / name, root / name)
     disk.remove(root / _MARKER)
-    disk.remove_tree(root / _WORK)
+    disk.remove_tree(root / WORK)
     return True
 
 

@@ -33,12 +33,14 @@ class Rescued:
     Attributes:
         groups: the row groups, in order.
         problem: why there is no more; empty if the file is whole.
-        lost_bytes: bytes that belong to no row group.
+        lost_bytes: bytes that belong to no row group that can be read.
+        is_cut: whether there is no footer, so that bytes at the end may belong to no row group.
     """
 
     groups: list[pa.Table]
     problem: str = ""
     lost_bytes: int = 0
+    is_cut: bool = False
 
 
 @dataclass
@@ -77,7 +79,7 @@ def is_cut_off(path: Path) -> bool:
 
 
 def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | None = None) -> Rescued:
-    """Return the row groups of a file, with its footer or without.
+    """Return the row groups of a file, with its footer or without; damaged ones are left out.
 
     Args:
         path: the file.
@@ -89,8 +91,8 @@ def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | 
         ValueError: rows of a column may have any length, so that the ends of its pages cannot be known.
     """
     try:
-        whole = pq.ParquetFile(path)
-        return Rescued([whole.read_row_group(group, use_threads=False) for group in range(whole.num_row_groups)])
+        whole = pq.ParquetFile(path, page_checksum_verification=True)
+        return _read(whole)
     except (OSError, pa.ArrowException) as error:
         problem = " ".join(str(error).split())
     data = path.read_bytes()
@@ -99,18 +101,31 @@ def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | 
     footer, factors = _template(schema, shapes or {})
     groups = _walk(memoryview(data), factors)
     if not groups:
-        return Rescued([], f"it has no footer and no whole row group ({problem[:120]})", len(data) - len(MAGIC))
+        return Rescued([], f"it has no footer and no whole row group ({problem[:120]})", len(data) - len(MAGIC), True)
     whole_bytes = data[: groups[-1][-1].end] + _footer(footer, groups, factors)
-    tables: list[pa.Table] = []
+    rest = len(data) - groups[-1][-1].end
     try:
-        file = pq.ParquetFile(pa.BufferReader(whole_bytes))
-        for group in range(len(groups)):
-            tables.append(file.read_row_group(group, use_threads=False))
+        found = _read(pq.ParquetFile(pa.BufferReader(whole_bytes), page_checksum_verification=True))
     except (OSError, pa.ArrowException, ValueError) as error:
-        # The headers were right, and what is between them is not.
-        problem = f"it has no footer, and row group {len(tables)} cannot be read ({' '.join(str(error).split())[:120]})"
-        return Rescued(tables, problem, len(data) - (groups[len(tables) - 1][-1].end if tables else len(MAGIC)))
-    return Rescued(tables, "it has no footer", len(data) - groups[-1][-1].end)
+        return Rescued([], f"it has no footer ({' '.join(str(error).split())[:120]})", len(data) - len(MAGIC), True)
+    problem = "it has no footer" + (f", and {found.problem}" if found.problem else "")
+    return Rescued(found.groups, problem, found.lost_bytes + rest, True)
+
+
+def _read(file: pq.ParquetFile) -> Rescued:
+    """Return the row groups whose pages are what was written."""
+    tables: list[pa.Table] = []
+    problems: list[str] = []
+    lost = 0
+    for group in range(file.num_row_groups):
+        try:
+            tables.append(file.read_row_group(group, use_threads=False))
+        except (OSError, pa.ArrowException, ValueError) as error:
+            # The headers are right, and what is between them is not.
+            problems.append(f"row group {group} cannot be read ({' '.join(str(error).split())[:120]})")
+            described = file.metadata.row_group(group)
+            lost += sum(described.column(place).total_compressed_size for place in range(described.num_columns))
+    return Rescued(tables, "; ".join(problems[:3]), lost)
 
 
 def _template(schema: pa.Schema, shapes: Mapping[str, Sequence[int]]) -> tuple[Struct, list[int]]:

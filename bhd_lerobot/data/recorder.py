@@ -131,7 +131,7 @@ class DatasetRecorder:
         if not root.is_dir():
             raise DatasetError(f"There is no dataset to resume at {root}. Create it first.")
         disk = Disk(fsync)
-        lock = RootLock(root)
+        lock = RootLock(root, is_choice=True)
         try:
             with write_errors("resume the dataset", root, _INTACT):
                 state, report = settle(root, disk)

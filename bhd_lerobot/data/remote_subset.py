@@ -45,7 +45,7 @@ def files_of(root: Path, episodes: Sequence[int]) -> set[str]:
         raise corrupt(root / layout.INFO, error) from error
     unknown = [episode for episode in episodes if episode not in by_index]
     if lost := [episode for episode in unknown if 0 <= episode < info["total_episodes"]]:
-        reason = f"info.json counts {info['total_episodes']} episodes, but {lost[0]} is missing"
+        reason = f"info.json counts {info['total_episodes']} episodes, but episode {lost[0]} is not described"
         raise corrupt(root / "meta/episodes", reason)
     if unknown:
         raise DatasetError(

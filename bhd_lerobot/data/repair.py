@@ -1,4 +1,4 @@
-"""Complete or drop what an interrupted recording left behind."""
+"""Complete or drop what an interrupted recording left behind, and recover what is whole where files are damaged."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from bhd_lerobot.data.salvage_told import Told
 from bhd_lerobot.data.schema import Schema
 from bhd_lerobot.data.state import (
     REPAIR_MAY_HELP,
+    DamagedFileError,
     DatasetState,
     corrupt,
     load_state,
@@ -36,11 +37,11 @@ class RepairReport:
 
     Attributes:
         root: the dataset.
-        episodes: episodes it holds now; none of the saved ones is ever lost.
+        episodes: episodes it holds now.
         frames: frames it holds now.
         completed: steps that had been decided before the interruption and were completed.
         dropped: files of unfinished episodes that were removed, relative to the root.
-        lost: what of another program's wreck could not be recovered, and why.
+        lost: what of a wreck could not be recovered, and why.
         hints: what may be so about it.
         aside: where its damaged files lie now; None if none were damaged.
     """
@@ -80,8 +81,8 @@ def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
 
     Raises:
         DatasetLockedError: it is being recorded at this moment.
-        DatasetCorruptError: a file of a saved episode is damaged; nothing was dropped then.
-        DatasetError: there is no dataset at `root`.
+        DatasetCorruptError: files are damaged and no whole episode can be recovered; nothing was changed then.
+        DatasetError: there is no dataset at `root`, or the disk does not give out one of its files.
         ConfigError: `info` is not needed, cannot be read or describes other data.
         DatasetWriteError: the disk refuses the repaired files.
     """
@@ -96,6 +97,18 @@ def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
         is_ours = (root / layout.IDENTITY).exists()
         if (root / layout.INFO).is_file() and (not is_ours or went_on(root)):
             return _repair_foreign(root, disk)
+        return _repair_own(root, disk)
+    except DatasetCorruptError as error:
+        # Whoever is told to try `repair` has done that now.
+        raise DatasetCorruptError(str(error).replace(REPAIR_MAY_HELP, "")) from error
+    finally:
+        lock.release()
+
+
+def _repair_own(root: Path, disk: Disk) -> RepairReport:
+    """Finish what our recorder or an edit began; where saved files are damaged, recover the episodes that are whole."""
+    report = RepairReport(root, 0, 0)
+    try:
         with write_errors("repair the dataset", root, "Its saved episodes are intact."):
             state, report = settle(root, disk)
             _check_deeply(state)
@@ -104,12 +117,30 @@ def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
                 disk.remove_tree(root / layout.STAGING)
                 done = (*report.completed, what)
                 report = RepairReport(root, report.episodes, report.frames, done, report.dropped)
-        return report
-    except DatasetCorruptError as error:
-        # Whoever is told to try `repair` has done that now.
-        raise DatasetCorruptError(str(error).replace(REPAIR_MAY_HELP, "")) from error
-    finally:
-        lock.release()
+    except DamagedFileError as error:
+        # These two nothing else can replace: what the columns are, and who recorded it how.
+        if error.path in (root / layout.INFO, root / layout.IDENTITY):
+            raise
+        return _salvaged(root, disk, error, report.completed, report.dropped, is_ours=True)
+    return report
+
+
+def _salvaged(
+    root: Path,
+    disk: Disk,
+    error: DatasetCorruptError,
+    completed: tuple[str, ...],
+    dropped: tuple[str, ...] = (),
+    *,
+    is_ours: bool = False,
+) -> RepairReport:
+    wrong = str(error).split(". ", 1)[0]
+    rescued = salvage(root, disk, wrong, is_ours=is_ours)
+    what = f"{rescued.episodes} whole episodes were recovered, with new statistics. What was wrong: {wrong}"
+    done = (*completed, what)
+    return RepairReport(
+        root, rescued.episodes, rescued.frames, done, dropped, rescued.lost, rescued.hints, rescued.aside
+    )
 
 
 def _repair_with(root: Path, donor: Path, disk: Disk) -> RepairReport:
@@ -144,15 +175,7 @@ def _repair_foreign(root: Path, disk: Disk, *completed: str) -> RepairReport:
             raise corrupt(root / extra[0], "no episode of meta/episodes is in it")
         _check_readable(state)
     except DatasetCorruptError as error:
-        rescued = salvage(root, disk)
-        wrong = str(error).split(". ", 1)[0]
-        done = (
-            *completed,
-            f"{rescued.episodes} whole episodes were recovered, with new statistics. What was wrong: {wrong}",
-        )
-        return RepairReport(
-            root, rescued.episodes, rescued.frames, done, (), rescued.lost, rescued.hints, rescued.aside
-        )
+        return _salvaged(root, disk, error, completed)
     if state.rows and not _has_stats(root):
         with write_errors("repair the dataset", root, "Its files are as they were."):
             completed = (*completed, compute_stats(state, disk))
@@ -169,10 +192,10 @@ def unfinished_files(root: Path) -> list[Path]:
 def went_on(root: Path) -> list[Path]:
     """Return what another program left unfinished when it went on with a dataset of ours.
 
-    A file that our own rows need and that is cut off is damage of another kind, and not for guessing.
+    A file that our own rows need and that is cut off is damage of another kind. LeRobot always leaves a data file.
     """
     unfinished = unfinished_files(root)
-    rows = Told(root, []).rows.values() if unfinished else ()
+    rows = Told(root, []).rows.values() if any(path.is_relative_to(root / "data") for path in unfinished) else ()
     needed = {root / layout.data_file(slot_of(row, "data")) for row in rows}
     return [] if not rows or needed & set(unfinished) else unfinished
 

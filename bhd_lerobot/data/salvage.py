@@ -1,4 +1,4 @@
-"""Bring back a dataset that another program's recorder left unreadable when it was killed.
+"""Bring back every whole episode of a dataset that cannot be read: a recorder was killed, or files are damaged.
 
 LeRobot keeps one Parquet file open for a whole recording, and a file without its footer is read by nobody; it writes
 ``meta/episodes`` ten episodes at a time, and ``info.json`` and a film at each. So after a kill nothing loads, though
@@ -6,8 +6,7 @@ nearly everything is on disk. Here the frames are read without the footer, films
 all of its frames are there in all of its columns and films. Everything else of ``meta`` is made anew from that.
 """
 
-import contextlib
-import os
+import datetime
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,17 +17,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data import exchange, layout
+from bhd_lerobot.data.assemble import EDITS
 from bhd_lerobot.data.disk import Disk, to_json, write_errors
 from bhd_lerobot.data.findings import few
 from bhd_lerobot.data.meta_files import tasks_table, write_meta
 from bhd_lerobot.data.parquet_rescue import rescue
 from bhd_lerobot.data.salvage_columns import lost_cameras, misfit
 from bhd_lerobot.data.salvage_films import Films, Found
+from bhd_lerobot.data.salvage_guard import check_readable, check_unused
+from bhd_lerobot.data.salvage_marks import RECOVERED, logged, recall
 from bhd_lerobot.data.salvage_rows import info_of, rows_of, tasks_of, write_data
 from bhd_lerobot.data.salvage_stats import stats_of
 from bhd_lerobot.data.salvage_told import Told
 from bhd_lerobot.data.state import corrupt, read_json, repair_with_info
-from bhd_lerobot.errors import DatasetCorruptError, DatasetLockedError, UnsupportedDatasetError
+from bhd_lerobot.errors import DatasetCorruptError, UnsupportedDatasetError
 
 
 @dataclass(frozen=True)
@@ -50,38 +52,45 @@ class Salvage:
     aside: Path
 
 
-def salvage(root: Path, disk: Disk) -> Salvage:
+def salvage(root: Path, disk: Disk, wrong: str, *, is_ours: bool = False) -> Salvage:
     """Recover every whole episode; the caller holds the lock.
 
     Damaged files go to a folder beside the dataset first, so nothing that was there is lost.
+
+    Args:
+        root: the wreck.
+        disk: how to write.
+        wrong: what was found to be wrong, for the error if nothing is left.
+        is_ours: whether our recorder alone wrote it.
 
     Raises:
         DatasetCorruptError: no whole episode is left, or ``info.json`` is gone, which says what the columns are;
             nothing was changed.
         DatasetLockedError: a process has files of the dataset open, so perhaps records it.
+        DatasetError: the disk does not give out a file, which may be whole.
         DatasetWriteError: the disk refuses; the wreck is as it was.
     """
     check_unused(root)
+    check_readable(root)
+    identity = read_json(root / layout.IDENTITY) if (root / layout.IDENTITY).exists() else None
     info = _info_of(root)
-    if wrong := misfit(root, info):
+    if other := misfit(root, info):
         raise DatasetCorruptError(
-            f"{root / layout.INFO} describes other data than those of {root}: {wrong}. Perhaps it is another "
+            f"{root / layout.INFO} describes other data than those of {root}: {other}. Perhaps it is another "
             f"recording's. {repair_with_info(root)}"
         )
     lost: list[str] = []
     hints: list[str] = []
     told = Told(root, lost)
-    found, is_torn = _frames(root, info, lost)
+    torn: list[str] = []
+    found, is_torn = _frames(root, info, lost, torn)
     films = Films(root, info, told.rows)
     kept = films.assign(found, lost, is_torn=is_torn)
+    # Where all that was counted is there, and no more, the bytes are of a footer or of what was never saved.
+    is_all = bool(kept) and [one.number for one in kept] == list(range(info.get("total_episodes") or 0))
+    (hints if is_all else lost).extend(torn)
     if not kept:
-        if cameras := lost_cameras(root, info):
-            lost.append(
-                f"{layout.INFO} describes {few(cameras)}, of which there is no film and no picture. If it is another "
-                f"recording's: {repair_with_info(root)}"
-            )
-        reasons = "".join(f"\n  {line}" for line in lost)
-        raise DatasetCorruptError(f"No whole episode of {root} can be recovered; nothing was changed.{reasons}")
+        raise _nothing_left(root, info, wrong, lost)
     numbers = {one.number for one in found}
     lost += [f"episode {number}: its frames are gone" for number in sorted(told.rows.keys() - numbers)]
     counted = info.get("total_episodes")
@@ -94,12 +103,15 @@ def salvage(root: Path, disk: Disk) -> Salvage:
     with write_errors("recover the dataset", root, "The damaged files are as they were."):
         aside = _keep_aside(root, disk)
         new = exchange.begin(root, disk)
-        tasks, known = tasks_of(root, kept, told, lost)
-        rows = rows_of(kept, tasks, known)
+        tasks, renumbered = tasks_of(root, kept, told, lost)
+        rows = rows_of(kept, tasks, renumbered)
         described = info_of(info, kept, len(tasks))
         write_data(kept, rows, described, new, disk)
         films.write(kept, rows, described, new, disk)
         told.complete(kept, rows)
+        forgotten, known = recall(root, kept, rows, told, is_ours=is_ours)
+        lost += forgotten
+        hints += known
         stats = stats_of((one.table for one in kept), described["features"], new, rows, told.stats_of(kept))
         exchange.link_others(root / "meta", new / "meta", disk, *_WRITTEN, take=disk.copy)
         sink = pa.BufferOutputStream()
@@ -107,13 +119,29 @@ def salvage(root: Path, disk: Disk) -> Salvage:
         disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
         write_meta(new, described, rows, told.metadata_types, stats, disk=disk, extra=told.extra_types)
         disk.write(new / layout.INFO, to_json(described))
-        if (root / layout.IDENTITY).exists():
-            _disown(root / layout.IDENTITY, new / layout.IDENTITY, disk)
+        if identity is not None:
+            disk.write(new / layout.IDENTITY, to_json(_disowned(identity)))
+        if identity is not None or (root / EDITS).is_file():
+            time = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+            disk.write(new / EDITS, logged(root, kept, time))
         exchange.complete(root, disk)
         disk.remove_tree(root / layout.STAGING)
         for folder in ("images", *(path.name for path in root.glob("tmp*") if path.is_dir())):
             disk.remove_tree(root / folder)  # of films that were being made; they are in `aside`
     return Salvage(len(kept), sum(one.table.num_rows for one in kept), tuple(lost), tuple(hints), aside)
+
+
+def _nothing_left(root: Path, info: dict[str, Any], wrong: str, lost: list[str]) -> DatasetCorruptError:
+    if cameras := lost_cameras(root, info):
+        lost.append(
+            f"{layout.INFO} describes {few(cameras)}, of which there is no film and no picture. If it is another "
+            f"recording's: {repair_with_info(root)}"
+        )
+    reasons = "".join(f"\n  {line}" for line in lost)
+    return DatasetCorruptError(
+        f"{wrong}. No whole episode of {root} can be recovered; nothing was changed. Restore this file from a copy (or "
+        f"from the Hub).{reasons}"
+    )
 
 
 def _info_of(root: Path) -> dict[str, Any]:
@@ -131,41 +159,19 @@ def _info_of(root: Path) -> dict[str, Any]:
     )
 
 
-_WRITTEN = ("info.json", "stats.json", "tasks.parquet", "bhd.json", "episodes/chunk-*/file-*.parquet")
+_WRITTEN = ("info.json", "stats.json", "tasks.parquet", "bhd.json", "edits.jsonl", "episodes/chunk-*/file-*.parquet")
 
 
-def _disown(old: Path, new: Path, disk: Disk) -> None:
+def _disowned(identity: dict[str, Any]) -> dict[str, Any]:
     """Keep what is told about the recording, but not as one that its recorder can go on with."""
-    identity = read_json(old)
-    recording = identity.get("recording")
-    edited = {"edit": "recovered"}
-    disk.write(new, to_json({**identity, "recording": {**(recording or {}), "edited": edited}}))
+    return {**identity, "recording": {**(identity.get("recording") or {}), "edited": {"edit": RECOVERED}}}
 
 
-def check_unused(root: Path) -> None:
-    """Check that no other process has a file below `root` open: LeRobot takes no lock.
+def _frames(root: Path, info: dict[str, Any], lost: list[str], torn: list[str]) -> tuple[list[Found], bool]:
+    """Return the episodes whose frames are whole, in order, and whether some frames are missing behind them.
 
-    Raises:
-        DatasetLockedError: one has.
+    Bytes that belong to no whole row group are told in `torn`: whether something is lost with them is not known here.
     """
-    own, place = str(os.getpid()), root.resolve()
-    for process in Path("/proc").glob("[0-9]*"):
-        if process.name == own:
-            continue
-        with contextlib.suppress(OSError):  # ended meanwhile, or somebody else's
-            for handle in (process / "fd").iterdir():
-                with contextlib.suppress(OSError):
-                    target = Path(os.readlink(handle))
-                    if target != place and place in target.parents:
-                        raise DatasetLockedError(
-                            f"Process {process.name} has {target} open, so {root} may be in the middle of a "
-                            "recording. Wait until it ends; without its last files a running recording looks like a "
-                            "wreck."
-                        )
-
-
-def _frames(root: Path, info: dict[str, Any], lost: list[str]) -> tuple[list[Found], bool]:
-    """Return the episodes whose frames are whole, in order, and whether some frames are missing behind them."""
     found: list[Found] = []
     is_torn = False
     schema = schema_of(root, info)
@@ -181,7 +187,8 @@ def _frames(root: Path, info: dict[str, Any], lost: list[str]) -> tuple[list[Fou
         except ValueError as error:
             raise UnsupportedDatasetError(f"{path} has no footer and cannot be read without: {error}.") from error
         if rescued.groups and rescued.lost_bytes:
-            lost.append(f"{name}: {rescued.lost_bytes} bytes at its end, an episode that was being saved")
+            where = "at its end, in which no episode is whole" if rescued.is_cut else f"are damaged: {rescued.problem}"
+            torn.append(f"{name}: {rescued.lost_bytes} bytes {where}")
         elif not rescued.groups:
             lost.append(f"{name}: {rescued.problem}")
         is_torn |= bool(rescued.lost_bytes) or not rescued.groups
@@ -238,7 +245,7 @@ def _keep_aside(root: Path, disk: Disk) -> Path:
     """Link every file into a new folder beside the dataset."""
     aside = layout.aside_of(root)
     for path in sorted(root.rglob("*")):
-        if path.is_file() and layout.STAGING not in path.relative_to(root).parts:
+        if path.is_file():
             disk.make_folder((aside / path.relative_to(root)).parent)
             disk.link(path, aside / path.relative_to(root))
     return aside

@@ -1,7 +1,6 @@
 """The films of a wreck: which frames of which film show which episode."""
 
 import contextlib
-import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,13 +8,12 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from bhd_lerobot.data import layout, video
 from bhd_lerobot.data.disk import Disk
+from bhd_lerobot.data.salvage_film_files import cut_out, encode
 from bhd_lerobot.data.state import Row, slot_columns, slot_of
-from bhd_lerobot.data.video_splice import splice
 
 _FRAMES = "images/{key}/episode-{episode:06d}"  # where LeRobot keeps the frames of a film that is not encoded yet
 
@@ -190,7 +188,7 @@ class Films:
     def write(self, kept: Sequence[Found], rows: Sequence[Row], info: dict[str, Any], new: Path, disk: Disk) -> None:
         """Write the films of the recovered dataset, and into `rows` where each episode is in them.
 
-        A film that is whole stays as it is; of one that is cut off, what is needed from its beginning on is kept.
+        A film of which all is needed stays as it is; of another the frames of these episodes are kept.
         """
         for key in self._keys:
             slot: layout.Slot | None = None
@@ -199,15 +197,16 @@ class Films:
                 slot = layout.next_slot(slot, info["chunks_size"])
                 target = new / layout.video_file(key, slot)
                 disk.make_folder(target.parent)
+                spans = [(one.films[key].start, one.films[key].length) for one, _ in members]
                 if path.is_dir():
-                    _encode(path, target, members[0][0].films[key].length, self._fps, self._features[key])
-                elif self._frames[path][1]:
-                    end = max(one.films[key].start + one.films[key].length for one, _ in members)
-                    splice([(path, [(0, end)])], target, self._fps)
+                    encode(path, target, spans[0][1], self._fps, self._features[key])
+                    starts = [0]
+                elif (cut := cut_out(path, target, spans, self._frames[path], self._fps)) is not None:
+                    starts = cut
                 else:
                     disk.copy(path, target)
-                for one, row in members:
-                    start = one.films[key].start
+                    starts = [start for start, _ in spans]
+                for (one, row), start in zip(members, starts, strict=True):
                     row.update(slot_columns(f"videos/{key}", slot))
                     row[f"videos/{key}/from_timestamp"] = float(start / self._fps)
                     row[f"videos/{key}/to_timestamp"] = float((start + one.table.num_rows) / self._fps)
@@ -263,34 +262,3 @@ def _are_whole(folder: Path, length: int) -> bool:
         except (OSError, SyntaxError):
             return False
     return True
-
-
-def _encode(folder: Path, target: Path, length: int, fps: Fraction, feature: dict[str, Any]) -> None:
-    from PIL import Image
-
-    os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder tells its life otherwise; 1 leaves errors
-    with Image.open(folder / "frame-000000.png") as picture:
-        width, height = picture.size  # a feature's shape may begin with the channels
-    encoder = video.CameraEncoder(target, round(fps), (height, width), _settings(feature))
-    try:
-        for frame in range(length):
-            with Image.open(folder / f"frame-{frame:06d}.png") as picture:
-                encoder.add(np.asarray(picture.convert("RGB")))
-        encoder.finish()
-    except BaseException:
-        encoder.cancel()
-        raise
-
-
-def _settings(feature: dict[str, Any]) -> video.VideoSettings:
-    """Return the settings that the other films were encoded with, as far as this machine has their encoder."""
-    told = feature.get("info") or {}
-    encoder = {"av1": "libsvtav1", "hevc": "hevc", "h264": "h264"}.get(str(told.get("video.codec")), "h264")
-    settings = video.VideoSettings(
-        vcodec=encoder, g=told.get("video.g", 2), crf=told.get("video.crf", 23), preset=told.get("video.preset")
-    )
-    try:
-        settings.check()
-    except Exception:
-        return video.VideoSettings()
-    return settings

@@ -1,5 +1,6 @@
 """What the readable files of ``meta/episodes`` of a wreck still tell."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from bhd_lerobot.data.salvage_films import Found
 from bhd_lerobot.data.state import Row, column_types
 from bhd_lerobot.data.statistics import Stats
 
+_OURS = re.compile(rb"(?<=bhd/)[a-z][a-z0-9_]*(?![a-zA-Z0-9_])")
+"""Names of our columns in the bytes of a footer."""
+
 
 class Told:
     """Rows and statistics of the episodes of sessions that were finished.
@@ -20,6 +24,7 @@ class Told:
         rows: by the number of the episode.
         metadata_types: Arrow types of our columns, by name without prefix.
         extra_types: Arrow types of columns of other programs.
+        torn: names without prefix of columns of ours that files tell which cannot be read.
 
     Args:
         root: the wreck.
@@ -30,6 +35,7 @@ class Told:
         self.rows: dict[int, Row] = {}
         self.metadata_types: dict[str, pa.DataType] = {}
         self.extra_types: dict[str, pa.DataType] = {}
+        self.torn: set[str] = set()
         self._stats: dict[int, dict[str, Stats]] = {}
         for path in sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet")):
             try:
@@ -39,8 +45,7 @@ class Told:
                 stats = read_stats(file)
             except (OSError, pa.ArrowException, ValueError):
                 # Nothing is lost by it that is not made anew, but for what only our or other programs tell.
-                if "bhd/" in path.read_bytes().decode("latin-1"):
-                    lost.append(f"{path.relative_to(root).as_posix()}: outcomes and all that is ours of its episodes")
+                self.torn |= {name.decode() for name in _OURS.findall(path.read_bytes())}
                 continue
             own, extra = column_types(file.schema_arrow)
             self.metadata_types = {**own, **self.metadata_types}

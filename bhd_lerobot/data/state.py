@@ -88,12 +88,24 @@ def ordered_slots(rows: Iterable[Row], kind: str) -> dict[Slot, list[Row]]:
     return slots
 
 
-def corrupt(path: Path, reason: object) -> DatasetCorruptError:
+class DamagedFileError(DatasetCorruptError):
+    """A file of a dataset cannot be trusted.
+
+    Attributes:
+        path: the file, or the folder that lacks it.
+    """
+
+    def __init__(self, path: Path, message: str) -> None:
+        super().__init__(message)
+        self.path = path
+
+
+def corrupt(path: Path, reason: object) -> DamagedFileError:
     """Return the error for a file that cannot be trusted."""
     remedy = f"Restore this file from a copy (or from the Hub){REPAIR_MAY_HELP}; nothing was changed."
     if path.as_posix().endswith(layout.INFO):
         remedy = repair_with_info(path.parents[1])
-    return DatasetCorruptError(f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}. {remedy}")
+    return DamagedFileError(path, f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}. {remedy}")
 
 
 def repair_with_info(root: Path) -> str:
@@ -217,7 +229,8 @@ def _read_rows(state: DatasetState) -> None:
         state.extra_types = {**extra, **state.extra_types}
     for index in range(total):
         if index not in by_index:
-            raise corrupt(state.root / "meta/episodes", f"info.json counts {total} episodes, but {index} is missing")
+            what = f"info.json counts {total} episodes, but episode {index} is not described"
+            raise corrupt(state.root / "meta/episodes", what)
     state.rows = [by_index[index] for index in range(total)]
 
 

@@ -115,11 +115,13 @@ def test_repair_never_sends_to_repair(recorded: Path, tmp_path: Path) -> None:
     for pattern in ("data/*/*.parquet", "meta/episodes/*/*.parquet", "videos/*/*/*.mp4", "meta/tasks.parquet"):
         root = Path(shutil.copytree(recorded, tmp_path / pattern[:4]))
         path = next(root.glob(pattern))
-        path.write_bytes(path.read_bytes()[:-30] + bytes(30) if path.suffix == ".parquet" else b"film")
-        with pytest.raises(DatasetError) as error:
-            repair(root)
-        assert "bhd-data repair" not in str(error.value)
-        assert path.name in str(error.value)
+        path.write_bytes(bytes(30) if path.suffix == ".parquet" else b"film")
+        try:
+            told = str(repair(root))
+        except DatasetError as error:
+            told = str(error)
+        assert "bhd-data repair" not in told
+        assert path.name in told
         shutil.rmtree(root)
 
 

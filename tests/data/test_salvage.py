@@ -448,7 +448,8 @@ def test_marks_and_columns_of_others_survive(lerobot: KillServer, tmp_path: Path
     recorded(lerobot, root, "none", 2, "saved")
     repair(root)
     assert [one.metadata.get("bhd/outcome") for one in content(root)] == [None, "success", None, None, None]
-    assert [edit["note"] for edit in edits_of(root)] == ["seen"]
+    assert [edit.get("note") for edit in edits_of(root)] == ["seen", None]
+    assert edits_of(root)[-1]["episodes"] == [0, 1, 2, 3, 4]
 
 
 def test_our_own_dataset_that_lerobot_went_on_with(lerobot: KillServer, tmp_path: Path) -> None:
