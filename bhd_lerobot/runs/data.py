@@ -3,12 +3,14 @@
 import argparse
 import importlib
 import os
+import re
 import select
 import signal
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
-from bhd_lerobot.errors import BhdError
+from bhd_lerobot.errors import BhdError, unknown_name
 from bhd_lerobot.runs.start import INTERRUPTED, leaving_on_interrupt
 
 # Modules, in the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
@@ -27,8 +29,29 @@ COMMANDS = (
 )
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="bhd-data", description=__doc__.split(": ", 1)[1])
+class _Parser(argparse.ArgumentParser):
+    """A parser that names the nearest command or option, which Python's own does from 3.14 on only."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with status 2, the usage, and what is wrong."""
+        if found := re.fullmatch(r"argument COMMAND: invalid choice: '(.*)' \(choose from (.*)\)", message):
+            message = unknown_name("command", found[1], re.findall(r"[\w-]+", found[2]))
+        super().error(message)
+
+    def parse(self, arguments: Sequence[str] | None) -> argparse.Namespace:
+        """Return what a command line asks for."""
+        options, unknown = self.parse_known_args(arguments)
+        if unknown:
+            command: argparse.ArgumentParser = options.command_parser
+            if not unknown[0].startswith("-"):
+                command.error(f"there is an argument too many: {' '.join(unknown)}")
+            valid = set(re.findall(r"(?<![\w-])--[\w-]+", command.format_help()))
+            command.error(unknown_name("option", unknown[0].partition("=")[0], valid))
+        return options
+
+
+def _parser() -> _Parser:
+    parser = _Parser(prog="bhd-data", description=__doc__.split(": ", 1)[1])
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", required=True)
     for name in COMMANDS:
         importlib.import_module(f"bhd_lerobot.runs.{name}").add_to(commands)
@@ -39,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bhd-data`; return the exit status."""
     with leaving_on_interrupt():
         parser = _parser()
-    options = parser.parse_args(arguments)
+    options = parser.parse(arguments)
     try:
         status: int = options.run(options)
         if sys.stdout is not None:

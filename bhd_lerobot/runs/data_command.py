@@ -44,14 +44,13 @@ def add_command(
         Its parser, for its own arguments.
     """
     command = commands.add_parser(name, help=help_text, description=help_text)
-    command.set_defaults(run=run, stopped="nothing was changed")
+    command.set_defaults(run=run, stopped="nothing was changed", command_parser=command)
     if names_dataset:
         text = "folder of the dataset" + ("; several may be named" if takes_several else "")
         command.add_argument("root", metavar="ROOT", nargs="*" if takes_several else "?", type=Path, help=text)
         command.add_argument("--root", dest="root_option", metavar="ROOT", type=Path, help="the same, as an option")
         text = "instead of the folder: the dataset's name, user/name, in LeRobot's default place"
         command.add_argument("--repo_id", metavar="NAME", help=text)
-        command.set_defaults(usage_error=command.error)
     return command
 
 
@@ -71,7 +70,7 @@ def roots_of(options: argparse.Namespace) -> list[Path]:
     given = {option: value for option, value in named.items() if value is not None}
     if len(given) != 1:
         told = " and ".join(f"{option} {value}" for option, value in given.items())
-        options.usage_error(
+        options.command_parser.error(
             f"name the dataset, in one way: its folder (ROOT or --root), or --repo_id; got {told or 'none'}"
         )
     if options.repo_id is not None:

@@ -126,18 +126,23 @@ def test_repair_reports_what_it_dropped(recorded, tmp_path, capsys):
     assert not leftover.exists()
 
 
-@pytest.mark.parametrize("command", ["info", "repair"])
-def test_a_corrupted_file_is_named_and_left_alone(recorded, tmp_path, capsys, command):
+def test_a_corrupted_file_is_named_left_alone_and_repaired(recorded, tmp_path, capsys):
     root = tmp_path / "d"
     shutil.copytree(recorded, root)
     path = next((root / "data").rglob("*.parquet"))
     content = bytearray(path.read_bytes())
     content[-50:] = bytes(50)
     path.write_bytes(content)
-    assert data.main([command, str(root)]) == 2
+    assert data.main(["info", str(root)]) == 2
     error = capsys.readouterr().err
     assert path.name in error
     assert path.read_bytes() == content
+    assert data.main(["repair", str(root)]) == 0
+    out = capsys.readouterr().out
+    assert path.name in out
+    assert "lost: nothing" in out
+    assert (tmp_path / "d.damaged-1" / path.relative_to(root)).read_bytes() == content
+    assert data.main(["check", str(root)]) == 0
 
 
 def test_no_dataset_and_no_argument(tmp_path, capsys):
@@ -183,3 +188,19 @@ def test_a_recording_that_goes_on_is_no_interrupted_one(tmp_path, capsys, monkey
     capsys.readouterr()
     assert data.main(["info", "--short", str(root)]) == 0
     assert "not finalised" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("chek x", "Did you mean 'check'?"),
+        ("view x --prt 0", "Did you mean '--port'?"),
+        ("info --shrt", "Did you mean '--short'?"),
+        ("check a b", "an argument too many: b"),
+    ],
+)
+def test_a_slip_of_the_keyboard_is_told_the_nearest_name(line, said, capsys):
+    with pytest.raises(SystemExit) as ended:
+        data.main(line.split())
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
