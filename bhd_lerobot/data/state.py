@@ -92,10 +92,10 @@ class DamagedFileError(DatasetCorruptError):
     """A file of a dataset cannot be trusted.
 
     Attributes:
-        path: the file, or the folder that lacks it.
+        path: the file, or the folder that lacks it; None if the message alone tells.
     """
 
-    def __init__(self, path: Path, message: str) -> None:
+    def __init__(self, message: str, path: Path | None = None) -> None:
         super().__init__(message)
         self.path = path
 
@@ -105,7 +105,7 @@ def corrupt(path: Path, reason: object) -> DamagedFileError:
     remedy = f"Restore this file from a copy (or from the Hub){REPAIR_MAY_HELP}; nothing was changed."
     if path.as_posix().endswith(layout.INFO):
         remedy = repair_with_info(path.parents[1])
-    return DamagedFileError(path, f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}. {remedy}")
+    return DamagedFileError(f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}. {remedy}", path)
 
 
 def repair_with_info(root: Path) -> str:
