@@ -13,6 +13,8 @@ from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.data.schema import Schema
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, DatasetLockedError
 
+_RESUME = "Resume it (--resume=true), remove it"  # what can be done if a dataset to be recorded is there
+
 
 def new_info(fps: int, schema: Schema, robot_type: str) -> dict[str, Any]:
     """Return the content of ``info.json`` before the first episode."""
@@ -57,9 +59,7 @@ def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any]
     return build_root(root, fill, disk)
 
 
-def build_root(
-    root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str = "Resume it (--resume=true), remove it"
-) -> RootLock:
+def build_root(root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str = _RESUME) -> RootLock:
     """Build a dataset beside its place, rename it, and return the lock on it.
 
     Args:
@@ -102,15 +102,16 @@ def is_free(root: Path) -> bool:
 
 
 def _exists(root: Path, remedy: str) -> DatasetError:
-    """Return what is in the way of a new dataset."""
+    """Return what is in the way of a new dataset; for a recorder also that another one is at work there."""
     if not root.is_dir():
         return DatasetExistsError(f"{root} is no folder, but a file or a link to nothing. Choose another root.")
-    try:
-        RootLock(root).release()
-    except DatasetLockedError as error:
-        return error
-    except OSError:  # a folder of somebody else's
-        pass
+    if remedy == _RESUME:
+        try:
+            RootLock(root).release()
+        except DatasetLockedError as error:
+            return error
+        except OSError:  # a folder of somebody else's
+            pass
     return DatasetExistsError(f"{root} exists already. {remedy}, or choose another root.")
 
 
