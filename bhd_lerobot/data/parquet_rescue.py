@@ -65,17 +65,23 @@ class _Page:
 
 
 def is_parquet(path: Path) -> bool:
-    """Tell whether a file begins like a Parquet file."""
-    with open(path, "rb") as file:
-        return file.read(len(MAGIC)) == MAGIC
+    """Tell whether a file begins like a Parquet file; of one that cannot be read nobody knows."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
 
 
 def is_cut_off(path: Path) -> bool:
     """Tell whether a Parquet file has no footer. A writer that is killed leaves none."""
-    with open(path, "rb") as file:
-        begin = file.read(len(MAGIC))
-        file.seek(max(0, path.stat().st_size - len(MAGIC)))
-        return begin == MAGIC and file.read() != MAGIC
+    try:
+        with open(path, "rb") as file:
+            begin = file.read(len(MAGIC))
+            file.seek(max(0, path.stat().st_size - len(MAGIC)))
+            return begin == MAGIC and file.read() != MAGIC
+    except OSError:
+        return False
 
 
 def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | None = None) -> Rescued:

@@ -195,7 +195,7 @@ def went_on(root: Path) -> list[Path]:
     A file that our own rows need and that is cut off is damage of another kind. LeRobot always leaves a data file.
     """
     unfinished = unfinished_files(root)
-    rows = Told(root, []).rows.values() if any(path.is_relative_to(root / "data") for path in unfinished) else ()
+    rows = Told(root).rows.values() if any(path.is_relative_to(root / "data") for path in unfinished) else ()
     needed = {root / layout.data_file(slot_of(row, "data")) for row in rows}
     return [] if not rows or needed & set(unfinished) else unfinished
 

@@ -62,7 +62,7 @@ def adopt_info(root: Path, donor: Path, disk: Disk) -> tuple[str, Path | None]:
         kept = layout.aside_of(root) / layout.INFO
         disk.make_folder(kept.parent)
         disk.copy(path, kept)
-    rows = Told(root, []).rows
+    rows = Told(root).rows
     # Ours are numbered without a hole; what is behind one is for `salvage`, which counts by itself.
     total = next(index for index in range(len(rows) + 1) if index not in rows)
     try:

@@ -81,7 +81,7 @@ def salvage(root: Path, disk: Disk, wrong: str, *, is_ours: bool = False) -> Sal
         )
     lost: list[str] = []
     hints: list[str] = []
-    told = Told(root, lost)
+    told = Told(root)
     torn: list[str] = []
     found, is_torn = _frames(root, info, lost, torn)
     films = Films(root, info, told.rows)
@@ -242,10 +242,10 @@ def _episodes(table: pa.Table) -> Iterator[tuple[int, pa.Table]]:
 
 
 def _keep_aside(root: Path, disk: Disk) -> Path:
-    """Link every file into a new folder beside the dataset."""
+    """Link every file into a new folder beside the dataset, but for what an attempt before left half built."""
     aside = layout.aside_of(root)
     for path in sorted(root.rglob("*")):
-        if path.is_file():
+        if path.is_file() and not path.is_relative_to(root / exchange.WORK):
             disk.make_folder((aside / path.relative_to(root)).parent)
             disk.link(path, aside / path.relative_to(root))
     return aside

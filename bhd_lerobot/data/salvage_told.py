@@ -1,5 +1,6 @@
 """What the readable files of ``meta/episodes`` of a wreck still tell."""
 
+import contextlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,10 +29,9 @@ class Told:
 
     Args:
         root: the wreck.
-        lost: lines about what is lost are added here.
     """
 
-    def __init__(self, root: Path, lost: list[str]) -> None:
+    def __init__(self, root: Path) -> None:
         self.rows: dict[int, Row] = {}
         self.metadata_types: dict[str, pa.DataType] = {}
         self.extra_types: dict[str, pa.DataType] = {}
@@ -44,8 +44,9 @@ class Told:
                 rows = file.read(columns=light, use_threads=False).to_pylist()
                 stats = read_stats(file)
             except (OSError, pa.ArrowException, ValueError):
-                # Nothing is lost by it that is not made anew, but for what only our or other programs tell.
-                self.torn |= {name.decode() for name in _OURS.findall(path.read_bytes())}
+                # Nothing is lost by it that is not made anew, but for what only we or other programs tell.
+                with contextlib.suppress(OSError):
+                    self.torn |= {name.decode() for name in _OURS.findall(path.read_bytes())}
                 continue
             own, extra = column_types(file.schema_arrow)
             self.metadata_types = {**own, **self.metadata_types}

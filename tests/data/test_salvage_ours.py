@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from bhd_lerobot.data import salvage_guard
+from bhd_lerobot.data import disk, salvage_guard
 from bhd_lerobot.data.check_dataset import check_dataset
 from bhd_lerobot.data.edits import delete, edits_of, keep
 from bhd_lerobot.data.inspect import dataset_info
@@ -49,9 +49,12 @@ def without_metadata(root: Path) -> list[Any]:
     return [(one.task, one.columns, one.films) for one in content(root)]
 
 
-def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path, tmp_path: Path) -> None:
-    for size in (1, 500, 1000):
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path, tmp_path: Path, is_ours: bool) -> None:
+    for size in (1, 1000):
         root = copied(recorded, tmp_path / f"d{size}")
+        if not is_ours:
+            (root / "meta/bhd.json").unlink()
         cut(size)(root / DATA)
         before = snapshot(root)
         remedies = [one.remedy for one in check_dataset(root).findings if one.where == DATA]
@@ -66,6 +69,8 @@ def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path,
         assert content(root) == content(recorded)
         assert_sound(root)
         assert not repair(root)
+        if not is_ours:
+            continue
         # It was edited, so nobody goes on as if nothing had happened.
         with pytest.raises(DatasetEditedError, match="recovered"):
             support.resume(root, video=True)
@@ -194,6 +199,38 @@ def test_what_the_disk_does_not_give_out_is_not_given_up(
                 repair(root)
         assert snapshot(root) == before
         assert repair(root).episodes == 4
+
+
+def test_a_kill_at_any_step_leaves_a_wreck_that_is_recovered(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        """Ends the process."""
+
+    step, done = 0, False
+    while not done:
+        root = copied(recorded, tmp_path / f"d{step}")
+        cut(500)(root / DATA)
+        before = (root / DATA).read_bytes()
+        seen: list[str] = []
+
+        def before_step(action: str, path: Path, seen: list[str] = seen, last: int = step) -> None:
+            seen.append(action)
+            if len(seen) == last + 1:
+                raise Killed
+
+        with monkeypatch.context() as patched:
+            patched.setattr(disk, "_before_step", before_step)
+            done = True
+            try:
+                repair(root)
+            except Killed:
+                done = False
+        repair(root)
+        assert content(root) == content(recorded), step
+        assert any(path.read_bytes() == before for path in tmp_path.glob(f"d{step}.damaged-*/{DATA}")), step
+        assert not (root / ".bhd").exists()
+        step += 5
 
 
 def test_who_recorded_it_is_not_guessed(recorded: Path, tmp_path: Path) -> None:
