@@ -1,4 +1,4 @@
-"""`bhd-data repair`: complete or drop what an interruption left."""
+"""`bhd-data repair`: finish or drop what an interruption left, and recover what is whole."""
 
 import argparse
 from pathlib import Path
@@ -9,7 +9,7 @@ from bhd_lerobot.runs.data_command import Commands, add_command, root_of
 
 def add_to(commands: Commands) -> None:
     """Add `repair`."""
-    help_text = "complete or drop what an interrupted recording left, and leave the dataset compact"
+    help_text = "finish what was interrupted, recover what is whole where files are damaged, and leave it compact"
     command = add_command(commands, "repair", help_text, _run)
     command.add_argument(
         "--info",
