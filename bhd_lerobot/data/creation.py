@@ -107,7 +107,7 @@ def _exists(root: Path, remedy: str) -> DatasetError:
         return DatasetExistsError(f"{root} is no folder, but a file or a link to nothing. Choose another root.")
     if remedy == _RESUME:
         try:
-            RootLock(root).release()
+            RootLock(root, is_choice=True).release()
         except DatasetLockedError as error:
             return error
         except OSError:  # a folder of somebody else's
