@@ -492,7 +492,3 @@ def test_the_default_folder_is_lerobots(
     doctor.main(["--json"], FakeChild())
     disk = next(one for one in json.loads(capsys.readouterr().out)["findings"] if one["check"] == "disk")
     assert str(tmp_path) in disk["found"] + disk["cause"]
-
-
-def test_the_command_is_installed_with_the_package() -> None:
-    assert 'bhd-doctor = "bhd_lerobot.runs.doctor:main"' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
