@@ -153,4 +153,9 @@ class RecordConfig:
             if not 0 < self.dataset.episode_time_s < float("inf"):
                 raise ConfigError(f"dataset.episode_time_s is {self.dataset.episode_time_s}; it must be positive.")
             chosen: Any = self.task
+            if chosen.duration_s not in (type(chosen).duration_s, self.dataset.episode_time_s):
+                raise ConfigError(
+                    f"task.duration_s is {chosen.duration_s} and dataset.episode_time_s is "
+                    f"{self.dataset.episode_time_s}. Both say how long an episode may take; set them alike, or one."
+                )
             chosen.duration_s = self.dataset.episode_time_s

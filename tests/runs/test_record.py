@@ -280,6 +280,7 @@ def test_episodes_come_in_order_and_are_dropped_when_told_to_stop(tmp_path):
         ({"dataset__fps": 7}, "valid values of fps"),
         ({"dataset__episode_time_s": 0}, "episode_time_s is 0"),
         ({"dataset__episode_time_s": ".nan"}, "episode_time_s is nan"),
+        ({"task__duration_s": 12}, "task.duration_s is 12.* and dataset.episode_time_s is 3"),
         ({"brain__type": "avoidence"}, "Did you mean 'avoidance'"),
         ({"task__type": "avoidd"}, "Did you mean 'avoid'"),
         ({"robot__type": "turtlebot4"}, "Did you mean 'turtlebot3'"),
