@@ -30,7 +30,7 @@ from bhd_lerobot.errors import DatasetError, DatasetMismatchError
 EDITS = "meta/edits.jsonl"
 """What was done to a dataset after its recording: one JSON object a line."""
 
-_WRITTEN = (
+WRITTEN = (
     "info.json",
     "stats.json",
     "tasks.parquet",
@@ -39,6 +39,7 @@ _WRITTEN = (
     "bhd_subset.json",  # tells what a pull was asked for, which is not so of an edited dataset
     "episodes/chunk-*/file-*.parquet",
 )
+"""Files of ``meta`` that are made anew with every change of episodes; all others are taken along."""
 
 
 def assemble(
@@ -82,7 +83,7 @@ def assemble(
     build_videos(plan, new, disk, take)
     disk.make_folder(new / "meta")
     if len(sources) == 1:
-        link_others(sources[0].root / "meta", new / "meta", disk, *_WRITTEN, take=take)
+        link_others(sources[0].root / "meta", new / "meta", disk, *WRITTEN, take=take)
     if in_place:
         link_others(sources[0].root / "data", new / "data", disk, "chunk-*/file-*.parquet")
         if (sources[0].root / "videos").is_dir():

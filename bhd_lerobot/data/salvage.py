@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data import exchange, layout
-from bhd_lerobot.data.assemble import EDITS
+from bhd_lerobot.data.assemble import EDITS, WRITTEN
 from bhd_lerobot.data.disk import Disk, to_json, write_errors
 from bhd_lerobot.data.findings import few
 from bhd_lerobot.data.meta_files import tasks_table, write_meta
@@ -86,14 +86,14 @@ def salvage(root: Path, disk: Disk, wrong: str, *, is_ours: bool = False) -> Sal
     found, is_torn = _frames(root, info, lost, torn)
     films = Films(root, info, told.rows)
     kept = films.assign(found, lost, is_torn=is_torn)
+    counted = info.get("total_episodes")
     # Where all that was counted is there, and no more, the bytes are of a footer or of what was never saved.
-    is_all = bool(kept) and [one.number for one in kept] == list(range(info.get("total_episodes") or 0))
+    is_all = counted == len(kept) > 0 and [one.number for one in kept] == list(range(len(kept)))
     (hints if is_all else lost).extend(torn)
     if not kept:
         raise _nothing_left(root, info, wrong, lost)
     numbers = {one.number for one in found}
     lost += [f"episode {number}: its frames are gone" for number in sorted(told.rows.keys() - numbers)]
-    counted = info.get("total_episodes")
     if isinstance(counted, int) and counted > len(kept) and not lost:
         # It may be a copy of another recording's, so this is no loss.
         hints.append(
@@ -113,7 +113,7 @@ def salvage(root: Path, disk: Disk, wrong: str, *, is_ours: bool = False) -> Sal
         lost += forgotten
         hints += known
         stats = stats_of((one.table for one in kept), described["features"], new, rows, told.stats_of(kept))
-        exchange.link_others(root / "meta", new / "meta", disk, *_WRITTEN, take=disk.copy)
+        exchange.link_others(root / "meta", new / "meta", disk, *WRITTEN, take=disk.copy)
         sink = pa.BufferOutputStream()
         pq.write_table(tasks_table(tasks), sink)
         disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
@@ -157,9 +157,6 @@ def _info_of(root: Path) -> dict[str, Any]:
         f"{root / layout.INFO} is corrupt: {reason}. It says what the columns are, without which nothing can be read. "
         f"{repair_with_info(root)}"
     )
-
-
-_WRITTEN = ("info.json", "stats.json", "tasks.parquet", "bhd.json", "edits.jsonl", "episodes/chunk-*/file-*.parquet")
 
 
 def _disowned(identity: dict[str, Any]) -> dict[str, Any]:

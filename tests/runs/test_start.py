@@ -80,22 +80,25 @@ def test_every_command_begins_this_way(script: str, monkeypatch: pytest.MonkeyPa
     assert SCRIPTS[script] == f"bhd_lerobot.runs.start:{begin.__name__}"
 
 
-def test_what_runs_before_ctrl_c_is_minded_imports_next_to_nothing() -> None:
-    program = "import bhd_lerobot.runs.start, bhd_lerobot.runs.data, sys; print(*sys.modules)"
+@pytest.mark.parametrize(
+    ("program", "slow"),
+    [
+        ("import bhd_lerobot.runs.start, bhd_lerobot.runs.data", "numpy torch lerobot rich yaml pyarrow mujoco"),
+        ("import bhd_lerobot.runs.data as d; d._parser()", "torch lerobot pandas mujoco pinocchio matplotlib ray"),
+    ],
+    ids=["before Ctrl-C is minded", "for the help"],
+)
+def test_nothing_slow_is_imported(program: str, slow: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT, stdin=subprocess.DEVNULL
+        [sys.executable, "-c", f"{program}; import sys; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
     )
     loaded = {name.partition(".")[0] for name in done.stdout.split()}
-    assert not loaded & {"numpy", "torch", "lerobot", "rich", "yaml", "pyarrow", "huggingface_hub", "mujoco"}
-
-
-def test_help_imports_nothing_that_takes_seconds() -> None:
-    program = "import bhd_lerobot.runs.data as d, sys; d._parser(); print(*sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT, stdin=subprocess.DEVNULL
-    )
-    loaded = {name.partition(".")[0] for name in done.stdout.split()}
-    assert not loaded & {"torch", "lerobot", "pandas", "mujoco", "pinocchio", "matplotlib", "huggingface_hub", "ray"}
+    assert not loaded & {*slow.split(), "huggingface_hub"}
 
 
 def test_the_handler_before_comes_back() -> None:
