@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from bhd_lerobot.data.creation import remove_abandoned
+from bhd_lerobot.data.creation import building_prefix, is_free, remove_abandoned
 from bhd_lerobot.data.disk import Disk, RootLock, write_errors
 from bhd_lerobot.errors import DatasetExistsError
 
@@ -26,8 +26,8 @@ def refuse_existing(target: Path, option: str) -> Path:
     if target.is_symlink() and not target.exists():
         raise DatasetExistsError(f"{target} is a link to nothing. Remove it, or choose another {option}.")
     place = target.resolve()  # a name such as ``new/..`` is no name for a folder beside it
-    remove_abandoned(place.parent, _prefix(place))
-    if place.exists() and not (place.is_dir() and not any(place.iterdir())):
+    remove_abandoned(place.parent, building_prefix(place))
+    if not is_free(place):
         raise DatasetExistsError(f"{target} exists already. Remove it, or choose another {option}.")
     return place
 
@@ -54,7 +54,7 @@ def complete_or_not(target: Path, option: str, action: str, consequence: str) ->
         try:
             place = refuse_existing(target, option)
             disk.make_folder(place.parent)
-            shell = Path(tempfile.mkdtemp(prefix=_prefix(place), dir=place.parent))
+            shell = Path(tempfile.mkdtemp(prefix=building_prefix(place), dir=place.parent))
             lock = RootLock(shell, shown_as=target)
             yield shell / place.name  # its final name, which rosbag2 gives to the files in it
             refuse_existing(target, option)
@@ -64,7 +64,3 @@ def complete_or_not(target: Path, option: str, action: str, consequence: str) ->
                 shutil.rmtree(shell, ignore_errors=True)
             if lock is not None:
                 lock.release()
-
-
-def _prefix(place: Path) -> str:
-    return f".{place.name}.bhd-"  # as of datasets that are built beside their place

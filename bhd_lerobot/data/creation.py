@@ -77,7 +77,7 @@ def build_root(root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str
         raise _exists(root, remedy)
     with write_errors("create the dataset", root, "Nothing was written there."):
         disk.make_folder(root.parent)
-        prefix = f".{root.name}.bhd-"
+        prefix = building_prefix(root)
         remove_abandoned(root.parent, prefix)
         building = Path(tempfile.mkdtemp(prefix=prefix, dir=root.parent))
         lock = RootLock(building, shown_as=root)
@@ -96,9 +96,14 @@ def build_root(root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str
 
 def is_free(root: Path) -> bool:
     """Tell whether a dataset can be made at a root: nothing is there, or an empty folder."""
-    if root.is_symlink() or not root.exists():
-        return not root.is_symlink()
-    return root.is_dir() and not any(root.iterdir())
+    if root.is_symlink():
+        return False
+    return not root.exists() or (root.is_dir() and not any(root.iterdir()))
+
+
+def building_prefix(root: Path) -> str:
+    """Return how the names of folders begin in which something for this place is built, beside it."""
+    return f".{root.name}.bhd-"
 
 
 def _exists(root: Path, remedy: str) -> DatasetError:

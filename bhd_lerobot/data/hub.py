@@ -239,8 +239,8 @@ class HubDataset:
         """Let a tag point at the pushed commit. A tag cannot be moved, so it is gone for a moment, as with LeRobot."""
         self._refs = None  # somebody may have pushed since they were read
         heads = {branch.name: branch.target_commit for branch in self._list_refs().branches}
-        if heads.get(self._branch, self.commit) != self.commit:
-            return  # a later push, which sets the tag itself; it must not go back
+        if tag == VERSION_TAG and heads.get(self._branch, self.commit) != self.commit:
+            return  # a later push, which sets this tag itself; it must not go back
         found = self._commit_of(tag)
         if found == self.commit:
             return

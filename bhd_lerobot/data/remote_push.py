@@ -164,9 +164,7 @@ def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, Rem
         return
     deleted = _deleted_since(local.root, remote.read(EDITS) if EDITS in there else b"")
     if episodes > here + deleted:
-        has, remedy = (
-            ("has", "Pull that one, or give it up") if is_shown else ("had", "Repeat that push, or give it up")
-        )
+        has, remedy = ("has", "Pull that one") if is_shown else ("had", "Repeat that push")
         since = f"{deleted} {'were' if deleted > 1 else 'was'}" if deleted else "none was"
         raise DatasetExistsError(
             f"{name} {has} {episodes} episodes, {local.root} has {here} and {since} deleted from it since: it is an "

@@ -134,7 +134,7 @@ def _salvaged(
     *,
     is_ours: bool = False,
 ) -> RepairReport:
-    wrong = str(error).split(". ", 1)[0]
+    wrong = error.wrong if isinstance(error, DamagedFileError) else str(error).split(". ", 1)[0]
     rescued = salvage(root, disk, wrong, is_ours=is_ours)
     what = f"{rescued.episodes} whole episodes were recovered, with new statistics. What was wrong: {wrong}"
     done = (*completed, what)
@@ -240,9 +240,7 @@ def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[Datas
     dropped: list[str] = []
     if state.identity is not None:
         if unfinished := went_on(root):
-            raise corrupt(
-                unfinished[0], "another program went on with this dataset and was killed. bhd-data repair helps"
-            )
+            raise corrupt(unfinished[0], "another program went on with this dataset and was killed")
         # Only in our own datasets: another program may know what its files are for.
         dropped = sorted(layout.recorded_files(root) - state.files())
         for name in dropped:

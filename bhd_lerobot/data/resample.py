@@ -25,7 +25,7 @@ class Grid:
     Attributes:
         times: of the frames [ns], shape (frames,).
         ages: of the newest message of each sensor, shape (sensors, frames) [ns].
-        why: what began it: ``"start"``, ``"gap"`` or ``"clock"``.
+        why: what began it: ``"start"``, ``"gap"``, ``"clock"`` or ``"reset"``.
     """
 
     times: Times

@@ -143,10 +143,10 @@ def _without_holes(block: Array) -> Array:
     Drivers that sort points into bins leave some empty, which is not a number, and not free space. What is missing in a
     row of more than two is no such bin.
     """
-    for _ in range(2):
-        empty = np.isnan(block)
-        if not empty.any():
-            break
-        before, after = np.roll(block, 1, axis=1), np.roll(block, -1, axis=1)
-        block = np.where(empty, np.where(np.isnan(before), after, before), block)
-    return block
+    empty = np.isnan(block)
+    if not empty.any():
+        return block
+    middle = empty & np.roll(empty, 1, axis=1) & np.roll(empty, -1, axis=1)  # of three in a row
+    hole = empty & ~(middle | np.roll(middle, 1, axis=1) | np.roll(middle, -1, axis=1))
+    before, after = np.roll(block, 1, axis=1), np.roll(block, -1, axis=1)
+    return np.where(hole, np.where(np.isnan(before), after, before), block)

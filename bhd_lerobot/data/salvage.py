@@ -22,7 +22,7 @@ from bhd_lerobot.data.disk import Disk, to_json, write_errors
 from bhd_lerobot.data.findings import few
 from bhd_lerobot.data.meta_files import tasks_table, write_meta
 from bhd_lerobot.data.parquet_rescue import rescue
-from bhd_lerobot.data.salvage_columns import lost_cameras, misfit
+from bhd_lerobot.data.salvage_columns import lost_cameras, misfit, read_info
 from bhd_lerobot.data.salvage_films import Films, Found
 from bhd_lerobot.data.salvage_guard import check_readable, check_unused
 from bhd_lerobot.data.salvage_marks import RECOVERED, logged, recall
@@ -147,10 +147,7 @@ def _nothing_left(root: Path, info: dict[str, Any], wrong: str, lost: list[str])
 def _info_of(root: Path) -> dict[str, Any]:
     """Return ``info.json``. LeRobot empties it before it writes it, so a kill may leave nothing."""
     try:
-        info = read_json(root / layout.INFO)
-        if isinstance(info.get("features"), dict) and isinstance(info.get("fps"), int | float):
-            return info
-        reason = "it has no features or no fps"
+        return read_info(root / layout.INFO)
     except DatasetCorruptError as error:
         reason = str(error.__cause__ or error)
     raise DatasetCorruptError(

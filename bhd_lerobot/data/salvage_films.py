@@ -86,6 +86,8 @@ class Films:
         for key in self._keys:
             for one in told:
                 row = self._rows[one.number]
+                if row.get(f"videos/{key}/from_timestamp") is None:
+                    continue  # a camera that these rows do not have
                 path = self._root / layout.video_file(key, slot_of(row, f"videos/{key}"))
                 start = round(row[f"videos/{key}/from_timestamp"] * self._fps)
                 if start + one.table.num_rows <= self._whole(path, lost)[0]:

@@ -35,7 +35,7 @@ def tasks_of(root: Path, kept: Sequence[Found], told: Told, lost: list[str]) -> 
             if len(words) == len(numbers) == 1:
                 sentences[int(numbers[0])] = words[0]
         if set(used) - sentences.keys():
-            lost.append(f"{layout.TASKS}: the words of some instructions ({error})")
+            lost.append(f"{layout.TASKS}: the words of some instructions ({getattr(error, 'wrong', error)})")
     texts: dict[str, int] = {}
     known: dict[int, int] = {}
     for index in used:

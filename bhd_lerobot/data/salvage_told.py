@@ -43,6 +43,8 @@ class Told:
                 light = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
                 rows = file.read(columns=light, use_threads=False).to_pylist()
                 stats = read_stats(file)
+                if "episode_index" not in file.schema_arrow.names:
+                    raise ValueError("it numbers no episodes")
             except (OSError, pa.ArrowException, ValueError):
                 # Nothing is lost by it that is not made anew, but for what only we or other programs tell.
                 with contextlib.suppress(OSError):

@@ -92,12 +92,13 @@ class DamagedFileError(DatasetCorruptError):
     """A file of a dataset cannot be trusted.
 
     Attributes:
+        wrong: what is wrong with it, without a remedy.
         path: the file, or the folder that lacks it; None if the message alone tells.
     """
 
-    def __init__(self, message: str, path: Path | None = None) -> None:
+    def __init__(self, message: str, path: Path | None = None, wrong: str | None = None) -> None:
         super().__init__(message)
-        self.path = path
+        self.path, self.wrong = path, message if wrong is None else wrong
 
 
 def corrupt(path: Path, reason: object) -> DamagedFileError:
@@ -105,7 +106,8 @@ def corrupt(path: Path, reason: object) -> DamagedFileError:
     remedy = f"Restore this file from a copy (or from the Hub){REPAIR_MAY_HELP}; nothing was changed."
     if path.as_posix().endswith(layout.INFO):
         remedy = repair_with_info(path.parents[1])
-    return DamagedFileError(f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}. {remedy}", path)
+    wrong = f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}"
+    return DamagedFileError(f"{wrong}. {remedy}", path, wrong)
 
 
 def repair_with_info(root: Path) -> str:

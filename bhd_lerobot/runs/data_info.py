@@ -60,10 +60,10 @@ def _line(summary: DatasetSummary) -> str:
         str(summary.robot_type),
         *_amount(summary),
         f"{summary.size / 1e6:.1f} MB",
-        *([_outcomes(summary)] if _outcomes(summary) else []),
-        *([_unfinished(summary)] if _unfinished(summary) else []),
+        _outcomes(summary),
+        _unfinished(summary),
     ]
-    return f"{summary.root}: {', '.join(parts)}"
+    return f"{summary.root}: {', '.join(part for part in parts if part)}"
 
 
 def _unfinished(summary: DatasetSummary) -> str:

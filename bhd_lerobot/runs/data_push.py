@@ -54,7 +54,6 @@ def add_to(commands: Commands) -> None:
         "--verify", action="store_true", help="of a URL: read what is there, and compare that instead of the list of it"
     )
     command.add_argument("--storage_options", help="options of the URL's file system, JSON")
-    command.set_defaults(parser=command)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -36,11 +36,11 @@ def repeat_line(options: argparse.Namespace, *places: object, **others: object) 
     """Return the command that repeats what was asked for.
 
     Args:
-        options: what was asked for, with the `parser` that read it; values that are its defaults are left out.
+        options: what was asked for, with the `command_parser` that read it; values that are its defaults are left out.
         places: what stands behind the command's name, whichever way it was given.
         others: options that say a place, likewise.
     """
-    parser: argparse.ArgumentParser = options.parser
+    parser: argparse.ArgumentParser = options.command_parser
     asked = {name: value for name, value in vars(options).items() if value != parser.get_default(name)}
     wishes = {name: value for name, value in asked.items() if name not in _PLACES}
     return command_line(options.command, places, **others, **wishes)

@@ -235,4 +235,6 @@ def test_empty_bins_are_no_free_space():
     scan[[10, 50, 51, 359]] = np.nan
     assert (scans(scan[None]) == 0.5).all()
     scan[100:120] = np.nan  # no such bin: nothing came back from there
-    assert (scans(scan[None])[0, 102:118] == LIDAR.range_max).all()
+    assert (scans(scan[None])[0, 100:120] == LIDAR.range_max).all()
+    scan[200:203] = np.nan  # nor is this
+    assert (scans(scan[None])[0, 199:204] == [0.5, *[LIDAR.range_max] * 3, 0.5]).all()

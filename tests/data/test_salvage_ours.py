@@ -319,3 +319,24 @@ def test_pages_that_are_damaged_cost_their_episodes_only(tmp_path: Path) -> None
     assert table["episode_index"].to_pylist() == [0] * support.length(0) + [1] * support.length(2)
     assert edits_of(root)[-1]["episodes"] == [0, 2]
     assert json.loads((root / "meta/info.json").read_text())["total_episodes"] == 2
+
+
+def test_a_sentence_in_the_name_of_a_folder_is_no_sentence(recorded: Path, tmp_path: Path) -> None:
+    root = copied(recorded, tmp_path / "Dr. Smith")
+    cut(1000)(root / DATA)
+    assert f"What was wrong: {root / DATA} is corrupt" in str(repair(root))
+
+
+@pytest.mark.parametrize(
+    "change", [{"features": {"a": 1}}, {"features": {"a": {}}}, {"fps": 0}, {"codebase_version": None}]
+)
+def test_an_info_that_describes_nothing_is_refused_in_words(recorded: Path, tmp_path: Path, change: dict) -> None:
+    root = copied(recorded, tmp_path / "d")
+    (root / "meta/bhd.json").unlink()
+    cut(1000)(root / DATA)
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps(info | change))
+    before = snapshot(root)
+    with pytest.raises(DatasetError, match=r"info\.json|format"):
+        repair(root)
+    assert snapshot(root) == before
