@@ -3,7 +3,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +19,7 @@ from benchmarks.realtime.load import Load, LoadError, cpu_load
 from benchmarks.realtime.machine import CpuTimes
 from benchmarks.realtime.parts import NAMES, QUICK_SIZES, Experiments, Sizes
 from benchmarks.realtime.statistics import Samples, summarise
+from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -283,7 +283,4 @@ def test_the_load_ends_when_its_parent_is_killed() -> None:
 
 
 def wait_until_gone(pids: list[int]) -> None:
-    until = time.monotonic() + 30  # generous: only a failure takes that long
-    while any(alive(pid) for pid in pids):
-        assert time.monotonic() < until, f"{pids} live on"
-        time.sleep(0.01)
+    until(lambda: not any(alive(pid) for pid in pids))

@@ -1,7 +1,6 @@
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,9 @@ from benchmarks.realtime.cases import CaseError
 from benchmarks.realtime.owner import Lines, OwnerSpec, Sway, as_argument
 from benchmarks.realtime.robots import OwnedRobot, is_running, standing_still
 from benchmarks.realtime.watcher import Watcher
+from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parents[2]
-PATIENCE_S = 30.0  # generous: only a failure takes that long
 
 
 def state_of(pid: int) -> str:
@@ -22,10 +21,7 @@ def state_of(pid: int) -> str:
 
 
 def wait_for_state(pid: int, wanted: str) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while state_of(pid) not in wanted:
-        assert time.monotonic() < until, f"{pid} is {state_of(pid)}, not {wanted}"
-        time.sleep(0.01)
+    until(lambda: state_of(pid) in wanted)
 
 
 def test_a_process_stands_still_for_a_block_and_goes_on_after_it() -> None:
@@ -73,7 +69,7 @@ def test_an_owner_that_cannot_start_its_robot_says_why_and_nothing_is_left(monke
 def test_an_owner_does_not_outlive_who_started_it() -> None:
     specification = as_argument(OwnerSpec("bench-test-orphan", "ur5"))
     wrong = [sys.executable, "-m", "benchmarks.realtime.owner", specification, str(os.getpid() + 1)]
-    done = subprocess.run(wrong, cwd=ROOT, capture_output=True, timeout=PATIENCE_S, check=False)
+    done = subprocess.run(wrong, cwd=ROOT, capture_output=True, check=False)
     assert (done.returncode, done.stdout) == (1, b"")
 
 

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import termios
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
@@ -20,6 +19,7 @@ from bhd_lerobot.control.estop import SIGNALS, EstopInputs, estop_signal
 from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.errors import ConfigError
 from tests.control.support import Rig
+from tests.waiting import until
 
 
 class Button:
@@ -57,10 +57,7 @@ def wire() -> Iterator[tuple[int, int]]:
 
 def hear(inputs: EstopInputs, cause: str) -> None:
     """Wait until a cause is among those that pressed."""
-    deadline = time.monotonic() + 20
-    while cause not in inputs.causes:
-        assert time.monotonic() < deadline, inputs.causes
-        time.sleep(0.001)
+    until(lambda: cause in inputs.causes)
 
 
 def test_a_byte_presses_and_after_a_reset_the_next_one_does(button, inputs, wire):
@@ -303,7 +300,7 @@ class Terminal:
 
     def end(self) -> tuple[int, str]:
         """Wait for the program's end; return its status and what it complained about."""
-        _, error = self.process.communicate(timeout=20)
+        _, error = self.process.communicate()
         return self.process.returncode, error
 
     def close(self) -> None:

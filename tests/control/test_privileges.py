@@ -336,7 +336,6 @@ def run(*parts: str) -> subprocess.CompletedProcess[str]:
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
         stdin=subprocess.DEVNULL,
         cwd=Path(__file__).resolve().parents[2],
     )

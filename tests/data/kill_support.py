@@ -35,7 +35,7 @@ class KillServer:
     def close(self) -> None:
         assert self.process.stdin is not None
         self.process.stdin.close()
-        self.process.wait(timeout=10)
+        self.process.wait()
         assert self.process.stdout is not None
         self.process.stdout.close()
 

@@ -12,6 +12,7 @@ import pytest
 from bhd_lerobot.data.repair import repair
 from tests.data import support
 from tests.data.kill_support import KillServer
+from tests.waiting import until
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +28,7 @@ def saved_episodes(progress: Path) -> int:
 
 
 def wait_for(progress: Path, lines: int) -> None:
-    deadline = time.monotonic() + 30
-    while not progress.exists() or progress.read_text().count("\n") < lines:
-        assert time.monotonic() < deadline, "the recording process makes no progress"
-        time.sleep(0.001)
+    until(lambda: progress.exists() and progress.read_text().count("\n") >= lines)
 
 
 @pytest.mark.parametrize(("video", "kills"), [(False, 20), (True, 4)])

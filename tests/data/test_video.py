@@ -66,7 +66,7 @@ def test_options_and_info_are_lerobots(tmp_path: Path) -> None:
 def test_a_slow_encoder_makes_the_caller_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go = threading.Event()
     real = statistics.image_histogram
-    monkeypatch.setattr(statistics, "image_histogram", lambda image: (go.wait(10), real(image))[1])
+    monkeypatch.setattr(statistics, "image_histogram", lambda image: (go.wait(), real(image))[1])
     encoder = CameraEncoder(tmp_path / "a.mp4", 10, SIZE, VideoSettings(queue_size=2))
     added: list[int] = []
 

@@ -4,8 +4,7 @@ import json
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,17 +17,7 @@ from bhd_lerobot.robots.config_realtime import RealtimeConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.live_state import WATCHDOGS
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
-
-PATIENCE_S = 60.0
-
-
-def until(condition: Callable[[], Any], what: str, seconds: float = PATIENCE_S) -> Any:
-    """Wait until a condition holds, and return what it returned."""
-    end = time.monotonic() + seconds
-    while not (result := condition()):
-        assert time.monotonic() < end, f"waited {seconds:g} s in vain: {what}"
-        time.sleep(0.002)
-    return result
+from tests.waiting import until
 
 
 def relaxed(**options: Any) -> RealtimeConfig:

@@ -27,10 +27,10 @@ from tests.robots.live_support import (
     is_gone,
     turtlebot,
     unique,
-    until,
     watchdog_count,
 )
 from tests.runs.support import options
+from tests.waiting import until
 
 TIMEOUT_S = 0.3
 

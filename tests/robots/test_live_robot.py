@@ -15,7 +15,8 @@ from bhd_lerobot.control.shared_block import names
 from bhd_lerobot.errors import CommandRefusedError, ConfigError, RealtimeError
 from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
-from tests.robots.live_support import drive, is_alive, is_gone, mode, turtlebot, unique, until
+from tests.robots.live_support import drive, is_alive, is_gone, mode, turtlebot, unique
+from tests.waiting import until
 
 NAME = unique("shared")
 

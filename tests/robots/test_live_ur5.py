@@ -11,7 +11,8 @@ from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.ur5 import UR5
-from tests.robots.live_support import is_gone, mode, relaxed, unique, until
+from tests.robots.live_support import is_gone, mode, relaxed, unique
+from tests.waiting import until
 
 NAME = unique("arm")
 TARGETS = ((0.3, 0.2, 0.4), (0.4, -0.1, 0.35))

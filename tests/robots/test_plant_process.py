@@ -41,6 +41,7 @@ from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.world import World
+from tests.waiting import until
 
 HZ = 200
 PERIOD = NANOSECONDS // HZ
@@ -436,7 +437,6 @@ def moving(kind: str) -> Iterator[tuple[Any, PlantLink]]:
         assert link is not None
         names, command = robot.action_names, robot.simulation.live_bridge.latest["command"][0].tolist()
         target = {"x.vel": 0.2, "theta.vel": 0.0} if kind == "turtlebot3" else dict(zip(names, command, strict=True))
-        deadline = time.monotonic() + 30
         while True:
             if kind == "ur5":
                 target["shoulder_pan.pos"] += 0.04
@@ -445,19 +445,11 @@ def moving(kind: str) -> Iterator[tuple[Any, PlantLink]]:
             state: Any = link.states.latest()
             if np.abs(state["velocity"]).max() > (3.0 if kind == "turtlebot3" else 0.5):
                 break
-            assert time.monotonic() < deadline, "the robot does not move"
         yield robot, link
     finally:
         robot.disconnect()
         if block is not None:
             block.close()
-
-
-def wait_for(condition: Any, seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 @pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
@@ -481,7 +473,7 @@ def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
                     stopped = row
             return stopped is not None
 
-        wait_for(look)
+        until(look)
         # The first tick on the plant's grid at which the last command was too old.
         assert last["command"] == stopped["command"]
         assert last["start_ns"] - last["command_ns"] <= timeout < stopped["start_ns"] - stopped["command_ns"]
@@ -491,7 +483,7 @@ def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
         if kind == "turtlebot3":
             assert not stopped["actuators"].any()
 
-        wait_for(lambda: np.abs(link.states.latest()["velocity"]).max() < 0.01)  # type: ignore[index]
+        until(lambda: np.abs(link.states.latest()["velocity"]).max() < 0.01)  # type: ignore[index]
         with pytest.raises(RealtimeError, match=r"cerebellum's process was killed by signal 9. The plant stops"):
             live_link.check()
         block_name, plant = live_link.block.name, live_link._processes["plant"]
@@ -503,14 +495,14 @@ def test_a_cerebellum_that_was_stopped_finds_a_fault_and_goes_on_after_a_reset()
     with moving("turtlebot3") as (robot, link):
         pid = robot.simulation.link.pids["cerebellum"]
         os.kill(pid, signal.SIGSTOP)
-        wait_for(lambda: link.states.latest()["phase"] == PlantPhase.STOPPED)  # type: ignore[index]
-        wait_for(lambda: np.abs(link.states.latest()["velocity"]).max() < 0.01)  # type: ignore[index]
+        until(lambda: link.states.latest()["phase"] == PlantPhase.STOPPED)  # type: ignore[index]
+        until(lambda: np.abs(link.states.latest()["velocity"]).max() < 0.01)  # type: ignore[index]
         os.kill(pid, signal.SIGCONT)
-        wait_for(lambda: robot.simulation.modes[0] == Mode.FAULT)
+        until(lambda: robot.simulation.modes[0] == Mode.FAULT)
         assert link.states.latest()["phase"] == PlantPhase.STOPPED  # type: ignore[index]
         bridge = robot.simulation.live_bridge
-        wait_for(lambda: bool(bridge.reset().accepted.all()))
-        wait_for(lambda: link.states.latest()["phase"] == PlantPhase.DRIVEN)  # type: ignore[index]
+        until(lambda: bool(bridge.reset().accepted.all()))
+        until(lambda: link.states.latest()["phase"] == PlantPhase.DRIVEN)  # type: ignore[index]
         robot.activate()
         robot.send_action({"x.vel": 0.1, "theta.vel": 0.0})
         assert link.states.latest()["stops"] == 1  # type: ignore[index]
@@ -520,13 +512,13 @@ def test_a_plant_that_is_stopped_or_killed_is_a_fault_and_an_error_that_says_so(
     with moving("turtlebot3") as (robot, _):
         live_link = robot.simulation.link
         os.kill(live_link.pids["plant"], signal.SIGSTOP)
-        wait_for(lambda: robot.simulation.modes[0] == Mode.FAULT)
+        until(lambda: robot.simulation.modes[0] == Mode.FAULT)
         seen = WATCHDOGS.index(Watchdog.PLANT)
-        wait_for(lambda: robot.simulation.live_bridge.latest["watchdogs"][seen] > 0)
+        until(lambda: robot.simulation.live_bridge.latest["watchdogs"][seen] > 0)
         with pytest.raises(RealtimeError, match=r"plant's process \(\d+\) has shown no sign of life for 2\.\d s"):
-            wait_for(live_link.check)  # it says nothing until then
+            until(live_link.check)  # it says nothing until then
         os.kill(live_link.pids["plant"], signal.SIGKILL)
-        wait_for(lambda: live_link._processes["plant"].poll() is not None)
+        until(lambda: live_link._processes["plant"].poll() is not None)
         with pytest.raises(RealtimeError, match=r"plant's process was killed by signal 9. The cerebellum is in FAULT"):
             live_link.check()
         block_name = live_link.block.name

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from importlib import metadata
 from pathlib import Path
 
@@ -33,8 +32,7 @@ from tests.runs import cluster_fakes as fakes
 from tests.runs.support import options, run_record
 from tests.runs.test_evaluate import FAILING, run_eval
 from tests.runs.test_evaluate_brains import checkpoint  # noqa: F401  (a fixture)
-
-pytestmark = pytest.mark.timeout(180)
+from tests.waiting import until
 
 STORE = 100 * 2**20
 ROOT = Path(__file__).parents[2]
@@ -51,14 +49,25 @@ ARM = {
 
 
 @pytest.fixture(scope="module")
-def cluster():
+def ray_folder():
+    """Return a folder for all that Ray leaves behind; its default one may not exist, or hold what others left."""
+    folder = tempfile.mkdtemp(prefix="bhd-ray-", dir="/tmp")  # a socket's path must be short
+    with pytest.MonkeyPatch.context() as patch:
+        # `Cluster` writes its address there, whatever folder its machines are told, and needs it to exist.
+        patch.setenv("RAY_TMPDIR", folder)
+        Path(folder, "ray").mkdir()
+        yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def cluster(ray_folder):
     """Return two machines with a processor each; the head has none to give."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] = "0"
     cluster_utils = pytest.importorskip("ray.cluster_utils")
     path = os.environ.get("PYTHONPATH", "")
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(Path(fakes.__file__).parent), path]))
-    folder = tempfile.mkdtemp(prefix="bhd-ray-", dir="/tmp")  # a socket's path must be short
     machines = cluster_utils.Cluster(
         initialize_head=True,
         head_node_args={
@@ -66,7 +75,6 @@ def cluster():
             "num_gpus": 0,
             "object_store_memory": STORE,
             "include_dashboard": False,
-            "temp_dir": folder,
         },
     )
     try:
@@ -75,7 +83,6 @@ def cluster():
     finally:
         os.environ["PYTHONPATH"] = path
         machines.shutdown()
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def add_machine(cluster):
@@ -113,13 +120,6 @@ def gone(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except OSError:
         return True
-
-
-def wait_until(condition, what: str, seconds: float = 60) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, f"{what} took too long"
-        time.sleep(0.05)
 
 
 # --- recordings -------------------------------------------------------------------------------------------------------
@@ -177,7 +177,7 @@ def workers_of(raylets: set[int]) -> list[int]:
     return found
 
 
-def test_a_killed_driver_leaves_good_episodes_and_no_processes(tmp_path):
+def test_a_killed_driver_leaves_good_episodes_and_no_processes(ray_folder, tmp_path):
     pytest.importorskip("ray")
     many = {"dataset__num_episodes": 400, "dataset__episode_time_s": 5}
     arguments = options(tmp_path / "ray", engine="ray", ray__num_workers=1, **many)
@@ -190,13 +190,13 @@ def test_a_killed_driver_leaves_good_episodes_and_no_processes(tmp_path):
     )
     family: set[int] = set()
     try:
-        wait_until(lambda: len(list((tmp_path / "ray" / "data").rglob("*.parquet"))) >= 3, "three episodes")
+        until(lambda: len(list((tmp_path / "ray" / "data").rglob("*.parquet"))) >= 3)
         family = descendants(driver.pid)
         assert any(b"RemoteWorker" in Path(f"/proc/{pid}/cmdline").read_bytes() for pid in family)
         driver.kill()
         driver.wait()
         # Ray's two agents try for a minute to tell somebody that the rest has gone.
-        wait_until(lambda: not any(working(pid) for pid in family), "the end of the cluster")
+        until(lambda: not any(working(pid) for pid in family))
     finally:
         for pid in {driver.pid, *family}:
             with contextlib.suppress(ProcessLookupError):
@@ -439,4 +439,4 @@ def test_the_run_stops_when_it_is_told_to(cluster):
     assert got == list(range(len(got)))
     assert len(got) < 1000
     raylets = {machine.all_processes["raylet"][0].process.pid for machine in cluster.spare}
-    wait_until(lambda: not workers_of(raylets), "the end of the workers")
+    until(lambda: not workers_of(raylets))

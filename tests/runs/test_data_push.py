@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +30,7 @@ from tests.runs.support import options as record_options
 from tests.runs.support import run_record
 from tests.runs.train_support import MLP, curve, make_dataset, run_train
 from tests.runs.train_support import options as train_options
+from tests.waiting import until
 
 pytest_plugins = ["tests.hub_server.fixtures"]
 
@@ -215,11 +215,9 @@ def test_ctrl_c_ends_a_stalled_upload_at_once(hub: HubServer, lesson: Path) -> N
     command = [sys.executable, "-m", "bhd_lerobot.runs.data", "push", str(lesson), "me/d", "--no-card"]
     process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
     try:
-        deadline = time.monotonic() + 60
-        while not hub.asked("^PUT") and time.monotonic() < deadline:
-            time.sleep(0.05)
+        until(lambda: hub.asked("^PUT"))
         process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=60)
+        _, error = process.communicate()
     finally:
         process.kill()
         gate.set()

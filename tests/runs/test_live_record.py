@@ -28,8 +28,9 @@ from bhd_lerobot.runs.record import record
 from bhd_lerobot.runs.record_report import ESTOP_STATUS, RecordResult
 from bhd_lerobot.tasks.avoid import AvoidTask
 from bhd_lerobot.tasks.task import Event
-from tests.robots.live_support import is_alive, is_gone, unique, until
+from tests.robots.live_support import is_alive, is_gone, unique
 from tests.runs.support import data_columns, options, run_record
+from tests.waiting import until
 
 LIVE = {
     "robot__clock": "realtime",

@@ -9,8 +9,7 @@ import subprocess
 import sys
 import termios
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +33,7 @@ from bhd_lerobot.runs.monitor import Keys, find, main, watch
 from bhd_lerobot.runs.monitor_state import CELLS, DECADES, Count, Sampler, cells
 from bhd_lerobot.runs.registry import make_simulation
 from tests.runs.support import options
+from tests.waiting import until
 
 S = 1_000_000_000
 NAME = f"test-monitor-{os.getpid()}"
@@ -416,13 +416,6 @@ def test_watching_shows_until_the_user_leaves(robot: Robot) -> None:
 
 
 # --- keys ------------------------------------------------------------------------------------------------------------
-
-
-def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 # It is to be its controlling terminal, in whose foreground it is.

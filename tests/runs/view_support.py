@@ -29,7 +29,7 @@ class Served:
         self, path: str, *, method: str = "GET", body: Any = None, headers: Mapping[str, str] | None = None
     ) -> tuple[int, dict[str, str], bytes]:
         """Return status, headers and content of an answer; the path is sent as it is."""
-        connection = http.client.HTTPConnection(HOST, self.port, timeout=20)
+        connection = http.client.HTTPConnection(HOST, self.port)
         content = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
         connection.request(method, path, content, dict(headers or {}))
         answer = connection.getresponse()
