@@ -6,6 +6,7 @@ traceback.
 """
 
 import difflib
+import shlex
 from collections.abc import Iterable
 
 
@@ -108,3 +109,8 @@ def install_extra(extra: str) -> str:
     return (
         f"In the folder of this project: `make venv`, or `pip install -e '.[{extra}]'` in an environment of your own."
     )
+
+
+def quoted(value: object) -> str:
+    """Return a value as a shell reads it back, for a command in a message: a path may hold spaces."""
+    return shlex.quote(str(value))

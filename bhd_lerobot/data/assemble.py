@@ -19,13 +19,13 @@ from bhd_lerobot.data import layout, statistics
 from bhd_lerobot.data.assemble_files import build_data, build_videos
 from bhd_lerobot.data.disk import Disk, to_json
 from bhd_lerobot.data.episode_table import PREFIX, stored_stats
-from bhd_lerobot.data.exchange import link_others
 from bhd_lerobot.data.identity import comparable, differences
 from bhd_lerobot.data.layout import Slot
 from bhd_lerobot.data.meta_files import tasks_table, write_meta
 from bhd_lerobot.data.picks import Files, Pick, Plan
+from bhd_lerobot.data.publish import link_others
 from bhd_lerobot.data.state import DatasetState, Row, corrupt, read_frames, slot_of
-from bhd_lerobot.errors import DatasetError, DatasetMismatchError
+from bhd_lerobot.errors import DatasetError, DatasetMismatchError, quoted
 
 EDITS = "meta/edits.jsonl"
 """What was done to a dataset after its recording: one JSON object a line."""
@@ -56,7 +56,7 @@ def assemble(
 
     Args:
         picks: its episodes, in order; at least one.
-        new: an empty or missing folder: becomes the dataset's root, or the place that `exchange.begin` gave.
+        new: an empty or missing folder: becomes the dataset's root, or the folder of a `Workspace`.
         disk: how to write.
         types: Arrow types of metadata columns that no source has, by name without prefix.
         in_place: the new content takes the place of the only source's. Then files that stay are linked; two datasets
@@ -147,11 +147,12 @@ def _sources(picks: Sequence[Pick]) -> list[DatasetState]:
         if (source.root / layout.STAGING).exists() or (source.without_stats and source.identity is not None):
             raise DatasetError(
                 f"{source.root} is not finalised: its recording was interrupted, or goes on. Run `bhd-data repair "
-                f"{source.root}` first."
+                f"{quoted(source.root)}` first."
             )
         if source.without_stats:
             raise DatasetError(
-                f"{source.root} has no statistics of single episodes. Run `bhd-data check --fix {source.root}` first."
+                f"{source.root} has no statistics of single episodes. Run `bhd-data check --fix "
+                f"{quoted(source.root)}` first."
             )
     return sources
 

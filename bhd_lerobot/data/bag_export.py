@@ -16,9 +16,10 @@ from bhd_lerobot.data import ros2_views as views
 from bhd_lerobot.data.bag_episode import EpisodeTopics
 from bhd_lerobot.data.bag_place import complete_or_not
 from bhd_lerobot.data.bag_write import BagWriter
-from bhd_lerobot.data.creation import refuse_inside
+from bhd_lerobot.data.edits import check_reported, opened
+from bhd_lerobot.data.publish import refuse_inside
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
-from bhd_lerobot.data.state import DatasetState, Row, corrupt, load_state, ordered_slots
+from bhd_lerobot.data.state import DatasetState, Row, corrupt, ordered_slots
 from bhd_lerobot.errors import DatasetError
 
 START_S = 1_000_000_000  # [s] since 1970: a dataset does not know on which day it was recorded
@@ -67,7 +68,8 @@ def export_bags(
         options: how.
 
     Raises:
-        DatasetError: no such dataset or episode.
+        DatasetError: no such dataset or episode, or an edit of it was interrupted that nobody was told of.
+        DatasetLockedError: it is being recorded or edited.
         ConfigError: `output` lies in the dataset.
         DatasetExistsError: `output` is there already.
         DatasetWriteError: the bags cannot be written.
@@ -76,12 +78,20 @@ def export_bags(
     root, output = Path(root), Path(output)
     refuse_inside(output, root)
     types.require_rosbags()
-    state = load_state(root)
+    with opened([root]) as (state,):
+        if options.episodes is not None:
+            check_reported(root)
+        return _export(state, output, view, repo_id, options)
+
+
+def _export(
+    state: DatasetState, output: Path, view: views.RobotView, repo_id: str, options: ExportOptions
+) -> ExportReport:
     rows = _chosen(state, options.episodes)
     topics = EpisodeTopics(
         state,
         view,
-        repo_id or root.resolve().name,
+        repo_id or state.root.resolve().name,
         start_s=options.start_s,
         bare_twist=options.bare_twist,
         compressed_images=options.compressed_images,

@@ -1,18 +1,16 @@
 """Where bags and the datasets made of them are written: they come to their place complete, or not at all."""
 
 import contextlib
-import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from bhd_lerobot.data.creation import building_prefix, is_free, remove_abandoned
-from bhd_lerobot.data.disk import Disk, RootLock, write_errors
+from bhd_lerobot.data.disk import Disk, write_errors
+from bhd_lerobot.data.publish import is_free, making, remove_abandoned
 from bhd_lerobot.errors import DatasetExistsError
 
 
-def refuse_existing(target: Path, option: str) -> Path:
-    """Return the real path of a place where nothing is yet, but perhaps an empty folder.
+def refuse_existing(target: Path, option: str) -> None:
+    """Check that nothing is at a place yet, but perhaps an empty folder.
 
     What killed attempts left beside it is removed, also if it is taken: the last of them may have got that far.
 
@@ -25,11 +23,9 @@ def refuse_existing(target: Path, option: str) -> Path:
     """
     if target.is_symlink() and not target.exists():
         raise DatasetExistsError(f"{target} is a link to nothing. Remove it, or choose another {option}.")
-    place = target.resolve()  # a name such as ``new/..`` is no name for a folder beside it
-    remove_abandoned(place.parent, building_prefix(place))
-    if not is_free(place):
+    remove_abandoned(target.resolve())  # a name such as ``new/..`` is no name for a folder beside it
+    if not is_free(target):
         raise DatasetExistsError(f"{target} exists already. Remove it, or choose another {option}.")
-    return place
 
 
 @contextlib.contextmanager
@@ -49,18 +45,8 @@ def complete_or_not(target: Path, option: str, action: str, consequence: str) ->
         DatasetExistsError: something is there, or came there meanwhile.
         DatasetWriteError: it cannot be written.
     """
-    disk, shell, lock = Disk(), None, None
-    with write_errors(action, target, consequence):
-        try:
-            place = refuse_existing(target, option)
-            disk.make_folder(place.parent)
-            shell = Path(tempfile.mkdtemp(prefix=building_prefix(place), dir=place.parent))
-            lock = RootLock(shell, shown_as=target)
-            yield shell / place.name  # its final name, which rosbag2 gives to the files in it
-            refuse_existing(target, option)
-            disk.move(shell / place.name, place)
-        finally:
-            if shell is not None:
-                shutil.rmtree(shell, ignore_errors=True)
-            if lock is not None:
-                lock.release()
+    with (
+        write_errors(action, target, consequence),
+        making(target, Disk(), lambda: refuse_existing(target, option)) as space,
+    ):
+        yield space.folder  # its final name, which rosbag2 gives to the files in it

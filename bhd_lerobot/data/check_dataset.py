@@ -12,6 +12,7 @@ from bhd_lerobot.data.check_files import RESTORE, Files, read_files
 from bhd_lerobot.data.check_values import Limits, ValueCheck
 from bhd_lerobot.data.episode_table import PREFIX
 from bhd_lerobot.data.findings import Finding, Findings, Severity
+from bhd_lerobot.data.publish import complete_interrupted
 
 __all__ = ["CHECKS", "DatasetCheck", "Finding", "Severity", "check_dataset"]
 
@@ -71,6 +72,7 @@ def check_dataset(
         DatasetError: there is no dataset, or its `meta/info.json` cannot be read.
     """
     findings = Findings()
+    complete_interrupted(Path(root))
     files = read_files(Path(root), findings)
     robot = files.info.get("robot_type")
     if not files.info["total_episodes"]:

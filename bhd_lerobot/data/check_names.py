@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from bhd_lerobot.data import layout
-from bhd_lerobot.data.exchange import WORK, is_decided
 from bhd_lerobot.data.findings import Findings, few
 from bhd_lerobot.data.parquet_rescue import is_cut_off
+from bhd_lerobot.data.publish import WORK, is_decided
 
 if TYPE_CHECKING:
     from bhd_lerobot.data.check_files import Files

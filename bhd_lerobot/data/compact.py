@@ -1,6 +1,6 @@
 """From one file per episode to few files, in one step that a kill cannot leave half done.
 
-New folders are built beside the old ones; files that need no change are linked. See `bhd_lerobot.data.exchange`.
+New folders are built beside the old ones; files that need no change are linked. See `bhd_lerobot.data.publish`.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -11,11 +11,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.data import exchange, layout, statistics, video
-from bhd_lerobot.data.disk import Disk
+from bhd_lerobot.data import layout, statistics, video
+from bhd_lerobot.data.disk import Disk, RootLock
 from bhd_lerobot.data.episode_table import stored_stats
 from bhd_lerobot.data.layout import Slot
 from bhd_lerobot.data.meta_files import MEBIBYTE, PARQUET_OPTIONS, write_meta
+from bhd_lerobot.data.publish import Workspace, link_others
 from bhd_lerobot.data.schema import Schema, as_numpy
 from bhd_lerobot.data.state import DatasetState, Row, corrupt, ordered_slots, read_frames, slot_columns, slot_of
 
@@ -34,13 +35,16 @@ class _Group:
         return self.sources == [self.target]
 
 
-def compact(state: DatasetState, schema: Schema, disk: Disk, known: Mapping[int, EpisodeStats]) -> bool:
+def compact(
+    state: DatasetState, schema: Schema, disk: Disk, lock: RootLock, known: Mapping[int, EpisodeStats] | None = None
+) -> bool:
     """Compact a dataset and store all statistics.
 
     Args:
         state: what is on disk now.
         schema: its columns.
         disk: how to write.
+        lock: of the dataset.
         known: statistics of episodes that are still in memory; those of others are computed from their data.
 
     Returns:
@@ -55,13 +59,13 @@ def compact(state: DatasetState, schema: Schema, disk: Disk, known: Mapping[int,
     moved = any(not group.unchanged for groups in (data, *videos.values()) for group in groups)
     if not state.rows or (not moved and not state.without_stats and (state.root / layout.STATS).exists()):
         return False
-    new = exchange.begin(state.root, disk)
-    stats = _all_stats(state, schema, known)
-    rows = [dict(row) for row in state.rows]
-    _build_data(state, schema, disk, data, rows, new=new)
-    _build_videos(state, disk, videos, rows, new=new)
-    _build_meta(state, disk, rows, stats, new=new)
-    exchange.complete(state.root, disk)
+    with Workspace(state.root, disk, lock) as space:
+        stats = _all_stats(state, schema, known or {})
+        rows = [dict(row) for row in state.rows]
+        _build_data(state, schema, disk, data, rows, new=space.folder)
+        _build_videos(state, disk, videos, rows, new=space.folder)
+        _build_meta(state, disk, rows, stats, new=space.folder)
+        space.publish(f"the files of {state.root} had been merged")
     return True
 
 
@@ -105,7 +109,7 @@ def _build_data(
     if all(group.unchanged for group in groups):
         return
     targets = {source: group.target for group in groups for source in group.sources}
-    exchange.link_others(state.root / "data", new / "data", disk, "chunk-*/file-*.parquet")
+    link_others(state.root / "data", new / "data", disk, "chunk-*/file-*.parquet")
     for group in groups:
         target = new / layout.data_file(group.target)
         disk.make_folder(target.parent)
@@ -145,7 +149,7 @@ def _build_videos(
     if all(group.unchanged for groups in videos.values() for group in groups):
         return
     fps = state.info["fps"]
-    exchange.link_others(state.root / "videos", new / "videos", disk, "*/chunk-*/file-*.mp4")
+    link_others(state.root / "videos", new / "videos", disk, "*/chunk-*/file-*.mp4")
     for key, groups in videos.items():
         kind = f"videos/{key}"
         by_slot = ordered_slots(rows, kind)
@@ -175,7 +179,7 @@ def _build_videos(
 def _build_meta(
     state: DatasetState, disk: Disk, rows: list[Row], stats: Mapping[str, statistics.Stats], *, new: Path
 ) -> None:
-    exchange.link_others(state.root / "meta", new / "meta", disk, "episodes/chunk-*/file-*.parquet", "stats.json")
+    link_others(state.root / "meta", new / "meta", disk, "episodes/chunk-*/file-*.parquet", "stats.json")
     limit = state.info["data_files_size_in_mb"] * MEBIBYTE
     # Full files whose rows did not change are kept; everything after the first other one is written again.
     done, slot = 0, None

@@ -1,17 +1,14 @@
 """An empty dataset, which appears on disk complete or not at all."""
 
-import contextlib
-import glob
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.data.publish import is_free, making
 from bhd_lerobot.data.schema import Schema
-from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, DatasetLockedError
+from bhd_lerobot.errors import DatasetError, DatasetExistsError, DatasetLockedError
 
 _RESUME = "Resume it (--resume=true), remove it"  # what can be done if a dataset to be recorded is there
 
@@ -60,7 +57,7 @@ def create_root(root: Path, info: Mapping[str, Any], identity: Mapping[str, Any]
 
 
 def build_root(root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str = _RESUME) -> RootLock:
-    """Build a dataset beside its place, rename it, and return the lock on it.
+    """Build a dataset beside its place, put it there, and return the lock on it.
 
     Args:
         root: where to put it; must not exist, or be an empty folder.
@@ -73,37 +70,25 @@ def build_root(root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str
         DatasetLockedError: it exists, and is being written.
         DatasetWriteError: it cannot be written.
     """
-    if not is_free(root):
-        raise _exists(root, remedy)
-    with write_errors("create the dataset", root, "Nothing was written there."):
-        disk.make_folder(root.parent)
-        prefix = building_prefix(root)
-        remove_abandoned(root.parent, prefix)
-        building = Path(tempfile.mkdtemp(prefix=prefix, dir=root.parent))
-        lock = RootLock(building, shown_as=root)
-        try:
-            building.chmod(0o755)
-            fill(building)
-            if not is_free(root):
-                raise _exists(root, remedy)
-            disk.move(building, root)
-        except BaseException:
+
+    def refuse() -> None:
+        if not is_free(root):
+            raise _exists(root, remedy)
+
+    lock: RootLock | None = None
+    try:
+        with (
+            write_errors("create the dataset", root, "Nothing was written there."),
+            making(root, disk, refuse) as space,
+        ):
+            lock = space.lock_new()
+            space.folder.chmod(0o755)
+            fill(space.folder)
+    except BaseException:
+        if lock is not None:
             lock.release()
-            shutil.rmtree(building, ignore_errors=True)
-            raise
+        raise
     return lock
-
-
-def is_free(root: Path) -> bool:
-    """Tell whether a dataset can be made at a root: nothing is there, or an empty folder."""
-    if root.is_symlink():
-        return False
-    return not root.exists() or (root.is_dir() and not any(root.iterdir()))
-
-
-def building_prefix(root: Path) -> str:
-    """Return how the names of folders begin in which something for this place is built, beside it."""
-    return f".{root.name}.bhd-"
 
 
 def _exists(root: Path, remedy: str) -> DatasetError:
@@ -118,21 +103,3 @@ def _exists(root: Path, remedy: str) -> DatasetError:
         except OSError:  # a folder of somebody else's
             pass
     return DatasetExistsError(f"{root} exists already. {remedy}, or choose another root.")
-
-
-def refuse_inside(target: Path, source: Path) -> None:
-    """Refuse to write into a dataset that is only read: it would be uploaded and checked with it.
-
-    Raises:
-        ConfigError: `target` lies in `source`.
-    """
-    if source.resolve() in target.resolve().parents:
-        raise ConfigError(f"{target} lies in {source}, which is to stay as it is. Choose a place beside it.")
-
-
-def remove_abandoned(parent: Path, prefix: str) -> None:
-    """Remove what killed calls left beside the root; folders of living processes are locked."""
-    for folder in parent.glob(f"{glob.escape(prefix)}*"):
-        with contextlib.suppress(OSError, DatasetLockedError):
-            RootLock(folder).release()
-            shutil.rmtree(folder)

@@ -5,6 +5,7 @@ and so that a test can stop the process before any single step.
 """
 
 import contextlib
+import ctypes
 import errno
 import fcntl
 import json
@@ -28,7 +29,9 @@ _REMEDIES = {
 }
 
 
-_FICLONE = 0x40049409  # Linux: let both files have the same blocks until one of them is written
+# Linux's own numbers.
+_FICLONE = 0x40049409  # let both files have the same blocks until one of them is written
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 
 def _before_step(action: str, path: Path) -> None:
@@ -86,6 +89,31 @@ class Disk:
         os.replace(source, target)
         self._flush_folder(target.parent)
 
+    def swap(self, one: Path, other: Path) -> None:
+        """Exchange the names of two folders, in one step.
+
+        Raises:
+            OSError: this kernel or file system cannot do that, among others.
+        """
+        _before_step("swap", other)
+        function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+        if function is None:
+            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS), str(other))
+        if function(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), str(one), None, str(other))
+        for folder in {one.parent, other.parent}:
+            self._flush_folder(folder)
+
+    def hard_link(self, source: Path, target: Path) -> None:
+        """Give a file a second name.
+
+        Raises:
+            OSError: the file system cannot do that.
+        """
+        _before_step("link", target)
+        os.link(source, target)
+
     def link(self, source: Path, target: Path) -> None:
         """Give a file a second name, or copy it where the file system cannot do that."""
         _before_step("link", target)
@@ -117,6 +145,11 @@ class Disk:
             return
         _before_step("rmtree", path)
         shutil.rmtree(path)
+
+    def try_remove_tree(self, path: Path) -> None:
+        """Remove a folder that nothing needs any more; what cannot be removed stays for whoever cleans up later."""
+        with contextlib.suppress(OSError):
+            self.remove_tree(path)
 
     def _flush_folder(self, path: Path) -> None:
         if self.fsync:
@@ -177,7 +210,23 @@ class RootLock:
         """Take the lock if it is not held; return whether it was taken now."""
         if self._handle is not None:
             return False
-        handle = os.open(self._root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        while True:
+            handle = self.open(self._root)
+            if os.path.samestat(os.fstat(handle), os.stat(self._root)):
+                break
+            os.close(handle)  # an edit has put another folder there since it was opened
+        self._handle = handle
+        # The folder may be renamed while it is locked; a second time it is taken under its final name.
+        self._root = self._shown_as
+        return True
+
+    def open(self, folder: Path) -> int:
+        """Return a handle on another folder, locked as well, for `replace`.
+
+        Raises:
+            DatasetLockedError: somebody else works there.
+        """
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -186,10 +235,12 @@ class RootLock:
                 f"{self._shown_as} is being written by another recorder or repair. Wait until it ends"
                 f"{', or choose another root' if self._is_choice else ''}."
             ) from None
+        return handle
+
+    def replace(self, handle: int) -> None:
+        """Hold the lock of another folder from now on, which has taken the place of the first."""
+        self.release()
         self._handle = handle
-        # The folder may be renamed while it is locked; a second time it is taken under its final name.
-        self._root = self._shown_as
-        return True
 
     def release(self) -> None:
         """Give the lock back; a second call does nothing."""

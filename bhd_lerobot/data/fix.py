@@ -11,12 +11,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.data import exchange, layout
+from bhd_lerobot.data import layout
 from bhd_lerobot.data.compact import compact
 from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.data.episode_table import stored_stats
 from bhd_lerobot.data.findings import Finding, Severity
 from bhd_lerobot.data.meta_files import write_meta
+from bhd_lerobot.data.publish import Workspace, link_others
 from bhd_lerobot.data.salvage_stats import stats_of
 from bhd_lerobot.data.schema import Schema
 from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots, read_frames, read_json
@@ -55,7 +56,7 @@ def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
             if any(one.check == "counts" for one in wanted):
                 done.append(_count_frames(root, disk))
             if any(one.check == "stats" for one in wanted):
-                done.append(compute_stats(load_state(root), disk))
+                done.append(compute_stats(load_state(root), disk, lock))
             disk.remove_tree(root / layout.STAGING)
     finally:
         lock.release()
@@ -79,20 +80,21 @@ def _count_frames(root: Path, disk: Disk) -> str:
     return f"{layout.INFO}: total_frames is {frames}, as the episodes say; it was {before}"
 
 
-def compute_stats(state: DatasetState, disk: Disk) -> str:
+def compute_stats(state: DatasetState, disk: Disk, lock: RootLock) -> str:
     """Compute the statistics of all episodes from their frames, store them, and return what was done in a line."""
     if state.identity is not None:
         state.without_stats = set(range(state.num_episodes))
-        compact(state, Schema(state.info["features"]), disk, {})
+        compact(state, Schema(state.info["features"]), disk, lock)
     else:
         rows = [dict(row) for row in state.rows]
         depth = _stored_depth(state)
         stats = stats_of(_tables(state), state.info["features"], state.root, rows, depth)
-        new = exchange.begin(state.root, disk)
         skipped = ("episodes/chunk-*/file-*.parquet", "stats.json")
-        exchange.link_others(state.root / "meta", new / "meta", disk, *skipped)
-        write_meta(new, state.info, rows, state.metadata_types, stats, disk=disk, extra=state.extra_types)
-        exchange.complete(state.root, disk)
+        with Workspace(state.root, disk, lock) as space:
+            new = space.folder
+            link_others(state.root / "meta", new / "meta", disk, *skipped)
+            write_meta(new, state.info, rows, state.metadata_types, stats, disk=disk, extra=state.extra_types)
+            space.publish(f"the statistics of {state.root} had been computed")
     return f"{layout.STATS} and meta/episodes: statistics of {state.num_episodes} episodes, computed from their frames"
 
 

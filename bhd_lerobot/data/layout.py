@@ -10,6 +10,9 @@ TASKS = "meta/tasks.parquet"
 IDENTITY = "meta/bhd.json"
 """What was recorded and by whom; its presence says that a dataset was written by this package."""
 
+UNREPORTED = "meta/bhd_unreported.json"
+"""Which edit made a dataset what it is, until whoever asked for it has been told."""
+
 STAGING = ".bhd"
 """Folder inside the root that holds everything unfinished. It is absent from a finalised dataset."""
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data import layout
-from bhd_lerobot.data.edits import EditReport, check_episodes, opened, rewrite
+from bhd_lerobot.data.edits import Change, EditReport, Tell, check_episodes, rewrite
 from bhd_lerobot.data.picks import Pick
 from bhd_lerobot.data.schema import as_numpy
 from bhd_lerobot.data.state import DatasetState, Row, ordered_slots, read_frames, slot_of
@@ -29,6 +29,7 @@ def mark(
     intervention: tuple[int, int] | None = None,
     clear_interventions: bool = False,
     note: str = "",
+    tell: Tell = lambda _: None,
 ) -> EditReport:
     """Say how episodes ended, or in which of their frames somebody intervened.
 
@@ -44,6 +45,7 @@ def mark(
         intervention: first and last frame of an intervention.
         clear_interventions: take back all interventions.
         note: why; for the log.
+        tell: told what came out; see `bhd_lerobot.data.edits.delete`.
 
     Raises:
         ConfigError: nothing is said, or an unknown outcome, one that the task or robot cannot have, or impossible
@@ -58,7 +60,16 @@ def mark(
         raise ConfigError(f"Say what to mark: an outcome ({', '.join(OUTCOMES)}), or frames of an intervention.")
     if not episodes:
         raise ConfigError("Say which episodes to mark.")
-    with opened([Path(root)]) as (state,):
+    request = {
+        "edit": "mark",
+        "episodes": list(episodes),
+        **({"outcome": outcome} if outcome is not None else {}),
+        **({"intervention": list(intervention)} if intervention is not None else {}),
+        **({"clear_interventions": True} if clear_interventions else {}),
+        **({"note": note} if note else {}),
+    }
+
+    def change(state: DatasetState) -> Change:
         check_episodes(state, episodes)
         for row in [state.rows[episode] for episode in episodes] if outcome is not None else []:
             if outcome not in (possible := possible_outcomes(state, row)):
@@ -71,7 +82,9 @@ def mark(
         picks = [changes.pick(row) if row["episode_index"] in meant else Pick(state, row) for row in state.rows]
         edit = {"edit": "mark", "episodes": changes.log, **({"note": note} if note else {})}
         types = _COLUMNS if outcome is not None and "outcome" not in state.metadata_types else {}
-        return rewrite(state, picks, edit, state.identity, types)
+        return Change(picks, edit, state.identity, types)
+
+    return rewrite(Path(root), request, change, tell)
 
 
 def possible_outcomes(state: DatasetState, row: Row) -> tuple[str, ...]:

@@ -248,7 +248,7 @@ class DatasetRecorder:
             with write_errors("compact the dataset", self.root, consequence):
                 self._settle_if_in_doubt()
                 self._in_doubt = True
-                compact(self._state, self._schema, self._disk, self._stats)
+                compact(self._state, self._schema, self._disk, self._lock, self._stats)
                 self._disk.remove_tree(self.root / layout.STAGING)
                 self._in_doubt = False
             self._finalized = True

@@ -1,7 +1,6 @@
 """The dataset on this machine while it is copied: whole, finalised, and the same until the copy is complete."""
 
 import os
-import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,10 +9,11 @@ from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock
+from bhd_lerobot.data.publish import complete_interrupted
 from bhd_lerobot.data.remote import MANIFEST, SUBSET, Item, is_recorded, listed
 from bhd_lerobot.data.remote_subset import read_subset
 from bhd_lerobot.data.state import DatasetState, load_state
-from bhd_lerobot.errors import DatasetError, DatasetLockedError
+from bhd_lerobot.errors import DatasetError, DatasetLockedError, quoted
 
 _TEMPORARY = ("images",)  # LeRobot's own, of frames whose film is not encoded yet
 
@@ -61,6 +61,7 @@ def open_local(root: Path) -> Iterator[LocalDataset]:
     if not root.is_dir():
         raise DatasetError(f"{root} is not a LeRobot dataset: it does not exist.")
     try:
+        complete_interrupted(root)
         lock = RootLock(root)
     except DatasetLockedError as error:
         raise DatasetLockedError(
@@ -91,9 +92,11 @@ def _refuse_unfinished(state: DatasetState) -> None:
     if not state.num_episodes:
         raise DatasetError(f"{root} has no episode, so there is nothing to copy. Record some with bhd-record.")
     if (root / layout.STAGING).exists():
-        raise DatasetError(f"{root} is not finalised: its recording was interrupted. Run bhd-data repair {root}.")
+        raise DatasetError(
+            f"{root} is not finalised: its recording was interrupted. Run bhd-data repair {quoted(root)}."
+        )
     if state.identity is not None and (state.without_stats or not (root / layout.STATS).is_file()):
-        raise DatasetError(f"{root} is not finalised: it has no statistics. Run bhd-data repair {root}.")
+        raise DatasetError(f"{root} is not finalised: it has no statistics. Run bhd-data repair {quoted(root)}.")
 
 
 def _files(state: DatasetState, stamps: dict[str, Any]) -> tuple[list[str], list[str]]:
@@ -105,7 +108,7 @@ def _files(state: DatasetState, stamps: dict[str, Any]) -> tuple[list[str], list
             "with `cp -rL`, and take the copy."
         )
     left_out = sorted(name for name in stamps if is_recorded(name) and name not in needed)
-    skipped = {*left_out, SUBSET, MANIFEST}
+    skipped = {*left_out, SUBSET, MANIFEST, layout.UNREPORTED}
     names = [name for name in sorted(stamps) if name not in skipped and name.split("/")[0] not in _TEMPORARY]
     _refuse_links_outside(state.root, names)
     return names, left_out
@@ -119,7 +122,7 @@ def _refuse_links_outside(root: Path, names: list[str]) -> None:
         if path.is_symlink() and not (target := path.resolve()).is_relative_to(whole):
             raise DatasetError(
                 f"{path} is a link to {target}, outside of the dataset, and a copy of that file would be sent. Remove "
-                f"the link; or, if the file belongs to the dataset, make a copy with `cp -rL {shlex.quote(str(root))} "
+                f"the link; or, if the file belongs to the dataset, make a copy with `cp -rL {quoted(root)} "
                 "COPY` and take that."
             )
 

@@ -4,7 +4,6 @@ Everything goes into a folder beside the target first, is compared with its chec
 a rename. What an interruption leaves is in that folder, and the next attempt goes on with it.
 """
 
-import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock, write_errors
+from bhd_lerobot.data.publish import complete_interrupted, is_free
 from bhd_lerobot.data.remote import (
     MANIFEST,
     SUBSET,
@@ -28,10 +28,10 @@ from bhd_lerobot.data.remote import (
 )
 from bhd_lerobot.data.remote_info import parse_info
 from bhd_lerobot.data.remote_pool import run_all
-from bhd_lerobot.data.remote_staging import Staging
+from bhd_lerobot.data.remote_staging import IN_ROOT, Staging
 from bhd_lerobot.data.remote_subset import Subset, SubsetNote, files_of, read_subset, subset_note
 from bhd_lerobot.data.state import load_state
-from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError
+from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError, quoted
 
 type Select = Callable[[Path], Sequence[int]]
 """Chooses episodes, given a folder that holds the metadata of the dataset."""
@@ -112,13 +112,11 @@ class _Pull:
         self._is_given_up = False  # what lies at the root, for what comes
 
     def run(self, select: Select | None) -> PullReport:
+        complete_interrupted(self._root)
         there = self._files()
-        if os.path.ismount(self._root):
-            raise DatasetError(f"{self._root} is a mount point, which cannot be exchanged. Name a folder in it.")
         self._staging = Staging(self._root)
         locks = [RootLock(self._staging.folder, self._root)]
         try:
-            self._staging.recover()
             if self._root.is_dir():
                 locks.append(RootLock(self._root))
             if self._verify:
@@ -214,11 +212,12 @@ class _Pull:
             return set()
         if not root.is_dir():
             raise DatasetExistsError(f"{root} is a file. Choose another folder with --root.")
-        if (root / layout.STAGING).exists():
+        if (root / layout.STAGING).exists() and not (root / IN_ROOT).exists():
             raise DatasetExistsError(
-                f"{root} is a recording that was interrupted. Run bhd-data repair {root}, or choose another --root."
+                f"{root} is a recording that was interrupted. Run bhd-data repair {quoted(root)}, or choose another "
+                "--root."
             )
-        if any(root.iterdir()) and not (root / layout.INFO).is_file():
+        if not is_free(root) and not (root / layout.INFO).is_file():
             raise DatasetExistsError(f"{root} exists and is no dataset. Choose another folder with --root.")
         same = self._compare(root, [path for path in there if (root / path).is_file()], there)
         changed = {path for path in there if (root / path).is_file() and path not in same}

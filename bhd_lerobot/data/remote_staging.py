@@ -8,8 +8,13 @@ from pathlib import Path
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.assemble import EDITS
+from bhd_lerobot.data.disk import Disk
+from bhd_lerobot.data.publish import must_be_inside, publish
 from bhd_lerobot.data.remote import MANIFEST, SUBSET, is_recorded
 from bhd_lerobot.errors import DatasetError
+
+IN_ROOT = Path(layout.STAGING, "pull")
+"""The folder, in a dataset beside which nothing can be put."""
 
 _MARKER = ".bhd-pull"
 """In folders beside the target that this program made, and may remove."""
@@ -33,24 +38,17 @@ class Staging:
             DatasetError: something else lies where the folder must be.
         """
         self._root = root
-        self.folder = root.with_name(f".{root.name}.pull")
-        self._old = root.with_name(f".{root.name}.old")
-        for folder in (self.folder, self._old):
-            is_empty = folder.is_dir() and not any(folder.iterdir())
-            if folder.exists() and not is_empty and not (folder / _MARKER).exists():
-                raise DatasetError(
-                    f"{folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
-                    "there. Move it, or choose another --root."
-                )
+        # Where nothing can be put beside the dataset, its staging folder is the place.
+        self.folder = root / IN_ROOT if must_be_inside(root) else root.with_name(f".{root.name}.pull")
+        is_empty = self.folder.is_dir() and not any(self.folder.iterdir())
+        if self.folder.exists() and not is_empty and not (self.folder / _MARKER).exists():
+            raise DatasetError(
+                f"{self.folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
+                "there. Move it, or choose another --root."
+            )
         self.is_new = not self.folder.exists()
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / _MARKER).touch()
-
-    def recover(self) -> None:
-        """Mend what a kill between two renames left; who calls it has locked the folder, so nobody is between them."""
-        if self._old.is_dir() and not self._root.exists():
-            self._old.rename(self._root)
-            (self._root / _MARKER).unlink(missing_ok=True)
 
     def take(self, path: str) -> None:
         """Link a file of the dataset into the folder, in the place of what an attempt for another version left."""
@@ -60,11 +58,18 @@ class Staging:
     def drop(self) -> None:
         """Remove the folder and all that is in it."""
         shutil.rmtree(self.folder, ignore_errors=True)
+        self._tidy()
 
     def drop_if_empty(self) -> None:
         """Remove the folder if nothing came."""
         with contextlib.suppress(OSError):
             self.folder.rmdir()
+        self._tidy()
+
+    def _tidy(self) -> None:
+        if self.folder == self._root / IN_ROOT:
+            with contextlib.suppress(OSError):
+                self.folder.parent.rmdir()
 
     def show(self, wanted: set[str], note: bytes | None) -> None:
         """Let the folder become the dataset; what belongs to no dataset comes along from the one before.
@@ -80,17 +85,16 @@ class Staging:
         _remove_others(folder, wanted)
         if note is not None:
             (folder / SUBSET).write_bytes(note)
-        if root.is_dir() and any(root.iterdir()):
-            for path in _foreign(root, wanted):
-                _link(root / path, folder / path)
-            shutil.rmtree(self._old, ignore_errors=True)
-            (root / _MARKER).touch()
-            root.rename(self._old)
-            folder.rename(root)
-            shutil.rmtree(self._old)
-        else:
-            folder.rename(root)
-        (root / _MARKER).unlink(missing_ok=True)
+        is_replaced = root.is_dir() and any(path.name != layout.STAGING for path in root.iterdir())
+        for path in _foreign(root, wanted) if is_replaced else ():
+            _link(root / path, folder / path)
+        (folder / _MARKER).unlink()
+        try:
+            publish(folder, root, Disk(), done=f"{root} had been pulled", replaced="all")
+        except BaseException:
+            if folder.is_dir():
+                (folder / _MARKER).touch()
+            raise
 
 
 def _link(source: Path, target: Path) -> None:
@@ -114,7 +118,7 @@ def _foreign(root: Path, wanted: Iterable[str]) -> list[str]:
     found: list[str] = []
     for place, folders, files in os.walk(root):
         inside = Path(place).relative_to(root)
-        folders[:] = [name for name in folders if (inside / name).as_posix() != ".cache/huggingface"]
+        folders[:] = [n for n in folders if (inside / n).as_posix() not in (".cache/huggingface", layout.STAGING)]
         # A link to a folder is a thing of its own, and an empty folder may mean something to who made it.
         names = [*files, *(name for name in folders if _is_kept(root / inside / name))]
         found += [(inside / name).as_posix() for name in names]

@@ -9,9 +9,9 @@ import pyarrow.parquet as pq
 from bhd_lerobot.data import layout, video
 from bhd_lerobot.data.compact import compact
 from bhd_lerobot.data.disk import Disk, RootLock, write_errors
-from bhd_lerobot.data.exchange import roll_forward
 from bhd_lerobot.data.fix import compute_stats
 from bhd_lerobot.data.parquet_rescue import is_cut_off, is_parquet
+from bhd_lerobot.data.publish import remove_abandoned, roll_forward
 from bhd_lerobot.data.repair_info import adopt_info, give_back
 from bhd_lerobot.data.salvage import salvage
 from bhd_lerobot.data.salvage_films import whole_frames
@@ -93,11 +93,11 @@ def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
     try:
         disk = Disk()
         if info is not None:
-            return _repair_with(root, Path(info), disk)
+            return _repair_with(root, Path(info), disk, lock)
         is_ours = (root / layout.IDENTITY).exists()
         if (root / layout.INFO).is_file() and (not is_ours or went_on(root)):
-            return _repair_foreign(root, disk)
-        return _repair_own(root, disk)
+            return _repair_foreign(root, disk, lock)
+        return _repair_own(root, disk, lock)
     except DatasetCorruptError as error:
         # Whoever is told to try `repair` has done that now.
         raise DatasetCorruptError(str(error).replace(REPAIR_MAY_HELP, "")) from error
@@ -105,14 +105,14 @@ def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
         lock.release()
 
 
-def _repair_own(root: Path, disk: Disk) -> RepairReport:
+def _repair_own(root: Path, disk: Disk, lock: RootLock) -> RepairReport:
     """Finish what our recorder or an edit began; where saved files are damaged, recover the episodes that are whole."""
     report = RepairReport(root, 0, 0)
     try:
         with write_errors("repair the dataset", root, "Its saved episodes are intact."):
             state, report = settle(root, disk)
             _check_deeply(state)
-            if state.identity is not None and compact(state, Schema(state.info["features"]), disk, {}):
+            if state.identity is not None and compact(state, Schema(state.info["features"]), disk, lock):
                 what = f"compaction and statistics of {len(state.without_stats)} episodes"
                 disk.remove_tree(root / layout.STAGING)
                 done = (*report.completed, what)
@@ -121,21 +121,22 @@ def _repair_own(root: Path, disk: Disk) -> RepairReport:
         # These two nothing else can replace: what the columns are, and who recorded it how.
         if error.path in (root / layout.INFO, root / layout.IDENTITY):
             raise
-        return _salvaged(root, disk, error, report.completed, report.dropped, is_ours=True)
+        return _salvaged(root, disk, lock, error, completed=report.completed, dropped=report.dropped, is_ours=True)
     return report
 
 
 def _salvaged(
     root: Path,
     disk: Disk,
+    lock: RootLock,
     error: DatasetCorruptError,
+    *,
     completed: tuple[str, ...],
     dropped: tuple[str, ...] = (),
-    *,
     is_ours: bool = False,
 ) -> RepairReport:
     wrong = error.wrong if isinstance(error, DamagedFileError) else str(error).split(". ", 1)[0]
-    rescued = salvage(root, disk, wrong, is_ours=is_ours)
+    rescued = salvage(root, disk, lock, wrong, is_ours=is_ours)
     what = f"{rescued.episodes} whole episodes were recovered, with new statistics. What was wrong: {wrong}"
     done = (*completed, what)
     return RepairReport(
@@ -143,7 +144,7 @@ def _salvaged(
     )
 
 
-def _repair_with(root: Path, donor: Path, disk: Disk) -> RepairReport:
+def _repair_with(root: Path, donor: Path, disk: Disk, lock: RootLock) -> RepairReport:
     """Mend a dataset whose `info.json` is lost.
 
     Frames that belong to no episode are recovered then, not dropped: nothing says any more which were saved.
@@ -153,7 +154,7 @@ def _repair_with(root: Path, donor: Path, disk: Disk) -> RepairReport:
         roll_forward(root, disk)
         adopted, kept = adopt_info(root, donor, disk)
     try:
-        report = _repair_foreign(root, disk, adopted)
+        report = _repair_foreign(root, disk, lock, adopted)
     except BaseException:
         with write_errors("repair the dataset", root, consequence):
             give_back(root, kept, disk)
@@ -161,10 +162,12 @@ def _repair_with(root: Path, donor: Path, disk: Disk) -> RepairReport:
     return report if kept is None or report.aside is not None else replace(report, aside=kept.parents[1])
 
 
-def _repair_foreign(root: Path, disk: Disk, *completed: str) -> RepairReport:
+def _repair_foreign(root: Path, disk: Disk, lock: RootLock, *completed: str) -> RepairReport:
     """Mend what another program wrote: nothing if all of it can be read, and else everything that is whole."""
     with write_errors("repair the dataset", root, "Its files are as they were."):
-        completed += ("an edit that was interrupted",) if roll_forward(root, disk) else ()
+        remove_abandoned(root.resolve())
+        if roll_forward(root, disk):
+            completed += ("a change that was interrupted while its files were moved in",)
         disk.remove_tree(root / layout.STAGING)  # of an attempt that was interrupted
     try:
         state = load_state(root)
@@ -175,10 +178,10 @@ def _repair_foreign(root: Path, disk: Disk, *completed: str) -> RepairReport:
             raise corrupt(root / extra[0], "no episode of meta/episodes is in it")
         _check_readable(state)
     except DatasetCorruptError as error:
-        return _salvaged(root, disk, error, completed)
+        return _salvaged(root, disk, lock, error, completed=completed)
     if state.rows and not _has_stats(root):
         with write_errors("repair the dataset", root, "Its files are as they were."):
-            completed = (*completed, compute_stats(state, disk))
+            completed = (*completed, compute_stats(state, disk, lock))
             disk.remove_tree(root / layout.STAGING)
     return RepairReport(root, state.num_episodes, state.num_frames, completed)
 
@@ -235,7 +238,8 @@ def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[Datas
     Raises:
         DatasetCorruptError: a file of a saved episode cannot be read; nothing was dropped then.
     """
-    completed = ["compaction"] if roll_forward(root, disk) else []
+    remove_abandoned(root.resolve())
+    completed = ["a change that was interrupted while its files were moved in"] if roll_forward(root, disk) else []
     state = load_state(root)
     dropped: list[str] = []
     if state.identity is not None:

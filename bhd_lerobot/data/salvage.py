@@ -16,12 +16,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.data import exchange, layout
+from bhd_lerobot.data import layout
 from bhd_lerobot.data.assemble import EDITS, WRITTEN
-from bhd_lerobot.data.disk import Disk, to_json, write_errors
+from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.data.findings import few
 from bhd_lerobot.data.meta_files import tasks_table, write_meta
 from bhd_lerobot.data.parquet_rescue import rescue
+from bhd_lerobot.data.publish import WORK, Workspace, link_others
 from bhd_lerobot.data.salvage_columns import lost_cameras, misfit, read_info
 from bhd_lerobot.data.salvage_films import Films, Found
 from bhd_lerobot.data.salvage_guard import check_readable, check_unused
@@ -52,14 +53,15 @@ class Salvage:
     aside: Path
 
 
-def salvage(root: Path, disk: Disk, wrong: str, *, is_ours: bool = False) -> Salvage:
-    """Recover every whole episode; the caller holds the lock.
+def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool = False) -> Salvage:
+    """Recover every whole episode.
 
     Damaged files go to a folder beside the dataset first, so nothing that was there is lost.
 
     Args:
         root: the wreck.
         disk: how to write.
+        lock: of the dataset.
         wrong: what was found to be wrong, for the error if nothing is left.
         is_ours: whether our recorder alone wrote it.
 
@@ -102,33 +104,38 @@ def salvage(root: Path, disk: Disk, wrong: str, *, is_ours: bool = False) -> Sal
         )
     with write_errors("recover the dataset", root, "The damaged files are as they were."):
         aside = _keep_aside(root, disk)
-        new = exchange.begin(root, disk)
-        tasks, renumbered = tasks_of(root, kept, told, lost)
-        rows = rows_of(kept, tasks, renumbered)
-        described = info_of(info, kept, len(tasks))
-        write_data(kept, rows, described, new, disk)
-        films.write(kept, rows, described, new, disk)
-        told.complete(kept, rows)
-        forgotten, known = recall(root, kept, rows, told, is_ours=is_ours)
-        lost += forgotten
-        hints += known
-        stats = stats_of((one.table for one in kept), described["features"], new, rows, told.stats_of(kept))
-        exchange.link_others(root / "meta", new / "meta", disk, *WRITTEN, take=disk.copy)
-        sink = pa.BufferOutputStream()
-        pq.write_table(tasks_table(tasks), sink)
-        disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
-        write_meta(new, described, rows, told.metadata_types, stats, disk=disk, extra=told.extra_types)
-        disk.write(new / layout.INFO, to_json(described))
-        if identity is not None:
-            disk.write(new / layout.IDENTITY, to_json(_disowned(identity)))
-        if identity is not None or (root / EDITS).is_file():
-            time = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-            disk.write(new / EDITS, logged(root, kept, time))
-        exchange.complete(root, disk)
-        disk.remove_tree(root / layout.STAGING)
-        for folder in ("images", *(path.name for path in root.glob("tmp*") if path.is_dir())):
-            disk.remove_tree(root / folder)  # of films that were being made; they are in `aside`
+        with Workspace(root, disk, lock) as space:
+            new = space.folder
+            tasks, renumbered = tasks_of(root, kept, told, lost)
+            rows = rows_of(kept, tasks, renumbered)
+            described = info_of(info, kept, len(tasks))
+            write_data(kept, rows, described, new, disk)
+            films.write(kept, rows, described, new, disk)
+            told.complete(kept, rows)
+            forgotten, known = recall(root, kept, rows, told, is_ours=is_ours)
+            lost += forgotten
+            hints += known
+            stats = stats_of((one.table for one in kept), described["features"], new, rows, told.stats_of(kept))
+            link_others(root / "meta", new / "meta", disk, *WRITTEN, take=disk.copy)
+            sink = pa.BufferOutputStream()
+            pq.write_table(tasks_table(tasks), sink)
+            disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
+            write_meta(new, described, rows, told.metadata_types, stats, disk=disk, extra=told.extra_types)
+            disk.write(new / layout.INFO, to_json(described))
+            if identity is not None:
+                disk.write(new / layout.IDENTITY, to_json(_disowned(identity)))
+            if identity is not None or (root / EDITS).is_file():
+                time = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+                disk.write(new / EDITS, logged(root, kept, time))
+            space.publish(f"what is whole of {root} had been recovered")
+        _remove_unfinished(root, disk)
     return Salvage(len(kept), sum(one.table.num_rows for one in kept), tuple(lost), tuple(hints), aside)
+
+
+def _remove_unfinished(root: Path, disk: Disk) -> None:
+    """Remove folders of videos that were being made; they are kept aside."""
+    for name in (layout.STAGING, "images", *(path.name for path in root.glob("tmp*") if path.is_dir())):
+        disk.try_remove_tree(root / name)
 
 
 def _nothing_left(root: Path, info: dict[str, Any], wrong: str, lost: list[str]) -> DatasetCorruptError:
@@ -239,7 +246,7 @@ def _keep_aside(root: Path, disk: Disk) -> Path:
     """Link every file into a new folder beside the dataset, but for what an attempt before left half built."""
     aside = layout.aside_of(root)
     for path in sorted(root.rglob("*")):
-        if path.is_file() and not path.is_relative_to(root / exchange.WORK):
+        if path.is_file() and not path.is_relative_to(root / WORK):
             disk.make_folder((aside / path.relative_to(root)).parent)
             disk.link(path, aside / path.relative_to(root))
     return aside

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.hub_errors import explain
+from bhd_lerobot.data.publish import complete_interrupted
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def local_metadata(
             f"Revision {revision!r} of {repo_id} is asked for, but {folder} holds a dataset that does not say which "
             "revision it is, and LeRobot would take it whatever it is. Leave the revision out, or name another root."
         )
+    complete_interrupted(folder)
     try:
         meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
         wanted = episodes if select is None else select(meta)

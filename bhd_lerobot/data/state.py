@@ -14,7 +14,8 @@ import pyarrow.parquet as pq
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.layout import Slot
-from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError
+from bhd_lerobot.data.publish import complete_interrupted
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError, quoted
 
 REPAIR_MAY_HELP = ", or see what `bhd-data repair` can recover"
 
@@ -114,7 +115,7 @@ def repair_with_info(root: Path) -> str:
     """Return what to do if `info.json` cannot be used, in words."""
     return (
         "Restore this file from a copy (or from the Hub), or take that of another recording with the same robot and "
-        f"cameras, whose counts do not matter: `bhd-data repair {root} --info OTHER`. Nothing was changed."
+        f"cameras, whose counts do not matter: `bhd-data repair {quoted(root)} --info OTHER`. Nothing was changed."
     )
 
 
@@ -144,6 +145,7 @@ def load_state(root: Path, *, films: bool = True) -> DatasetState:
         DatasetError: `root` is not a dataset.
         DatasetCorruptError: a file is missing, unreadable or contradicts the others; the message names it.
     """
+    complete_interrupted(root)
     if not (root / layout.INFO).is_file():
         raise no_dataset(root)
     info = read_json(root / layout.INFO)
@@ -271,7 +273,7 @@ def _check_files(state: DatasetState, films: bool) -> None:
     if start != state.info["total_frames"]:
         raise DatasetCorruptError(
             f"{state.root / layout.INFO} counts {state.info['total_frames']} frames; its episodes have {start}. "
-            f"`bhd-data check {state.root} --fix` counts anew. Nothing was changed."
+            f"`bhd-data check {quoted(state.root)} --fix` counts anew. Nothing was changed."
         )
     for slot, rows in ordered_slots(state.rows, "data").items():
         path = state.root / layout.data_file(slot)

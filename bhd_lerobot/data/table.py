@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.publish import complete_interrupted
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.data.state import corrupt
 from bhd_lerobot.errors import DatasetError, unknown_name
@@ -28,6 +29,7 @@ def open_metadata(root: Path | str) -> "LeRobotDatasetMetadata":
         DatasetError: there is no dataset at `root`, or it has no episode.
     """
     root = Path(root)
+    complete_interrupted(root)
     if not (root / layout.INFO).is_file():
         found = "has no meta/info.json" if root.is_dir() else "does not exist"
         raise DatasetError(f"{root} is not a LeRobot dataset: it {found}. Record one with bhd-record.")

@@ -12,7 +12,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 
 from bhd_lerobot.data.selection import HOLD_OUTS, EpisodeFilter
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.errors import ConfigError, quoted, unknown_name
 
 OWN_CONFIG_NAME = "bhd_train.json"
 """The fields that LeRobot's `train_config.json` has no place for; beside it in every checkpoint."""
@@ -136,7 +136,7 @@ class BhdTrainConfig(TrainPipelineConfig):
         if self.output_dir is not None and not self.resume and _is_there(Path(self.output_dir)):
             raise ConfigError(
                 f"The output folder {self.output_dir} exists. Set another --output_dir, or continue its run with "
-                f"--resume=true --config_path={Path(self.output_dir) / 'checkpoints/last/pretrained_model'}."
+                f"--resume=true --config_path={quoted(Path(self.output_dir) / 'checkpoints/last/pretrained_model')}."
             )
         if self.policy.push_to_hub and not self.policy.repo_id:
             raise ConfigError("policy.push_to_hub is true: set --policy.repo_id=user/name, or push_to_hub to false.")

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from bhd_lerobot.data.publish import noting_what_is_done
 from bhd_lerobot.errors import BhdError, unknown_name
 from bhd_lerobot.runs.start import INTERRUPTED, leaving_on_interrupt
 
@@ -63,6 +64,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with leaving_on_interrupt():
         parser = _parser()
     options = parser.parse(arguments)
+    with noting_what_is_done() as done:
+        return _carry_out(options, done)
+
+
+def _carry_out(options: argparse.Namespace, done: Sequence[str]) -> int:
+    """Run a command; return the exit status.
+
+    Args:
+        options: from the command line.
+        done: what has come into force so far.
+    """
     try:
         status: int = options.run(options)
         if sys.stdout is not None:
@@ -76,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"Stopped; {options.stopped}.", file=sys.stderr)
+        print(f"Stopped; {', '.join(done) or options.stopped}.", file=sys.stderr)
         return INTERRUPTED
 
 

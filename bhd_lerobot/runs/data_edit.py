@@ -4,7 +4,7 @@ import argparse
 import random
 from pathlib import Path
 
-from bhd_lerobot.data.edits import delete, keep, merge, split
+from bhd_lerobot.data.edits import EditReport, delete, keep, merge, split
 from bhd_lerobot.data.inspect import check_not_empty, dataset_info
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.runs.data_command import Commands, add_command, root_of
@@ -72,8 +72,11 @@ def _filter(options: argparse.Namespace) -> int:
 
 
 def _delete(options: argparse.Namespace) -> int:
-    report = delete(root_of(options), parse_episodes(options.episodes))
-    print(f"{report}; episodes {options.episodes} are gone, and those behind them have new numbers")
+    def tell(report: EditReport) -> None:
+        gone = f"; episodes {options.episodes} are gone, and those behind them have new numbers"
+        print(f"{report}{'' if report.is_repeated else gone}", flush=True)
+
+    delete(root_of(options), parse_episodes(options.episodes), tell)
     return 0
 
 

@@ -16,7 +16,7 @@ from bhd_lerobot.data.bag_robot import import_robot
 from bhd_lerobot.data.bag_tracks import TrackOptions
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.ros2_types import require_rosbags
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.errors import ConfigError, quoted, unknown_name
 from bhd_lerobot.runs.data_command import Commands, add_command
 from bhd_lerobot.tasks.task import OUTCOMES
 
@@ -182,4 +182,7 @@ def _tell(report: ImportReport, bags: list[Bag]) -> None:
         print(f"note: {note}", file=sys.stderr)
     episodes = "1 episode" if report.episodes == 1 else f"{report.episodes} episodes"
     source = "1 bag" if len(bags) == 1 else f"{len(bags)} bags"
-    print(f"{report.root}: {episodes}, {report.frames} frames, of {source}. Is it sound? bhd-data check {report.root}")
+    print(
+        f"{report.root}: {episodes}, {report.frames} frames, of {source}. Is it valid? "
+        f"bhd-data check {quoted(report.root)}"
+    )

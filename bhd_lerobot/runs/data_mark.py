@@ -31,16 +31,16 @@ def _run(options: argparse.Namespace) -> int:
                 f"--intervention is {options.intervention!r}; valid: FIRST-LAST in frames, such as 20-35."
             )
         span = int(first), int(last or first)
-    report = mark(
+    said = [options.outcome] * bool(options.outcome)
+    said += [f"an intervention in frames {span[0]} to {span[1]}"] if span is not None else []
+    said += ["no interventions"] * options.clear_interventions
+    mark(
         root_of(options),
         parse_episodes(options.episodes),
         outcome=options.outcome,
         intervention=span,
         clear_interventions=options.clear_interventions,
         note=options.note,
+        tell=lambda report: print(f"{report}; episodes {options.episodes}: {', '.join(said)}", flush=True),
     )
-    said = [options.outcome] * bool(options.outcome)
-    said += [f"an intervention in frames {span[0]} to {span[1]}"] if span is not None else []
-    said += ["no interventions"] * options.clear_interventions
-    print(f"{report}; episodes {options.episodes}: {', '.join(said)}")
     return 0

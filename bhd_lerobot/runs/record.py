@@ -16,9 +16,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
-from bhd_lerobot.data.creation import is_free
 from bhd_lerobot.data.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
 from bhd_lerobot.data.identity import default_root
+from bhd_lerobot.data.publish import is_free
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetEditedError, RealtimeError, RenderingError
 from bhd_lerobot.policies.brain import Brain

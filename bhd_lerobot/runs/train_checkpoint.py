@@ -10,7 +10,7 @@ from typing import Any
 from lerobot.common.train_utils import get_step_checkpoint_dir, load_training_state, save_checkpoint
 from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
 
-from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.errors import BhdError, ConfigError, quoted
 from bhd_lerobot.policies.contract import PolicyContract
 from bhd_lerobot.runs.config_train import BhdTrainConfig
 
@@ -118,7 +118,7 @@ def clean(output_dir: Path) -> None:
 def resume_command(checkpoint: Path) -> str:
     """Return the command that goes on from a run's last checkpoint."""
     last = checkpoint.parent / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR / "train_config.json"
-    return f"bhd-train --resume=true --config_path={last}"
+    return f"bhd-train --resume=true --config_path={quoted(last)}"
 
 
 def _rename(part: Path, final: Path) -> None:

@@ -16,7 +16,7 @@ from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.loader import Loader, check, imagenet_stats, make_loader
 from bhd_lerobot.data.source import local_metadata
 from bhd_lerobot.data.table import checked_episodes
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import DatasetError, quoted
 from bhd_lerobot.runs.config_train import BhdTrainConfig
 
 
@@ -62,7 +62,7 @@ def open_metadata(config: BhdTrainConfig) -> LeRobotDatasetMetadata:
     if not meta.stats:
         raise DatasetError(
             f"{meta.root} has no statistics, so nothing can be normalised: it was not finalised. "
-            f"Run bhd-data repair {meta.root}."
+            f"Run bhd-data repair {quoted(meta.root)}."
         )
     if dataset.use_imagenet_stats:
         imagenet_stats(meta)

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from bhd_lerobot.errors import quoted
 from bhd_lerobot.policies.contract import PolicyContract
 from bhd_lerobot.robots.simulation import describe
 from bhd_lerobot.runs.config_train import BhdTrainConfig
@@ -90,7 +91,7 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
     kinds = {str(kind.get_choice_name(kind)): kind for kind in SIMULATED_ROBOTS}
     task = (contract.task or {}).get("type")
     if contract.robot_type not in kinds:
-        rollout = f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={path} --duration=60"
+        rollout = f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={quoted(path)} --duration=60"
         return ["Let it drive the robot for a minute with:", f"  {rollout}"]
     if task not in TaskConfig.get_known_choices():
         task = _EXAMPLE_TASKS[contract.robot_type]
@@ -99,7 +100,9 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
         said = "Evaluate it with:"
     options = _options("robot", contract.robot or {}, describe(kinds[contract.robot_type]()))
     asked = _options("task", contract.task or {}, asdict(TaskConfig.get_choice_class(task)()))
-    command = f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task}{asked} --brain.path={path}"
+    command = (
+        f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task}{asked} --brain.path={quoted(path)}"
+    )
     return [said, f"  {command}"]
 
 

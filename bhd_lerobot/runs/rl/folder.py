@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, quoted
 from bhd_lerobot.runs.rl.config import CONFIG_NAME, RlConfig, encode
 
 
@@ -27,7 +27,7 @@ def run_folder(config: RlConfig) -> Path:
     if is_there and not config.resume:
         raise ConfigError(
             f"The output folder {folder} exists. Set another --output_dir, or continue its run with "
-            f"--resume=true --config_path={folder}."
+            f"--resume=true --config_path={quoted(folder)}."
         )
     if config.resume and not folder.is_dir():
         raise ConfigError(f"There is no run to resume in {folder}.")

@@ -18,7 +18,7 @@ from rich.markup import escape
 
 import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.envs.vector import BhdVectorEnv
-from bhd_lerobot.errors import BhdError, ConfigError, install_extra
+from bhd_lerobot.errors import BhdError, ConfigError, install_extra, quoted
 from bhd_lerobot.runs import configuration
 from bhd_lerobot.runs.rl import checkpoint as checkpoints
 from bhd_lerobot.runs.rl.config import RlConfig, parse_rl
@@ -93,7 +93,7 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
     except OSError as error:
         raise BhdError(
             f"The run in {folder} cannot be written: {error.strerror or error}. Checkpoints saved before are intact. "
-            f"Make room, and go on with --resume=true --config_path={folder}."
+            f"Make room, and go on with --resume=true --config_path={quoted(folder)}."
         ) from error
     finally:
         torch.set_num_threads(threads)
@@ -281,7 +281,8 @@ class _Run:
         lines.append(f"curve: {result.output_dir / PLOT_NAME}")
         if self._stop:
             lines.append(
-                f"Stopped by {self._stop.name}. Go on with: bhd-train --resume=true --config_path={result.output_dir}"
+                f"Stopped by {self._stop.name}. Go on with: bhd-train --resume=true "
+                f"--config_path={quoted(result.output_dir)}"
             )
         self._console.print(escape("\n".join(lines)), soft_wrap=True, highlight=False)
 
