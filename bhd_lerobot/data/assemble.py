@@ -23,7 +23,7 @@ from bhd_lerobot.data.identity import comparable, differences
 from bhd_lerobot.data.layout import Slot
 from bhd_lerobot.data.meta_files import tasks_table, write_meta
 from bhd_lerobot.data.picks import Files, Pick, Plan
-from bhd_lerobot.data.publish import link_others
+from bhd_lerobot.data.publish import has_unfinished_episodes, link_others
 from bhd_lerobot.data.state import DatasetState, Row, corrupt, read_frames, slot_of
 from bhd_lerobot.errors import DatasetError, DatasetMismatchError, quoted
 
@@ -144,7 +144,7 @@ def _sources(picks: Sequence[Pick]) -> list[DatasetState]:
         if not any(pick.source is source for source in sources):
             sources.append(pick.source)
     for source in sources:
-        if (source.root / layout.STAGING).exists() or (source.without_stats and source.identity is not None):
+        if has_unfinished_episodes(source.root) or (source.without_stats and source.identity is not None):
             raise DatasetError(
                 f"{source.root} is not finalised: its recording was interrupted, or goes on. Run `bhd-data repair "
                 f"{quoted(source.root)}` first."

@@ -12,8 +12,6 @@ from bhd_lerobot.errors import DatasetExistsError
 def refuse_existing(target: Path, option: str) -> None:
     """Check that nothing is at a place yet, but perhaps an empty folder.
 
-    What killed attempts left beside it is removed, also if it is taken: the last of them may have got that far.
-
     Args:
         target: the place.
         option: what named it, for the error.

@@ -16,7 +16,15 @@ from bhd_lerobot.data.creation import build_root
 from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.data.identity import FORMAT
 from bhd_lerobot.data.picks import Pick
-from bhd_lerobot.data.publish import Workspace, complete_interrupted, is_free, making, refuse_inside, uninterrupted
+from bhd_lerobot.data.publish import (
+    Workspace,
+    clean,
+    complete_interrupted,
+    is_free,
+    making,
+    refuse_inside,
+    uninterrupted,
+)
 from bhd_lerobot.data.state import DatasetState, load_state, no_dataset, read_json
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, quoted
 
@@ -341,7 +349,9 @@ def _lock(root: Path) -> RootLock:
     if not root.is_dir():
         raise no_dataset(root)
     complete_interrupted(root)
-    return RootLock(root)
+    lock = RootLock(root)
+    clean(root)
+    return lock
 
 
 def _state_of(root: Path) -> DatasetState:

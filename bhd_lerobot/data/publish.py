@@ -29,6 +29,8 @@ from bhd_lerobot.data.disk import Disk, RootLock, write_errors
 from bhd_lerobot.errors import ConfigError, DatasetLockedError
 
 WORK = Path(layout.STAGING, "compact")  # the name that versions before had, so that what they left is found
+PULL = Path(layout.STAGING, "pull")  # where a download comes together, if nothing can be put beside its place
+_WORKSPACES = {WORK.name, PULL.name}
 _MARKER = WORK / "ready"
 _NO_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.EBUSY, errno.EXDEV, errno.EPERM, errno.EACCES)
 
@@ -116,9 +118,14 @@ def making(target: Path, disk: Disk, refuse: Callable[[], None]) -> Iterator[Wor
         disk: how to write.
         refuse: raises if something is at the place; called before and after the block.
     """
+    remove_abandoned(target.resolve())
     refuse()
     with Workspace(target, disk) as space:
-        yield space
+        token = _done.set(None)  # what is done in the workspace is not in force yet
+        try:
+            yield space
+        finally:
+            _done.reset(token)
         refuse()
         space.publish(f"{target} had been made")
 
@@ -164,7 +171,7 @@ def is_free(place: Path) -> bool:
     if not place.is_dir() or is_decided(place):
         return False
     nothing = {"lost+found"} if os.path.ismount(place) else set()
-    if _names(place / layout.STAGING) <= {WORK.name, "pull"}:
+    if not has_unfinished_episodes(place):
         nothing.add(layout.STAGING)
     return _names(place) <= nothing
 
@@ -185,6 +192,20 @@ def remove_abandoned(place: Path) -> None:
         with contextlib.suppress(OSError, DatasetLockedError):
             RootLock(folder).release()
             shutil.rmtree(folder)
+
+
+def clean(place: Path) -> None:
+    """Remove what killed processes left of content that never came to its place; the caller has locked the place."""
+    remove_abandoned(place.resolve())
+    if not is_decided(place):
+        Disk().try_remove_tree(place / WORK)
+        with contextlib.suppress(OSError):
+            (place / layout.STAGING).rmdir()
+
+
+def has_unfinished_episodes(root: Path) -> bool:
+    """Tell whether there is something in a staging folder that is no workspace: what a recorder has not saved."""
+    return bool(_names(root / layout.STAGING) - _WORKSPACES)
 
 
 def is_decided(place: Path) -> bool:

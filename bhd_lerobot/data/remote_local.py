@@ -9,7 +9,7 @@ from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock
-from bhd_lerobot.data.publish import complete_interrupted
+from bhd_lerobot.data.publish import complete_interrupted, has_unfinished_episodes
 from bhd_lerobot.data.remote import MANIFEST, SUBSET, Item, is_recorded, listed
 from bhd_lerobot.data.remote_subset import read_subset
 from bhd_lerobot.data.state import DatasetState, load_state
@@ -91,7 +91,7 @@ def _refuse_unfinished(state: DatasetState) -> None:
     root = state.root
     if not state.num_episodes:
         raise DatasetError(f"{root} has no episode, so there is nothing to copy. Record some with bhd-record.")
-    if (root / layout.STAGING).exists():
+    if has_unfinished_episodes(root):
         raise DatasetError(
             f"{root} is not finalised: its recording was interrupted. Run bhd-data repair {quoted(root)}."
         )

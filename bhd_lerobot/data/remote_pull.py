@@ -12,7 +12,7 @@ from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock, write_errors
-from bhd_lerobot.data.publish import complete_interrupted, is_free
+from bhd_lerobot.data.publish import complete_interrupted, has_unfinished_episodes, is_free
 from bhd_lerobot.data.remote import (
     MANIFEST,
     SUBSET,
@@ -28,7 +28,7 @@ from bhd_lerobot.data.remote import (
 )
 from bhd_lerobot.data.remote_info import parse_info
 from bhd_lerobot.data.remote_pool import run_all
-from bhd_lerobot.data.remote_staging import IN_ROOT, Staging
+from bhd_lerobot.data.remote_staging import Staging
 from bhd_lerobot.data.remote_subset import Subset, SubsetNote, files_of, read_subset, subset_note
 from bhd_lerobot.data.state import load_state
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError, quoted
@@ -212,7 +212,7 @@ class _Pull:
             return set()
         if not root.is_dir():
             raise DatasetExistsError(f"{root} is a file. Choose another folder with --root.")
-        if (root / layout.STAGING).exists() and not (root / IN_ROOT).exists():
+        if has_unfinished_episodes(root):
             raise DatasetExistsError(
                 f"{root} is a recording that was interrupted. Run bhd-data repair {quoted(root)}, or choose another "
                 "--root."

@@ -9,12 +9,9 @@ from pathlib import Path
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.assemble import EDITS
 from bhd_lerobot.data.disk import Disk
-from bhd_lerobot.data.publish import must_be_inside, publish
+from bhd_lerobot.data.publish import PULL, must_be_inside, publish, uninterrupted
 from bhd_lerobot.data.remote import MANIFEST, SUBSET, is_recorded
 from bhd_lerobot.errors import DatasetError
-
-IN_ROOT = Path(layout.STAGING, "pull")
-"""The folder, in a dataset beside which nothing can be put."""
 
 _MARKER = ".bhd-pull"
 """In folders beside the target that this program made, and may remove."""
@@ -39,13 +36,14 @@ class Staging:
         """
         self._root = root
         # Where nothing can be put beside the dataset, its staging folder is the place.
-        self.folder = root / IN_ROOT if must_be_inside(root) else root.with_name(f".{root.name}.pull")
+        self.folder = root / PULL if must_be_inside(root) else root.with_name(f".{root.name}.pull")
         is_empty = self.folder.is_dir() and not any(self.folder.iterdir())
         if self.folder.exists() and not is_empty and not (self.folder / _MARKER).exists():
             raise DatasetError(
                 f"{self.folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
                 "there. Move it, or choose another --root."
             )
+        (root / _MARKER).unlink(missing_ok=True)  # of a pull that was killed as soon as it was done
         self.is_new = not self.folder.exists()
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / _MARKER).touch()
@@ -67,7 +65,7 @@ class Staging:
         self._tidy()
 
     def _tidy(self) -> None:
-        if self.folder == self._root / IN_ROOT:
+        if self.folder == self._root / PULL:
             with contextlib.suppress(OSError):
                 self.folder.parent.rmdir()
 
@@ -88,13 +86,9 @@ class Staging:
         is_replaced = root.is_dir() and any(path.name != layout.STAGING for path in root.iterdir())
         for path in _foreign(root, wanted) if is_replaced else ():
             _link(root / path, folder / path)
-        (folder / _MARKER).unlink()
-        try:
+        with uninterrupted():
             publish(folder, root, Disk(), done=f"{root} had been pulled", replaced="all")
-        except BaseException:
-            if folder.is_dir():
-                (folder / _MARKER).touch()
-            raise
+            (root / _MARKER).unlink(missing_ok=True)
 
 
 def _link(source: Path, target: Path) -> None:
