@@ -23,6 +23,7 @@ from bhd_lerobot.data.publish import (
     is_free,
     making,
     refuse_inside,
+    remove_abandoned,
     uninterrupted,
 )
 from bhd_lerobot.data.state import DatasetState, load_state, no_dataset, read_json
@@ -124,6 +125,7 @@ def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | s
             if owner.setdefault(episode, name) != name:
                 raise ConfigError(f"Episode {episode} is wanted in {owner[episode]!r} and in {name!r}.")
     folder = Path(folder)
+    remove_abandoned(folder.resolve())
     with opened([Path(root)]) as (state,):
         check_reported(state.root)
         refuse_inside(folder / "part", state.root)

@@ -187,20 +187,22 @@ def refuse_inside(target: Path, source: Path) -> None:
 
 
 def remove_abandoned(place: Path) -> None:
-    """Remove the workspaces that killed processes left beside a place; those of living ones are locked."""
+    """Remove the workspaces that killed processes left beside a place, or in it; those of living ones are locked."""
     for folder in place.parent.glob(f"{glob.escape(_prefix(place))}*"):
         with contextlib.suppress(OSError, DatasetLockedError):
             RootLock(folder).release()
             shutil.rmtree(folder)
+    if (place / WORK).exists():
+        with contextlib.suppress(OSError, DatasetLockedError):
+            lock = RootLock(place)
+            _clean_inside(place)
+            lock.release()
 
 
 def clean(place: Path) -> None:
     """Remove what killed processes left of content that never came to its place; the caller has locked the place."""
     remove_abandoned(place.resolve())
-    if not is_decided(place):
-        Disk().try_remove_tree(place / WORK)
-        with contextlib.suppress(OSError):
-            (place / layout.STAGING).rmdir()
+    _clean_inside(place)
 
 
 def has_unfinished_episodes(root: Path) -> bool:
@@ -272,6 +274,13 @@ def link_others(
             (take or disk.link)(path, new / path.relative_to(old))
 
 
+def _clean_inside(place: Path) -> None:
+    if not is_decided(place):
+        Disk().try_remove_tree(place / WORK)
+        with contextlib.suppress(OSError):
+            (place / layout.STAGING).rmdir()
+
+
 # --- both ways of replacing -------------------------------------------------------------------------------------------
 
 
@@ -302,6 +311,11 @@ def _exchange(new: Path, old: Path, disk: Disk, replaced: Replaced, lock: RootLo
     with contextlib.suppress(OSError):
         for name in _others(old, new) if replaced == "parts" else ():
             (old / name).rename(new / name)
+    if not old.parent.name.startswith(_prefix(new)):
+        # A folder that goes on to be used after a kill: what is being removed must not be taken for what is in it.
+        with contextlib.suppress(OSError):
+            aside = Path(tempfile.mkdtemp(prefix=_prefix(new), dir=new.parent))
+            old = old.rename(aside / "old").parent
     disk.try_remove_tree(old)
     return True
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock, write_errors
-from bhd_lerobot.data.publish import complete_interrupted, has_unfinished_episodes, is_free
+from bhd_lerobot.data.publish import clean, complete_interrupted, has_unfinished_episodes, is_free
 from bhd_lerobot.data.remote import (
     MANIFEST,
     SUBSET,
@@ -119,6 +119,7 @@ class _Pull:
         try:
             if self._root.is_dir():
                 locks.append(RootLock(self._root))
+                clean(self._root)
             if self._verify:
                 there |= self._verified(there)
             same = self._same(there)

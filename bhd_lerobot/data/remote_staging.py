@@ -43,7 +43,8 @@ class Staging:
                 f"{self.folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
                 "there. Move it, or choose another --root."
             )
-        (root / _MARKER).unlink(missing_ok=True)  # of a pull that was killed as soon as it was done
+        if root.is_dir():
+            (root / _MARKER).unlink(missing_ok=True)  # of a pull that was killed as soon as it was done
         self.is_new = not self.folder.exists()
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / _MARKER).touch()
@@ -87,6 +88,8 @@ class Staging:
         for path in _foreign(root, wanted) if is_replaced else ():
             _link(root / path, folder / path)
         with uninterrupted():
+            if is_replaced:
+                (root / _MARKER).touch()  # it is going to be in the place of the folder for a moment
             publish(folder, root, Disk(), done=f"{root} had been pulled", replaced="all")
             (root / _MARKER).unlink(missing_ok=True)
 

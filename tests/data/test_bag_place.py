@@ -143,7 +143,7 @@ def test_a_link_to_nothing_stays(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["link"]
 
 
-@pytest.mark.parametrize("moves", [0, 1, 6, 12])
+@pytest.mark.parametrize("moves", [0, 1, 6, 9])
 def test_a_full_disk_leaves_no_dataset_and_promises_none(
     bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moves: int
 ) -> None:
