@@ -113,7 +113,7 @@ class BhdEnvConfig(EnvConfig):
             name = self._settings().name
             vector = BhdVectorEnv(n_envs, name, **self.gym_kwargs, autoreset_mode=mode, threads=self.threads)
         else:
-            makers = [_Maker(self, i, n_envs) for i in range(n_envs)]
+            makers = [_Maker(self, i) for i in range(n_envs)]
             if self.vector == "sync":
                 vector = SyncVectorEnv(makers, autoreset_mode=mode)
             else:
@@ -150,9 +150,9 @@ class BhdEnvConfig(EnvConfig):
 class _Maker:
     """Makes one of n environments, in whatever process it is called."""
 
-    def __init__(self, config: BhdEnvConfig, first: int, stride: int) -> None:
+    def __init__(self, config: BhdEnvConfig, first: int) -> None:
         self._name = config.gym_id
-        self._kwargs = {**config.gym_kwargs, "first_episode": first, "episode_stride": stride}
+        self._kwargs = {**config.gym_kwargs, "first_episode": first}
 
     def __call__(self) -> gymnasium.Env:
         return BhdEnv(self._name, **self._kwargs)

@@ -1,7 +1,19 @@
 """Which episode an environment runs next."""
 
+import numpy as np
+
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.task import SPLITS, Split, episode_seed
+
+STREAM = 2**32
+"""How many episodes further an environment goes each time, unless told otherwise.
+
+Clients seed environment i of n with seed + i, and only once. What follows must lead into nobody else's episodes, so the
+numbers of an environment with seed k are k, k + 2**32, k + 2 * 2**32, …: two seeds below 2**32, to which
+Stable-Baselines3 and NumPy's own seeds are limited, never meet.
+"""
+
+_END = 2**63  # infos of vector environments hold the numbers as int64
 
 
 class Course:
@@ -17,15 +29,16 @@ class Course:
     Args:
         seed: the run's seed.
         split: which of two disjoint sets of episodes.
-        first: number of the first episode.
-        stride: how many episodes further each next one is: with n, n environments that start at 0 to n - 1 run
-            different episodes.
+        first: number of the first episode, if it is not told one; drawn at random below `STREAM` if None, so that
+            environments that do not know of each other run different ones.
+        stride: how many episodes further each next one is.
 
     Raises:
         ConfigError: there is no such split, or a number is out of range.
     """
 
-    def __init__(self, seed: int = 0, split: Split = "train", first: int = 0, stride: int = 1) -> None:
+    def __init__(self, seed: int = 0, split: Split = "train", first: int | None = None, stride: int = STREAM) -> None:
+        first = int(np.random.default_rng().integers(STREAM)) if first is None else first
         for name, value, least in (("seed", seed, 0), ("first_episode", first, 0), ("episode_stride", stride, 1)):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ConfigError(f"{name} is {value!r}; it must be a whole number of at least {least}.")
@@ -36,7 +49,14 @@ class Course:
         self.following = first
 
     def advance(self, episode: int | None = None) -> int:
-        """Go on to an episode, the next one if None; return its seed."""
-        self.episode = self.following if episode is None else int(episode)
+        """Go on to an episode, the next one if None; return its seed.
+
+        Raises:
+            ConfigError: the number is out of range.
+        """
+        episode = self.following if episode is None else episode
+        if not 0 <= episode < _END:
+            raise ConfigError(f"The number of an episode is {episode}; it must be from 0 to 2**63 - 1.")
+        self.episode = int(episode)
         self.following = self.episode + self.stride
         return episode_seed(self.seed, self.episode, self.split)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.envs import register  # noqa: F401  registers the environments
-from bhd_lerobot.envs.course import Course
+from bhd_lerobot.envs.course import STREAM, Course
 from bhd_lerobot.envs.settings import make_settings
 from bhd_lerobot.envs.spaces import ActionScale, observation_space
 from bhd_lerobot.envs.stage import EVENT_NAMES, ClosedError, ResetNeededError, Seen, Stage
@@ -23,10 +23,11 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     One step is one frame: the action goes to the cerebellum, which controls the robot at its own rate meanwhile.
     Observation: `agent_pos`, `environment_state` and `pixels`, LeRobot's names, as far as there are any. Action: the
-    robot's action features, in SI units. `reset(seed=k)` starts episode k of the run `seed`; `reset()` the next one.
+    robot's action features, in SI units. `reset(seed=k)` starts episode k of the run `seed`; each `reset()` after it
+    goes on to an episode that no other seed below 2**32 leads to.
 
     An episode is terminated by what happens in it and truncated by the end of its time. `info` holds `is_success`,
-    `event`, `episode` and `seed` (the episode's), and at the end `score` and the task's `details`.
+    `event`, `episode_index` and `seed` (the episode's), and at the end `score` and the task's `details`.
 
     Attributes:
         stage: simulation and task.
@@ -43,7 +44,7 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         obs_type: what an observation holds: one of `settings.OBS_TYPES`; all that there is if None.
         normalise_actions: take actions in [-1, 1], mapped to the bounds.
         render_mode: ``"rgb_array"`` or None.
-        first_episode: number of the first episode, if `reset` is not told one.
+        first_episode: number of the first episode, if `reset` is not told one; drawn at random below 2**32 if None.
         episode_stride: how many episodes further the next one is.
 
     Raises:
@@ -64,8 +65,8 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         obs_type: str | None = None,
         normalise_actions: bool = False,
         render_mode: str | None = None,
-        first_episode: int = 0,
-        episode_stride: int = 1,
+        first_episode: int | None = None,
+        episode_stride: int = STREAM,
     ) -> None:
         settings = make_settings(environment, robot, task, cameras=cameras, obs_type=obs_type)
         self.render_mode = check_render_mode(render_mode)
@@ -152,7 +153,7 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return {
             "is_success": False,
             "event": EVENT_NAMES[event],
-            "episode": self.course.episode,
+            "episode_index": self.course.episode,
             "seed": int(self.stage.seeds[0]),
         }
 

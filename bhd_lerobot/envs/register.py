@@ -1,6 +1,7 @@
 """The environments' names, and their registration with Gymnasium.
 
-Importing this module registers them. It imports nothing heavy: Gymnasium itself may import it as a plug-in.
+Importing this module registers them, also as the part of an id before its colon:
+``gymnasium.make("bhd_lerobot.envs.register:bhd_lerobot/UR5Reach-v0")``. It imports nothing heavy.
 """
 
 from gymnasium.envs.registration import register as register_environment

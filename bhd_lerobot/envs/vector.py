@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bhd_lerobot.envs.course import Course
+from bhd_lerobot.envs.course import STREAM, Course
 from bhd_lerobot.envs.gym_env import RENDER_MODES, batched, check_render_mode, end_info
 from bhd_lerobot.envs.settings import make_settings
 from bhd_lerobot.envs.spaces import ActionScale, observation_space
@@ -27,8 +27,8 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
     The same seeds and actions give the same as n `BhdEnv` in Gymnasium's `SyncVectorEnv`, bit for bit: observations,
     rewards, ends and infos. Both of Gymnasium's autoreset modes are supported, and none.
 
-    Environment i starts with episode i of the run and goes on with every n-th: no two run the same. `reset(seed=k)`
-    starts episodes k to k + n - 1.
+    Environment i starts with episode i of the run, and `reset(seed=k)` starts episodes k to k + n - 1. Each goes on as
+    a `BhdEnv` does: no two run the same episode.
 
     Attributes:
         stage: simulations and task.
@@ -46,8 +46,9 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         normalise_actions: take actions in [-1, 1], mapped to the bounds.
         render_mode: ``"rgb_array"`` or None.
         autoreset_mode: when an environment whose episode is over starts the next.
-        first_episode: number of the first environment's first episode, if `reset` is not told one.
-        episode_stride: how many episodes further an environment's next one is; num_envs if None.
+        first_episode: number of the first environment's first episode, if `reset` is not told one; each draws its own
+            at random below 2**32 if None.
+        episode_stride: how many episodes further an environment's next one is.
         threads: threads that step the physics; all processors if None.
 
     Raises:
@@ -68,8 +69,8 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         normalise_actions: bool = False,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        first_episode: int = 0,
-        episode_stride: int | None = None,
+        first_episode: int | None = 0,
+        episode_stride: int = STREAM,
         threads: int | None = None,
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
@@ -80,8 +81,9 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         self.num_envs = n = num_envs
         self.stage = Stage(settings.robot, settings.task, n, threads)
         self.task = settings.name
-        stride = n if episode_stride is None else episode_stride
-        self.members = [Member(self.stage, i, Course(seed, split, first_episode + i, stride), self) for i in range(n)]
+        firsts = [None if first_episode is None else first_episode + i for i in range(n)]
+        courses = [Course(seed, split, first, episode_stride) for first in firsts]
+        self.members = [Member(self.stage, i, course, self) for i, course in enumerate(courses)]
         self.metadata = {
             "render_modes": list(RENDER_MODES),
             "render_fps": settings.robot.fps,
@@ -251,7 +253,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         finals = [
             {
                 "event": EVENT_NAMES[self._event[sim]],
-                "episode": int(self._episodes[sim]),
+                "episode_index": int(self._episodes[sim]),
                 "seed": int(self.stage.seeds[sim]),
                 **end_info(outcome),
             }
@@ -305,7 +307,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         infos = {
             "is_success": self._success.copy(),
             "event": EVENT_NAMES[self._event],
-            "episode": self._episodes.copy(),
+            "episode_index": self._episodes.copy(),
             "seed": self.stage.seeds.copy(),
         }
         mask = np.ones(n, np.bool_)
@@ -313,7 +315,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
             mask[:] = False
             mask[only] = True
             infos["event"][~mask] = None
-            for key in ("is_success", "episode", "seed"):
+            for key in ("is_success", "episode_index", "seed"):
                 infos[key][~mask] = 0
         return infos | {f"_{key}": mask.copy() for key in infos}
 

@@ -80,7 +80,7 @@ class Member:
         return self.course.split
 
     @property
-    def episode(self) -> int:
+    def episode_index(self) -> int:
         """Number of the present episode."""
         return self.course.episode
 

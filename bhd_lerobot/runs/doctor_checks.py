@@ -13,6 +13,7 @@ from pathlib import Path
 # LeRobot requires it, so it is there; its absence would be a finding of its own.
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
 
 from bhd_lerobot.control.privileges import GRANT_BANDWIDTH, Grant, real_interpreter
 from bhd_lerobot.runs.doctor_child import Outcome
@@ -48,25 +49,67 @@ def check_python(version: str = platform.python_version()) -> list[Finding]:
 
 
 def check_versions(
-    names: Sequence[str] = ("lerobot", "mujoco"), version_of: Callable[[str], str] = metadata.version
+    shown: Sequence[str] = ("lerobot", "mujoco"), version_of: Callable[[str], str] = metadata.version
 ) -> list[Finding]:
-    """Check that packages have the versions that ours asks for."""
+    """Check that packages have the versions that ours asks for.
+
+    What it always needs must be there; what only an extra of it needs, and happens to be there, is compared as well.
+
+    Args:
+        shown: the packages that get a finding also if all is well.
+        version_of: returns the version of an installed package.
+    """
     try:
-        asked = {one.name: one.specifier for one in map(Requirement, metadata.requires(DISTRIBUTION) or [])}
+        extras = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
+        asked = {extra: _requirements(extra) for extra in ("", *extras)}
     except metadata.PackageNotFoundError:
         return [complain("package.missing", "not installed", name=DISTRIBUTION)]
     findings = []
-    for name in names:
+    for name, wanted in asked[""].items():
         try:
             version = version_of(name)
         except metadata.PackageNotFoundError:
             findings.append(complain("package.missing", f"{name} is not installed", name=name))
             continue
-        if asked[name].contains(version, prereleases=True):
-            findings.append(fine("versions", f"{name} {version}, asked for is {asked[name]}"))
-        else:
-            values = {"name": name, "version": version, "asked": asked[name]}
+        if not wanted.contains(version, prereleases=True):
+            values = {"name": name, "version": version, "asked": wanted}
             findings.append(complain("package.version", f"{name} {version}", **values))
+        elif name in shown:
+            findings.append(fine("versions", f"{name} {version}, asked for is {wanted}"))
+    return findings + _check_extras({extra: asked[extra] for extra in extras}, asked[""], version_of)
+
+
+def _requirements(extra: str) -> dict[str, SpecifierSet]:
+    """Return which versions of which packages ours asks for on this machine: always, or with an extra of it.
+
+    A package may be named several times, as for an extra of its own; all of that holds at once.
+    """
+    asked: dict[str, SpecifierSet] = {}
+    for one in map(Requirement, metadata.requires(DISTRIBUTION) or []):
+        if one.marker is None or one.marker.evaluate({"extra": extra}):
+            name = canonicalize_name(one.name)
+            asked[name] = asked.get(name, SpecifierSet()) & one.specifier
+    return asked
+
+
+def _check_extras(
+    asked: dict[str, dict[str, SpecifierSet]], always: dict[str, SpecifierSet], version_of: Callable[[str], str]
+) -> list[Finding]:
+    wanted: dict[tuple[str, SpecifierSet], list[str]] = {}
+    for extra, packages in asked.items():
+        for name, versions in packages.items():
+            if versions != always.get(name):
+                wanted.setdefault((name, versions), []).append(extra)
+    findings = []
+    for (name, versions), extras in wanted.items():
+        try:
+            version = version_of(name)
+        except metadata.PackageNotFoundError:
+            continue  # nobody says which extras were asked for
+        known = not always.get(name, SpecifierSet()).contains(version, prereleases=True)  # a problem of its own
+        if not known and not versions.contains(version, prereleases=True):
+            values = {"name": name, "version": version, "asked": versions, "extra": ",".join(extras)}
+            findings.append(complain("package.extra", f"{name} {version}", **values))
     return findings
 
 

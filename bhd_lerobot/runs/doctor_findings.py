@@ -106,6 +106,13 @@ COMPLAINTS: dict[str, Complaint] = {
         "`{name}` is {version}; asked for is {asked}",
         _REINSTALL,
     ),
+    "package.extra": Complaint(
+        "versions",
+        _W,
+        "errors about arguments, attributes or types that there are not, where the extra {extra} is used",
+        "`{name}` is {version}; the extra {extra} asks for {asked}",
+        "nothing, if you do not use it; otherwise `pip install -e '.[{extra}]'` in the checkout",
+    ),
     "plugins.error": Complaint(
         "plug-ins",
         _P,

@@ -43,6 +43,11 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 def run(module: str) -> int:
     """Import a module and run its `main`; return the exit status. The process is to end then."""
+    # PyTorch's threads wait for each other after every operation, by default in a loop that keeps a processor busy.
+    # Where other programs run as well, that takes the processor from the thread that is waited for: with two threads
+    # on two processors, beside four busy processes, a training made a fiftieth of its steps. Asleep they compute the
+    # same bits. OpenMP reads this once, when PyTorch is imported.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         with leaving_on_interrupt():
             main = importlib.import_module(module).main

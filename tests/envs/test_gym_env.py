@@ -42,15 +42,17 @@ def test_registering_twice_changes_nothing() -> None:
     assert {f"bhd_lerobot/{name}" for name in ENVIRONMENTS} <= before.keys()
 
 
-def test_equal_seeds_and_actions_give_equal_episodes_and_the_next_reset_goes_on() -> None:
+def test_equal_seeds_and_actions_give_equal_episodes_and_so_do_the_next_resets() -> None:
     first, second = make(seed=7), make(seed=7)
     assert_same(first.reset(seed=4), second.reset(seed=4))
     for action in some_actions(AVOID, 5)[:, 0]:
         assert_same(first.step(action), second.step(action))
-    _, info = first.reset()
-    assert info["episode"] == 5
-    assert info["seed"] == episode_seed(7, 5, "train")
-    assert_same(second.reset(seed=5), first.reset(seed=5))
+    following = first.reset()
+    assert_same(following, second.reset())
+    index = following[1]["episode_index"]
+    assert index != 4
+    assert following[1]["seed"] == episode_seed(7, index, "train")
+    assert_same(first.reset(seed=index), following)
 
 
 def test_splits_are_other_episodes() -> None:
@@ -121,6 +123,7 @@ def test_it_renders_when_asked_to() -> None:
         ({"obs_type": "pixels", "cameras": False}, "cameras is False"),
         ({"render_mode": "human"}, "Unknown render_mode 'human'"),
         ({"episode_stride": 0}, "episode_stride is 0"),
+        ({"first_episode": -1}, "first_episode is -1"),
     ],
 )
 def test_what_cannot_be_honoured_is_named(arguments: dict[str, Any], message: str) -> None:
@@ -168,4 +171,4 @@ def test_it_must_be_reset_before_and_after_an_episode_and_not_be_closed() -> Non
 def test_its_specification_survives_pickling() -> None:
     spec = pickle.loads(pickle.dumps(gymnasium.spec(f"bhd_lerobot/{AVOID}")))
     env = gymnasium.make(spec, **short(AVOID))
-    assert env.reset(seed=0)[1]["episode"] == 0
+    assert env.reset(seed=0)[1]["episode_index"] == 0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
+from bhd_lerobot.envs.course import STREAM
 from bhd_lerobot.envs.gym_env import BhdEnv
 from bhd_lerobot.envs.stage import ClosedError, ResetNeededError
 from bhd_lerobot.envs.vector import BhdVectorEnv
@@ -21,7 +22,7 @@ N = 3
 
 def makers(name: str, n: int = N, **arguments: Any) -> list[Any]:
     def maker(first: int) -> Any:
-        return lambda: BhdEnv(name, **short(name, **arguments), first_episode=first, episode_stride=n)
+        return lambda: BhdEnv(name, **short(name, **arguments), first_episode=first)
 
     return [maker(first) for first in range(n)]
 
@@ -56,7 +57,7 @@ def test_images_are_those_of_the_single_environments() -> None:
     size = {"camera_width": 32, "camera_height": 24, "beams": 36}
     arguments = {"robot": size, "cameras": True, "task": {"duration_s": 0.3}}
     ours = BhdVectorEnv(2, AVOID, **arguments, autoreset_mode="SameStep")
-    sync = SyncVectorEnv([lambda i=i: BhdEnv(AVOID, **arguments, first_episode=i, episode_stride=2) for i in range(2)])
+    sync = SyncVectorEnv([lambda i=i: BhdEnv(AVOID, **arguments, first_episode=i) for i in range(2)])
     actions = some_actions(AVOID, 2, 2)
     for mine, theirs in zip(play(ours, actions), play(sync, actions), strict=True):
         assert_same(mine[0], theirs[0])
@@ -68,7 +69,7 @@ def test_images_are_those_of_the_single_environments() -> None:
 
 
 def test_an_environment_does_not_depend_on_its_neighbours_or_on_threads() -> None:
-    many, one = make(4, autoreset_mode="SameStep", threads=1), make(1, autoreset_mode="SameStep", episode_stride=4)
+    many, one = make(4, autoreset_mode="SameStep", threads=1), make(1, autoreset_mode="SameStep")
     actions = some_actions(AVOID, 45, 4)
     for mine, alone in zip(play(many, actions), play(one, actions[:, :1]), strict=True):
         np.testing.assert_array_equal(mine[0]["agent_pos"][0], alone[0]["agent_pos"][0])
@@ -78,10 +79,15 @@ def test_an_environment_does_not_depend_on_its_neighbours_or_on_threads() -> Non
 
 def test_environments_run_different_episodes_that_follow_from_the_seed() -> None:
     env = make(task={"duration_s": 0.1}, autoreset_mode="SameStep")
-    seen = [env.reset(seed=10)[1]["episode"].tolist()]
-    seen += [env.step(np.zeros((N, 2), np.float32))[4]["episode"].tolist() for _ in range(2)]
-    assert seen == [[10, 11, 12], [13, 14, 15], [16, 17, 18]]
-    assert env.reset(seed=[5, None, 5])[1]["episode"].tolist() == [5, 20, 5]
+    seen = [env.reset(seed=10)[1]["episode_index"].tolist()]
+    seen += [env.step(np.zeros((N, 2), np.float32))[4]["episode_index"].tolist() for _ in range(2)]
+    assert seen == [[10, 11, 12], [STREAM + 10, STREAM + 11, STREAM + 12], [2 * STREAM + k for k in (10, 11, 12)]]
+    assert env.reset(seed=[5, None, 5])[1]["episode_index"].tolist() == [5, 3 * STREAM + 11, 5]
+    dense = make(task={"duration_s": 0.1}, autoreset_mode="SameStep", episode_stride=N)
+    assert dense.reset()[1]["episode_index"].tolist() == [0, 1, 2]
+    assert dense.reset()[1]["episode_index"].tolist() == [3, 4, 5]
+    drawn = make(first_episode=None).reset()[1]["episode_index"].tolist()
+    assert len(set(drawn)) == N
 
 
 def test_what_was_handed_out_is_never_written_to_again() -> None:
@@ -105,7 +111,7 @@ def test_a_mask_resets_some_of_them() -> None:
     with pytest.raises(ResetNeededError, match=r"environments \[0, 1, 2\] are over"):
         env.step(np.zeros((N, 2), np.float32))
     _, infos = env.reset(options={"reset_mask": np.array([True, True, False])})
-    assert infos["_episode"].tolist() == [True, True, False]
+    assert infos["_episode_index"].tolist() == [True, True, False]
     with pytest.raises(ResetNeededError, match=r"environments \[2\] are over"):
         env.step(np.zeros((N, 2), np.float32))
     env.reset(options={"reset_mask": np.array([False, False, True])})
@@ -131,7 +137,7 @@ def test_in_a_rollout_of_lerobot_what_is_over_is_left_alone(mode: AutoresetMode)
         np.testing.assert_array_equal(ours.stage.running, ~over)
         last = mine
     assert over.all()
-    assert ours.reset(seed=7)[1]["episode"].tolist() == [7, 8, 9]
+    assert ours.reset(seed=7)[1]["episode_index"].tolist() == [7, 8, 9]
     assert ours.stage.running.all()
 
 
@@ -149,7 +155,7 @@ def test_attributes_are_found_and_set() -> None:
         env.get_attr("colour")
     env.set_attr("split", "held_out")
     assert (env.reset()[1]["seed"] % 2 == 1).all()
-    assert env.get_attr("episode") == (3, 4, 5)
+    assert env.get_attr("episode_index") == (STREAM, STREAM + 1, STREAM + 2)
     env.set_attr("seed", [1, 2, 3])
     assert env.get_attr("seed") == (1, 2, 3)
     for name, value in (("colour", 1), ("seed", [1, 2]), ("split", "test"), ("seed", -1)):

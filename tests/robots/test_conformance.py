@@ -10,9 +10,11 @@ from lerobot.robots.config import RobotConfig
 from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.conformance import ConformanceError, check_robot
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+from tests.robots.fake_feetech import START, so101
 
 
 class GoodRobot(Robot):
@@ -51,6 +53,8 @@ class GoodRobot(Robot):
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
         if not self._on:
             raise DeviceNotConnectedError
+        if not all(map(math.isfinite, action.values())):
+            raise ValueError(action)
         self._applied = {name: float(action[name]) for name in self.action_features}
         return dict(self._applied)
 
@@ -116,13 +120,14 @@ class ListObservation(GoodRobot):
 
 class SharedImage(GoodRobot):
     breach = "shares memory"
+    adversarial = True
 
     def get_observation(self):
         return {**super().get_observation(), "eye": self._image}
 
 
 class SharedDict(GoodRobot):
-    breach = "shares memory|same dict"
+    breach = "same dict"
 
     def __init__(self, config):
         super().__init__(config)
@@ -147,7 +152,7 @@ class LiveImage(GoodRobot):
 
 
 class SharedAction(GoodRobot):
-    breach = "robot's own state|finite"
+    breach = "same dict every time: the robot's own state"
 
     def __init__(self, config):
         super().__init__(config)
@@ -223,13 +228,48 @@ class NeverDisconnects(GoodRobot):
     def disconnect(self): ...
 
 
-class DisconnectsOnce(GoodRobot):
-    breach = "must be idempotent"
+class DisconnectsOnceWithAnotherError(GoodRobot):
+    breach = "disconnect\\(\\) a second time raised KeyError"
 
     def disconnect(self):
         if not self._on:
-            raise DeviceNotConnectedError
+            raise KeyError("bus")
         self._on = False
+
+
+class KeepsWhatItReturned(GoodRobot):
+    breach = "came back in an observation"
+    adversarial = True
+
+    def send_action(self, action):
+        super().send_action(action)
+        self._kept = action
+        return action
+
+    def get_observation(self):
+        seen = super().get_observation()
+        return {**seen, "b.vel": self._kept["b.vel"]} if hasattr(self, "_kept") else seen
+
+
+class TakesNan(GoodRobot):
+    breach = "what is not finite must be refused"
+    adversarial = True
+
+    def send_action(self, action):
+        if not self._on:
+            raise DeviceNotConnectedError
+        return dict(action)
+
+
+class ObservesNanAfterNan(GoodRobot):
+    breach = "'a.vel' was nan: it reached the robot"
+    adversarial = True
+
+    def send_action(self, action):
+        if not self._on:
+            raise DeviceNotConnectedError
+        self._state["a.pos"] = action["a.vel"]
+        return dict.fromkeys(action, 0.0)
 
 
 class SwallowsExceptions(GoodRobot):
@@ -282,13 +322,138 @@ def config(tmp_path: Path) -> RobotConfig:
 
 
 def test_a_good_robot_passes(config):
-    check_robot(lambda: GoodRobot(config))
+    assert check_robot(lambda: GoodRobot(config), adversarial=True) == ()
 
 
 @pytest.mark.parametrize("robot", BROKEN, ids=lambda cls: cls.__name__)
 def test_a_broken_robot_is_found(robot, config):
     with pytest.raises(ConformanceError, match=robot.breach):
-        check_robot(lambda: robot(config))
+        check_robot(lambda: robot(config), adversarial=getattr(robot, "adversarial", False))
+
+
+class MockRobot(Robot):
+    """What LeRobot's `tests.mocks.mock_robot.MockRobot` does, which is not part of its distribution.
+
+    It returns the dict that it was given, and refuses a second `disconnect`.
+    """
+
+    config_class = RobotConfig
+    name = "mock_robot"
+    observation_features: ClassVar[dict[str, Any]] = {f"motor_{i}.pos": float for i in range(3)}
+    action_features: ClassVar[dict[str, Any]] = {f"motor_{i}.pos": float for i in range(3)}
+
+    def __init__(self, config: RobotConfig, position: float = 40.0) -> None:
+        super().__init__(config)
+        self.cameras: dict[str, Any] = {}
+        self.is_on, self.position = False, position
+        self.arrived: list[dict[str, float]] = []
+
+    is_connected = property(lambda self: self.is_on)
+    is_calibrated = True
+
+    def connect(self, calibrate: bool = True) -> None:
+        if self.is_on:
+            raise DeviceAlreadyConnectedError
+        self.is_on = True
+
+    def calibrate(self) -> None: ...
+
+    def configure(self) -> None: ...
+
+    def get_observation(self) -> dict[str, Any]:
+        if not self.is_on:
+            raise DeviceNotConnectedError
+        return dict.fromkeys(self.observation_features, self.position)
+
+    def send_action(self, action: dict[str, float]) -> dict[str, float]:
+        self.arrived.append(dict(action))
+        if not self.is_on:
+            raise DeviceNotConnectedError
+        return action
+
+    def disconnect(self) -> None:
+        if not self.is_on:
+            raise DeviceNotConnectedError
+        self.is_on = False
+
+
+def test_lerobots_mock_robot_gets_findings_and_only_what_leaves_it_where_it_is(config):
+    made: list[MockRobot] = []
+
+    def make() -> MockRobot:
+        made.append(MockRobot(config))
+        return made[-1]
+
+    findings = check_robot(make)
+    assert len(findings) == 1
+    assert "disconnect() a second time raises DeviceNotConnectedError" in findings[0]
+    assert len(made[0].arrived) == 3 + 2 + 1  # the last one without a connection
+    for robot in made:
+        assert all(set(action.values()) == {40.0} for action in robot.arrived)
+        assert not robot.is_connected
+    given = {"motor_0.pos": 1.0, "motor_1.pos": 2.0, "motor_2.pos": 3.0}
+    check_robot(make, given)
+    assert all(action == given for robot in made[2:] for action in robot.arrived)
+    assert given == {"motor_0.pos": 1.0, "motor_1.pos": 2.0, "motor_2.pos": 3.0}
+    with pytest.raises(ConformanceError, match=r"took nan for 'motor_0.pos'"):
+        check_robot(make, adversarial=True)
+    assert not made[-1].is_connected
+
+
+@pytest.mark.parametrize("options", [{}, {"use_degrees": False}, {"max_relative_target": 5.0}], ids=str)
+def test_lerobots_so101_stays_where_it_is(options, tmp_path, monkeypatch):
+    make, buses = so101(tmp_path, monkeypatch, **options)
+    findings = check_robot(make)
+    assert len(findings) == 1
+    assert "disconnect() a second time" in findings[0]
+    assert len(buses[0].goals) == 3 + 2
+    for bus in buses:
+        assert all(map(math.isfinite, bus.asked))
+        assert not bus.is_connected
+        for goal in bus.goals:  # LeRobot rounds steps towards zero
+            assert all(abs(goal[motor] - START[motor]) <= 1 for motor in START), goal
+    # Asked for, NaN is tried. LeRobot's bus refuses it.
+    assert check_robot(make, adversarial=True) == findings
+    assert not all(map(math.isfinite, buses[-2].asked))
+
+
+def test_what_may_not_be_sent_is_refused_before_anything_is(config):
+    made: list[MockRobot] = []
+
+    def make() -> MockRobot:
+        made.append(MockRobot(config))
+        return made[-1]
+
+    for bad in (math.nan, math.inf):
+        with pytest.raises(ConfigError, match=f"'motor_1.pos': {bad}"):
+            check_robot(make, {"motor_0.pos": 1.0, "motor_1.pos": bad, "motor_2.pos": 3.0})
+    assert not any(robot.arrived for robot in made)
+
+    class Blind(MockRobot):
+        observation_features: ClassVar[dict[str, Any]] = {"motor_0.pos": float}
+
+    blind = Blind(config)
+    with pytest.raises(ConfigError, match=r"does not observe 'motor_1.pos', 'motor_2.pos'"):
+        check_robot(lambda: blind)
+    assert not blind.arrived
+    assert not blind.is_connected
+
+
+def test_after_an_error_the_robot_is_disconnected_and_the_error_stays(config):
+    class Stuck(MockRobot):
+        def get_observation(self):
+            return {**super().get_observation(), "motor_0.pos": math.nan}
+
+        def disconnect(self):
+            raise OSError("no such device")
+
+    with pytest.raises(ConformanceError, match="not a finite float") as caught:
+        check_robot(lambda: Stuck(config))
+    assert "no such device" in caught.value.__notes__[0]
+
+
+def test_shared_images_are_a_finding(config):
+    assert "shared the memory of 'eye'" in check_robot(lambda: SharedImage(config))[0]
 
 
 @pytest.mark.parametrize(
@@ -297,6 +462,9 @@ def test_a_broken_robot_is_found(robot, config):
     ids=str,
 )
 def test_turtlebot3_keeps_the_contract(options, tmp_path):
-    check_robot(
-        lambda: TurtleBot3(TurtleBot3Config(calibration_dir=tmp_path, **options)), {"x.vel": 0.1, "theta.vel": 0.3}
+    findings = check_robot(
+        lambda: TurtleBot3(TurtleBot3Config(calibration_dir=tmp_path, **options)),
+        {"x.vel": 0.1, "theta.vel": 0.3},
+        adversarial=True,
     )
+    assert findings == ()

@@ -164,5 +164,5 @@ def test_two_robots_at_once_and_the_second_connects_twice(robot):
 
 
 def test_it_keeps_lerobots_contract():
-    check_robot(lambda: turtlebot(unique("contract")))
+    assert check_robot(lambda: turtlebot(unique("contract")), adversarial=True) == ()
     assert is_gone(unique("contract"))

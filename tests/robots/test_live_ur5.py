@@ -127,5 +127,5 @@ def test_an_action_replaces_a_goal(arm):
 
 
 def test_it_keeps_lerobots_contract():
-    check_robot(lambda: ur5(unique("arm-contract")))
+    assert check_robot(lambda: ur5(unique("arm-contract")), adversarial=True) == ()
     assert is_gone(unique("arm-contract"))

@@ -44,7 +44,7 @@ def stay(robot) -> dict[str, float]:
 def test_it_keeps_the_contract_of_a_lerobot_robot(tmp_path, space, scene):
     with make(tmp_path, action_space=space) as robot:
         action = stay(robot)
-    check_robot(lambda: make(tmp_path, action_space=space, scene=scene), action)
+    assert check_robot(lambda: make(tmp_path, action_space=space, scene=scene), action, adversarial=True) == ()
 
 
 def test_features_are_the_joints_and_the_gripper(robot):
@@ -314,7 +314,7 @@ def test_an_impedance_robot_keeps_the_contract_and_follows_tool_poses(tmp_path):
         assert not refusal.success
         with pytest.raises(CommandRefusedError, match="length"):
             robot.send_action({**action, "tool_qw.pos": 3.0})
-    check_robot(lambda: make(tmp_path, **options), action)
+    assert check_robot(lambda: make(tmp_path, **options), action, adversarial=True) == ()
 
 
 def test_an_impedance_with_too_much_latency_is_refused():

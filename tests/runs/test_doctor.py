@@ -270,8 +270,16 @@ def test_nothing_is_wrong_with_a_sound_machine(name: str, tmp_path: Path) -> Non
 # --- what can be wrong -----------------------------------------------------------------------------------------------
 
 
-def absent(name: str) -> str:
-    raise metadata.PackageNotFoundError(name)
+def installed(**versions: str | None) -> Callable[[str], str]:
+    """Return a `version_of` that differs from what is installed here; None is not installed."""
+
+    def version_of(name: str) -> str:
+        version = versions[name] if name in versions else metadata.version(name)
+        if version is None:
+            raise metadata.PackageNotFoundError(name)
+        return version
+
+    return version_of
 
 
 def full(_: Path) -> int:
@@ -280,10 +288,14 @@ def full(_: Path) -> int:
 
 BROKEN: dict[str, tuple[Callable[[Path], list[Finding]], str]] = {
     "python": (lambda _: doctor_checks.check_python("3.11.4"), "3.11.4"),
-    "package.missing": (lambda _: doctor_checks.check_versions(["mujoco"], absent), "`mujoco`"),
+    "package.missing": (lambda _: doctor_checks.check_versions(version_of=installed(mujoco=None)), "`mujoco`"),
     "package.version": (
-        lambda _: doctor_checks.check_versions(["mujoco"], lambda _: "3.9.1"),
-        "3.9.1; asked for is >=4",
+        lambda _: doctor_checks.check_versions(version_of=installed(lerobot="0.5.1")),
+        "`lerobot` is 0.5.1; asked for is <0.7,>=0.6.1",
+    ),
+    "package.extra": (
+        lambda _: doctor_checks.check_versions(version_of=installed(rosbags="0.9")),
+        "`rosbags` is 0.9; the extra ros2,test asks for >=0.11",
     ),
     "plugins.error": (lambda _: doctor_checks.check_plugins(failed("error", "ImportError: no torch")), "no torch"),
     "plugins.missing": (
@@ -359,6 +371,39 @@ def test_our_own_package_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(doctor_checks, "DISTRIBUTION", "no-such-distribution")
     for findings in (doctor_checks.check_python(), doctor_checks.check_versions()):
         assert [one.cause for one in findings] == ["`no-such-distribution` is not installed in this environment"]
+
+
+@pytest.mark.parametrize(
+    ("version", "causes"),
+    [
+        ("1.5", []),
+        ("0.9", ["`brain` is 0.9; asked for is <2,>=1"]),
+        ("2.0", ["`brain` is 2.0; asked for is <2,>=1"]),
+        # A second line of the metadata narrows the first, and is not lost behind a third without a version.
+        ("1.1", ["`brain` is 1.1; the extra exact asks for !=1.1,<2,>=1"]),
+    ],
+)
+def test_every_requirement_counts(version: str, causes: list[str], tmp_path: Path, monkeypatch: Any) -> None:
+    text = """Metadata-Version: 2.4
+Name: fake-hand
+Version: 1
+Requires-Dist: Brain[fast]<2
+Requires-Dist: brain>=1
+Requires-Dist: other>=9; python_version < "3"
+Requires-Dist: brain!=1.1; extra == "exact"
+Requires-Dist: brain[slow]; extra == "test"
+Requires-Dist: absent>=3; extra == "test"
+Provides-Extra: exact
+Provides-Extra: test
+"""
+    (tmp_path / "fake_hand-1.dist-info").mkdir()
+    (tmp_path / "fake_hand-1.dist-info" / "METADATA").write_text(text, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(doctor_checks, "DISTRIBUTION", "fake-hand")
+    findings = doctor_checks.check_versions(("brain",), installed(brain=version, absent=None))
+    assert [one.cause for one in findings if one.status is not Status.OK] == causes
+    if not causes:
+        assert [one.found for one in findings] == [f"brain {version}, asked for is <2,>=1"]
 
 
 def test_the_documentation_has_the_same_table() -> None:

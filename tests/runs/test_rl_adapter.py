@@ -6,6 +6,7 @@ import torch
 
 pytest.importorskip("stable_baselines3")
 
+from bhd_lerobot.envs.course import STREAM
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.runs.rl.adapter import RlVecEnv
@@ -113,7 +114,7 @@ def test_an_episode_whose_time_is_over_is_truncated_and_the_next_begins_in_the_s
         # It stood still: what it saw last is what it saw before, but for the noise of a scan; the new arena is another.
         assert np.abs(info["terminal_observation"] - before[sim]).max() < np.abs(features[sim] - before[sim]).max()
         assert info["episode"]["l"] == 10
-    assert [member.course.episode for member in rig.env.members] == [one + N for one in episodes]
+    assert [member.course.episode for member in rig.env.members] == [one + STREAM for one in episodes]
     assert len(rig.episodes) == N
 
 

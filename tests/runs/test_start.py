@@ -69,6 +69,16 @@ def test_where_ctrl_c_is_ignored_it_stays_ignored(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (5, "")
 
 
+def test_threads_that_wait_sleep_unless_somebody_said_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = "import os\nsaid = os.environ['OMP_WAIT_POLICY']\ndef main():\n    print(said)\n    return 0\n"
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    assert started(tmp_path, program).stdout == "PASSIVE\n"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    assert started(tmp_path, program).stdout == "ACTIVE\n"
+
+
 @pytest.mark.parametrize("script", sorted(SCRIPTS))
 def test_every_command_begins_this_way(script: str, monkeypatch: pytest.MonkeyPatch) -> None:
     begin = STARTS.get(script) or getattr(start, script.removeprefix("bhd-"))

@@ -4,6 +4,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import yaml
 from lerobot.policies.factory import make_policy
 
 from bhd_lerobot.robots.catalog import make_robot
@@ -53,6 +54,13 @@ def test_a_configuration_is_valid_and_its_policy_can_be_built(path: Path, tmp_pa
     if "cameras" in path.stem:
         assert "observation.environment_state" not in policy.config.input_features  # it would tell what is to be seen
     assert sum(one.numel() for one in policy.parameters()) > 1000
+
+
+def test_no_configuration_for_a_cpu_counts_on_a_second_processor() -> None:
+    for path in FOLDER.glob("*.yaml"):
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if "gpu" not in path.stem and values.get("policy", {}).get("device", "cpu") == "cpu":
+            assert values["threads"] == 1, path
 
 
 def test_the_configuration_for_fine_tuning_takes_its_policy_from_the_checkpoint(tmp_path: Path) -> None:

@@ -132,6 +132,7 @@ class _Run:
             autoreset_mode="Disabled",
             threads=config.env.threads,
             first_episode=self._first_episode(),
+            episode_stride=config.env.n_envs,
         )
         with closing(env):
             parts = make_parts(config, env, episodes)

@@ -1,0 +1,39 @@
+"""Which episodes an environment runs, one after the other."""
+
+import itertools
+
+import pytest
+
+from bhd_lerobot.envs.course import STREAM, Course
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.tasks.task import episode_seed
+
+
+def played(course: Course, seed: int | None, resets: int = 20) -> set[int]:
+    """Return the seeds of the episodes of some resets, of which only the first is told a number, as clients do."""
+    return {course.advance(seed), *(course.advance() for _ in range(resets - 1))}
+
+
+def test_no_two_seeds_lead_into_the_same_episodes() -> None:
+    runs = {seed: played(Course(), seed) for seed in (0, 1, 2, 3, 4, 1000, STREAM - 1)}
+    for one, other in itertools.combinations(runs, 2):
+        assert not runs[one] & runs[other], (one, other)
+    assert runs[3] == played(Course(), 3)
+
+
+def test_the_first_number_is_the_episode_of_the_run() -> None:
+    for split in ("train", "held_out"):
+        assert Course(7, split).advance(4) == episode_seed(7, 4, split)
+        assert Course(7, split, first=4).advance() == episode_seed(7, 4, split)
+
+
+def test_without_any_number_the_first_is_drawn() -> None:
+    assert len({Course().advance() for _ in range(8)}) == 8
+
+
+@pytest.mark.parametrize("episode", [-1, 2**63])
+def test_numbers_out_of_range_are_refused_and_change_nothing(episode: int) -> None:
+    course = Course(first=5)
+    with pytest.raises(ConfigError, match=f"is {episode}; it must be from 0"):
+        course.advance(episode)
+    assert course.advance() == episode_seed(0, 5, "train")
