@@ -90,12 +90,13 @@ def check_links(root: Path) -> None:
     """Check that no link among the files of a dataset leads out of it.
 
     Args:
-        root: the dataset, whose folders `meta`, `data` and `videos` are looked through.
+        root: the dataset, whose folders are looked through: `meta`, `data`, `videos`, and those of films that LeRobot
+            had not encoded yet, `images` and `tmp…`.
 
     Raises:
         DatasetError: one does.
     """
-    pending = [root / name for name in ("meta", "data", "videos")]
+    pending = [*(root / name for name in ("meta", "data", "videos", "images")), *root.glob("tmp*")]
     seen: set[Path] = set()  # a link to a folder above would never end
     while pending:
         path = pending.pop()

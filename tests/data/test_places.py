@@ -137,7 +137,7 @@ def test_files_that_a_remote_place_lists(tmp_path: Path) -> None:
 def test_no_command_follows_a_link_out_of_the_dataset(root: Path, tmp_path: Path) -> None:
     data, film = "data/chunk-000/file-000.parquet", layout.video_file(support.CAMERA, (0, 0))
     episodes = "meta/episodes/chunk-000/file-000.parquet"
-    others = ("meta/notes.txt", "videos/x", "data/chunk-000/.hidden")
+    others = ("images", "tmp123", "meta/notes.txt", "videos/x", "data/chunk-000/.hidden")
     for name in (data, film, episodes, layout.INFO, layout.TASKS, layout.STATS, "videos", "data/chunk-000", *others):
         place, secret = root / name, tmp_path / "secret"
         if place.exists():
