@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shutil
+import stat
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -37,7 +38,8 @@ class Staging:
         self._old = root.with_name(f".{root.name}.old")
         for folder in (self.folder, self._old):
             is_empty = folder.is_dir() and not any(folder.iterdir())
-            if folder.exists() and not is_empty and not (folder / _MARKER).exists():
+            is_ours = is_empty or (folder / _MARKER).exists()
+            if os.path.lexists(folder) and not (is_ours and _is_own(folder)):
                 raise DatasetError(
                     f"{folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
                     "there. Move it, or choose another --root."
@@ -91,6 +93,12 @@ class Staging:
         else:
             folder.rename(root)
         (root / _MARKER).unlink(missing_ok=True)
+
+
+def _is_own(folder: Path) -> bool:
+    """Tell whether a path is a folder of this user: in a place that is everybody's, another could change it later."""
+    about = folder.lstat()
+    return stat.S_ISDIR(about.st_mode) and about.st_uid == os.geteuid()
 
 
 def _link(source: Path, target: Path) -> None:

@@ -29,6 +29,7 @@ _POLICIES_WITH_CODE = ("gaussian_actor", "groot", "pi0_fast", "wall_x")
 _CODE_KEYS = (
     "action_tokenizer_name",
     "action_tokenizer_path",
+    "base_model_id",
     "base_model_path",
     "model_name",
     "paligemma_tokenizer_name",

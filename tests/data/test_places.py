@@ -134,6 +134,22 @@ def test_files_that_a_remote_place_lists(tmp_path: Path) -> None:
         assert not any(tmp_path.iterdir())
 
 
+def test_a_pull_does_not_come_together_in_a_folder_of_somebody_else(tmp_path: Path) -> None:
+    """In a folder that is everybody's, as /tmp, its name can be foreseen, and what is in it could change later."""
+    staging = tmp_path / ".d.pull"
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / ".bhd-pull").touch()
+    staging.symlink_to("elsewhere")
+    with pytest.raises(DatasetError, match=r"\.d\.pull is in the way"):
+        pull(Listing([]), tmp_path / "d")  # type: ignore[arg-type]
+    staging.unlink()
+    if not os.geteuid():
+        (tmp_path / "elsewhere").rename(staging)
+        os.chown(staging, 65534, -1)
+        with pytest.raises(DatasetError, match=r"\.d\.pull is in the way"):
+            pull(Listing([]), tmp_path / "d")  # type: ignore[arg-type]
+
+
 def test_no_command_follows_a_link_out_of_the_dataset(root: Path, tmp_path: Path) -> None:
     data, film = "data/chunk-000/file-000.parquet", layout.video_file(support.CAMERA, (0, 0))
     episodes = "meta/episodes/chunk-000/file-000.parquet"
