@@ -76,7 +76,11 @@ def check_inside(root: Path, path: Path) -> Path:
     Raises:
         DatasetError: a link leads elsewhere; names both, and the remedy.
     """
-    whole, target = root.resolve(), path.resolve()
+    try:
+        # Unlike Path.resolve, it takes a link that leads to itself: whoever opens that says what is wrong.
+        whole, target = Path(os.path.realpath(root)), Path(os.path.realpath(path))
+    except ValueError as error:
+        raise DatasetError(f"{root} names a file {str(path)!r}, which no file can be called ({error}).") from error
     if target.is_relative_to(whole) or any(target.is_relative_to(place) for place in _places(whole)):
         return target
     raise DatasetError(

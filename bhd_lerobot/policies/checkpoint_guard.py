@@ -149,7 +149,7 @@ def _read(file: Path) -> dict[str, Any]:
     try:
         if not file.is_file():
             raise OSError("it is not a file")
-        values = json.loads(file.read_text(encoding="utf-8"))
+        values = json.loads(file.read_text())  # in the encoding of the locale, so that it reads what LeRobot reads
         if not isinstance(values, dict):
             raise ValueError("it is not a JSON object")
         return values

@@ -191,6 +191,7 @@ def test_links_within_and_to_declared_places(root: Path, tmp_path: Path, monkeyp
     (root / "videos").rename(root / "films")
     (root / "videos").symlink_to("films")
     (root / "data" / "again").symlink_to("..")  # a circle
+    (root / "meta" / "itself").symlink_to("itself")
     load_state(root)
     (root / "films").rename(tmp_path / "big")
     (root / "videos").unlink()
@@ -200,6 +201,7 @@ def test_links_within_and_to_declared_places(root: Path, tmp_path: Path, monkeyp
     monkeypatch.setenv(LINKED_FOLDERS, f"/nowhere:{tmp_path / 'big'}")
     load_state(root)
     (root / "data" / "again").unlink()
+    (root / "meta" / "itself").unlink()
     assert content(root) == wanted
     link = tmp_path / "link"
     link.symlink_to(root)  # the folder itself may be one
@@ -228,4 +230,6 @@ def test_pictures_beside_the_data_are_within(root: Path) -> None:
     for path in ("/etc/passwd", "../x", "images/../../x"):
         with pytest.raises(DatasetError, match="outside of the dataset"):
             check_inside(root, root / path)
+    with pytest.raises(DatasetError, match="no file can be called"):
+        check_inside(root, root / "a\0b")
     assert check_inside(root, root / "images/x.png") == root.resolve() / "images/x.png"
