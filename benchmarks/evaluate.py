@@ -32,6 +32,7 @@ from rich.console import Console
 
 from benchmarks._spread import ratios, spread, write
 from bhd_lerobot.envs.config_env import BhdEnvConfig
+from bhd_lerobot.policies.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.contract import find_checkpoint
 from bhd_lerobot.runs.config_eval import EvalConfig
 from bhd_lerobot.runs.configuration import parse
@@ -159,6 +160,7 @@ def run_stock(task: str, path: str, episodes: int, n_envs: int, seed: int) -> tu
     started = time.perf_counter()
     env_config = BhdEnvConfig(task=TASKS[task][1], vector="sync", seed=seed)
     folder = find_checkpoint(path)
+    check_checkpoint(folder)
     config = PreTrainedConfig.from_pretrained(folder)
     config.pretrained_path, config.device = Path(folder), "cpu"
     ((envs,),) = (tuple(group.values()) for group in env_config.create_envs(n_envs=n_envs).values())

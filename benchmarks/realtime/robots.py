@@ -184,9 +184,7 @@ class OwnedRobot:
         while True:
             left = [f"{name} ({pid})" for name, pid in self.pids.items() if is_running(pid)]
             # What its last user left behind is removed by whoever comes next; what somebody holds is not.
-            memory = FOLDER / f"{PREFIX}{self.spec.name}"
-            if memory.exists():
-                left.append(str(memory))
+            left += map(str, FOLDER.glob(f"{PREFIX}{self.spec.name}.*"))
             if not left or time.monotonic() > until:
                 return left
             time.sleep(0.05)

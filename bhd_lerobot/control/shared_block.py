@@ -3,15 +3,22 @@
 It is a file in the memory file system. Every process that uses it holds a shared lock on it, which the kernel releases
 however the process ends: a block that nobody holds is rubbish, and `sweep` removes it. Nothing else is needed to clean
 up after SIGKILL, and no process number is ever trusted.
+
+The folder is everybody's. A file's name has a part that nobody can guess, so that nobody can be in its way; only this
+user can open it; and what is not a plain file of this user is neither read nor removed, whatever it is called.
 """
 
 import contextlib
+import errno
 import fcntl
 import json
 import mmap
 import os
 import platform
+import random
 import re
+import secrets
+import stat
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,6 +28,8 @@ from bhd_lerobot.errors import ConfigError, RealtimeError
 
 FOLDER = Path("/dev/shm")
 PREFIX = "bhd-"
+_FILE = re.compile(rf"{PREFIX}(?P<name>[\w.-]{{1,100}})\.[0-9a-f]{{16}}")
+_TRIES = 8  # to make a block of a name that another process is seen to hold
 _MAGIC = b"bhd-blk1"
 _ALIGNMENT = 64  # a cache line: no two sections share one
 _ASKING_S = 0.002  # it takes much less to find out whether somebody holds a block
@@ -50,14 +59,14 @@ class SharedBlock:
     """One block: sections of bytes, and a description of them as JSON.
 
     Attributes:
-        name: its name, unique on this machine.
+        name: its name, unique among the blocks of this user.
         about: what its maker says about it.
 
     Use `create` or `attach`, and `close` when done.
     """
 
-    def __init__(self, name: str, descriptor: int, memory: mmap.mmap, sections: dict[str, tuple[int, int]]) -> None:
-        self.name = name
+    def __init__(self, path: Path, descriptor: int, memory: mmap.mmap, sections: dict[str, tuple[int, int]]) -> None:
+        self.name, self._path = _name(path), path
         self.about: dict[str, Any] = {}
         self._descriptor, self._memory, self._sections = descriptor, memory, sections
         self._views: list[memoryview] = []
@@ -84,13 +93,13 @@ class SharedBlock:
             end += -(-size // _ALIGNMENT) * _ALIGNMENT
         text = json.dumps({"sections": places, "about": about}).encode()
         header = -(-(16 + len(text)) // _HEADER) * _HEADER
-        descriptor = cls._make_file(FOLDER / f"{PREFIX}{name}")
+        path, descriptor = cls._make_file(name)
         try:
             # Not truncate: pages that do not exist would be found out by a bus error later.
             os.posix_fallocate(descriptor, 0, header + max(end, 1))
-            memory = _map(FOLDER / f"{PREFIX}{name}")
+            memory = _map(path)
         except OSError as error:
-            os.unlink(FOLDER / f"{PREFIX}{name}")
+            os.unlink(path)
             os.close(descriptor)
             raise RealtimeError(
                 f"No room for {end / 1e6:.1f} MB of shared memory in {FOLDER}: {error.strerror}. Free some, or give "
@@ -99,7 +108,7 @@ class SharedBlock:
         memory[8:16] = len(text).to_bytes(8, "little")
         memory[16 : 16 + len(text)] = text
         memory[0:8] = _MAGIC  # last: from here on it can be attached to
-        return cls._opened(name, descriptor, memory)
+        return cls._opened(path, descriptor, memory)
 
     @classmethod
     def attach(cls, name: str) -> Self:
@@ -108,11 +117,7 @@ class SharedBlock:
         Raises:
             RealtimeError: there is none; the message lists those that there are.
         """
-        path = FOLDER / f"{PREFIX}{name}"
-        try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-        except OSError as error:
-            raise _nobody(name, error.strerror) from error
+        path, descriptor = _find(name)
         fcntl.flock(descriptor, fcntl.LOCK_SH)
         try:
             memory = _map(path)
@@ -122,7 +127,7 @@ class SharedBlock:
         if not valid:
             os.close(descriptor)
             raise RealtimeError(f"{path} is not a block of this version of bhd_lerobot.")
-        return cls._opened(name, descriptor, memory)
+        return cls._opened(path, descriptor, memory)
 
     @classmethod
     def watch(cls, name: str) -> Self:
@@ -133,11 +138,7 @@ class SharedBlock:
         Raises:
             RealtimeError: there is none; the message lists those that there are.
         """
-        path = FOLDER / f"{PREFIX}{name}"
-        try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-        except OSError as error:
-            raise _nobody(name, error.strerror) from error
+        path, descriptor = _find(name)
         try:
             memory = mmap.mmap(descriptor, os.fstat(descriptor).st_size, access=mmap.ACCESS_READ)
             valid = memory[0:8] == _MAGIC
@@ -146,7 +147,7 @@ class SharedBlock:
         if not valid or _is_free(descriptor):
             os.close(descriptor)
             raise _nobody(name, "it is no block of this version" if not valid else "nobody holds it any more")
-        return cls._opened(name, descriptor, memory)
+        return cls._opened(path, descriptor, memory)
 
     @property
     def is_held(self) -> bool:
@@ -167,28 +168,32 @@ class SharedBlock:
         os.pwrite(self._descriptor, data, start + offset)
 
     @classmethod
-    def _opened(cls, name: str, descriptor: int, memory: mmap.mmap) -> Self:
+    def _opened(cls, path: Path, descriptor: int, memory: mmap.mmap) -> Self:
         length = int.from_bytes(memory[8:16], "little")
         described = json.loads(memory[16 : 16 + length])
         start = -(-(16 + length) // _HEADER) * _HEADER
-        block = cls(name, descriptor, memory, {k: (start + o, s) for k, (o, s) in described["sections"].items()})
+        block = cls(path, descriptor, memory, {k: (start + o, s) for k, (o, s) in described["sections"].items()})
         block.about = described["about"]
         return block
 
     @staticmethod
-    def _make_file(path: Path) -> int:
-        while True:
+    def _make_file(name: str) -> tuple[Path, int]:
+        for _ in range(_TRIES):
+            path = FOLDER / f"{PREFIX}{name}.{secrets.token_hex(8)}"
             try:
                 descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-            except FileExistsError:
-                raise RealtimeError(f"A robot called {path.name.removeprefix(PREFIX)!r} is running already.") from None
             except OSError as error:
                 raise RealtimeError(f"Shared memory cannot be made in {FOLDER}: {error.strerror}.") from error
             fcntl.flock(descriptor, fcntl.LOCK_SH)
-            # A sweep between the two calls took it for rubbish.
-            if path.exists() and os.stat(path).st_ino == os.fstat(descriptor).st_ino:
-                return descriptor
+            others = any(not free and other != path and _name(other) == name for other, free in _blocks())
+            # A sweep between the two calls may have taken it for rubbish.
+            if path.exists() and not others:
+                return path, descriptor
+            path.unlink(missing_ok=True)
             os.close(descriptor)
+            # Perhaps somebody was just asking whether anybody holds the other, or makes one of this name, too.
+            time.sleep(random.uniform(1, 3) * _ASKING_S)
+        raise RealtimeError(f"A robot called {name!r} is running already.")
 
     def section(self, name: str) -> memoryview:
         """Return a section's memory; it is valid until `close`."""
@@ -214,14 +219,57 @@ class SharedBlock:
         with contextlib.suppress(BufferError):
             self._memory.close()
         sweep()
-        path = FOLDER / f"{PREFIX}{self.name}"
-        if path.exists():
+        if self._path.exists():
             # Either others hold it, or somebody was just asking whether anybody does.
             time.sleep(_ASKING_S)
             sweep()
 
 
-def _nobody(name: str, why: str | None) -> RealtimeError:
+def _find(name: str) -> tuple[Path, int]:
+    """Return the file of this user's block of a name, and a descriptor of it.
+
+    Raises:
+        RealtimeError: there is none; the message lists those that there are.
+    """
+    # A killed run may have left another one, and one that is being made is given up if this one is held.
+    found = [(free, not _is_made(path), path) for path, free in _blocks() if _name(path) == name]
+    for _, _, path in sorted(found):
+        if (descriptor := _open(path)) is not None:
+            return path, descriptor
+    raise _nobody(name, "no process of yours has made such a block")
+
+
+def _open(path: Path) -> int | None:
+    """Return a descriptor of a block; None if it is gone, or no plain file that this user alone can open."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:
+        return None
+    about = os.fstat(descriptor)
+    if stat.S_ISREG(about.st_mode) and about.st_uid == os.geteuid() and not stat.S_IMODE(about.st_mode) & 0o077:
+        return descriptor
+    os.close(descriptor)
+    return None
+
+
+def _is_made(path: Path) -> bool:
+    """Return whether a block is complete."""
+    descriptor = _open(path)
+    if descriptor is None:
+        return False
+    try:
+        return os.pread(descriptor, len(_MAGIC), 0) == _MAGIC
+    finally:
+        os.close(descriptor)
+
+
+def _name(path: Path) -> str:
+    """Return the name of the block in a file; version 0.1 called files by it alone."""
+    found = _FILE.fullmatch(path.name)
+    return found["name"] if found else path.name.removeprefix(PREFIX)
+
+
+def _nobody(name: str, why: str) -> RealtimeError:
     return RealtimeError(f"No running robot is called {name!r} ({why}). Running: {', '.join(names()) or 'none'}.")
 
 
@@ -237,7 +285,9 @@ def _is_free(descriptor: int) -> bool:
 
 def _map(path: Path) -> mmap.mmap:
     # By a descriptor of its own: the mapping keeps a copy of it, and would keep the lock of the other.
-    descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    descriptor = _open(path)
+    if descriptor is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
     try:
         return mmap.mmap(descriptor, os.fstat(descriptor).st_size)
     finally:
@@ -245,22 +295,24 @@ def _map(path: Path) -> mmap.mmap:
 
 
 def names() -> list[str]:
-    """Return the names of the blocks that a process holds."""
-    return sorted(path.name.removeprefix(PREFIX) for path, free in _blocks() if not free)
+    """Return the names of this user's blocks that a process holds."""
+    return sorted({_name(path) for path, free in _blocks() if not free})
 
 
 def sweep() -> list[str]:
-    """Remove the blocks that no process holds any more; return their names."""
-    return sorted(path.name.removeprefix(PREFIX) for path, free in _blocks(remove=True) if free)
+    """Remove this user's blocks that no process holds any more; return their names."""
+    return sorted(_name(path) for path, free in _blocks(remove=True) if free)
 
 
 def _blocks(*, remove: bool = False) -> Iterator[tuple[Path, bool]]:
-    """Yield each block's file and whether nobody holds it."""
+    """Yield the file of each block of this user, and whether nobody holds it."""
     for path in sorted(FOLDER.glob(f"{PREFIX}*")) if FOLDER.is_dir() else []:
-        try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-        except OSError:
-            continue  # gone in the meantime, or another user's
+        # Other programs have files with such names, too; version 0.1's have no part that cannot be guessed.
+        if not _FILE.fullmatch(path.name) and not _is_made(path):
+            continue
+        descriptor = _open(path)
+        if descriptor is None:
+            continue
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if remove:

@@ -11,6 +11,11 @@ from bhd_lerobot.data.bag_qos import offered
 from bhd_lerobot.data.bag_read import FILES, Bag, first_time
 from bhd_lerobot.errors import ConfigError, DatasetError
 
+_UNREADABLE = (
+    *(OSError, yaml.YAMLError, RecursionError),  # the file, its YAML, or how deep that is
+    *(LookupError, TypeError, ValueError, ArithmeticError, AttributeError),  # YAML, but of another shape
+)
+
 
 def find_bags(path: Path) -> list[Bag]:
     """Return the bag at a path, or the bags in a folder of bags.
@@ -73,10 +78,9 @@ def _folder(path: Path) -> Bag | None:
         # rosbag2's first versions wrote the folder in front of the name, and a moved bag has another one
         names = [Path(name).name for name in _texts(told["relative_file_paths"])]
         expected = int(told["message_count"])
-        mode = str(told.get("compression_mode") or "").lower()
-        kind = str(told.get("compression_format") or "").lower()
+        mode, kind = (_text(told.get(f"compression_{what}") or "").lower() for what in ("mode", "format"))
         publishers = publishers_of(told.get("topics_with_message_count"))
-    except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
+    except _UNREADABLE as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         if not files:
             raise DatasetError(f"{metadata} cannot be read ({reason[:200]}), and there is no bag file.") from error
@@ -174,14 +178,23 @@ def publishers_of(topics: Any) -> dict[str, int]:
     for one in topics if isinstance(topics, list) else ():
         told = one.get("topic_metadata") if isinstance(one, dict) else None
         if isinstance(told, dict):
-            name = str(told.get("name"))
+            name = told.get("name")
+            if not isinstance(name, str):
+                continue
             found[name] = max(found.get(name, 0), offered(told.get("offered_qos_profiles")))
     return {name: count for name, count in found.items() if count}
 
 
 def _texts(value: Any) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
-        raise TypeError(f"relative_file_paths is {value!r}, not a list of names")
+        raise TypeError("relative_file_paths is not a list of names")
+    return value
+
+
+def _text(value: Any) -> str:
+    """Return a text. In YAML, lists of lists by reference are short, and as text have any length."""
+    if not isinstance(value, str):
+        raise TypeError(f"a {type(value).__name__} is where a text was expected")
     return value
 
 

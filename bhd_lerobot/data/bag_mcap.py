@@ -5,16 +5,15 @@ shows only in the order in which messages were written. So the records are walke
 """
 
 import contextlib
-import importlib
 import mmap
 import struct
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from zlib import crc32
 
 from bhd_lerobot.data.bag_qos import offered
+from bhd_lerobot.data.bag_unpack import MESSAGE_BYTES, Budget
 from bhd_lerobot.errors import DatasetError
 
 _MAGIC = b"\x89MCAP0\r\n"
@@ -30,17 +29,20 @@ class McapFile:
     Attributes:
         channels: number -> topic, type, serialisation; those seen so far.
         publishers: number -> how many offered the channel's topic, where the recorder wrote it.
+        budget: how much it may still unpack to.
         problems: what could not be read, in sentences.
 
     Args:
         path: the file.
+        budget: how much it may unpack to; by its own size if None.
 
     Raises:
         DatasetError: it is no MCAP file.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, budget: Budget | None = None) -> None:
         self.path = path
+        self.budget = budget or Budget(path)
         self.channels: dict[int, tuple[str, str, str]] = {}
         self.publishers: dict[int, int] = {}
         self.problems: list[str] = []
@@ -73,8 +75,13 @@ class McapFile:
         return counts if counts is not None and counts.keys() <= self.channels.keys() else None
 
     def messages(self) -> Iterator[tuple[int, int, Any, int, int]]:
-        """Yield channel, receive time [ns], and where its bytes lie: a buffer, first and last; in the file's order."""
+        """Yield channel, receive time [ns], and where its bytes lie: a buffer, first and last; in the file's order.
+
+        Raises:
+            DatasetError: it unpacks to more than any recording does, or its compression is not known.
+        """
         self.problems = []
+        self.budget.start()
         try:
             yield from self._walk()
         except struct.error as error:
@@ -120,8 +127,8 @@ class McapFile:
         name = self._data[at + 4 : at + 4 + length].decode(errors="replace")
         at += 4 + length + 8
         try:
-            content = self._data[at:end] if not name else _decompressor(name, self.path)(self._data[at:end])
-        except DatasetError:
+            content = self.budget.unpack(name, self._data[at:end], size) if name else self._data[at:end]
+        except (DatasetError, MemoryError):
             raise
         except Exception as error:  # of two libraries, and they differ in what they raise
             self._note(f"the chunk at byte {place} cannot be decompressed ({' '.join(str(error).split())}); left out")
@@ -131,6 +138,8 @@ class McapFile:
             return
         for op, first, last in _records(content, 0, len(content)):
             if op == _MESSAGE:
+                if name:
+                    self.budget.take(MESSAGE_BYTES)
                 yield (*_message(content, first), content, first + 22, last)
             else:
                 self._define(op, content, first, last)
@@ -138,11 +147,11 @@ class McapFile:
     def _define(self, op: int, data: Any, at: int, end: int) -> None:
         if op == _SCHEMA:
             (number,) = struct.unpack_from("<H", data, at)
-            self._schemas[number], _ = _text(data, at + 2)
+            self._schemas[number], _ = _text(data, at + 2, end)
         elif op == _CHANNEL:
             number, schema = struct.unpack_from("<HH", data, at)
-            topic, at = _text(data, at + 4)
-            encoding, at = _text(data, at)
+            topic, at = _text(data, at + 4, end)
+            encoding, at = _text(data, at, end)
             self.channels[number] = (topic, self._schemas.get(schema, ""), encoding)
             with contextlib.suppress(struct.error):  # what is damaged there is not needed
                 self.publishers[number] = offered(_pairs(data, at, end).get("offered_qos_profiles"))
@@ -164,8 +173,10 @@ def _records(data: Any, at: int, end: int) -> Iterator[tuple[int, int, int]]:
         at = start + size
 
 
-def _text(data: Any, at: int) -> tuple[str, int]:
+def _text(data: Any, at: int, end: int) -> tuple[str, int]:
     (size,) = struct.unpack_from("<I", data, at)
+    if at + 4 + size > end:
+        raise struct.error("a text is longer than what it is in")
     return bytes(data[at + 4 : at + 4 + size]).decode(errors="replace"), at + 4 + size
 
 
@@ -175,20 +186,6 @@ def _pairs(data: Any, at: int, end: int) -> dict[str, str]:
     at += 4
     pairs = {}
     while at < stop:
-        key, at = _text(data, at)
-        pairs[key], at = _text(data, at)
+        key, at = _text(data, at, stop)
+        pairs[key], at = _text(data, at, stop)
     return pairs
-
-
-def _decompressor(name: str, path: Path) -> Callable[[bytes], bytes]:
-    """Return what takes a chunk apart; of one that is cut off, as much as there is."""
-    if name == "zstd":
-        return zstd().ZstdDecompressor().decompress
-    if name == "lz4":
-        return importlib.import_module("lz4.frame").LZ4FrameDecompressor().decompress
-    raise DatasetError(f"{path} is compressed with {name!r}, which is not known; valid: zstd, lz4, nothing.")
-
-
-def zstd() -> Any:
-    """Return the zstd module that `rosbags` brings."""
-    return importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")

@@ -22,6 +22,6 @@ def offered(profiles: Any) -> int:
 def _listed(text: str) -> int:
     try:
         profiles = yaml.safe_load(text)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError, RecursionError):
         return 0
     return len(profiles) if isinstance(profiles, list) else 0

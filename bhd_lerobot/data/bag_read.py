@@ -1,8 +1,6 @@
 """Bags as they are: folders or files, SQLite or MCAP, in the order in which they were written, damage and all."""
 
 import contextlib
-import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -12,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.data.bag_mcap import McapFile, zstd
+from bhd_lerobot.data.bag_mcap import McapFile
 from bhd_lerobot.data.bag_sqlite import SqliteFile
+from bhd_lerobot.data.bag_unpack import Budget, plain_file
 from bhd_lerobot.errors import DatasetError
 
 FILES: dict[str, Any] = {".mcap": McapFile, ".db3": SqliteFile}
@@ -162,7 +161,7 @@ class Bag:
 
     def _open(self) -> Iterator[Any]:
         for path in self.files:
-            with _plain(path) as plain, contextlib.closing(FILES[plain.suffix](plain)) as file:
+            with plain_file(path) as plain, contextlib.closing(FILES[plain.suffix](plain, Budget(path))) as file:
                 yield file
 
 
@@ -203,7 +202,9 @@ class _Walk:
                 if payload[:4] == _ZSTD:  # a serialised message never begins so
                     self.packed += 1
                     try:
-                        payload = zstd().decompress(payload)
+                        payload = file.budget.unpack("zstd", payload)
+                    except (DatasetError, MemoryError):
+                        raise
                     except Exception:  # of whichever zstd there is
                         self.lost += 1
                         continue
@@ -240,24 +241,7 @@ class Picker:
 def first_time(path: Path) -> int | None:
     """Return when the first message of a file was received [ns]; None if it cannot be read."""
     try:
-        with _plain(path) as plain, contextlib.closing(FILES[plain.suffix](plain)) as file:
+        with plain_file(path) as plain, contextlib.closing(FILES[plain.suffix](plain, Budget(path))) as file:
             return next((int(received) for _, received, *_ in file.messages()), None)
     except DatasetError:
         return None
-
-
-@contextlib.contextmanager
-def _plain(path: Path) -> Iterator[Path]:
-    """Give a file without the compression around it."""
-    if path.suffix != ".zstd":
-        yield path
-        return
-    with tempfile.TemporaryDirectory(prefix="bhd-bag-") as folder:
-        target = Path(folder) / path.stem
-        try:
-            with zstd().open(path, "rb") as packed, target.open("wb") as file:
-                shutil.copyfileobj(packed, file)
-        except (EOFError, zstd().ZstdError) as error:
-            if not target.stat().st_size:
-                raise DatasetError(f"{path} cannot be decompressed: {error}. Restore it from a copy.") from error
-        yield target

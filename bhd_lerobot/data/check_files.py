@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.check_names import check_names
 from bhd_lerobot.data.findings import Findings, few, one_line
+from bhd_lerobot.data.places import wrong_info
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.data.state import no_dataset, repair_with_info
 from bhd_lerobot.errors import DatasetError
@@ -118,6 +119,8 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise DatasetError(
             f"{path} has no {few(missing) or 'features'}; nothing can be checked without. {repair_with_info(root)}"
         )
+    if wrong := wrong_info(info):
+        raise DatasetError(f"{path} cannot be used: {wrong}. {repair_with_info(root)}")
     for key in _COUNTS:
         if isinstance(info[key], bool) or not isinstance(info[key], int) or info[key] < 0:
             raise DatasetError(

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.findings import Findings, few
 from bhd_lerobot.data.parquet_rescue import is_cut_off
+from bhd_lerobot.data.places import check_links
 from bhd_lerobot.data.publish import WORK, is_decided
+from bhd_lerobot.errors import DatasetError
 
 if TYPE_CHECKING:
     from bhd_lerobot.data.check_files import Files
@@ -21,6 +23,10 @@ def check_names(files: Files, findings: Findings) -> None:
     for key in files.cameras:
         wanted |= {layout.video_file(key, slot) for slot in files.slots(f"videos/{key}")}
     there = {name for name in layout.recorded_files(files.root) if not name.startswith("meta/")}
+    try:
+        check_links(files.root)
+    except DatasetError as error:
+        findings.error("files", layout.INFO, "a link leads out of the dataset, which no command follows", str(error))
     for name in sorted(wanted - there):
         findings.error("files", name, "it is missing", _RECORD)
     leftovers = sorted(there - wanted)

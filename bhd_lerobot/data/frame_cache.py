@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.places import check_inside
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.data.state import corrupt
 from bhd_lerobot.data.table import FrameTable
@@ -269,11 +270,11 @@ class FrameCache:
     def _decode_pictures(self, key: str) -> None:
         from PIL import Image
 
-        column, images = self._table.pictures[key], self.images[key]
+        column, images, root = self._table.pictures[key], self.images[key], Path(self._table.meta.root)
 
         def decode(row: int, value: Mapping[str, Any]) -> None:
             # The file of a picture that is not in the table lies beside it.
-            source = io.BytesIO(value["bytes"]) if value["bytes"] else self._table.meta.root / value["path"]
+            source = io.BytesIO(value["bytes"]) if value["bytes"] else check_inside(root, root / value["path"])
             pixels = np.asarray(Image.open(source))
             if pixels.dtype != np.uint8:
                 raise UnsupportedDatasetError(f"The images of {key!r} are {pixels.dtype}, which is not kept in memory")

@@ -4,6 +4,7 @@ import json
 from typing import Any
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.places import wrong_info
 from bhd_lerobot.errors import DatasetError
 
 _COUNTS = ("total_episodes", "total_frames", "total_tasks")
@@ -59,7 +60,7 @@ def _wrong(info: dict[str, Any]) -> str:
     for key in ("data_path", "video_path", "robot_type"):
         if not isinstance(info.get(key), str | None):
             return f"{key!r} is {_kind(info[key])} and no text"
-    return ""
+    return wrong_info(info)
 
 
 def _kind(value: object) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock
+from bhd_lerobot.data.places import check_inside
 from bhd_lerobot.data.publish import complete_interrupted, has_unfinished_episodes
 from bhd_lerobot.data.remote import MANIFEST, SUBSET, Item, is_recorded, listed
 from bhd_lerobot.data.remote_subset import read_subset
@@ -110,21 +111,9 @@ def _files(state: DatasetState, stamps: dict[str, Any]) -> tuple[list[str], list
     left_out = sorted(name for name in stamps if is_recorded(name) and name not in needed)
     skipped = {*left_out, SUBSET, MANIFEST, layout.UNREPORTED}
     names = [name for name in sorted(stamps) if name not in skipped and name.split("/")[0] not in _TEMPORARY]
-    _refuse_links_outside(state.root, names)
+    for name in names:  # notes beside the dataset, too: nobody sees in a listing that a file is only linked there
+        check_inside(state.root, state.root / name)
     return names, left_out
-
-
-def _refuse_links_outside(root: Path, names: list[str]) -> None:
-    """Refuse to publish a file that is not of the dataset: nobody sees in a listing that it is only linked there."""
-    whole = root.resolve()
-    for name in names:
-        path = root / name
-        if path.is_symlink() and not (target := path.resolve()).is_relative_to(whole):
-            raise DatasetError(
-                f"{path} is a link to {target}, outside of the dataset, and a copy of that file would be sent. Remove "
-                f"the link; or, if the file belongs to the dataset, make a copy with `cp -rL {quoted(root)} "
-                "COPY` and take that."
-            )
 
 
 def _stamps(root: Path) -> dict[str, tuple[int, ...]]:

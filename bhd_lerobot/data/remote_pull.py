@@ -7,11 +7,12 @@ a rename. What an interruption leaves is in that folder, and the next attempt go
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock, write_errors
+from bhd_lerobot.data.places import wrong_path
 from bhd_lerobot.data.publish import clean, complete_interrupted, has_unfinished_episodes, is_free
 from bhd_lerobot.data.remote import (
     MANIFEST,
@@ -169,8 +170,8 @@ class _Pull:
                 "moment, wait until that ends; otherwise check the name and the revision."
             )
         for path in there:
-            if path.startswith("/") or ".." in PurePosixPath(path).parts:
-                raise TransferError(f"{name} has a file {path!r}, which would lie outside of the dataset.")
+            if wrong := wrong_path(path):
+                raise TransferError(f"{name} has a file that cannot be fetched: {wrong}.")
         hidden = {path for path in there if path.startswith(".") or path in (SUBSET, MANIFEST)}
         return {path: file for path, file in there.items() if path not in hidden}
 

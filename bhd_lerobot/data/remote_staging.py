@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shutil
+import stat
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -36,11 +37,12 @@ class Staging:
         """
         self._root = root
         # Where nothing can be put beside the dataset, its staging folder is the place.
-        self.folder = root / PULL if must_be_inside(root) else root.with_name(f".{root.name}.pull")
-        is_empty = self.folder.is_dir() and not any(self.folder.iterdir())
-        if self.folder.exists() and not is_empty and not (self.folder / _MARKER).exists():
+        self.folder = folder = root / PULL if must_be_inside(root) else root.with_name(f".{root.name}.pull")
+        is_empty = folder.is_dir() and not any(folder.iterdir())
+        is_ours = is_empty or (folder / _MARKER).exists()
+        if os.path.lexists(folder) and not (is_ours and _is_own(folder)):
             raise DatasetError(
-                f"{self.folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
+                f"{folder} is in the way: bhd-data pull needs this name for a while, and did not make what is "
                 "there. Move it, or choose another --root."
             )
         if root.is_dir():
@@ -92,6 +94,12 @@ class Staging:
                 (root / _MARKER).touch()  # it is going to be in the place of the folder for a moment
             publish(folder, root, Disk(), done=f"{root} had been pulled", replaced="all")
             (root / _MARKER).unlink(missing_ok=True)
+
+
+def _is_own(folder: Path) -> bool:
+    """Tell whether a path is a folder of this user: in a place that is everybody's, another could change it later."""
+    about = folder.lstat()
+    return stat.S_ISDIR(about.st_mode) and about.st_uid == os.geteuid()
 
 
 def _link(source: Path, target: Path) -> None:

@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.findings import few
+from bhd_lerobot.data.places import wrong_info
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.data.state import read_json
 from bhd_lerobot.errors import DatasetCorruptError
@@ -57,6 +58,8 @@ def read_info(path: Path) -> dict[str, Any]:
         isinstance(one, dict) and "dtype" in one and isinstance(one.get("shape"), list) for one in features.values()
     ):
         raise DatasetCorruptError("it has no features")
+    if wrong := wrong_info(info):
+        raise DatasetCorruptError(wrong)
     if isinstance(info.get("fps"), bool) or not isinstance(info.get("fps"), int | float) or not info["fps"] > 0:
         raise DatasetCorruptError("it has no fps")
     if not str(info.get("codebase_version")).startswith("v3."):

@@ -1,6 +1,8 @@
 """The films of a wreck: which frames of which film show which episode."""
 
 import contextlib
+import os
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -225,10 +227,21 @@ def _being_moved(path: Path) -> Path | None:
     """
     begin = path.read_bytes() if path.is_file() else b""
     for other in sorted(Path(tempfile.gettempdir()).glob("*.mp4")) if begin else []:
+        if not _is_own(other):  # that folder is everybody's
+            continue
         with contextlib.suppress(OSError), open(other, "rb") as file:
             if other.stat().st_size > len(begin) and file.read(len(begin)) == begin and not whole_frames(other)[1]:
                 return other
     return None
+
+
+def _is_own(path: Path) -> bool:
+    """Tell whether a path is a plain file of this user: neither another's, nor a link, nor a pipe that never ends."""
+    try:
+        about = path.lstat()
+    except OSError:
+        return False
+    return stat.S_ISREG(about.st_mode) and about.st_uid == os.getuid()
 
 
 def whole_frames(path: Path) -> tuple[int, str]:

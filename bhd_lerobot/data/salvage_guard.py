@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 from typing import NoReturn
 
+from bhd_lerobot.data.places import check_links
 from bhd_lerobot.errors import DatasetError, DatasetLockedError
 
 _BLOCK = 1 << 20
@@ -38,8 +39,9 @@ def check_readable(root: Path) -> None:
     A file that may not be read, or not at this moment, is not damaged: its episodes would be given up for nothing.
 
     Raises:
-        DatasetError: it refuses.
+        DatasetError: it refuses, or a link leads out of the dataset.
     """
+    check_links(root)
 
     def refuse(error: OSError) -> NoReturn:
         raise DatasetError(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from bhd_lerobot.data.places import wrong_name
 from bhd_lerobot.errors import ConfigError, FrameError, unknown_name
 
 DEFAULT_FEATURES: dict[str, dict[str, Any]] = {
@@ -130,8 +131,8 @@ def _row_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _checked(key: str, feature: Mapping[str, Any]) -> dict[str, Any]:
-    if not key or "/" in key:
-        raise ConfigError(f"Feature name {key!r} is not valid: it must not be empty or contain '/'.")
+    if wrong := wrong_name(key):
+        raise ConfigError(f"A feature's name is not valid: {wrong}. It must not be empty or contain '/'.")
     dtype = feature.get("dtype")
     if dtype not in _ARROW and dtype not in ("video", "language"):
         raise ConfigError(f"Feature {key!r}: {unknown_name('dtype', dtype, [*_ARROW, 'video', 'language'])}")

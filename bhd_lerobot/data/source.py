@@ -37,6 +37,8 @@ def local_metadata(
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
+    from bhd_lerobot.data.table import checked
+
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
     if revision is not None and (folder / layout.INFO).is_file() and not (folder / ".cache/huggingface").is_dir():
         raise ConfigError(
@@ -45,7 +47,7 @@ def local_metadata(
         )
     complete_interrupted(folder)
     try:
-        meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
+        meta = checked(LeRobotDatasetMetadata(repo_id, root=root, revision=revision))
         wanted = episodes if select is None else select(meta)
         if _missing(meta, wanted):
             meta = LeRobotDataset(repo_id, root=root, revision=revision, episodes=_listed(wanted)).meta

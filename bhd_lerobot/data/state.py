@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.layout import Slot
+from bhd_lerobot.data.places import check_links, wrong_info
 from bhd_lerobot.data.publish import complete_interrupted
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError, quoted
 
@@ -142,18 +143,21 @@ def load_state(root: Path, *, films: bool = True) -> DatasetState:
     Reads file footers, not their pages: a damaged value inside a file is found by `bhd_lerobot.data.repair.repair`.
 
     Raises:
-        DatasetError: `root` is not a dataset.
+        DatasetError: `root` is not a dataset, or a link in it leads out of it.
         DatasetCorruptError: a file is missing, unreadable or contradicts the others; the message names it.
     """
     complete_interrupted(root)
     if not (root / layout.INFO).is_file():
         raise no_dataset(root)
+    check_links(root)
     info = read_json(root / layout.INFO)
     for key in ("codebase_version", "features", "fps", "total_episodes", "total_frames", "total_tasks"):
         if key not in info:
             raise corrupt(root / layout.INFO, f"it has no {key!r}")
     if not isinstance(info["features"], dict) or not all(isinstance(one, dict) for one in info["features"].values()):
         raise corrupt(root / layout.INFO, "its features are no JSON objects")
+    if wrong := wrong_info(info):
+        raise corrupt(root / layout.INFO, wrong)
     if info.get("data_path") not in (None, layout.DATA_PATH) or info.get("video_path") not in (None, layout.VIDEO_PATH):
         raise UnsupportedDatasetError(
             f"{root} keeps its files at {info.get('data_path')!r} and {info.get('video_path')!r}; this program reads "

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.places import wrong_info
 from bhd_lerobot.data.publish import complete_interrupted
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
 from bhd_lerobot.data.state import corrupt
@@ -35,7 +36,19 @@ def open_metadata(root: Path | str) -> "LeRobotDatasetMetadata":
         raise DatasetError(f"{root} is not a LeRobot dataset: it {found}. Record one with bhd-record.")
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-    return LeRobotDatasetMetadata(root.name, root=root)
+    return checked(LeRobotDatasetMetadata(root.name, root=root))
+
+
+def checked(meta: "LeRobotDatasetMetadata") -> "LeRobotDatasetMetadata":
+    """Return LeRobot's metadata if no name in them leads out of the dataset.
+
+    Raises:
+        DatasetCorruptError: one does.
+    """
+    templates = {"data_path": meta.data_path, "video_path": meta.video_path}
+    if wrong := wrong_info({"features": meta.features, **templates}):
+        raise corrupt(Path(meta.root) / layout.INFO, wrong)
+    return meta
 
 
 class FrameTable:

@@ -16,12 +16,13 @@ WEIGHT_FILES = ("model.safetensors", "adapter_model.safetensors")
 _HUB_ID = re.compile(r"[\w][\w.-]*/[\w][\w.-]*")
 
 
-def find_checkpoint(path: str | Path) -> Path:
+def find_checkpoint(path: str | Path, revision: str | None = None) -> Path:
     """Return the folder with a policy's configuration and weights.
 
     Args:
         path: that folder; a checkpoint's or a training run's folder, then its last checkpoint; or the name of a model
             on the Hub, `user/name`.
+        revision: branch, tag or commit of a model on the Hub; its main branch if None.
 
     Raises:
         ConfigError: there is none, or it is not complete; the message says what was looked for.
@@ -41,7 +42,7 @@ def find_checkpoint(path: str | Path) -> Path:
     try:
         # What a policy consists of: neither the optimizer's state nor videos.
         patterns = ["*.json", "*.safetensors", "*.model", "*.txt"]
-        return _complete(_in_folder(Path(snapshot_download(text, allow_patterns=patterns))))
+        return _complete(_in_folder(Path(snapshot_download(text, revision=revision, allow_patterns=patterns))))
     except ConfigError:
         raise
     except Exception as error:  # the Hub's client lets through whatever its transport raises

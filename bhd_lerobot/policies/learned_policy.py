@@ -20,8 +20,10 @@ from lerobot.utils.constants import (
     POLICY_PREPROCESSOR_DEFAULT_NAME,
 )
 from lerobot.utils.device_utils import is_torch_device_available
+from lerobot.utils.import_utils import register_third_party_plugins
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.contract import CONFIG_FILE, camera_name
 from bhd_lerobot.policies.mlp import configuration_mlp  # noqa: F401 - registers bhd_mlp
 
@@ -88,6 +90,7 @@ def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = 
                 f"The checkpoint {folder} has no {name}.json, so nothing says how its inputs were normalised. Copy it "
                 "again; if a LeRobot before 0.4 wrote it, convert it with LeRobot's migrate_policy_normalization.py."
             )
+    check_checkpoint(folder)
     try:
         # LeRobot prints where it loads from, and without `strict` it would go on with weights that are not there.
         with contextlib.redirect_stdout(io.StringIO()):
@@ -118,6 +121,8 @@ def _config(folder: Path, device: str) -> Any:
         kind = values["type"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{file} cannot be read ({error!r}). Copy the checkpoint again.") from error
+    if kind not in PreTrainedConfig.get_known_choices():
+        register_third_party_plugins()
     if kind not in PreTrainedConfig.get_known_choices():
         known = ", ".join(sorted(PreTrainedConfig.get_known_choices()))
         raise ConfigError(

@@ -47,7 +47,7 @@ def running() -> list[LiveBlock]:
     for name in names():
         try:
             block = LiveBlock.watch(name)
-        except (RealtimeError, KeyError):  # gone in the meantime, or the block of something else
+        except (RealtimeError, KeyError, TypeError, ValueError):  # gone in the meantime, or the block of something else
             continue
         if "made_ns" in block.about and "commands" in block.about:
             found.append(block)

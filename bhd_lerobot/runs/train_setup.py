@@ -18,7 +18,8 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot.utils.random_utils import set_seed
 
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
-from bhd_lerobot.policies.contract import PolicyContract
+from bhd_lerobot.policies.checkpoint_guard import check_checkpoint
+from bhd_lerobot.policies.contract import PolicyContract, find_checkpoint
 from bhd_lerobot.runs.config_train import BhdTrainConfig
 
 
@@ -134,6 +135,10 @@ def build_policy(config: BhdTrainConfig, meta: LeRobotDatasetMetadata, accelerat
     """
     policy: Any = config.policy
     check_features(policy, meta, config.rename_map)
+    if policy.pretrained_path is not None:
+        # One folder on this machine, so that what is checked is what LeRobot loads.
+        policy.pretrained_path = find_checkpoint(policy.pretrained_path, policy.pretrained_revision).resolve()
+        check_checkpoint(policy.pretrained_path)
     if config.seed is not None:
         set_seed(config.seed, accelerator=accelerator)
     try:

@@ -345,15 +345,18 @@ def test_datasets_share_no_file(plain: Path, filmed: Path, tmp_path: Path) -> No
 
 def test_links_of_a_cache_are_followed(filmed: Path, tmp_path: Path) -> None:
     """The Hub's client keeps datasets as relative links."""
-    for path in filmed.rglob("*"):
-        if path.is_file():
-            link = tmp_path / "cache" / path.relative_to(filmed)
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(os.path.relpath(path, link.parent))
-    keep(tmp_path / "cache", range(4), tmp_path / "kept")
+    cache = tmp_path / "datasets--me--d"
+    (cache / "blobs").mkdir(parents=True)
+    snapshot = cache / "snapshots" / "abc"
+    for number, path in enumerate(one for one in sorted(filmed.rglob("*")) if one.is_file()):
+        blob, link = cache / "blobs" / str(number), snapshot / path.relative_to(filmed)
+        shutil.copy(path, blob)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(os.path.relpath(blob, link.parent))
+    keep(snapshot, range(4), tmp_path / "kept")
     assert content(tmp_path / "kept") == content(filmed)
-    mark(tmp_path / "cache", [0], outcome="stuck")
-    assert content(tmp_path / "cache")[1:] == content(filmed)[1:]
+    mark(snapshot, [0], outcome="stuck")
+    assert content(snapshot)[1:] == content(filmed)[1:]
 
 
 def test_instructions_of_an_episode_that_has_several(tmp_path: Path) -> None:

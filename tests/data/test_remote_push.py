@@ -129,15 +129,19 @@ def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path) -> No
     assert stored(hub)["README.md"] == b"# my own\n"
 
 
-def test_a_folder_behind_a_link_is_not_taken_for_gone(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_a_folder_behind_a_link_is_not_taken_for_gone(
+    hub: HubServer, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is not seen must not be removed at the other end."""
     copied = Path(shutil.copytree(root, tmp_path / "copied"))
     send(root)
     before = HubDataset("me/d").files()
     (copied / "videos").rename(tmp_path / "big")
     (copied / "videos").symlink_to(tmp_path / "big")
-    with pytest.raises(DatasetError, match="behind a link"):
-        send(copied)
+    for declared, said in (("", "is a link to .*big"), (tmp_path / "big", "behind a link")):
+        monkeypatch.setenv("BHD_LINKED_FOLDERS", str(declared))
+        with pytest.raises(DatasetError, match=said):
+            send(copied)
     assert HubDataset("me/d").files() == before
 
 

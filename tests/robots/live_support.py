@@ -56,7 +56,7 @@ def is_alive(pid: int) -> bool:
 
 def is_gone(name: str) -> bool:
     """Return whether nothing of a robot is left in shared memory."""
-    return name not in names() and not (FOLDER / f"{PREFIX}{name}").exists()
+    return name not in names() and not any(FOLDER.glob(f"{PREFIX}{name}.*"))
 
 
 def mode(robot: Any) -> Mode:

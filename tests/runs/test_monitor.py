@@ -148,18 +148,22 @@ def test_who_watches_does_not_hold_the_name() -> None:
         LiveBlock.watch(f"{NAME}-held")
 
 
+def files(name: str) -> list[Path]:
+    return list(shared_block.FOLDER.glob(f"{shared_block.PREFIX}{name}.*"))
+
+
 def test_what_nobody_holds_any_more_is_not_watched() -> None:
-    path = shared_block.FOLDER / f"{shared_block.PREFIX}{NAME}-dead"
+    name = f"{NAME}-dead"
     code = (
         "import os; from bhd_lerobot.control.shared_block import SharedBlock\n"
-        f"SharedBlock.create({path.name.removeprefix(shared_block.PREFIX)!r}, {{'words': 512}}, {{}}); os._exit(9)"
+        f"SharedBlock.create({name!r}, {{'words': 512}}, {{}}); os._exit(9)"
     )
     subprocess.run([sys.executable, "-c", code], check=False)
-    assert path.exists()
+    assert files(name)
     with pytest.raises(RealtimeError, match="nobody holds it any more"):
-        SharedBlock.watch(path.name.removeprefix(shared_block.PREFIX))
+        SharedBlock.watch(name)
     shared_block.sweep()
-    assert not path.exists()
+    assert not files(name)
 
 
 # --- states ----------------------------------------------------------------------------------------------------------

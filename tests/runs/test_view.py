@@ -15,11 +15,14 @@ import webbrowser
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from aiohttp import web
 from matplotlib.image import imread
 
 from bhd_lerobot.data.state import load_state
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.runs import data, data_view
 from bhd_lerobot.runs.view.dataset import stamp_of
 from bhd_lerobot.runs.view.guard import TOKEN_HEADER, is_loopback
@@ -42,6 +45,40 @@ def test_a_part_of_a_film_is_that_part(base, base_server) -> None:
     assert base_server.ask(path, headers={"Range": f"bytes={len(whole)}-"})[0] == 416
     header, _ = episode(base_server, 1)
     assert header["films"][0]["from"] == pytest.approx(20 / 10)  # behind the first episode's
+
+
+def test_a_link_out_of_the_dataset_is_not_served(base: Path, stock: Path, tmp_path: Path) -> None:
+    """Any user of this machine may ask the server, for what its owner alone may read."""
+    secret = tmp_path / "secret"
+    secret.write_text("password")
+    root = Path(shutil.copytree(base, tmp_path / "base"))
+    film = next((root / "videos").glob("*/*/*.mp4"))
+    with served(root) as server:  # the link is made while it runs
+        whole = film.read_bytes()
+        film.unlink()
+        film.symlink_to(secret)
+        path = f"/films/{film.parts[-3]}/0/0.mp4"
+        status, _, said = server.ask(path)
+        assert (status, b"password" in said, b"is a link to" in said) == (409, False, True)
+        (root / "own.mp4").write_bytes(whole)
+        film.unlink()
+        film.symlink_to("../../../own.mp4")
+        assert server.ask(path)[2] == whole
+    film.unlink()
+    film.symlink_to(secret)
+    with pytest.raises(DatasetError, match=r"is a link to .*secret, outside of the dataset"), served(root):
+        pass
+    root = Path(shutil.copytree(stock, tmp_path / "stock"))
+    data = next((root / "data").glob("*/*.parquet"))
+    table = pq.read_table(data)
+    key = next(name for name in table.column_names if name == PHOTO)
+    place = table.schema.get_field_index(key)
+    for path in (str(secret), "../secret"):
+        column = pa.array([{"bytes": None, "path": path}] * table.num_rows, table.schema.field(place).type)
+        pq.write_table(table.set_column(place, table.schema.field(place), column), data)
+        with served(root) as server:
+            status, _, said = server.ask(f"/api/episodes/0/images/{key}/0")
+            assert (status, b"password" in said) == (409, False)
 
 
 @pytest.mark.parametrize(

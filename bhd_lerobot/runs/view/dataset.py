@@ -17,6 +17,7 @@ from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock
 from bhd_lerobot.data.episode_table import PREFIX
 from bhd_lerobot.data.mark import possible_outcomes
+from bhd_lerobot.data.places import check_inside
 from bhd_lerobot.data.state import DatasetState, Row, corrupt, load_state, slot_of
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.runs.view.episode import packed_episode
@@ -135,10 +136,14 @@ class ViewedDataset:
             self._packed.clear()
 
     def film(self, key: str, slot: layout.Slot) -> Path | None:
-        """Return the file of a camera's film, or None if there is no such camera or file."""
+        """Return the file of a camera's film, or None if there is no such camera or file.
+
+        Raises:
+            DatasetError: a link leads out of the dataset. It is looked at each time: links can be made meanwhile.
+        """
         if key not in self.state.video_keys:
             return None
-        path = self.root / layout.video_file(key, slot)
+        path = check_inside(self.root, self.root / layout.video_file(key, slot))
         return path if path.is_file() else None
 
     def image(self, index: int, key: str, frame: int) -> bytes | None:
@@ -157,9 +162,10 @@ class ViewedDataset:
             stored = _table(self.state, row, [key])[key][frame].as_py() or {}
         if stored.get("bytes"):
             return bytes(stored["bytes"])
-        beside = self.root / (stored.get("path") or "")
-        inside = beside.resolve().is_relative_to(self.root.resolve())
-        return beside.read_bytes() if stored.get("path") and inside and beside.is_file() else None
+        if not stored.get("path"):
+            return None
+        beside = check_inside(self.root, self.root / stored["path"])
+        return beside.read_bytes() if beside.is_file() else None
 
 
 def stamp_of(root: Path) -> str:
