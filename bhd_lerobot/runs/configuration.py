@@ -75,10 +75,10 @@ def run(main: Callable[[Any], int | None], config_class: type, arguments: Sequen
     An error of this package is printed as a sentence, without a traceback, and gives status 2.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    if any(a in ("-h", "--help") for a in arguments):
-        print(describe(config_class))
-        return 0
     try:
+        if any(a in ("-h", "--help") for a in arguments):
+            print(describe(config_class), flush=True)
+            return 0
         return main(parse(config_class, arguments)) or 0
     except BhdError as error:
         print(f"error: {error}", file=sys.stderr)

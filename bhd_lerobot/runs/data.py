@@ -2,17 +2,14 @@
 
 import argparse
 import importlib
-import os
 import re
-import select
-import signal
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
 from bhd_lerobot.data.publish import noting_what_is_done
 from bhd_lerobot.errors import BhdError, unknown_name
-from bhd_lerobot.runs.start import INTERRUPTED, leaving_on_interrupt
+from bhd_lerobot.runs.start import INTERRUPTED, ending_when_unread, leaving_on_interrupt
 
 # Modules, in the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
 COMMANDS = (
@@ -76,32 +73,13 @@ def _carry_out(options: argparse.Namespace, done: Sequence[str]) -> int:
         done: what has come into force so far.
     """
     try:
-        status: int = options.run(options)
-        if sys.stdout is not None:
-            sys.stdout.flush()  # a pipe that nobody reads shows now, not when Python ends
-        return status
-    except BrokenPipeError:
-        if not _is_unread():
-            raise
-        return 128 + signal.SIGPIPE  # without a word, as other programs
+        return ending_when_unread(lambda: options.run(options))
     except BhdError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print(f"Stopped; {', '.join(done) or options.stopped}.", file=sys.stderr)
         return INTERRUPTED
-
-
-def _is_unread() -> bool:
-    """Tell whether nobody reads any more what is printed; then Python shall not try it again when it ends."""
-    if sys.stdout is None:
-        return False
-    poll = select.poll()
-    poll.register(sys.stdout, 0)
-    if not any(what & select.POLLERR for _, what in poll.poll(0)):
-        return False
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return True
 
 
 if __name__ == "__main__":

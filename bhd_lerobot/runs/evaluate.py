@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -22,7 +21,7 @@ from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
 from bhd_lerobot.robots.simulation import Simulation, describe
 from bhd_lerobot.runs.cluster_loop import open_crew
 from bhd_lerobot.runs.config_eval import YARDSTICKS, EvalConfig
-from bhd_lerobot.runs.configuration import encode, run
+from bhd_lerobot.runs.configuration import run
 from bhd_lerobot.runs.eval_console import tell_summary
 from bhd_lerobot.runs.eval_metrics import JerkMeasure
 from bhd_lerobot.runs.eval_report import Film, ReportInput, write_report
@@ -32,6 +31,7 @@ from bhd_lerobot.runs.preview import Preview
 from bhd_lerobot.runs.provenance import versions
 from bhd_lerobot.runs.record_report import ESTOP_STATUS, tell_refusals
 from bhd_lerobot.runs.registry import make_robot, make_simulation
+from bhd_lerobot.runs.run_folder import run_folder
 from bhd_lerobot.runs.signals import StopRequest, stop_on_signals
 
 RESULTS_NAME = "results.json"
@@ -102,8 +102,8 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
             key = "space or e, or " if pressed.add_key() else ""
             console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} this process")
         preview, no_films = _make_preview(config, console)
-        output_dir = _make_output_dir(config)
-        facts = _facts(config, simulation, runs)
+        with run_folder(config, "eval") as output_dir:
+            facts = _facts(config, simulation, runs)
         with _progress(console) as progress:
             bars = [progress.add_task(escape(one.label), total=len(config.indices), success="") for one in runs]
             for one, bar in zip(runs, bars, strict=True):
@@ -234,21 +234,6 @@ def _refuse_results(config: EvalConfig) -> None:
             f"The folder {config.output_dir} holds the results of an evaluation ({RESULTS_NAME}). Set another "
             "--output_dir, or remove it."
         )
-
-
-def _make_output_dir(config: EvalConfig) -> Path:
-    if config.output_dir:
-        folder = Path(config.output_dir).expanduser()
-    else:
-        now = datetime.now()
-        name = f"{now:%H-%M-%S}_{config.robot.type}_{config.task.get_choice_name(type(config.task))}"
-        folder = Path("outputs/eval") / f"{now:%Y-%m-%d}" / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "config.yaml").write_text(yaml.safe_dump(encode(config), sort_keys=False), encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
-    return folder
 
 
 @contextmanager

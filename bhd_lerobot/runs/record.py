@@ -5,11 +5,9 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -25,7 +23,7 @@ from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.robots.simulation import Simulation, describe
 from bhd_lerobot.runs.cluster_loop import ClusterLoop, open_crew
 from bhd_lerobot.runs.config_record import RecordConfig
-from bhd_lerobot.runs.configuration import encode, run
+from bhd_lerobot.runs.configuration import run
 from bhd_lerobot.runs.data_push import check_pushable, left_by_interrupt, push_command, push_dataset, tell
 from bhd_lerobot.runs.data_transfer import prompt_interrupt
 from bhd_lerobot.runs.episode import EpisodeLoop
@@ -39,6 +37,7 @@ from bhd_lerobot.runs.provenance import episode_metadata
 from bhd_lerobot.runs.record_report import RecordResult, tell_refusals, tell_summary
 from bhd_lerobot.runs.registry import make_brain, make_robot, make_simulation, make_task
 from bhd_lerobot.runs.resume_advice import instead_of_resuming
+from bhd_lerobot.runs.run_folder import run_folder
 from bhd_lerobot.runs.signals import stop_on_signals
 from bhd_lerobot.tasks.task import Task, episode_seed, outcomes_of
 
@@ -83,12 +82,14 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         preview = _make_preview(config, simulation, console)
         if simulation.camera_names and is_here:
             simulation.start_rendering()  # a machine without OpenGL fails here, before a dataset exists
-        output_dir = _make_output_dir(config)
-        result = RecordResult(root, output_dir, stopped_by=stop)
-        show = live_view(config, simulation, console)  # a view that cannot be started fails before a dataset exists
-        with show as loop.observer, open_recorder(config, root, simulation, task, brain) as recorder:
+        with ExitStack() as opened:
+            with run_folder(config, "record") as output_dir:
+                # A view that cannot be started fails before a dataset exists.
+                loop.observer = opened.enter_context(live_view(config, simulation, console))
+                recorder = opened.enter_context(open_recorder(config, root, simulation, task, brain))
+            result = RecordResult(root, output_dir, stopped_by=stop)
             if recorder.repair_report:
-                console.print(f"Mended before resuming: {recorder.repair_report}")
+                console.print(f"Repaired before resuming: {recorder.repair_report}")
             album, first = _run(config, recorder, loop, result, console)
         if loop.emergency_stop:
             result.estop = ", ".join(pressed.causes) or "from another process"
@@ -277,21 +278,6 @@ def _make_preview(config: RecordConfig, simulation: Simulation, console: Console
             raise
         console.print(f"No film of an episode: {error}")
         return None
-
-
-def _make_output_dir(config: RecordConfig) -> Path:
-    if config.output_dir:
-        folder = Path(config.output_dir).expanduser()
-    else:
-        now = datetime.now()
-        name = f"{now:%H-%M-%S}_{config.robot.type}_{config.task.get_choice_name(type(config.task))}"
-        folder = Path("outputs/record") / f"{now:%Y-%m-%d}" / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "config.yaml").write_text(yaml.safe_dump(encode(config), sort_keys=False), encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
-    return folder
 
 
 def _progress(console: Console) -> Progress:

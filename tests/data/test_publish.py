@@ -1,0 +1,370 @@
+"""New content takes its place in one step, wherever that is; the sweeps say what happens when it is disturbed."""
+
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from bhd_lerobot.data import disk, layout, publish
+from bhd_lerobot.data.check_dataset import check_dataset
+from bhd_lerobot.data.disk import Disk, RootLock
+from bhd_lerobot.data.edits import delete, keep, merge, split
+from bhd_lerobot.data.inspect import dataset_info
+from bhd_lerobot.data.mark import mark
+from bhd_lerobot.data.repair import repair
+from bhd_lerobot.data.table import open_metadata
+from bhd_lerobot.errors import DatasetError, DatasetExistsError, DatasetLockedError
+from bhd_lerobot.runs import data
+from tests.data import support
+from tests.data.edit_support import content, record
+from tests.data.sweeps.operations import leftovers
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return record(tmp_path / "d", [0, 1, 2])
+
+
+def names(root: Path) -> list[str]:
+    return sorted(path.relative_to(root).as_posix() for path in root.rglob("*"))
+
+
+# --- the place --------------------------------------------------------------------------------------------------------
+
+
+def test_what_others_put_into_a_dataset_stays_as_it_was(root: Path) -> None:
+    (root / "README.md").write_text("mine")
+    (root / "own/deep/empty").mkdir(parents=True)
+    (root / "own/secret").write_text("mine")
+    (root / "own/secret").chmod(0o600)
+    (root / "link").symlink_to("own/secret")
+    root.chmod(0o750)
+    inode = (root / "own/secret").stat().st_ino
+    delete(root, [1])
+    assert [one.task for one in content(root)] == [["task 0"], ["task 0"]]
+    assert (root / "README.md").read_text() == "mine"
+    assert (root / "own/deep/empty").is_dir()
+    assert ((root / "own/secret").stat().st_mode & 0o777, (root / "own/secret").stat().st_ino) == (0o600, inode)
+    assert os.readlink(root / "link") == "own/secret"
+    assert root.stat().st_mode & 0o777 == 0o750
+    assert leftovers(root.parent) == []
+
+
+def test_what_somebody_adds_while_the_names_are_exchanged_comes_along(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    swap = Disk.swap
+
+    def late(self: Disk, one: Path, other: Path) -> None:
+        (root / "late.txt").write_text("mine")
+        swap(self, one, other)
+
+    monkeypatch.setattr(Disk, "swap", late)
+    delete(root, [1])
+    assert (root / "late.txt").read_text() == "mine"
+
+
+def test_nobody_ever_sees_anything_between_the_old_content_and_the_new_one(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between any two changes of the disk the dataset is the old one or the new one, as a stock LeRobot reads it."""
+    old = content(root)
+    new = [old[0], old[2]]
+    seen: list[int] = []
+
+    def look(action: str, path: Path) -> None:
+        found = content(root)
+        assert found in (old, new)
+        seen.append(len(found))
+
+    monkeypatch.setattr(disk, "_before_step", look)
+    delete(root, [1])
+    assert set(seen) == {2, 3}
+    assert seen == sorted(seen, reverse=True)
+
+
+def test_the_current_folder_is_not_put_aside(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(root)
+    inode = root.stat().st_ino
+    assert data.main(["delete", ".", "--episodes=1"]) == 0
+    assert (root.stat().st_ino, Path.cwd(), len(content(root))) == (inode, root, 2)
+    assert leftovers(root.parent) == []
+
+
+def test_a_link_to_an_empty_folder_and_one_to_a_dataset_stay_links(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "link").symlink_to("disk")
+    keep(root, [0, 2], tmp_path / "link")
+    assert (tmp_path / "link").is_symlink()
+    assert len(content(tmp_path / "disk")) == 2
+    delete(tmp_path / "link", [0])
+    assert (tmp_path / "link").is_symlink()
+    assert content(tmp_path / "disk") == [content(root)[2]]
+    (tmp_path / "new").mkdir()
+    (tmp_path / "to_new").symlink_to("new")
+    with support.create(tmp_path / "to_new") as recorder:
+        support.record(recorder)
+    assert support.read_back(tmp_path / "new") == 1
+    (tmp_path / "dangling").symlink_to("nowhere")
+    with pytest.raises(DatasetExistsError, match="link to nothing"):
+        keep(root, [0], tmp_path / "dangling")
+
+
+def test_a_mount_point_is_a_place_like_any_other(root: Path, tmp_path: Path) -> None:
+    """Of a container, for example, whose volume is the dataset."""
+    folder = Path(__file__).parent
+    program = f"""
+import os, sys
+from pathlib import Path
+sys.path[:0] = [{str(folder)!r}]
+import support
+from bhd_lerobot.data.edits import delete, keep, split
+from bhd_lerobot.runs import data
+root, place = Path({str(root)!r}), Path({str(tmp_path / "volume")!r})
+def empty():
+    os.system(f"umount {{place}} 2>/dev/null")
+    assert os.system(f"mount -t tmpfs tmpfs {{place}}") == 0
+    (place / "lost+found").mkdir()
+    return place
+with support.create(empty()) as recorder:
+    support.record(recorder), support.record(recorder)
+with support.resume(place) as recorder:
+    support.record(recorder)
+assert support.read_back(place) == 3
+delete(place, [1])
+assert sorted(os.listdir(place)) == ["data", "lost+found", "meta"], os.listdir(place)
+keep(root, [0, 2], empty())
+assert data.main(["mark", str(place), "--episodes=0", "--outcome=failure"]) == 0
+split(root, {{"a": [0], "b": [1]}}, empty())
+assert sorted(os.listdir(place)) == ["a", "b", "lost+found"]
+assert data.main(["export", str(root), "--output", str(empty())]) == 0
+assert data.main(["import", str(place), "--repo_id=t/t", "--root", str(root.parent / "again")]) == 0
+assert data.main(["pull", f"file://{{root}}", "--root", str(empty())]) == 0
+delete(place, [0])
+assert data.main(["pull", f"file://{{root}}", "--root", str(place), "--replace", "--verify"]) == 0
+assert support.read_back(place) == 3
+assert sorted(os.listdir(place)) == ["data", "lost+found", "meta"], os.listdir(place)
+print("all of it")
+"""
+    (tmp_path / "volume").mkdir()
+    for options in (["--mount"], ["--mount", "--map-root-user"]):
+        if subprocess.run(["unshare", *options, "true"], capture_output=True, check=False).returncode == 0:
+            break
+    else:
+        pytest.skip("this system permits no mounts")
+    done = subprocess.run(
+        ["unshare", *options, sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(folder.parents[1])},
+    )
+    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["all of it"]), done.stderr
+
+
+@pytest.mark.parametrize("reason", ["a folder that links cannot reach", "a file system without an exchange of names"])
+def test_where_names_cannot_be_exchanged_the_content_is_moved_in(
+    root: Path, monkeypatch: pytest.MonkeyPatch, reason: str
+) -> None:
+    inode = root.stat().st_ino
+    (root / "own").mkdir()
+    if "links" in reason:
+        os.mkfifo(root / "own/pipe")
+    else:
+
+        def refuse(*_: object) -> None:
+            raise OSError(22, "Invalid argument")
+
+        monkeypatch.setattr(Disk, "swap", refuse)
+        (root / "own/notes").write_text("mine")
+    delete(root, [1])
+    assert (len(content(root)), root.stat().st_ino) == (2, inode)
+    assert len(list((root / "own").iterdir())) == 1
+    assert leftovers(root.parent) == []
+
+
+# --- who else is there ------------------------------------------------------------------------------------------------
+
+
+def test_a_lock_goes_along_and_a_lock_on_what_was_put_aside_is_none(root: Path) -> None:
+    handle = os.open(root, os.O_RDONLY)  # of somebody who is about to lock it
+    lock = RootLock(root)
+    with publish.Workspace(root, Disk(), lock) as space:
+        shutil.copytree(root / "meta", space.folder / "meta")
+        space.publish("it had been made")
+    assert os.fstat(handle).st_ino != root.stat().st_ino
+    with pytest.raises(DatasetLockedError):
+        RootLock(root)
+    lock.release()
+    RootLock(root).release()
+    os.close(handle)
+
+
+def test_workspaces_of_killed_processes_are_removed_and_those_of_living_ones_stay(root: Path) -> None:
+    (root.parent / ".d.bhd-old/d/data").mkdir(parents=True)
+    living = root.parent / ".d.bhd-new"
+    living.mkdir()
+    lock = RootLock(living)
+    delete(root, [1])
+    assert leftovers(root.parent) == [".d.bhd-new"]
+    lock.release()
+    assert not repair(root)
+    assert leftovers(root.parent) == []
+
+
+# --- a move that was decided ------------------------------------------------------------------------------------------
+
+
+def half_moved(root: Path) -> None:
+    """Leave a dataset as a process does that is killed between the renames of an edit."""
+    new = root / publish.WORK / "new"
+    other = root.with_name("other")
+    shutil.copytree(root, other)
+    delete(other, [1])
+    shutil.copytree(other / "meta", new / "meta")
+    shutil.copytree(other / "data", new / "data")
+    shutil.rmtree(other)
+    (root / publish.WORK / "old").mkdir()
+    (root / "data").rename(root / publish.WORK / "old/data")
+    (root / publish.WORK / "ready").touch()
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        dataset_info,
+        check_dataset,
+        open_metadata,
+        lambda root: merge([root, record(root.with_name("e"), [5])], root.with_name("all")),
+        lambda root: split(root, {"a": [0], "b": [1]}, root.with_name("parts")),
+        lambda root: data.main(["info", str(root)]),
+        lambda root: data.main(["export", str(root), "--output", str(root.with_name("bags"))]),
+        lambda root: data.main(["repair", str(root)]),
+    ],
+    ids=["info", "check", "loader", "merge", "split", "bhd-data info", "export", "repair"],
+)
+def test_whoever_comes_next_completes_it_and_says_so(root: Path, read, caplog, capsys) -> None:
+    half_moved(root)
+    with caplog.at_level(logging.WARNING):
+        read(root)
+    assert len(content(root)) == 2
+    assert "completed" in caplog.text + capsys.readouterr().out
+    assert leftovers(root.parent) == []
+
+
+def test_while_its_process_lives_it_is_waited_for(root: Path) -> None:
+    half_moved(root)
+    lock = RootLock(root)
+    with pytest.raises(DatasetLockedError, match="Wait until it ends"):
+        dataset_info(root)
+    lock.release()
+
+
+# --- an edit that nobody was told of ----------------------------------------------------------------------------------
+
+
+class KilledError(Exception):
+    pass
+
+
+def killed(report: object) -> None:
+    raise KilledError
+
+
+def test_an_edit_that_nobody_was_told_of_is_recognised(root: Path, tmp_path: Path, capsys) -> None:
+    """With the numbers of another state, the next one would delete a good episode."""
+    first, _, last = content(root)
+    with pytest.raises(KilledError):
+        delete(root, [1], killed)
+    assert data.main(["delete", str(root), "--episodes=1"]) == 0
+    assert "interrupted before, after it had been completed: nothing was changed now" in capsys.readouterr().out
+    assert content(root) == [first, last]
+    assert data.main(["delete", str(root), "--episodes=1"]) == 0  # now it is meant
+    assert content(root) == [first]
+
+    with pytest.raises(KilledError):
+        mark(root, [0], outcome="failure", note="why", tell=killed)
+    assert mark(root, [0], outcome="failure", note="why").is_repeated
+    assert not mark(root, [0], outcome="failure", note="why").is_repeated
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda root: delete(root, [0]),
+        lambda root: mark(root, [0], outcome="failure"),
+        lambda root: keep(root, [0], root.with_name("kept")),
+        lambda root: split(root, {"a": [0], "b": [1]}, root.with_name("parts")),
+    ],
+    ids=["delete", "mark", "filter", "split"],
+)
+def test_other_numbers_of_episodes_are_refused_once_after_it(root: Path, other) -> None:
+    with pytest.raises(KilledError):
+        delete(root, [1], killed)
+    before = names(root)
+    with pytest.raises(DatasetError, match="had been completed"):
+        other(root)
+    assert names(root) == [name for name in before if name != layout.UNREPORTED]
+    assert len(content(root)) == 2
+    other(root)
+
+
+# --- signals ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_wait_until_it_is_done(root: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals) -> None:
+    seen: list[int] = []
+    former = signal.signal(number, lambda got, frame: seen.append(len(content(root))))
+    swap = Disk.swap
+
+    def disturbed(self: Disk, one: Path, other: Path) -> None:
+        signal.raise_signal(number)
+        assert seen == []
+        swap(self, one, other)
+        signal.raise_signal(number)
+        assert seen == []
+
+    try:
+        monkeypatch.setattr(Disk, "swap", disturbed)
+        delete(root, [1])
+    finally:
+        signal.signal(number, former)
+    assert seen == [2]
+
+
+def test_ctrl_c_at_the_end_of_an_edit_says_that_it_was_made(root: Path, monkeypatch, capsys) -> None:
+    swap = Disk.swap
+
+    def disturbed(self: Disk, one: Path, other: Path) -> None:
+        swap(self, one, other)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Disk, "swap", disturbed)
+    assert data.main(["delete", str(root), "--episodes=1"]) == 130
+    said = capsys.readouterr().err
+    assert "had been completed" in said
+    assert "nothing was changed" not in said
+    assert len(content(root)) == 2
+
+
+def test_in_another_thread_signals_are_somebody_elses(root: Path) -> None:
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            delete(root, [1])
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert failed == []
+    assert len(content(root)) == 2
