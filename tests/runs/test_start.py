@@ -122,3 +122,25 @@ def test_the_handler_before_comes_back() -> None:
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, former)
+
+
+@pytest.mark.parametrize("command", ["bhd-record", "bhd-replay", "bhd-data"])
+def test_help_that_nobody_reads_to_its_end_ends_without_a_word(command: str) -> None:
+    """As of ``--help | head``; bhd-data has tests of its other output."""
+    module, _, function = SCRIPTS[command].partition(":")
+    program = f"import sys; sys.argv = [{command!r}, '--help']; import {module} as m; sys.exit(m.{function}())"
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdout=writing,
+            stderr=subprocess.PIPE,
+            stdin=subprocess.DEVNULL,
+            check=False,
+        )
+    finally:
+        os.close(writing)
+    assert done.returncode in (0, 128 + signal.SIGPIPE)
+    assert b"Traceback" not in done.stderr
