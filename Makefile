@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format bench bench-realtime results lock clean venv
+.PHONY: help demo test sweep lint format bench bench-realtime results lock clean venv
 
 PYTHON_IN_VENV := .venv/bin/python
 # Two test processes by default; `make test WORKERS=0` runs everything in one, for a debugger.
@@ -17,6 +17,9 @@ demo: venv ## record, replay, train and evaluate both robots
 
 test: venv ## run the tests; PYTEST_ARGS='-k name' narrows them down
 	$(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal $(PYTEST_ARGS)
+
+sweep: venv ## disturb every command that writes at each of its steps (half an hour), of which `make test` tries some
+	BHD_SWEEP=full $(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal tests/data/sweeps $(PYTEST_ARGS)
 
 lint: venv ## check style, docstrings and types
 	$(PYTHON_IN_VENV) -m ruff check
