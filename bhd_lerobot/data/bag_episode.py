@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pyarrow import types as arrow
 
 from bhd_lerobot.data import bag_checksum, layout
 from bhd_lerobot.data import features as keys
@@ -29,8 +30,10 @@ from bhd_lerobot.data.ros2_parts import (
 from bhd_lerobot.data.ros2_split import check_topics, parts_of
 from bhd_lerobot.data.schema import DEFAULT_FEATURES, LANGUAGE
 from bhd_lerobot.data.state import DatasetState, Row, slot_of
-from bhd_lerobot.errors import UnsupportedDatasetError
+from bhd_lerobot.errors import DatasetError, UnsupportedDatasetError
 
+_PLAIN = (arrow.is_string, arrow.is_boolean, arrow.is_integer, arrow.is_floating, arrow.is_list, arrow.is_null)
+_LONGEST_S = 1e8  # three years, which nobody records
 _PAUSE_NS = 10 * NANO  # between two episodes
 
 STATE_COLUMNS = (
@@ -71,6 +74,12 @@ class EpisodeTopics:
         self._features: dict[str, Any] = {k: v for k, v in state.info["features"].items() if k not in DEFAULT_FEATURES}
         self._robot = str(state.info.get("robot_type") or "")
         self._next_start = round(start_s * NANO)
+        for name, kind in state.metadata_types.items():
+            if not any(is_one(kind) for is_one in _PLAIN):
+                raise UnsupportedDatasetError(
+                    f"{PREFIX}{name} of the episodes of {state.root} is {kind}; bags hold texts, numbers, truth values "
+                    "and lists of them."
+                )
         self._parts = {key: self._parts_of(key) for key in self._features}
         check_topics(part for parts in self._parts.values() for part in parts)
         self.custom = {"bhd_format": str(types.FORMAT), "bhd_repo_id": repo_id, "bhd_robot_type": self._robot}
@@ -102,6 +111,13 @@ class EpisodeTopics:
     def streams(self, row: Row, columns: Mapping[str, NDArray[Any]]) -> list[Stream]:
         """Return the topics of an episode. At the same time, observations come before actions."""
         start, n, episode = self._next_start, row["length"], row["episode_index"]
+        for key in (keys.TIME, keys.AGE):
+            wrong = np.flatnonzero(~(np.abs(columns.get(key, np.zeros(0))) <= _LONGEST_S))
+            if len(wrong):
+                raise DatasetError(
+                    f"{key} of episode {episode} of {self._state.root} is {columns[key][wrong[0]]} in frame "
+                    f"{wrong[0]}, so its messages have no time. Leave the episode out (--episodes)."
+                )
         seconds = columns.get(keys.TIME, np.arange(n) / self._state.info["fps"])
         observed = _rising(start + np.round(np.asarray(seconds, np.float64) * NANO).astype(np.int64))
         ended = np.append(observed[1:], observed[-1:] + round(NANO / self._state.info["fps"]))
