@@ -234,7 +234,7 @@ def _stats(picks: Sequence[Pick], rows: Sequence[Row], tasks: Mapping[str, int])
         fresh = statistics.column_stats({key: values for key, values in columns.items() if key in own})
         for key, stat in {**own, **fresh}.items():
             for name in own[key]:
-                stacked.setdefault(key, {}).setdefault(name, []).append(stat[name])
+                stacked.setdefault(key, {}).setdefault(name, []).append(stat.get(name, own[key][name]))
     for key, stat in stacked.items():
         for name, values in stat.items():
             if len({np.shape(value) for value in values}) > 1:

@@ -3,23 +3,27 @@
 A short form runs here; ``BHD_SWEEP=full`` runs thousands of examples, ``BHD_SWEEP=NUMBER`` the one of this number.
 """
 
+import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.runs import data
 from bhd_lerobot.runs.view.dataset import ViewedDataset
-from tests.data import loader_support
+from tests.data import loader_support, support
 from tests.runs import fuzz_support
 from tests.runs.support import run_record
 
 SEEDS = {"": range(200), "full": range(6000)}
 
+GRANT = ("name", "wanted", "granted", "detail", "remedy")
 READS: Mapping[str, Sequence[str]] = {
     "info": (), "info --short": ("--short",), "info --json": ("--json",), "timing": ("--json",), "check": (),
     "check --no-videos": ("--no-videos", "--json"), "filter": ("--outcome=all", "--output={out}"),
@@ -38,14 +42,23 @@ def sources(tmp_path_factory) -> list[Path]:
     folder = tmp_path_factory.mktemp("sources")
     run_record(folder / "recorded", dataset__episode_time_s=1)
     data.main(["mark", str(folder / "recorded"), "--episodes=2", "--outcome=stuck"])
-    shutil.copytree(folder / "recorded", folder / "other")
+    (path,) = (folder / "recorded/meta/episodes").rglob("*.parquet")
+    table = pq.read_table(path)
+    for name, told in (("interventions", [[1, 3, "a person"]]), ("realtime", [dict.fromkeys(GRANT, "x")])):
+        table = table.append_column(f"bhd/{name}", pa.array([json.dumps(told)] * table.num_rows))
+    pq.write_table(table, path)
     run_record(folder / "filmed", dataset__episode_time_s=0.5, robot__camera="true", n_envs=1, dataset__num_episodes=2)
-    return [folder / "recorded", folder / "filmed", loader_support.record_stock(folder / "stock", cameras=True)]
+    killed = support.create(folder / "killed", video=True)
+    for _ in range(3):
+        support.record(killed, video=True)
+    killed._lock.release()  # as if it had been killed
+    stock = loader_support.record_stock(folder / "stock", cameras=True)
+    return [folder / "recorded", folder / "filmed", folder / "killed", stock]
 
 
 def seeds() -> Sequence[int]:
     wanted = os.environ.get("BHD_SWEEP", "")
-    return SEEDS[wanted] if wanted in SEEDS else [int(wanted)]
+    return [int(wanted)] if wanted.isdecimal() else SEEDS["full" if wanted == "full" else ""]
 
 
 def run(arguments: list[str]) -> int | str:
@@ -56,6 +69,7 @@ def run(arguments: list[str]) -> int | str:
         return ended.code or 0
 
 
+@pytest.mark.timeout(3600)  # the complete form takes minutes
 def test_a_damaged_dataset_ends_no_command_in_a_traceback(sources: list[Path], tmp_path: Path, capsys) -> None:
     root, out = tmp_path / "data" / "d", tmp_path / "out"
     commands = {**READS, **CHANGES}
