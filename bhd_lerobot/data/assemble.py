@@ -174,6 +174,8 @@ def _tasks(picks: Sequence[Pick]) -> dict[str, int]:
     tasks: dict[str, None] = {}
     for source in _sources(picks):
         used = {task for pick in picks if pick.source is source for task in pick.row["tasks"]}
+        if unknown := used - set(source.tasks):
+            raise corrupt(source.root / layout.TASKS, f"it does not have the instruction {min(unknown)!r}")
         tasks |= dict.fromkeys(task for task in source.tasks if task in used)
     return {task: index for index, task in enumerate(tasks)}
 
@@ -233,9 +235,14 @@ def _stats(picks: Sequence[Pick], rows: Sequence[Row], tasks: Mapping[str, int])
         fresh = statistics.column_stats({key: values for key, values in columns.items() if key in own})
         for key, stat in {**own, **fresh}.items():
             for name in own[key]:
-                stacked.setdefault(key, {}).setdefault(name, []).append(stat[name])
+                stacked.setdefault(key, {}).setdefault(name, []).append(stat.get(name, own[key][name]))
     for key, stat in stacked.items():
         for name, values in stat.items():
+            if len({np.shape(value) for value in values}) > 1:
+                raise DatasetMismatchError(
+                    f"The statistic {name} of {key} has {np.size(values[0])} numbers in one episode, and another "
+                    "number of them in others. `lerobot-edit-dataset --operation.type recompute_stats` computes them."
+                )
             if len(values) != len(picks):
                 # Later files of LeRobot's would have more columns than these, and nothing would load any more.
                 raise DatasetMismatchError(

@@ -145,6 +145,8 @@ def _episodes(run: Run, path: Path, plan: Plan) -> Iterable[pa.Table]:
         if part.num_rows != length or part["episode_index"][0].as_py() != old["episode_index"]:
             raise corrupt(path, f"the frames of episode {old['episode_index']} are not where they should be")
         told = part["task_index"].to_numpy()
+        if told.min() < 0 or told.max() >= len(renumbered):
+            raise corrupt(path, f"episode {old['episode_index']} has an instruction that {layout.TASKS} does not tell")
         changed: dict[str, np.ndarray] = {
             "episode_index": np.full(length, new["episode_index"]),
             "index": np.arange(new["dataset_from_index"], new["dataset_to_index"]),

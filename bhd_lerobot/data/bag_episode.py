@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pyarrow import types as arrow
 
 from bhd_lerobot.data import bag_checksum, layout
 from bhd_lerobot.data import features as keys
@@ -29,8 +30,10 @@ from bhd_lerobot.data.ros2_parts import (
 from bhd_lerobot.data.ros2_split import check_topics, parts_of
 from bhd_lerobot.data.schema import DEFAULT_FEATURES, LANGUAGE
 from bhd_lerobot.data.state import DatasetState, Row, slot_of
-from bhd_lerobot.errors import UnsupportedDatasetError
+from bhd_lerobot.errors import DatasetError, UnsupportedDatasetError
 
+_PLAIN = (arrow.is_string, arrow.is_boolean, arrow.is_integer, arrow.is_floating, arrow.is_list, arrow.is_null)
+_LONGEST_S = 1e8  # three years, which nobody records
 _PAUSE_NS = 10 * NANO  # between two episodes
 
 STATE_COLUMNS = (
@@ -71,6 +74,12 @@ class EpisodeTopics:
         self._features: dict[str, Any] = {k: v for k, v in state.info["features"].items() if k not in DEFAULT_FEATURES}
         self._robot = str(state.info.get("robot_type") or "")
         self._next_start = round(start_s * NANO)
+        for name, kind in state.metadata_types.items():
+            if not any(is_one(kind) for is_one in _PLAIN):
+                raise UnsupportedDatasetError(
+                    f"{PREFIX}{name} of the episodes of {state.root} is {kind}; bags hold texts, numbers, truth values "
+                    "and lists of them."
+                )
         self._parts = {key: self._parts_of(key) for key in self._features}
         check_topics(part for parts in self._parts.values() for part in parts)
         self.custom = {"bhd_format": str(types.FORMAT), "bhd_repo_id": repo_id, "bhd_robot_type": self._robot}
@@ -96,12 +105,13 @@ class EpisodeTopics:
             return [NumbersPart(own_topic(key), tuple(map(str, names)))]
         return parts_of(
             key, [str(name) for name in names], self._robot,
-            lidar=self._view.lidar, bare_twist=self._bare_twist,
+            lidar=self._view.lidar, noise=self._view.noise, bare_twist=self._bare_twist,
         )  # fmt: skip
 
     def streams(self, row: Row, columns: Mapping[str, NDArray[Any]]) -> list[Stream]:
         """Return the topics of an episode. At the same time, observations come before actions."""
         start, n, episode = self._next_start, row["length"], row["episode_index"]
+        self._check_times(episode, columns)
         seconds = columns.get(keys.TIME, np.arange(n) / self._state.info["fps"])
         observed = _rising(start + np.round(np.asarray(seconds, np.float64) * NANO).astype(np.int64))
         ended = np.append(observed[1:], observed[-1:] + round(NANO / self._state.info["fps"]))
@@ -109,7 +119,8 @@ class EpisodeTopics:
         index = np.arange(n)
         at_start, at_end = Frames(episode, index, observed), Frames(episode, index, ended)
         streams = [Stream(EPISODE_TOPIC, types.EPISODE, [(start, self._episode(row, columns, start))], latched=True)]
-        if still := views.static_transforms(self._view.frames, start):
+        motion = views.Motion.of(self._view, self._features, columns)
+        if still := views.static_transforms(views.still_frames(self._view, motion), start):
             streams.append(Stream("/tf_static", views.TF, [(start, still[0])], latched=True))
         for key, parts in self._parts.items():
             frames = at_end if key == keys.APPLIED_ACTION else at_start
@@ -122,7 +133,7 @@ class EpisodeTopics:
                     moved = views.base_transforms(part, frames, values)
                     streams.append(_stream("/tf", views.TF, frames, moved))
             if key == keys.OBSERVATION_STATE:
-                streams += self._looks(at_start, columns)
+                streams += self._looks(at_start, columns, motion)
         for key, feature in self._features.items():
             if feature["dtype"] == "video":
                 streams += self._film(key, row, at_start)
@@ -132,14 +143,21 @@ class EpisodeTopics:
         streams.append(_stream(OUTCOME_TOPIC, types.OUTCOME, at_end, _outcomes(at_end, columns)))
         return streams
 
-    def _looks(self, frames: Frames, columns: Mapping[str, NDArray[Any]]) -> list[Stream]:
+    def _check_times(self, episode: int, columns: Mapping[str, NDArray[Any]]) -> None:
+        for key in (keys.TIME, keys.AGE):
+            wrong = np.flatnonzero(~(np.abs(columns.get(key, np.zeros(0))) <= _LONGEST_S))
+            if len(wrong):
+                raise DatasetError(
+                    f"{key} of episode {episode} of {self._state.root} is {columns[key][wrong[0]]} in frame "
+                    f"{wrong[0]}, so its messages have no time. Leave the episode out (--episodes)."
+                )
+
+    def _looks(self, frames: Frames, columns: Mapping[str, NDArray[Any]], motion: views.Motion) -> list[Stream]:
         streams = []
         if wheels := views.wheel_states(self._view, frames, self._features, columns):
             streams.append(_stream("/joint_states", views.JOINT_STATE, frames, wheels))
-        names = self._features[keys.OBSERVATION_STATE].get("names") or []
-        state = columns[keys.OBSERVATION_STATE].astype(np.float64)
-        if tool := views.tool_transforms(self._view, frames, names, state):
-            streams.append(_stream("/tf", views.TF, frames, tool))
+        if links := views.moving_transforms(self._view, frames, motion):
+            streams.append(_stream("/tf", views.TF, frames, links))
         return streams
 
     def _film(self, key: str, row: Row, frames: Frames) -> list[Stream]:

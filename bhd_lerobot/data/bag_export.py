@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from bhd_lerobot.data import layout
@@ -19,7 +18,7 @@ from bhd_lerobot.data.bag_write import BagWriter
 from bhd_lerobot.data.edits import check_reported, opened
 from bhd_lerobot.data.publish import refuse_inside
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
-from bhd_lerobot.data.state import DatasetState, Row, corrupt, ordered_slots
+from bhd_lerobot.data.state import DatasetState, Row, corrupt, ordered_slots, read_frames
 from bhd_lerobot.errors import DatasetError
 
 START_S = 1_000_000_000  # [s] since 1970: a dataset does not know on which day it was recorded
@@ -134,10 +133,7 @@ def _episodes(state: DatasetState, chosen: Sequence[Row]) -> Iterator[tuple[Row,
     stored = [key for key, feature in features.items() if feature["dtype"] != "video"]
     for slot, rows in ordered_slots(chosen, "data").items():
         path = state.root / layout.data_file(slot)
-        try:
-            table = pq.ParquetFile(path, page_checksum_verification=True).read(columns=["episode_index", *stored])
-        except (OSError, pa.ArrowException) as error:
-            raise corrupt(path, error) from error
+        table = read_frames(path, ["episode_index", *stored])
         indices = np.asarray(table["episode_index"])
         for row in rows:
             first, last = np.searchsorted(indices, [row["episode_index"], row["episode_index"] + 1])

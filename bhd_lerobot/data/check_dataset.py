@@ -76,7 +76,8 @@ def check_dataset(
     files = read_files(Path(root), findings)
     robot = files.info.get("robot_type")
     if not files.info["total_episodes"]:
-        findings.warning("counts", layout.INFO, "the dataset is empty: it has no episodes", "Record some.")
+        remedy = "Record some (bhd-record --resume=true), or remove it; nothing can be learned from it as it is."
+        findings.error("counts", layout.INFO, "the dataset is empty: it has no episodes", remedy)
     values = ValueCheck(files, findings, limits_of(robot if isinstance(robot, str) else None))
     values.run()
     if videos:
@@ -119,7 +120,7 @@ def _judge_outcomes(files: Files, findings: Findings) -> None:
     outcomes = files.episodes.get(f"{PREFIX}outcome")
     if not outcomes:
         return
-    counts = Counter("not said" if outcome is None else outcome for outcome in outcomes)
+    counts = Counter("not said" if outcome is None else str(outcome) for outcome in outcomes)
     told = ", ".join(f"{name} {count}" for name, count in counts.most_common())
     if counts.get("success"):
         findings.note("outcome", f"{len(outcomes)} episodes", told)

@@ -5,30 +5,27 @@ all of them are wanted, also in datasets that another program left behind.
 """
 
 import contextlib
-import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.check_names import check_names
+from bhd_lerobot.data.check_stats import UNREAD
+from bhd_lerobot.data.expected import wrong_types
 from bhd_lerobot.data.findings import Findings, few, one_line
-from bhd_lerobot.data.places import wrong_info
+from bhd_lerobot.data.info import InfoError, parse_object, read_info, wrong_feature
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
-from bhd_lerobot.data.state import no_dataset, repair_with_info
+from bhd_lerobot.data.state import UNREADABLE, no_dataset, repair_with_info
 from bhd_lerobot.errors import DatasetError
 
 _COPY = "Restore it from a copy, or try bhd-data repair."
 RESTORE = "Restore it from a copy, or run bhd-data repair, which recovers the episodes that are whole."
-_COUNTS = ("total_episodes", "total_frames", "total_tasks")
-_NEEDED = ("codebase_version", "features", "fps", *_COUNTS)
 _LIGHT = (
     *("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index"),
     "tasks",
@@ -66,9 +63,8 @@ class Files:
 
     @property
     def fps(self) -> float:
-        """Frames a second; NaN if the dataset names no such rate."""
-        fps = self.info["fps"]
-        return float(fps) if isinstance(fps, int | float) and not isinstance(fps, bool) and fps > 0 else math.nan
+        """Frames a second."""
+        return float(self.info["fps"])
 
     @property
     def cameras(self) -> list[str]:
@@ -109,29 +105,11 @@ def _read_info(root: Path) -> dict[str, Any]:
     if not path.is_file():
         raise no_dataset(root)
     try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-        missing = [key for key in _NEEDED if key not in info]
-    except (OSError, ValueError, TypeError) as error:
+        return read_info(path, root, features=False)
+    except (OSError, InfoError) as error:
         raise DatasetError(
-            f"{path} cannot be read, and nothing can be checked without it: {error}. {repair_with_info(root)}"
+            f"{path} cannot be used, and nothing can be checked without it: {one_line(error)}. {repair_with_info(root)}"
         ) from error
-    if not isinstance(info, dict) or missing or not isinstance(info["features"], dict):
-        raise DatasetError(
-            f"{path} has no {few(missing) or 'features'}; nothing can be checked without. {repair_with_info(root)}"
-        )
-    if wrong := wrong_info(info):
-        raise DatasetError(f"{path} cannot be used: {wrong}. {repair_with_info(root)}")
-    for key in _COUNTS:
-        if isinstance(info[key], bool) or not isinstance(info[key], int) or info[key] < 0:
-            raise DatasetError(
-                f"{path} has {info[key]!r} as {key}; it must be a whole number from 0. {repair_with_info(root)}"
-            )
-    if not str(info["codebase_version"]).startswith("v3."):
-        raise DatasetError(
-            f"{root} has dataset format {info['codebase_version']}; this program reads v3.x. LeRobot converts older "
-            "ones."
-        )
-    return info
 
 
 def _check_features(files: Files, findings: Findings) -> None:
@@ -139,16 +117,13 @@ def _check_features(files: Files, findings: Findings) -> None:
         if key not in files.features:
             findings.error("schema", layout.INFO, f"the feature {key!r} is missing, which every dataset has", _COPY)
     for key, feature in list(files.features.items()):
-        described = feature if isinstance(feature, dict) else {}
-        shape, names = described.get("shape"), described.get("names")
-        sizes = list(shape) if isinstance(shape, list | tuple) and shape else [None]
-        if "dtype" not in described or not all(isinstance(size, int) and size > 0 for size in sizes):
-            findings.error("schema", f"{layout.INFO}: {key}", f"it is described by {feature!r}", _COPY)
+        if wrong := wrong_feature(feature):
+            findings.error("schema", f"{layout.INFO}: {key}", f"it {wrong}", _COPY)
             del files.features[key]  # nothing can be said about it
-        elif described["dtype"] not in ("video", "image") and isinstance(names, list) and len(names) != sizes[0]:
-            findings.error("schema", f"{layout.INFO}: {key}", f"{len(names)} names for {sizes[0]} numbers", _COPY)
-    if math.isnan(files.fps):
-        findings.error("schema", layout.INFO, f"fps is {files.info['fps']!r}; it must be positive [Hz]", _COPY)
+            continue
+        names, size = feature.get("names"), feature["shape"][0]
+        if feature["dtype"] not in ("video", "image") and isinstance(names, list) and len(names) != size:
+            findings.error("schema", f"{layout.INFO}: {key}", f"{len(names)} names for {size} numbers", _COPY)
 
 
 def _read_tasks(files: Files, findings: Findings) -> None:
@@ -159,11 +134,12 @@ def _read_tasks(files: Files, findings: Findings) -> None:
         # All of it, though one column is looked at: what is damaged elsewhere shows in the pages' checksums.
         table = pq.ParquetFile(path, page_checksum_verification=True).read()
         indices = table["task_index"].to_pylist()
-    except (OSError, pa.ArrowException, ValueError, KeyError) as error:
+        are_numbered = set(indices) == set(range(len(indices)))
+    except (*UNREADABLE, KeyError, TypeError) as error:
         findings.error("files", layout.TASKS, f"it cannot be read: {one_line(error)}", _COPY)
         return
     files.tasks = len(indices)
-    if set(indices) != set(range(len(indices))):
+    if not are_numbered:
         findings.error("counts", layout.TASKS, f"its numbers are not 0 to {len(indices) - 1}, each once", _COPY)
     elif files.tasks < files.info["total_tasks"]:
         what = f"it holds {files.tasks} instructions; meta/info.json counts {files.info['total_tasks']}"
@@ -181,8 +157,11 @@ def _read_episodes(files: Files, findings: Findings) -> None:
             if len(columns) == len(file.schema_arrow.names) and not files.is_ours:
                 what = "it has no statistics of single episodes, without which nothing can be edited"
                 findings.warning("stats", name, what, stats_remedy(files))
+            if wrong := wrong_types(file.schema_arrow, files.cameras):
+                findings.error("schema", name, wrong, _COPY)
+                continue
             part = file.read().select(columns).to_pydict()
-        except (OSError, pa.ArrowException, ValueError) as error:
+        except UNREADABLE as error:
             findings.error("files", name, f"it cannot be read: {one_line(error)}", _COPY)
             continue
         wanted = [*_LIGHT, *(f"videos/{key}/{one}" for key in files.cameras for one in _SLOT)]
@@ -217,8 +196,6 @@ def _read_episodes(files: Files, findings: Findings) -> None:
 def _check_counts(files: Files, findings: Findings) -> None:
     episodes = files.episodes
     if not episodes:
-        if files.info["total_episodes"] == 0:
-            findings.warning("counts", layout.INFO, "the dataset has no episode", "Record some with bhd-record.")
         return
     length, first, last = (
         np.array(episodes[name], np.int64) for name in ("length", "dataset_from_index", "dataset_to_index")
@@ -251,30 +228,31 @@ def _read_stats(files: Files, findings: Findings) -> None:
         findings.error("stats", name, "it is missing, so no policy can be normalised", remedy)
         return
     try:
-        stats = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        stats = parse_object(path.read_bytes())
+    except (OSError, InfoError) as error:
         findings.error("stats", name, f"it cannot be read: {one_line(error)}", remedy)
         return
     for key, feature in files.features.items():
         if feature["dtype"] in ("string", "language"):
             continue
-        told = stats.get(key) if isinstance(stats, dict) else None
+        told = stats.get(key)
         known = files.stats[key] = _vectors(told if isinstance(told, dict) else {})
         lacking = [one for one in _STATISTICS if one not in known]
+        report = findings.warning if key in UNREAD else findings.error
         if lacking:
-            findings.error("stats", f"{name}: {key}", f"it has no {few(lacking)}", remedy)
+            report("stats", f"{name}: {key}", f"it has no {few(lacking)}", remedy)
         elif feature["dtype"] not in ("video", "image"):
             count = known["count"][0]
             if count != files.info["total_frames"]:
                 what = f"they are of {count:g} frames; the dataset has {files.info['total_frames']}"
-                findings.error("stats", f"{name}: {key}", what, remedy)
+                report("stats", f"{name}: {key}", what, remedy)
 
 
 def _vectors(told: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
     """Return what there are numbers for, flat."""
     vectors: dict[str, NDArray[np.float64]] = {}
     for name, value in told.items():
-        with contextlib.suppress(TypeError, ValueError):
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
             values = np.asarray(value, np.float64).reshape(-1)
             if values.size:
                 vectors[name] = values

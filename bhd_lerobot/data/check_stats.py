@@ -16,6 +16,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+UNREAD = ("index", "episode_index", "task_index")
+"""Columns that LeRobot numbers anew when it merges, splits or deletes, without their statistics. No policy reads them,
+so nothing wrong is learned from these."""
+
 _RANGE = 1e-3  # of the range: histograms and samples of other programs
 _ROUNDING = 2.0**-24  # relative, of one operation in single precision
 _MORE = 4  # operations beside the sum

@@ -18,8 +18,9 @@ from bhd_lerobot.data import features as keys
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.check_files import RESTORE, Files, stats_remedy
 from bhd_lerobot.data.check_frozen import FrozenCheck
-from bhd_lerobot.data.check_stats import Moments, wrong_statistic
+from bhd_lerobot.data.check_stats import UNREAD, Moments, wrong_statistic
 from bhd_lerobot.data.check_steps import StepCheck
+from bhd_lerobot.data.expected import wrong_columns
 from bhd_lerobot.data.findings import Findings, few, name_of, one_line
 
 Limits = Mapping[str, Mapping[str, tuple[float, float]]]
@@ -94,6 +95,9 @@ class ValueCheck:
             if missing:
                 self._findings.error("schema", name, f"it has no column {few(missing)}", _LEAVE)
                 return None
+            if wrong := wrong_columns(file.schema_arrow, self._files.features):
+                self._findings.error("schema", name, wrong, _LEAVE)
+                return None
             extra = [key for key in file.schema_arrow.names if key not in self._files.features]
             if extra:
                 self._findings.warning(
@@ -137,7 +141,7 @@ class ValueCheck:
 
     def _check_times(self, name: str, got: Mapping[str, NDArray[Any]], frame: NDArray[np.int64]) -> None:
         fps = self._files.fps
-        if "timestamp" in got and not math.isnan(fps):
+        if "timestamp" in got:
             off = np.abs(got["timestamp"] - frame / fps)
             # Single precision cannot say it better after a while.
             wrong = np.flatnonzero(~(off <= np.maximum(_TIMESTAMP_TOLERANCE, 1e-6 * frame / fps)))
@@ -175,9 +179,8 @@ class ValueCheck:
                 continue
             self._check_column(key, values.reshape(len(table), size), starts, lengths)
         for key in (keys.LATE, keys.SKIPPED):
-            if key in table.column_names:
-                count = int(table[key].to_numpy().sum())
-                self._counted[key] += count
+            if key in table.column_names and not table[key].null_count:
+                self._counted[key] += int(table[key].to_numpy().sum())
 
     def _count_new(self, table: pa.Table) -> int:
         """Return how many of the episodes known last are in this table."""
@@ -250,7 +253,12 @@ class ValueCheck:
                 continue  # LeRobot's are over other axes
             wrong = wrong_statistic(known, column, self.frames, max(self._lengths))
             if wrong is not None:
-                self._findings.error("stats", f"{layout.STATS}: {key}", f"{wrong} is not that of the data", remedy)
+                where, what = f"{layout.STATS}: {key}", f"{wrong} is not that of the data"
+                if key in UNREAD:
+                    what += ", as after an edit by LeRobot; no policy reads it"
+                    self._findings.warning("stats", where, what, remedy)
+                else:
+                    self._findings.error("stats", where, what, remedy)
 
 
 def _numbers(column: pa.ChunkedArray) -> NDArray[Any] | None:

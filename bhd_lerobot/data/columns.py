@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from bhd_lerobot.data import layout
-from bhd_lerobot.data.state import corrupt, load_state, ordered_slots
+from bhd_lerobot.data.state import load_state, ordered_slots, read_frames
 from bhd_lerobot.errors import DatasetError
 
 
@@ -37,10 +35,7 @@ def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = No
     result: dict[int, dict[str, NDArray]] = {}
     for slot, inside in ordered_slots(rows, "data").items():
         path = root / layout.data_file(slot)
-        try:
-            table = pq.read_table(path, columns=["episode_index", *present], page_checksum_verification=True)
-        except (OSError, pa.ArrowException) as error:
-            raise corrupt(path, error) from error
+        table = read_frames(path, ["episode_index", *present])
         indices = np.asarray(table["episode_index"])  # in ascending order, as LeRobot's format wants it
         arrays = {key: np.asarray(table[key]) for key in present}
         for row in inside:

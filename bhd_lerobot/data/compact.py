@@ -216,10 +216,13 @@ def _all_stats(state: DatasetState, schema: Schema, known: Mapping[int, EpisodeS
                 _store(result, row["episode_index"], known[row["episode_index"]])
             continue
         order, stored = stored_stats(state.root / layout.episodes_file(slot))
-        places = [i for i, index in enumerate(order) if index < state.num_episodes]
+        places = [i for i, index in enumerate(order) if index is not None and 0 <= index < state.num_episodes]
         for key, stat in stored.items():
             for name, values in stat.items():
                 if name in result.get(key, {}):
+                    if values.shape[1:] != result[key][name].shape[1:]:
+                        what = f"its statistic {name} of {key!r} has another shape than the feature"
+                        raise corrupt(state.root / layout.episodes_file(slot), what)
                     result[key][name][[order[i] for i in places]] = values[places]
         unknown += [row for row in rows if row["episode_index"] in state.without_stats]
     for slot, rows in ordered_slots(unknown, "data").items():
@@ -231,7 +234,11 @@ def _stats_from_data(
     state: DatasetState, schema: Schema, slot: Slot, rows: list[Row], result: dict[str, statistics.Stats]
 ) -> None:
     path = state.root / layout.data_file(slot)
-    table = read_frames(path, schema.float_keys)
+    try:
+        wanted = pa.schema([schema.arrow.field(key) for key in schema.float_keys])
+        table = read_frames(path, schema.float_keys).select(schema.float_keys).cast(wanted)
+    except (pa.ArrowException, ValueError) as error:
+        raise corrupt(path, error) from error
     first = min(row["dataset_from_index"] for row in state.rows if slot_of(row, "data") == slot)
     columns = {key: as_numpy(table[key]) for key in schema.float_keys}
     for row in rows:

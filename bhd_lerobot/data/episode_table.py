@@ -8,11 +8,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.data.state import Row, corrupt
+from bhd_lerobot.data.expected import is_listed, wrong_array
+from bhd_lerobot.data.state import UNREADABLE, Row, corrupt
 from bhd_lerobot.errors import FrameError
 
 PREFIX = "bhd/"
 
+_NEEDED = ("min", "max", "mean", "std", "count")  # quantiles may be absent: older versions have none
 _INT = pa.int64()
 _TASKS = pa.list_(pa.field("element", pa.string()))
 _TYPES: dict[type, pa.DataType] = {str: pa.string(), bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
@@ -91,7 +93,12 @@ def episode_table(
         else:
             kind = pa.float64() if name.endswith("_timestamp") else _INT
         names.append(name)
-        arrays.append(pa.array([row.get(name) for row in rows], type=kind))
+        try:
+            arrays.append(pa.array([row.get(name) for row in rows], type=kind))
+        except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
+            raise FrameError(
+                f"{name!r} of the episodes is {kind} and cannot hold what is to be written: {error}."
+            ) from error
     for feature, values in stats.items():
         for statistic, stacked in values.items():
             names.append(f"stats/{feature}/{statistic}")
@@ -110,18 +117,34 @@ def _nested(stacked: np.ndarray) -> pa.Array:
 
 
 def read_stats(file: pq.ParquetFile) -> dict[str, dict[str, np.ndarray]]:
-    """Return the statistics in one file of ``meta/episodes``: feature -> statistic -> values of shape (E, ...)."""
+    """Return the statistics in one file of ``meta/episodes``: feature -> statistic -> values of shape (E, ...).
+
+    Raises:
+        ValueError: one is no array of numbers.
+    """
     names = [name for name in file.schema_arrow.names if name.startswith("stats/")]
+    if len(set(names)) != len(names):
+        raise ValueError("it has more than one column of a statistic")
     table = file.read(columns=names, use_threads=False)
     result: dict[str, dict[str, np.ndarray]] = {}
     for name in names:
         feature, _, statistic = name.removeprefix("stats/").rpartition("/")
         values, shape = table[name].combine_chunks(), [table.num_rows]
-        while pa.types.is_list(values.type):
+        if wrong := wrong_array(values):
+            raise ValueError(f"in its column {name!r}, {wrong}")
+        while is_listed(values.type):
             inner = values.flatten()
             shape.append(len(inner) // max(len(values), 1))
             values = inner
+        if not (pa.types.is_integer(values.type) or pa.types.is_floating(values.type)) or 0 in shape[1:]:
+            raise ValueError(f"its column {name!r} is {table[name].type} and holds no numbers")
         result.setdefault(feature, {})[statistic] = values.to_numpy(zero_copy_only=False).reshape(shape)
+    for feature, stat in result.items():
+        shapes = {values.shape for name, values in stat.items() if name != "count"}
+        if lacking := [name for name in _NEEDED if name not in stat]:
+            raise ValueError(f"it has no {lacking[0]} of {feature!r} among its statistics")
+        if len(shapes) > 1 or stat["count"].size != table.num_rows or not (stat["count"] > 0).all():
+            raise ValueError(f"its statistics of {feature!r} do not fit each other")
     return result
 
 
@@ -135,5 +158,5 @@ def stored_stats(path: Path) -> tuple[list[int], dict[str, dict[str, np.ndarray]
         file = pq.ParquetFile(path)
         order = file.read(columns=["episode_index"], use_threads=False)["episode_index"].to_pylist()
         return order, read_stats(file)
-    except (OSError, pa.ArrowException, ValueError) as error:
+    except (*UNREADABLE, KeyError) as error:
         raise corrupt(path, error) from error

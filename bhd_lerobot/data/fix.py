@@ -20,7 +20,7 @@ from bhd_lerobot.data.meta_files import write_meta
 from bhd_lerobot.data.publish import Workspace, has_unfinished_episodes, link_others, remove_abandoned
 from bhd_lerobot.data.salvage_stats import stats_of
 from bhd_lerobot.data.schema import Schema
-from bhd_lerobot.data.state import DatasetState, corrupt, load_state, ordered_slots, read_frames, read_json
+from bhd_lerobot.data.state import DatasetState, corrupt, load_info, load_state, ordered_slots, read_frames
 
 
 def is_fixable(finding: Finding) -> bool:
@@ -65,7 +65,7 @@ def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
 
 
 def _count_frames(root: Path, disk: Disk) -> str:
-    info = read_json(root / layout.INFO)
+    info = load_info(root)
     frames = 0
     for path in sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet")):
         try:

@@ -52,6 +52,18 @@ def video_file(key: str, slot: Slot) -> str:
     return VIDEO_PATH.format(video_key=key, chunk_index=slot[0], file_index=slot[1])
 
 
+def slot_in(path: Path) -> Slot:
+    """Return the numbers in the name of a file of this layout.
+
+    Raises:
+        ValueError: it has another name.
+    """
+    slot = int(path.parent.name.removeprefix("chunk-")), int(path.stem.removeprefix("file-"))
+    if CHUNK_FILE.format(chunk_index=slot[0], file_index=slot[1]) != f"{path.parent.name}/{path.stem}":
+        raise ValueError(f"{path.parent.name}/{path.stem} is not the name of a chunk and a file")
+    return slot
+
+
 def recorded_files(root: Path) -> set[str]:
     """Return every data, video and episode-metadata file below `root`, as relative POSIX paths.
 

@@ -152,7 +152,7 @@ class _Changes:
         """Change the events of an episode, and what its metadata tells of interventions; return what is logged."""
         if not self._clear and self._intervention is None:
             return {}
-        recorded = json.loads(row.get("bhd/interventions") or "[]")
+        recorded = _interventions(row)
         driven = events == Event.INTERVENTION
         for first, end, _ in recorded:  # the last frame's event is what ended the episode, whoever drove
             driven[first:end] = True
@@ -183,6 +183,21 @@ class _Changes:
         table = read_frames(path, [key])
         first = row["dataset_from_index"] - self._slots[slot][0]["dataset_from_index"]
         return as_numpy(table[key])[first : first + row["length"]].copy()
+
+
+def _interventions(row: Row) -> list[tuple[int, int, str]]:
+    """Return first frame, end and reason of each intervention that is told of an episode."""
+    told = row.get("bhd/interventions")
+    try:
+        found = [(first, end, str(why)) for first, end, why in json.loads(told or "[]")]
+    except (ValueError, TypeError, RecursionError):
+        found = [(-1, 0, "")]
+    if not all(isinstance(first, int) and isinstance(end, int) and 0 <= first <= end for first, end, _ in found):
+        raise DatasetError(
+            f"bhd/interventions of episode {row['episode_index']} is no list of first frame, end and reason: "
+            f"{told!r:.200}. Restore meta/episodes from a copy. Nothing was changed."
+        )
+    return found
 
 
 def _spans(flags: np.ndarray) -> list[list[int]]:

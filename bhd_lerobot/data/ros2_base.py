@@ -19,6 +19,25 @@ GYRO = ("imu_x.vel", "imu_y.vel", "imu_z.vel")
 ODOM_FRAME, FOOTPRINT_FRAME, SCAN_FRAME, IMU_FRAME = "odom", "base_footprint", "base_scan", "imu_link"
 
 
+@dataclass(frozen=True)
+class BaseNoise:
+    """Standard deviations of what a base measures of its own motion.
+
+    Attributes:
+        distance: of the way it has gone, along its heading [m].
+        yaw: of its heading since the start [rad].
+        speed: of its forward speed [m/s].
+        turn: of its yaw rate [rad/s].
+        gyro: of each axis of its gyroscope [rad/s].
+    """
+
+    distance: float
+    yaw: float
+    speed: float
+    turn: float
+    gyro: float
+
+
 class TwistPart(Part):
     """A command of a base."""
 
@@ -53,23 +72,34 @@ def twist_tree(values: Array) -> dict[str, Any]:
     return {"linear": {"x": values[:, 0]}, "angular": {"z": values[:, 1]}}
 
 
+@dataclass(frozen=True)
 class OdometryPart(Part):
     """What the wheels measure: speeds, and the pose where it is recorded.
 
-    Where it is not, the message's pose is integrated from the speeds, so that a viewer has a path to draw.
+    Where it is not, the message's pose is integrated from the speeds, so that a viewer has a path to draw; how far it
+    is off is not known then.
+
+    Attributes:
+        noise: if it is known; only needed to write.
     """
+
+    noise: BaseNoise | None = None
 
     msgtype = "nav_msgs/msg/Odometry"
 
     @override
     def encode(self, frames: Frames, values: Array) -> list[bytes]:
         pose = self.pose(frames, values)
-        fields = {
+        fields: dict[str, Any] = {
             "header": header(frames.stamps, ODOM_FRAME),
             "child_frame_id": FOOTPRINT_FRAME,
             "pose": {"pose": {"position": {"x": pose[:, 0], "y": pose[:, 1]}, "orientation": _yaw_tree(pose[:, 2])}},
             "twist": {"twist": twist_tree(values)},
         }
+        if self.noise is not None:
+            fields["twist"]["covariance"] = np.diag([self.noise.speed**2, *[0] * 4, self.noise.turn**2]).reshape(-1)
+            if len(self.names) > len(TWIST):
+                fields["pose"]["covariance"] = _pose_covariance(self.noise, pose[:, 2])
         return encode(self.msgtype, fields, len(values))
 
     @override
@@ -86,6 +116,15 @@ class OdometryPart(Part):
         yaw = np.cumsum(step * (turn + np.roll(turn, 1)) / 2)
         way, middle = step * (speed + np.roll(speed, 1)) / 2, (yaw + np.roll(yaw, 1)) / 2
         return np.stack([np.cumsum(way * np.cos(middle)), np.cumsum(way * np.sin(middle)), yaw], axis=1)
+
+
+def _pose_covariance(noise: BaseNoise, yaw: Array) -> Array:
+    """Return the covariances of x, y, z, roll, pitch and yaw, row by row, shape (n, 36)."""
+    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    covariance = np.zeros((len(yaw), 6, 6))
+    covariance[:, :2, :2] = noise.distance**2 * (ahead[:, :, None] * ahead[:, None, :])
+    covariance[:, 5, 5] = noise.yaw**2
+    return covariance.reshape(len(yaw), 36)
 
 
 def odometry(messages: Sequence[bytes]) -> tuple[Array, Array]:
@@ -119,8 +158,15 @@ def _yaw_tree(yaw: Array) -> dict[str, Array]:
     return {"z": np.sin(yaw / 2), "w": np.cos(yaw / 2)}
 
 
+@dataclass(frozen=True)
 class GyroPart(Part):
-    """A gyroscope; orientation and acceleration are said to be unknown, as ROS has it."""
+    """A gyroscope; orientation and acceleration are said to be unknown, as ROS has it.
+
+    Attributes:
+        noise: if it is known; only needed to write.
+    """
+
+    noise: BaseNoise | None = None
 
     msgtype = "sensor_msgs/msg/Imu"
 
@@ -134,6 +180,8 @@ class GyroPart(Part):
             "angular_velocity": dict(zip(XYZ, values.T, strict=True)),
             "linear_acceleration_covariance": unknown,
         }
+        if self.noise is not None:
+            fields["angular_velocity_covariance"] = np.eye(3).reshape(-1) * self.noise.gyro**2
         return encode(self.msgtype, fields, len(values))
 
     @override

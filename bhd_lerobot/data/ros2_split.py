@@ -12,6 +12,7 @@ from bhd_lerobot.data.ros2_base import (
     ODOMETRY,
     TWIST,
     BareTwistPart,
+    BaseNoise,
     GyroPart,
     OdometryPart,
     ScanPart,
@@ -36,7 +37,13 @@ ROBOTS = ("turtlebot3", "ur5")
 
 
 def parts_of(
-    key: str, names: Sequence[str], robot_type: str, *, lidar: LidarSpec | None, bare_twist: bool = False
+    key: str,
+    names: Sequence[str],
+    robot_type: str,
+    *,
+    lidar: LidarSpec | None,
+    noise: BaseNoise | None = None,
+    bare_twist: bool = False,
 ) -> list[Part]:
     """Return what carries a vector of floats; every name is in exactly one part.
 
@@ -45,6 +52,7 @@ def parts_of(
         names: of its numbers.
         robot_type: of any but our robots' nothing is known about units, and `Numbers` carry everything.
         lidar: of the robot, if it has one.
+        noise: of what it measures of its own motion, if it is known; only needed to write.
         bare_twist: commands of a base without stamps.
     """
     left = list(names)
@@ -57,9 +65,9 @@ def parts_of(
 
     if robot_type in ROBOTS and len(set(names)) == len(names):
         if key == _OBSERVED:
-            take(OdometryPart, "/odom", (*TWIST, *ODOMETRY))
-            take(OdometryPart, "/odom", TWIST)
-            take(GyroPart, "/imu", GYRO)
+            take(OdometryPart, "/odom", (*TWIST, *ODOMETRY), noise=noise)
+            take(OdometryPart, "/odom", TWIST, noise=noise)
+            take(GyroPart, "/imu", GYRO, noise=noise)
             if lidar is not None:
                 take(ScanPart, "/scan", [name for name in names if _SCAN.fullmatch(name)], lidar=lidar)
             take(PosePart, "/tool_pose", TOOL)

@@ -1,8 +1,8 @@
 """Topics that are there for those who look at a bag: transforms, cameras' geometry, wheels. Nothing reads them back."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.data import features as keys
 from bhd_lerobot.data.ros2_arm import ARM_FRAME, TOOL, TOOL_FRAME
-from bhd_lerobot.data.ros2_base import FOOTPRINT_FRAME, ODOM_FRAME, OdometryPart
+from bhd_lerobot.data.ros2_base import FOOTPRINT_FRAME, ODOM_FRAME, BaseNoise, OdometryPart
 from bhd_lerobot.data.ros2_cdr import encode
 from bhd_lerobot.data.ros2_parts import Array, Frames, header
 
@@ -36,25 +36,94 @@ class StaticFrame:
 
 
 @dataclass(frozen=True)
+class JointFrame(StaticFrame):
+    """A frame that turns about its z axis, with a joint; `position` and `rotation` are those at zero.
+
+    Attributes:
+        joint: the joint's name in ROS.
+    """
+
+    joint: str = ""
+
+
+@dataclass(frozen=True)
 class RobotView:
     """What is known of a robot beside its data.
 
     Attributes:
         lidar: its range finder, if it has one.
-        frames: of its sensors.
+        noise: of what it measures of its own motion, if it is known.
+        frames: that sit still in others.
+        joints: frames that turn; their parents come first.
         fovy: vertical field of view of its cameras by name [rad].
-        tool_pose: gives position and quaternion wxyz of the tool in the base frame, shape (n, 7), of the positions of
-            the joints named in `joints`, shape (n, len(joints)); for arms.
-        joints: the arm's joints, as in the names of its features.
         wheels: names of the wheels' joints in ROS -> names of angle and speed in `simulation.state`.
     """
 
     lidar: LidarSpec | None = None
+    noise: BaseNoise | None = None
     frames: tuple[StaticFrame, ...] = ()
+    joints: tuple[JointFrame, ...] = ()
     fovy: Mapping[str, float] = field(default_factory=dict)
-    tool_pose: Callable[[Array], Array] | None = None
-    joints: tuple[str, ...] = ()
     wheels: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What moves in an episode.
+
+    Attributes:
+        angles: of joints by their names in ROS [rad], each of shape (n,).
+        tool: position and quaternion wxyz of an arm's tool in its base frame, shape (n, 7), where they are recorded.
+    """
+
+    angles: Mapping[str, Array]
+    tool: Array | None = None
+
+    @classmethod
+    def of(cls, view: RobotView, features: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> Self:
+        """Return what is recorded of an episode."""
+        names = features.get(keys.OBSERVATION_STATE, {}).get("names")
+        state = _columns_of(names, columns.get(keys.OBSERVATION_STATE))
+        angles = {f"{name.removesuffix('.pos')}_joint": values for name, values in state.items()}
+        physics = _columns_of(features.get(keys.PHYSICS_STATE, {}).get("names"), columns.get(keys.PHYSICS_STATE))
+        angles |= {joint: physics[angle] for joint, (angle, _) in view.wheels.items() if angle in physics}
+        tool = np.stack([state[name] for name in TOOL], axis=1) if set(TOOL) <= state.keys() else None
+        return cls({one.joint: angles[one.joint] for one in view.joints if one.joint in angles}, tool)
+
+
+def _columns_of(names: Any, values: NDArray[Any] | None) -> dict[str, Array]:
+    if values is None or not isinstance(names, list) or values.ndim != 2 or len(names) != values.shape[1]:
+        return {}
+    return {str(name): values[:, column].astype(np.float64) for column, name in enumerate(names)}
+
+
+def still_frames(view: RobotView, motion: Motion) -> list[StaticFrame]:
+    """Return the frames that sit still and have a place: not those on links whose joints are not recorded."""
+    lost = {one.child for one in view.joints if one.joint not in motion.angles}
+    found = []
+    for one in view.frames:
+        if one.parent in lost and not (one.parent == TOOL_FRAME and motion.tool is not None):
+            lost.add(one.child)
+        else:
+            found.append(one)
+    return found
+
+
+def moving_transforms(view: RobotView, frames: Frames, motion: Motion) -> list[bytes]:
+    """Return messages for ``/tf`` of the links of a robot; none if no joint of it is recorded, nor its tool's pose."""
+    transforms = []
+    for one in view.joints:
+        if one.joint in motion.angles:
+            half = motion.angles[one.joint] / 2
+            w, x, y, z = one.rotation
+            c, s = np.cos(half), np.sin(half)
+            turned = np.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], axis=1)
+            place = np.broadcast_to(one.position, (len(half), 3))
+            pose = np.concatenate([place, turned], axis=1)
+            transforms.append(_transform(frames.stamps, one.parent, one.child, pose))
+    if not transforms and motion.tool is not None:
+        transforms.append(_transform(frames.stamps, ARM_FRAME, TOOL_FRAME, motion.tool))
+    return encode(TF, {"transforms": transforms}, len(frames.stamps)) if transforms else []
 
 
 def static_transforms(frames: Sequence[StaticFrame], stamp: int) -> list[bytes]:
@@ -73,19 +142,6 @@ def base_transforms(part: OdometryPart, frames: Frames, values: Array) -> list[b
     poses = np.stack([x, y, still, np.cos(yaw / 2), still, still, np.sin(yaw / 2)], axis=1)
     transform = _transform(frames.stamps, ODOM_FRAME, FOOTPRINT_FRAME, poses)
     return encode(TF, {"transforms": [transform]}, len(x))
-
-
-def tool_transforms(view: RobotView, frames: Frames, names: Sequence[str], state: Array) -> list[bytes]:
-    """Return messages for ``/tf`` of an arm's tool; none if its pose is not known."""
-    columns = {name: state[:, column] for column, name in enumerate(names)}
-    joints = [f"{joint}.pos" for joint in view.joints]
-    if set(TOOL) <= columns.keys():
-        poses = np.stack([columns[name] for name in TOOL], axis=1)
-    elif view.tool_pose is not None and set(joints) <= columns.keys():
-        poses = view.tool_pose(np.stack([columns[name] for name in joints], axis=1))
-    else:
-        return []
-    return encode(TF, {"transforms": [_transform(frames.stamps, ARM_FRAME, TOOL_FRAME, poses)]}, len(state))
 
 
 def wheel_states(

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.assemble import EDITS, WRITTEN
 from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.data.expected import wrong_columns, wrong_values
 from bhd_lerobot.data.findings import few
 from bhd_lerobot.data.meta_files import tasks_table, write_meta
 from bhd_lerobot.data.parquet_rescue import rescue
@@ -30,7 +31,7 @@ from bhd_lerobot.data.salvage_marks import RECOVERED, logged, recall
 from bhd_lerobot.data.salvage_rows import info_of, rows_of, tasks_of, write_data
 from bhd_lerobot.data.salvage_stats import stats_of
 from bhd_lerobot.data.salvage_told import Told
-from bhd_lerobot.data.state import corrupt, read_json, repair_with_info
+from bhd_lerobot.data.state import corrupt, read_identity, repair_with_info
 from bhd_lerobot.errors import DatasetCorruptError, UnsupportedDatasetError
 
 
@@ -74,7 +75,7 @@ def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool
     """
     check_unused(root)
     check_readable(root)
-    identity = read_json(root / layout.IDENTITY) if (root / layout.IDENTITY).exists() else None
+    identity = read_identity(root)
     info = _info_of(root)
     if other := misfit(root, info):
         raise DatasetCorruptError(
@@ -196,8 +197,11 @@ def _frames(root: Path, info: dict[str, Any], lost: list[str], torn: list[str]) 
         if not rescued.groups:
             continue
         table = pa.concat_tables(rescued.groups).combine_chunks()
-        if missing := [column for column in schema.names if column not in table.column_names]:
-            lost.append(f"{name}: it has no column {', '.join(missing)}")
+        if missing := [column for column in schema.names if table.column_names.count(column) != 1]:
+            lost.append(f"{name}: it has no column {', '.join(missing)}, or more than one")
+            continue
+        if wrong := wrong_columns(table.schema, info["features"]) or wrong_values(table):
+            lost.append(f"{name}: {wrong}")
             continue
         table = table.select(schema.names)
         if not table.schema.metadata:
@@ -237,6 +241,8 @@ def schema_of(root: Path, info: dict[str, Any]) -> pa.Schema:
 
 def _episodes(table: pa.Table) -> Iterator[tuple[int, pa.Table]]:
     numbers = table["episode_index"].to_numpy()
+    if not len(numbers):
+        return
     begins = np.flatnonzero((np.diff(numbers, prepend=-1) != 0) | (table["frame_index"].to_numpy() == 0))
     for start, end in zip(begins, [*begins[1:], len(numbers)], strict=True):
         yield int(numbers[start]), table.slice(start, end - start)

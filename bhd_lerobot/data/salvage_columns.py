@@ -8,12 +8,12 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from bhd_lerobot.data import info as meta_info
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.findings import few
-from bhd_lerobot.data.places import wrong_info
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
-from bhd_lerobot.data.state import read_json
-from bhd_lerobot.errors import DatasetCorruptError
+from bhd_lerobot.data.state import UNREADABLE
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError
 
 _PICTURES = ("video", "image")
 _NO_STATISTICS = ("string", "language", *_PICTURES)  # of pictures there may be some
@@ -52,19 +52,10 @@ def read_info(path: Path) -> dict[str, Any]:
     Raises:
         DatasetCorruptError: it does not; its cause, or else its message, says why.
     """
-    info = read_json(path)
-    features = info.get("features")
-    if not isinstance(features, dict) or not all(
-        isinstance(one, dict) and "dtype" in one and isinstance(one.get("shape"), list) for one in features.values()
-    ):
-        raise DatasetCorruptError("it has no features")
-    if wrong := wrong_info(info):
-        raise DatasetCorruptError(wrong)
-    if isinstance(info.get("fps"), bool) or not isinstance(info.get("fps"), int | float) or not info["fps"] > 0:
-        raise DatasetCorruptError("it has no fps")
-    if not str(info.get("codebase_version")).startswith("v3."):
-        raise DatasetCorruptError(f"its dataset format is {info.get('codebase_version')}, not v3.x")
-    return info
+    try:
+        return meta_info.read_info(path, path, counts=False)
+    except (OSError, meta_info.InfoError, DatasetError) as error:
+        raise DatasetCorruptError(str(error).rstrip(".")) from error
 
 
 def _witnesses(root: Path) -> Iterator[tuple[dict[str, int | None], bool]]:
@@ -72,13 +63,13 @@ def _witnesses(root: Path) -> Iterator[tuple[dict[str, int | None], bool]]:
     for path in sorted((root / "data").glob("chunk-*/file-*.parquet")):
         try:
             schema = pq.read_schema(path)
-        except (OSError, pa.ArrowException):
+        except UNREADABLE:
             continue
         yield {field.name: field.type.list_size if _is_vector(field.type) else None for field in schema}, True
     try:
         stats = json.loads((root / layout.STATS).read_text(encoding="utf-8"))
         yield {key: len(one["mean"]) if _is_flat(one["mean"]) else None for key, one in stats.items()}, False
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return
 
 

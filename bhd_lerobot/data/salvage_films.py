@@ -14,6 +14,7 @@ import pyarrow as pa
 
 from bhd_lerobot.data import layout, video
 from bhd_lerobot.data.disk import Disk
+from bhd_lerobot.data.expected import wrong_part
 from bhd_lerobot.data.salvage_film_files import cut_out, encode
 from bhd_lerobot.data.state import Row, slot_columns, slot_of
 
@@ -88,7 +89,7 @@ class Films:
         for key in self._keys:
             for one in told:
                 row = self._rows[one.number]
-                if row.get(f"videos/{key}/from_timestamp") is None:
+                if wrong_part(row, key):
                     continue  # a camera that these rows do not have
                 path = self._root / layout.video_file(key, slot_of(row, f"videos/{key}"))
                 start = round(row[f"videos/{key}/from_timestamp"] * self._fps)
@@ -149,7 +150,7 @@ class Films:
 
     def _following(self, key: str, lost: list[str]) -> Iterator[Path]:
         """Yield the films after those of the readable rows, as long as their numbers have no gap."""
-        slots = [slot_of(row, f"videos/{key}") for row in self._rows.values() if f"videos/{key}/file_index" in row]
+        slots = [slot_of(row, f"videos/{key}") for row in self._rows.values() if not wrong_part(row, key)]
         slot: layout.Slot | None = max(slots, default=None)
         seen = {self._root / layout.video_file(key, one) for one in slots}
         while True:

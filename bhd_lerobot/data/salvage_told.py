@@ -10,8 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data.episode_table import PREFIX, read_stats
+from bhd_lerobot.data.expected import repeated, wrong_row
 from bhd_lerobot.data.salvage_films import Found
-from bhd_lerobot.data.state import Row, column_types
+from bhd_lerobot.data.state import UNREADABLE, Row, column_types
 from bhd_lerobot.data.statistics import Stats
 
 _OURS = re.compile(rb"(?<=bhd/)[a-z][a-z0-9_]*(?![a-zA-Z0-9_])")
@@ -43,9 +44,9 @@ class Told:
                 light = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
                 rows = file.read(columns=light, use_threads=False).to_pylist()
                 stats = read_stats(file)
-                if "episode_index" not in file.schema_arrow.names:
-                    raise ValueError("it numbers no episodes")
-            except (OSError, pa.ArrowException, ValueError):
+                if wrong := repeated(file.schema_arrow):
+                    raise ValueError(wrong)
+            except UNREADABLE:
                 # Nothing is lost by it that is not made anew, but for what only we or other programs tell.
                 with contextlib.suppress(OSError):
                     self.torn |= {name.decode() for name in _OURS.findall(path.read_bytes())}
@@ -54,6 +55,8 @@ class Told:
             self.metadata_types = {**own, **self.metadata_types}
             self.extra_types = {**extra, **self.extra_types}
             for place, row in enumerate(rows):
+                if wrong_row(row, ()):
+                    continue
                 self.rows[row["episode_index"]] = row
                 self._stats[row["episode_index"]] = {
                     key: {name: values[place] for name, values in stat.items()} for key, stat in stats.items()

@@ -5,13 +5,15 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
 
 from bhd_lerobot.data.episode_table import PREFIX
 from bhd_lerobot.data.features import EVENT
+from bhd_lerobot.data.state import DatasetState
 from bhd_lerobot.data.table import FrameTable, checked_episodes
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.tasks.task import OUTCOMES, Event
@@ -21,6 +23,36 @@ if TYPE_CHECKING:
 
 HOLD_OUTS = ("episode", "instruction")
 """Of what a share is held out: of all episodes, or of those of each instruction, as LeRobot does it."""
+
+
+class _Columns(dict[str, list[Any]]):
+    @property
+    def column_names(self) -> list[str]:
+        return list(self)
+
+
+@dataclass(frozen=True)
+class StoredEpisodes:
+    """What an `EpisodeFilter` asks a dataset for, of one that was read without LeRobot.
+
+    Attributes:
+        root: the dataset.
+        total_episodes: how many there are.
+        total_frames: how many frames they have.
+        episodes: columns of ``meta/episodes`` by name, one entry for each episode.
+    """
+
+    root: Path
+    total_episodes: int
+    total_frames: int
+    episodes: _Columns
+
+    @classmethod
+    def of(cls, state: DatasetState) -> Self:
+        """Return those of a dataset."""
+        names = {name for row in state.rows for name in row}
+        columns = _Columns({name: [row.get(name) for row in state.rows] for name in sorted(names)})
+        return cls(state.root, state.num_episodes, state.num_frames, columns)
 
 
 @dataclass(frozen=True)
@@ -58,7 +90,9 @@ class EpisodeFilter:
         names = (self.outcome,) if isinstance(self.outcome, str) else tuple(self.outcome)
         return None if "all" in names else names
 
-    def select(self, meta: "LeRobotDatasetMetadata", episodes: Sequence[int] | None = None) -> list[int]:
+    def select(
+        self, meta: "LeRobotDatasetMetadata | StoredEpisodes", episodes: Sequence[int] | None = None
+    ) -> list[int]:
         """Return the wanted ones among some episodes, ascending.
 
         Args:
@@ -72,25 +106,25 @@ class EpisodeFilter:
         wanted = candidates
         if self.outcomes is not None:
             values = _metadata(meta, "outcome", "the outcome 'all'")
-            wanted = [episode for episode in wanted if values[episode] in self.outcomes]
+            wanted = [episode for episode in wanted if str(values[episode]) in self.outcomes]
         if self.min_score is not None:
             scores = _metadata(meta, "score", "no min_score")
-            wanted = [episode for episode in wanted if (scores[episode] or 0.0) >= self.min_score]
+            wanted = [episode for episode in wanted if _score(meta.root, episode, scores[episode]) >= self.min_score]
         if self.exclude_late:
             timings = _metadata(meta, "timing", "exclude_late off")
-            wanted = [episode for episode in wanted if not _is_late(json.loads(timings[episode] or "{}"))]
+            wanted = [episode for episode in wanted if not _is_late(meta.root, episode, timings[episode])]
         if not wanted:
             raise DatasetError(self._nothing_left(meta, candidates))
         return wanted
 
-    def _nothing_left(self, meta: "LeRobotDatasetMetadata", candidates: Sequence[int]) -> str:
+    def _nothing_left(self, meta: "LeRobotDatasetMetadata | StoredEpisodes", candidates: Sequence[int]) -> str:
         asked = [f"outcome {' or '.join(self.outcomes)}"] if self.outcomes else []
         asked += [f"a score of at least {self.min_score:g}"] if self.min_score is not None else []
         asked += ["not too many late frames"] if self.exclude_late else []
         found = ""
         if f"{PREFIX}outcome" in meta.episodes.column_names:
             outcomes = meta.episodes[f"{PREFIX}outcome"]
-            counts = Counter(outcomes[episode] for episode in candidates)
+            counts = Counter(str(outcomes[episode]) for episode in candidates)
             found = f": {', '.join(f'{count} {name}' for name, count in counts.most_common())}"
         return (
             f"No episode of {meta.root} is left after filtering: {' and '.join(asked)} was asked for, and it has "
@@ -189,7 +223,7 @@ def intervention_weights(
     return None if bool((weights == 1).all()) else weights.to(torch.float32)
 
 
-def _metadata(meta: "LeRobotDatasetMetadata", name: str, remedy: str) -> list[Any]:
+def _metadata(meta: "LeRobotDatasetMetadata | StoredEpisodes", name: str, remedy: str) -> list[Any]:
     if f"{PREFIX}{name}" not in meta.episodes.column_names:
         raise DatasetError(
             f"{meta.root} has no {PREFIX}{name} for its episodes, because another program recorded it. Filter with "
@@ -198,7 +232,23 @@ def _metadata(meta: "LeRobotDatasetMetadata", name: str, remedy: str) -> list[An
     return list(meta.episodes[f"{PREFIX}{name}"])
 
 
-def _is_late(timing: dict[str, Any]) -> bool:
-    share = (timing.get("tolerated") or {}).get("late_frames", 0.0)
-    # The same rule as at the recording; the small number is for products such as 0.07 * 100.
-    return bool(timing.get("late_frames", 0) > math.floor(share * timing.get("frames", 0) + 1e-9))
+def _score(root: Path, episode: int, stored: object) -> float:
+    if not isinstance(stored, int | float | None):
+        raise DatasetError(
+            f"{PREFIX}score of episode {episode} of {root} is {stored!r:.80} and no number. Filter with no min_score, "
+            "or give the episodes' numbers."
+        )
+    return stored or 0.0
+
+
+def _is_late(root: Path, episode: int, stored: str | None) -> bool:
+    try:
+        timing = json.loads(stored or "{}")
+        share = (timing.get("tolerated") or {}).get("late_frames", 0.0)
+        # The same rule as at the recording; the small number is for products such as 0.07 * 100.
+        return bool(timing.get("late_frames", 0) > math.floor(share * timing.get("frames", 0) + 1e-9))
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise DatasetError(
+            f"{PREFIX}timing of episode {episode} of {root} is no timing summary: {stored!r:.200}. Filter with "
+            "exclude_late off, or give the episodes' numbers."
+        ) from error

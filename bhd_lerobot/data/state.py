@@ -3,7 +3,6 @@
 An episode exists if and only if ``info.json`` counts it. Files of other episodes are leftovers of an interrupted save.
 """
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,10 +12,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data import layout
+from bhd_lerobot.data.expected import repeated, wrong_columns, wrong_row, wrong_values
+from bhd_lerobot.data.info import InfoError, kind_of, parse_object, read_info
 from bhd_lerobot.data.layout import Slot
-from bhd_lerobot.data.places import check_links, wrong_info
+from bhd_lerobot.data.places import check_links
 from bhd_lerobot.data.publish import complete_interrupted
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError, quoted
+
+UNREADABLE = (OSError, pa.ArrowException, ValueError)
+"""What reading a damaged Parquet file raises; texts in it that are no UTF-8 are a `ValueError`."""
 
 REPAIR_MAY_HELP = ", or see what `bhd-data repair` can recover"
 
@@ -150,22 +154,13 @@ def load_state(root: Path, *, films: bool = True) -> DatasetState:
     if not (root / layout.INFO).is_file():
         raise no_dataset(root)
     check_links(root)
-    info = read_json(root / layout.INFO)
-    for key in ("codebase_version", "features", "fps", "total_episodes", "total_frames", "total_tasks"):
-        if key not in info:
-            raise corrupt(root / layout.INFO, f"it has no {key!r}")
-    if not isinstance(info["features"], dict) or not all(isinstance(one, dict) for one in info["features"].values()):
-        raise corrupt(root / layout.INFO, "its features are no JSON objects")
-    if wrong := wrong_info(info):
-        raise corrupt(root / layout.INFO, wrong)
+    info = load_info(root)
     if info.get("data_path") not in (None, layout.DATA_PATH) or info.get("video_path") not in (None, layout.VIDEO_PATH):
         raise UnsupportedDatasetError(
             f"{root} keeps its files at {info.get('data_path')!r} and {info.get('video_path')!r}; this program reads "
             f"{layout.DATA_PATH!r} and {layout.VIDEO_PATH!r}. Copy it with lerobot-edit-dataset first."
         )
-    if not str(info["codebase_version"]).startswith("v3."):
-        raise DatasetError(f"{root} has dataset format {info['codebase_version']}; this program reads v3.x.")
-    identity = read_json(root / layout.IDENTITY) if (root / layout.IDENTITY).exists() else None
+    identity = read_identity(root)
     state = DatasetState(root, info, identity)
     if info["total_episodes"]:
         state.tasks = read_tasks(root / layout.TASKS)
@@ -183,12 +178,39 @@ def read_json(path: Path) -> dict[str, Any]:
         DatasetCorruptError: there is none.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return parse_object(path.read_bytes())
+    except (OSError, InfoError) as error:
         raise corrupt(path, error) from error
-    if not isinstance(content, dict):
-        raise corrupt(path, "it is not a JSON object")
-    return content
+
+
+def read_identity(root: Path) -> dict[str, Any] | None:
+    """Return the content of ``meta/bhd.json``; None if another program recorded the dataset.
+
+    Raises:
+        DatasetCorruptError: it cannot be read, or does not describe a recording.
+    """
+    path = root / layout.IDENTITY
+    if not path.exists():
+        return None
+    identity = {"recording": {}, "video": {}, **read_json(path)}
+    for key in ("recording", "video"):
+        if not isinstance(identity[key], dict):
+            raise corrupt(path, f"{key!r} is {kind_of(identity[key])} and no JSON object")
+    return identity
+
+
+def load_info(root: Path) -> dict[str, Any]:
+    """Return the content of ``meta/info.json``, checked and with defaults; see `info.checked_info`.
+
+    Raises:
+        DatasetCorruptError: it cannot be read, or a value is missing or not valid.
+        DatasetError: it is of another version.
+    """
+    path = root / layout.INFO
+    try:
+        return read_info(path, root)
+    except (OSError, InfoError) as error:
+        raise corrupt(path, error) from error
 
 
 def read_tasks(path: Path) -> list[str]:
@@ -201,12 +223,14 @@ def read_tasks(path: Path) -> list[str]:
         table = pq.ParquetFile(path).read(use_threads=False)
         # LeRobot keeps the sentence in the index of a pandas table; the column name differs between its versions.
         name = next(n for n in table.column_names if n != "task_index")
-        pairs = sorted(zip(table["task_index"].to_pylist(), table[name].to_pylist(), strict=True))
-    except (OSError, pa.ArrowException, KeyError, StopIteration) as error:
+        told = dict(zip(table["task_index"].to_pylist(), table[name].to_pylist(), strict=True))
+    except (*UNREADABLE, KeyError, StopIteration, TypeError) as error:
         raise corrupt(path, error) from error
-    if [index for index, _ in pairs] != list(range(len(pairs))):
-        raise corrupt(path, f"its numbers are not 0 to {len(pairs) - 1}, each once")
-    return [task for _, task in pairs]
+    if table.num_rows != len(told) or told.keys() != set(range(len(told))):
+        raise corrupt(path, f"its numbers are not 0 to {table.num_rows - 1}, each once")
+    if not all(isinstance(task, str) for task in told.values()):
+        raise corrupt(path, "not all of its instructions are texts")
+    return [told[index] for index in range(len(told))]
 
 
 def _read_rows(state: DatasetState) -> None:
@@ -217,19 +241,22 @@ def _read_rows(state: DatasetState) -> None:
             file = pq.ParquetFile(path)
             names = file.schema_arrow.names
             light = [name for name in names if not name.startswith("stats/")]
-            table = file.read(columns=light, use_threads=False)
-        except (OSError, pa.ArrowException) as error:
+            rows = file.read(columns=light, use_threads=False).to_pylist()
+            slot = layout.slot_in(path)
+        except UNREADABLE as error:
             raise corrupt(path, error) from error
+        if wrong := repeated(file.schema_arrow):
+            raise corrupt(path, wrong)
         has_stats = "stats/index/mean" in names
-        for row in table.to_pylist():
+        for row in rows:
             index = row.get("episode_index")
-            if index is None or index >= total:
+            if index is None or (isinstance(index, int) and index >= total):
                 continue  # a save that was interrupted before it counted
-            if not row.get("tasks"):
-                raise corrupt(path, f"episode {index} has no instruction")
+            if wrong := wrong_row(row, state.video_keys):
+                raise corrupt(path, f"episode {index!r} {wrong}")
             if index in by_index:
                 raise corrupt(path, f"episode {index} is in another file as well")
-            by_index[index] = row
+            by_index[index] = row | slot_columns("meta/episodes", slot)  # the file knows better than its row
             if not has_stats:
                 state.without_stats.add(index)
         own, extra = column_types(file.schema_arrow)
@@ -246,12 +273,15 @@ def read_frames(path: Path, columns: list[str] | None = None) -> pa.Table:
     """Return a data file, or some of its columns.
 
     Raises:
-        DatasetCorruptError: it cannot be read, or a page is not what was written.
+        DatasetCorruptError: it cannot be read, a page is not what was written, or a number is missing.
     """
     try:
-        return pq.ParquetFile(path, page_checksum_verification=True).read(columns, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
+        table = pq.ParquetFile(path, page_checksum_verification=True).read(columns, use_threads=False)
+    except UNREADABLE as error:
         raise corrupt(path, error) from error
+    if wrong := wrong_values(table):
+        raise corrupt(path, wrong)
+    return table
 
 
 def column_types(schema: pa.Schema) -> tuple[dict[str, pa.DataType], dict[str, pa.DataType]]:
@@ -283,11 +313,14 @@ def _check_files(state: DatasetState, films: bool) -> None:
         path = state.root / layout.data_file(slot)
         wanted = sum(row["length"] for row in rows)
         try:
-            found = pq.read_metadata(path).num_rows
-        except (OSError, pa.ArrowException) as error:
+            footer = pq.read_metadata(path)
+            found, schema = footer.num_rows, footer.schema.to_arrow_schema()
+        except UNREADABLE as error:
             raise corrupt(path, error) from error
         if found != wanted:
             raise corrupt(path, f"it has {found} frames; its episodes have {wanted}")
+        if wrong := wrong_columns(schema, state.info["features"]):
+            raise corrupt(path, wrong)
     for key in state.video_keys if films else ():
         for slot in ordered_slots(state.rows, f"videos/{key}"):
             path = state.root / layout.video_file(key, slot)

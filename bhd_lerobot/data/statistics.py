@@ -156,8 +156,9 @@ def aggregate(stacked: Mapping[str, np.ndarray]) -> Stats:
     """
     counts = stacked["count"].astype(np.float64)
     weights = counts.reshape(-1, *[1] * (stacked["mean"].ndim - 1)) / counts.sum()
-    mean = (weights * stacked["mean"]).sum(axis=0)
-    variance = (weights * (stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2)).sum(axis=0)
+    with np.errstate(invalid="ignore", over="ignore"):  # other programs store what is not finite, too
+        mean = (weights * stacked["mean"]).sum(axis=0)
+        variance = (weights * (stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2)).sum(axis=0)
     return {
         "min": stacked["min"].min(axis=0),
         "max": stacked["max"].max(axis=0),

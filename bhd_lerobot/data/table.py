@@ -14,7 +14,7 @@ from bhd_lerobot.data import layout
 from bhd_lerobot.data.places import wrong_info
 from bhd_lerobot.data.publish import complete_interrupted
 from bhd_lerobot.data.schema import DEFAULT_FEATURES
-from bhd_lerobot.data.state import corrupt
+from bhd_lerobot.data.state import corrupt, load_info
 from bhd_lerobot.errors import DatasetError, unknown_name
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def open_metadata(root: Path | str) -> "LeRobotDatasetMetadata":
     if not (root / layout.INFO).is_file():
         found = "has no meta/info.json" if root.is_dir() else "does not exist"
         raise DatasetError(f"{root} is not a LeRobot dataset: it {found}. Record one with bhd-record.")
+    load_info(root)  # says what is wrong with it, which LeRobot does not
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     return checked(LeRobotDatasetMetadata(root.name, root=root))
@@ -170,7 +171,7 @@ class FrameTable:
         self.last = self.first + torch.repeat_interleave(self.lengths, self.lengths) - 1
 
 
-def checked_episodes(meta: "LeRobotDatasetMetadata", episodes: Sequence[int] | None) -> list[int]:
+def checked_episodes(meta: Any, episodes: Sequence[int] | None) -> list[int]:
     """Return the wanted episodes, sorted and each once.
 
     Raises:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from bhd_lerobot.data.edits import EditReport, delete, keep, merge, split
 from bhd_lerobot.data.inspect import check_not_empty, dataset_info
+from bhd_lerobot.data.state import load_state
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.runs.data_command import Commands, add_command, root_of
 from bhd_lerobot.runs.episode_list import parse_episodes
@@ -59,14 +60,11 @@ def _filter(options: argparse.Namespace) -> int:
             "filter needs to know which episodes are wanted: --episodes 0,3,5-9, --outcome success, --min_score 0.5 or "
             "--exclude_late. With --outcome all it copies them all."
         )
-    check_not_empty(dataset_info(root))  # says what is wrong before LeRobot looks for it on the Hub
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata  # seconds to import
-
-    from bhd_lerobot.data.selection import EpisodeFilter
+    from bhd_lerobot.data.selection import EpisodeFilter, StoredEpisodes  # seconds to import
 
     wanted = EpisodeFilter((options.outcome or "all").split(","), options.min_score, options.exclude_late)
     named = parse_episodes(options.episodes) if options.episodes is not None else None
-    episodes = wanted.select(LeRobotDatasetMetadata(root.name, root=root), named)
+    episodes = wanted.select(StoredEpisodes.of(load_state(root)), named)
     print(keep(root, episodes, options.output.expanduser()))
     return 0
 

@@ -36,7 +36,9 @@ def _run(options: argparse.Namespace) -> int:
         return short(roots)
     if options.json:
         told = [_plain(dataset_info(root)) for root in roots]
-        print(json.dumps(told if len(told) > 1 else told[0], indent=1))
+        print(
+            json.dumps(told if len(told) > 1 else told[0], indent=1, default=str)
+        )  # who calls the recorder chooses the metadata
         return 0
     for root in roots:
         info(root, Terminal())
@@ -152,9 +154,13 @@ def _episode_columns(summary: DatasetSummary, timings: Sequence[TimingSummary | 
         ("frames", [str(one.frames) for one in summary.episodes]),
         ("seconds", [f"{one.frames / summary.fps:.1f}" for one in summary.episodes]),
         ("outcome", [str(one.get("outcome", "")) for one in metadata]),
-        ("score", ["" if one.get("score") is None else f"{one['score']:.3f}" for one in metadata]),
+        ("score", [_score(one.get("score")) for one in metadata]),
         *([seed, *timing] if simulated else [*timing, seed]),
     ]
+
+
+def _score(score: object) -> str:
+    return "" if score is None else f"{score:.3f}" if isinstance(score, int | float) else str(score)
 
 
 def _timing(timings: Sequence[TimingSummary]) -> str:

@@ -18,6 +18,10 @@ from bhd_lerobot.errors import DatasetError
 
 _COLUMNS = (keys.TIME, keys.AGE, *keys.PUNCTUALITY)
 
+_GRANT = {"name", "wanted", "granted", "detail", "remedy"}
+_MOST = 1e18  # of counts and seconds: beyond it is no measurement
+CLOCKS = ("lockstep", "realtime")
+
 SIMULATED = (
     "Time was simulated (clock: lockstep). It stood still while the brain thought and while a tick was computed, so "
     "nothing could be late; how punctual this machine is does not show in this dataset."
@@ -136,7 +140,24 @@ def timing_of(episode: EpisodeSummary) -> TimingSummary | None:
         summary = TimingSummary.from_fields(_stored(episode, "timing"))
     except TypeError as error:
         raise DatasetError(f"The timing summary of episode {episode.index} is not complete: {error}.") from error
+    for name, value in asdict(summary).items():
+        limits = value.values() if name == "tolerated" and isinstance(value, dict) else [value]
+        if value not in CLOCKS if name == "clock" else not all(map(_is_number, limits)):
+            raise DatasetError(f"The timing summary of episode {episode.index} is wrong: {name} is {value!r:.80}.")
     return summary if summary.frames else replace(summary, frames=episode.frames)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MOST
+
+
+def _grants_of(episode: EpisodeSummary) -> tuple[dict[str, Any], ...]:
+    if not episode.metadata.get("realtime"):
+        return ()
+    grants = _stored(episode, "realtime")
+    if not isinstance(grants, list) or not all(isinstance(one, dict) and one.keys() >= _GRANT for one in grants):
+        raise DatasetError(f"bhd/realtime of episode {episode.index} is no list of grants: {grants!r:.200}.")
+    return tuple(grants)
 
 
 def load_timing(root: Path | str, episode: int | None = None) -> TimingReport:
@@ -161,7 +182,7 @@ def load_timing(root: Path | str, episode: int | None = None) -> TimingReport:
             )
         # Columns that a version before this did not know: it recorded on the simulated clock only.
         zeros = {key: np.zeros(one.frames, keys.SCALARS[key][0]) for key in _COLUMNS}
-        grants = tuple(_stored(one, "realtime")) if one.metadata.get("realtime") else ()
+        grants = _grants_of(one)
         intervals = np.diff(stored[keys.TIME])
         found.append(EpisodeTiming(str(one.index), summary, {**zeros, **stored}, intervals, grants))
     return TimingReport(info.root, info.fps, tuple(found))
@@ -170,9 +191,9 @@ def load_timing(root: Path | str, episode: int | None = None) -> TimingReport:
 def _stored(episode: EpisodeSummary, name: str) -> Any:
     try:
         return json.loads(episode.metadata[name])
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         text = episode.metadata[name]
-        raise DatasetError(f"bhd/{name} of episode {episode.index} is not JSON: {text!r} ({error}).") from error
+        raise DatasetError(f"bhd/{name} of episode {episode.index} is not JSON: {text!r:.200} ({error}).") from error
 
 
 def quantiles(values: NDArray) -> dict[str, float]:

@@ -1,6 +1,5 @@
 """What a training run learns from, by its configuration; `data/` chooses, splits, checks and serves it."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +11,11 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.transforms import ImageTransforms
 
+from bhd_lerobot.data import layout
 from bhd_lerobot.data.identity import default_root
 from bhd_lerobot.data.loader import Loader, check, imagenet_stats, make_loader
 from bhd_lerobot.data.source import local_metadata
+from bhd_lerobot.data.state import load_info
 from bhd_lerobot.data.table import checked_episodes
 from bhd_lerobot.errors import DatasetError, quoted
 from bhd_lerobot.runs.config_train import BhdTrainConfig
@@ -81,11 +82,7 @@ def select_episodes(config: BhdTrainConfig, meta: LeRobotDatasetMetadata) -> Non
 
 def _refuse_empty(root: Path) -> None:
     """Say so, because LeRobot cannot open the metadata of a dataset without episodes."""
-    try:
-        info = json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return  # whoever opens it says so
-    if isinstance(info, dict) and info.get("total_episodes") == 0:
+    if (root / layout.INFO).is_file() and load_info(root)["total_episodes"] == 0:
         raise DatasetError(f"{root} has no episode, so there is nothing to learn from. Record some with bhd-record.")
 
 

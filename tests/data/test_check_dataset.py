@@ -13,10 +13,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from bhd_lerobot.data.check_dataset import CHECKS, DatasetCheck, Finding, Severity, check_dataset
 from bhd_lerobot.data.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.runs import data
 from tests.data import loader_support
 
 FPS, EPISODES, CAMERA = 10, 6, "observation.images.front"
@@ -307,9 +310,8 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str, str, str]] = {
     "stats of": (stats(lambda all_: all_.pop("action")), "stats", "meta/stats.json: action", "no min"),
     "frames": (info(total_frames=134), "counts", "info.json", "counts 134 frames; the episodes have 135"),
     "episodes": (info(total_episodes=7), "counts", "meta/episodes", "1 episodes are not described, 6 first"),
-    "rate": (info(fps=0), "schema", "info.json", "fps is 0"),
     "names": (one_name, "schema", "meta/info.json: action", "1 names for 2 numbers"),
-    "shape": (no_shape, "schema", "meta/info.json: action", "it is described by"),
+    "shape": (no_shape, "schema", "meta/info.json: action", "it has the shape None"),
     "start": (row("dataset_from_index", 40), "counts", "meta/episodes", "episode 2 "),
     "no place": (row("data/file_index", None), "schema", "meta/episodes", "it lacks data/file_index"),
     "no frame": (row("length", 0), "counts", "meta/episodes", "episode 2 has 0 frames"),
@@ -364,10 +366,10 @@ def test_what_cannot_be_checked_is_an_error(sound: Path, tmp_path: Path) -> None
         check_dataset(tmp_path / "none")
     root = copy(sound, tmp_path)
     (root / "meta/info.json").write_text("{")
-    with pytest.raises(DatasetError, match="cannot be read"):
+    with pytest.raises(DatasetError, match="cannot be used"):
         check_dataset(root)
     (root / "meta/info.json").write_text("{}")
-    with pytest.raises(DatasetError, match="has no codebase_version"):
+    with pytest.raises(DatasetError, match="has no 'codebase_version'"):
         check_dataset(root)
 
 
@@ -417,3 +419,55 @@ def test_a_value_of_any_other_kind_is_a_finding_or_a_clear_error(sound: Path, tm
         (root / name).write_text(json.dumps(value))
         with contextlib.suppress(DatasetError):
             assert check_dataset(root).frames in {0, 135}
+
+
+# --- edits by LeRobot ------------------------------------------------------------------------------------------------
+
+
+def record_with_lerobot(root: Path) -> Path:
+    features = {key: {**FEATURES[key], "names": None} for key in ("observation.state", "action")}
+    dataset = LeRobotDataset.create("t/stock", FPS, features, root=root, use_videos=False)
+    for episode in range(EPISODES):
+        values = columns(episode)
+        for frame in range(length(episode)):
+            dataset.add_frame({**{key: values[key][frame] for key in features}, "task": f"task {episode % 2}"})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+@pytest.mark.parametrize("source", ["ours", "stock"])
+def test_what_lerobot_edited_has_warnings_of_statistics_that_no_policy_reads(
+    sound, tmp_path, source, capsys, monkeypatch
+) -> None:
+    root = copy(sound, tmp_path) if source == "ours" else record_with_lerobot(tmp_path / "stock")
+    monkeypatch.setenv("COLUMNS", "200")
+    dataset, again = loader_support.stock(root), loader_support.stock(root)
+    folder = tmp_path / "edited"
+    delete_episodes(dataset, [1], output_dir=folder / "deleted", repo_id="t/deleted")
+    merge_datasets([dataset, again], output_repo_id="t/merged", output_dir=folder / "merged")
+    split_dataset(dataset, {"first": [0, 1], "last": [3, 5]}, output_dir=folder)
+    stale = set()
+    for name in ("deleted", "merged", "first", "last"):
+        found = [one for one in bad(check_dataset(folder / name)) if one.check == "stats"]
+        assert {one.severity for one in found} <= {Severity.WARNING}, (name, found)
+        assert data.main(["check", str(folder / name)]) == 0
+        assert all(one.where in capsys.readouterr().out.replace("\n", "") for one in found[:1])
+        stale |= {one.where.removeprefix("meta/stats.json: ") for one in found}
+    assert {"index", "episode_index"} <= stale <= {"index", "episode_index", "task_index"}
+    # What a policy is normalised with stays an error there, too.
+    edit_json(folder / "merged/meta/stats.json", lambda all_: all_["action"]["mean"].reverse())
+    assert [one.where for one in check_dataset(folder / "merged").findings if one.severity == Severity.ERROR] == [
+        "meta/stats.json: action"
+    ]
+
+
+def test_a_dataset_without_episodes_is_an_error_with_what_to_do(tmp_path: Path) -> None:
+    ours = DatasetRecorder.create("t/t", FPS, FEATURES, robot_type="toy", root=tmp_path / "ours", recording={})
+    ours.finalize()
+    LeRobotDataset.create("t/t", FPS, {"action": FEATURES["action"]}, root=tmp_path / "stock", use_videos=False)
+    for name in ("ours", "stock"):
+        (one,) = bad(check_dataset(tmp_path / name))
+        assert (one.severity, one.check, one.where) == (Severity.ERROR, "counts", "meta/info.json")
+        assert "no episodes" in one.what
+        assert "--resume=true" in one.remedy

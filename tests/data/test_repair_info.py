@@ -89,8 +89,8 @@ def test_info_that_is_not_needed_or_cannot_be_used_changes_nothing(recorded: Pat
         (stranger, "does not describe event, next.done, note"),
         (tmp_path / "none", "No such file"),
         (tmp_path, "No such file"),
-        (tmp_path / "list.json", "not a JSON object"),
-        (tmp_path / "v2.json", "not v3.x"),
+        (tmp_path / "list.json", "no JSON object"),
+        (tmp_path / "v2.json", "this program reads v3.x"),
     ):
         with pytest.raises(ConfigError, match=told):
             repair(root, donor)

@@ -15,7 +15,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
+from scipy.spatial.transform import Rotation
 
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5 as ur5_body
 from bhd_lerobot.control.forward_kinematics import ForwardKinematics
 from bhd_lerobot.data import bag_write
 from bhd_lerobot.data.features import dataset_features
@@ -148,7 +151,7 @@ def test_an_independent_reader_sees_what_was_recorded_of_a_base(turtlebot3, tmp_
     topics = decoded(bags / "episode_000000/episode_000000.mcap")
     times = 1000 * NANO + np.round(columns["control.time"] * NANO).astype(np.int64)
     n = len(times)
-    for topic in ("/odom", "/imu", "/cmd_vel", "/tf", "/joint_states", "/cmd_vel_applied", "/bhd/outcome"):
+    for topic in ("/odom", "/imu", "/cmd_vel", "/joint_states", "/cmd_vel_applied", "/bhd/outcome"):
         assert len(topics[topic]) == n, topic
     odom = [message for _, message in topics["/odom"]]
     assert [stamp(one) for one in odom] == times.tolist()
@@ -212,13 +215,6 @@ def test_an_independent_reader_sees_what_was_recorded_of_an_arm(ur5, tmp_path):
     assert np.array_equal([one.velocity for one in joints], state[:, 7:])
     assert list(joints[0].name)[:2] == ["shoulder_pan_joint", "shoulder_lift_joint"]
     assert np.array_equal([m.position for _, m in topics["/joint_command"]], columns["action"].astype(np.float64))
-    poses = [message.transforms[0] for _, message in topics["/tf"]]
-    assert {(one.header.frame_id, one.child_frame_id) for one in poses} == {("base", "tool")}
-    from bhd_lerobot.bodies.ur5 import ur5 as body
-
-    tool = ForwardKinematics(body().chain).tool(state[:, :6])
-    place = [(one.transform.translation.x, one.transform.translation.y, one.transform.translation.z) for one in poses]
-    assert np.allclose(place, tool[:, :3, 3])
     texts = [message.subtask for _, message in topics["/bhd/outcome"]]
     assert texts == columns["subtask"].tolist()
 
@@ -280,13 +276,147 @@ def test_every_frame_is_in_one_tree(request, tmp_path, robot):
         assert turn.x**2 + turn.y**2 + turn.z**2 + turn.w**2 == pytest.approx(1)
         assert parents.setdefault(one.child_frame_id, one.header.frame_id) == one.header.frame_id
     (root,) = set(parents.values()) - parents.keys()
-    assert root == {"turtlebot3": "odom", "ur5": "base"}[robot]
+    assert root == {"turtlebot3": "odom", "ur5": "base_link"}[robot]
     used = {message.header.frame_id for name, sent in topics.items() if not name.startswith(("/bhd", "/tf"))
             for _, message in sent}  # fmt: skip
     assert used - {""} <= {root, *parents}
     # Nothing is sent before the transform that places it.
     begin = min(stamp(one) for one in transforms)
     assert all(stamp(message) >= begin for _, message in topics["/scan"])
+
+
+def matrix(one):
+    """Return a transform as a matrix, by another formula than ours."""
+    turn, place = one.transform.rotation, one.transform.translation
+    found = np.eye(4)
+    found[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    found[:3, 3] = place.x, place.y, place.z
+    return found
+
+
+def tree(topics, frame):
+    """Return child -> (parent, transform) at a frame, as tf2 has them: the static ones, and what is sent then."""
+    moving = defaultdict(list)
+    for _, message in topics["/tf"]:
+        moving[stamp(message.transforms[0])] += message.transforms
+    found = [*topics["/tf_static"][0][1].transforms, *moving[sorted(moving)[frame]]]
+    assert len({one.child_frame_id for one in found}) == len(found)
+    return {one.child_frame_id: (one.header.frame_id, matrix(one)) for one in found}
+
+
+def lookup(links, parent, child):
+    """Return a frame in another one that is above it."""
+    pose = np.eye(4)
+    while child != parent:
+        child, step = links[child]
+        pose = step @ pose
+    return pose
+
+
+def write_arm(root, names, values):
+    """Record frames of an arm that is anywhere."""
+    features = dataset_features(names, ["gripper.pos"], {}, ["q"])
+    with DatasetRecorder.create("t/t", 10, features, robot_type="ur5", root=root) as recorder:
+        writer, n = recorder.begin_episode(), len(values)
+        columns = {key: np.zeros((n, *one["shape"]) if one["shape"] != (1,) else n, one["dtype"])
+                   for key, one in features.items()}  # fmt: skip
+        columns["observation.state"][:] = values
+        columns["control.time"] = np.arange(n) / 10
+        writer.set_columns(columns)
+        recorder.save(writer, task="turn", metadata={})
+    return root
+
+
+def test_the_links_of_an_arm_add_up_to_its_forward_kinematics(tmp_path):
+    joints = np.random.default_rng(0).uniform(-2 * np.pi, 2 * np.pi, (40, 6)).astype(np.float32)
+    joints[0] = 0
+    names = [f"{joint}.pos" for joint in ur5_body().chain.joints]
+    bags = export(write_arm(tmp_path / "d", names, joints), tmp_path / "bags")
+    topics = decoded(bags / "episode_000000/episode_000000.mcap")
+    kinematics = ForwardKinematics(ur5_body().chain)
+    frames, tool = kinematics.frames(joints.astype(np.float64)), kinematics.tool(joints.astype(np.float64))
+    for frame in range(len(joints)):
+        links = tree(topics, frame)
+        base = lookup(links, "base_link", "base")
+        assert np.allclose(base, np.diag([-1, -1, 1, 1]), atol=1e-15)  # REP-103: x is where the arm points to at zero
+        for name, expected in (("tool0", frames[frame, 6]), ("wrist_3_link", frames[frame, 6]), ("tool", tool[frame])):
+            found = lookup(links, "base_link", name)
+            assert np.allclose(np.linalg.inv(base) @ found, expected, atol=1e-12), (frame, name)
+        # The flange's x axis is tool0's z axis.
+        flange, tool0 = lookup(links, "base_link", "flange"), lookup(links, "base_link", "tool0")
+        assert np.allclose(flange[:3, 0], tool0[:3, 2], atol=1e-12)
+        # Each link is at its joint's axis, which is the z axis of the Denavit-Hartenberg frame before it.
+        order = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+        for number, link in enumerate(order):
+            found = lookup(links, "base_link_inertia", f"{link}_link")
+            assert np.allclose(found[:3, 2], frames[frame, number, :3, 2], atol=1e-12), link
+    # Published positions of ur_description for the UR5, config/ur5/default_kinematics.yaml.
+    at_zero = tree(topics, 0)
+    for link, place in (("shoulder", (0, 0, 0.089159)), ("upper_arm", (0, 0, 0)), ("forearm", (-0.425, 0, 0)),
+                        ("wrist_1", (-0.39225, 0, 0.10915)), ("wrist_2", (0, -0.09465, 0)),
+                        ("wrist_3", (0, 0.0823, 0))):  # fmt: skip
+        assert np.allclose(at_zero[f"{link}_link"][1][:3, 3], place, atol=1e-12), link
+
+
+def test_an_arm_without_joints_has_its_tool_and_nothing_that_hangs_in_the_air(tmp_path):
+    names = [f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+    bags = export(write_arm(tmp_path / "d", names, np.array([[0.1, 0.2, 0.3, 0, 1, 0, 0]] * 3)), tmp_path / "bags")
+    links = tree(decoded(bags / "episode_000000/episode_000000.mcap"), 1)
+    expected = {"base_link_inertia": "base_link", "base": "base_link", "tool": "base", "wrist_optical_frame": "tool"}
+    assert {child: parent for child, (parent, _) in links.items()} == expected
+    assert lookup(links, "base", "tool")[:3, 3] == pytest.approx((0.1, 0.2, 0.3), abs=1e-7)
+
+
+def test_the_wheels_of_a_base_are_where_the_urdf_has_them_and_turn_with_their_joints(turtlebot3, tmp_path):
+    bags = export(turtlebot3, tmp_path / "bags", "--episodes=1")
+    topics = decoded(bags / "episode_000001/episode_000001.mcap")
+    state = read_episode(turtlebot3, 1)["simulation.state"]
+    for frame in (0, len(state) // 2, len(state) - 1):
+        links = tree(topics, frame)
+        for column, (side, y) in enumerate((("left", 0.08), ("right", -0.08))):
+            wheel = lookup(links, "base_link", f"wheel_{side}_link")
+            assert np.allclose(wheel[:3, 3], (0, y, 0.023), atol=1e-12)
+            assert np.allclose(wheel[:3, 2], (0, 1, 0), atol=1e-12)
+            # Forward: what was on top comes to the front.
+            angle = state[frame, 7 + column]
+            spoke = wheel[:3, :3] @ Rotation.from_euler("x", 90, degrees=True).apply([0.0, 0.0, 1.0])
+            assert np.allclose(spoke, (np.sin(angle), 0, np.cos(angle)), atol=1e-9)
+            assert lookup(links, "odom", f"wheel_{side}_link")[2, 3] == pytest.approx(
+                turtlebot3_burger().drive.wheel_radius
+            )
+        for name, place in (("base_scan", (-0.032, 0, 0.172)), ("imu_link", (-0.032, 0, 0.068)),
+                            ("caster_back_link", (-0.081, 0, -0.004))):  # fmt: skip
+            assert np.allclose(lookup(links, "base_link", name)[:3, 3], place, atol=1e-12)
+
+
+def test_covariances_are_those_of_the_simulated_sensors_and_zeros_where_nobody_knows_them(turtlebot3, tmp_path):
+    topics = decoded(export(turtlebot3, tmp_path / "bags", "--one_bag") / "bags.mcap")
+    drive = turtlebot3_burger().drive
+    # Counts of both wheels are rounded at the start and now: an experiment of its own.
+    rng = np.random.default_rng(0)
+    moved = rng.uniform(0, 10, (200_000, 2, 2)) * drive.encoder_ticks
+    error = np.diff(np.floor(moved) - moved, axis=1)[:, 0] * 2 * np.pi * drive.wheel_radius / drive.encoder_ticks
+    distance, yaw = error.mean(axis=1).var(), (np.diff(error, axis=1) / drive.wheel_separation).var()
+    for _, one in topics["/odom"]:
+        pose, twist = (np.array(part.covariance).reshape(6, 6) for part in (one.pose, one.twist))
+        assert np.trace(pose[:2, :2]) == pytest.approx(distance, rel=0.02)
+        assert pose[5, 5] == pytest.approx(yaw, rel=0.02)
+        for covariance in (pose, twist):
+            assert np.array_equal(covariance, covariance.T)
+            assert (np.linalg.eigvalsh(covariance) >= -1e-20).all()
+        assert 0 < twist[0, 0] < 1e-12
+        assert 0 < twist[5, 5] < 1e-12
+    for _, one in topics["/imu"]:
+        assert 0 < one.angular_velocity_covariance[0] == one.angular_velocity_covariance[8] < 1e-12
+        assert one.orientation_covariance[0] == one.linear_acceleration_covariance[0] == -1
+    # Of an imported drive of a real robot, nothing says how good its sensors are.
+    (turtlebot3 / "meta/bhd.json").rename(tmp_path / "bhd.json")
+    try:
+        topics = decoded(export(turtlebot3, tmp_path / "unknown", "--one_bag") / "unknown.mcap")
+    finally:
+        (tmp_path / "bhd.json").rename(turtlebot3 / "meta/bhd.json")
+    assert not any(np.any(one.pose.covariance) or np.any(one.twist.covariance) for _, one in topics["/odom"])
+    assert not any(np.any(one.angular_velocity_covariance) for _, one in topics["/imu"])
 
 
 def test_the_same_dataset_gives_the_same_bytes(turtlebot3, tmp_path):

@@ -16,9 +16,10 @@ from bhd_lerobot.data import features as keys
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.disk import RootLock
 from bhd_lerobot.data.episode_table import PREFIX
+from bhd_lerobot.data.expected import wrong_values
 from bhd_lerobot.data.mark import possible_outcomes
 from bhd_lerobot.data.places import check_inside
-from bhd_lerobot.data.state import DatasetState, Row, corrupt, load_state, slot_of
+from bhd_lerobot.data.state import UNREADABLE, DatasetState, Row, corrupt, load_state, slot_of
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.runs.view.episode import packed_episode
 from bhd_lerobot.runs.view.marking import mark_episode
@@ -237,8 +238,10 @@ def _table(state: DatasetState, row: Row, columns: Sequence[str] | None = None) 
             filters=[("episode_index", "=", row["episode_index"])],
             page_checksum_verification=True,
         )
-    except (OSError, pa.ArrowException) as error:
+    except UNREADABLE as error:
         raise corrupt(path, error) from error
+    if wrong := wrong_values(table):
+        raise corrupt(path, wrong)
     if table.num_rows != row["length"]:
         raise corrupt(path, f"episode {row['episode_index']} has {table.num_rows} of {row['length']} frames")
     return table.drop_columns(["episode_index"]) if "episode_index" not in columns else table
