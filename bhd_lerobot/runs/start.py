@@ -45,10 +45,11 @@ def _leave(number: int, frame: FrameType | None) -> None:
 def ending_when_unread(main: Callable[[], int]) -> int:
     """Run a program; return its exit status, that of other programs if nobody reads on, as of ``| head -1``."""
     try:
-        status = main()
-        if sys.stdout is not None:
-            sys.stdout.flush()  # a pipe that nobody reads shows now, not when Python ends
-        return status
+        try:
+            return main()
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()  # a pipe that nobody reads shows now, not when Python ends
     except BrokenPipeError:
         if not _is_unread():
             raise

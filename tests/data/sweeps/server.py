@@ -19,12 +19,12 @@ import mcap.writer  # noqa: F401
 import pandas as pd  # noqa: F401
 import pyarrow.dataset  # noqa: F401
 import rosbags.rosbag2  # noqa: F401
-import support  # PYTHONPATH names its folder: "tests" alone may be another package
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata  # noqa: F401
 
 from bhd_lerobot.data import disk, publish, remote_staging
 from bhd_lerobot.data.ros2_types import type_store
 from bhd_lerobot.runs import data, data_transfer  # noqa: F401
+from tests.data import support
 
 REMOVALS = ("os.remove", "os.rmdir")
 CHANGES = ("os.mkdir", "os.rename", "os.link", "os.symlink", "os.truncate", *REMOVALS)

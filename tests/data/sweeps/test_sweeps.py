@@ -43,7 +43,7 @@ class Runner:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tests/data")))},
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
         )
 
     def run(
