@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bhd_lerobot.data.disk import Disk, write_errors
-from bhd_lerobot.data.publish import is_free, making, remove_abandoned
+from bhd_lerobot.data.publish import is_free, making, real, remove_abandoned
 from bhd_lerobot.errors import DatasetExistsError
 
 
@@ -21,7 +21,7 @@ def refuse_existing(target: Path, option: str) -> None:
     """
     if target.is_symlink() and not target.exists():
         raise DatasetExistsError(f"{target} is a link to nothing. Remove it, or choose another {option}.")
-    remove_abandoned(target.resolve())  # a name such as ``new/..`` is no name for a folder beside it
+    remove_abandoned(real(target))  # a name such as ``new/..`` is no name for a folder beside it
     if not is_free(target):
         raise DatasetExistsError(f"{target} exists already. Remove it, or choose another {option}.")
 

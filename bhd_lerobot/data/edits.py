@@ -22,6 +22,7 @@ from bhd_lerobot.data.publish import (
     complete_interrupted,
     is_free,
     making,
+    real,
     refuse_inside,
     remove_abandoned,
     uninterrupted,
@@ -125,7 +126,7 @@ def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | s
             if owner.setdefault(episode, name) != name:
                 raise ConfigError(f"Episode {episode} is wanted in {owner[episode]!r} and in {name!r}.")
     folder = Path(folder)
-    remove_abandoned(folder.resolve())
+    remove_abandoned(real(folder))
     with opened([Path(root)]) as (state,):
         check_reported(state.root)
         refuse_inside(folder / "part", state.root)

@@ -17,7 +17,7 @@ from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.data.episode_table import stored_stats
 from bhd_lerobot.data.findings import Finding, Severity
 from bhd_lerobot.data.meta_files import write_meta
-from bhd_lerobot.data.publish import Workspace, has_unfinished_episodes, link_others, remove_abandoned
+from bhd_lerobot.data.publish import Workspace, has_unfinished_episodes, link_others, real, remove_abandoned
 from bhd_lerobot.data.salvage_stats import stats_of
 from bhd_lerobot.data.schema import Schema
 from bhd_lerobot.data.state import DatasetState, corrupt, load_info, load_state, ordered_slots, read_frames
@@ -44,7 +44,7 @@ def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
     """
     root = Path(root)
     wanted = [one for one in findings if is_fixable(one)]
-    remove_abandoned(root.resolve())
+    remove_abandoned(real(root))
     if has_unfinished_episodes(root):
         return []  # an interrupted recording, which is for `repair`
     if not wanted or any(one.severity is Severity.ERROR and not is_fixable(one) for one in findings):

@@ -32,6 +32,7 @@ WORK = Path(layout.STAGING, "compact")  # the name that versions before had, so 
 PULL = Path(layout.STAGING, "pull")  # where a download comes together, if nothing can be put beside its place
 _WORKSPACES = {WORK.name, PULL.name}
 _MARKER = WORK / "ready"
+_LONGEST = 240  # bytes of a name, to which a random part is added
 _NO_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.EBUSY, errno.EXDEV, errno.EPERM, errno.EACCES)
 
 
@@ -59,30 +60,35 @@ class Workspace:
             DatasetLockedError: another process makes something in this folder.
             OSError: nothing can be written there.
         """
-        self.place, self._disk, self._replaced = place.resolve(), disk, lock
-        place = self.place
+        self.place = place = real(place)
+        self._disk, self._replaced = disk, lock
         self._is_inside = must_be_inside(place)
-        if self._is_inside:
-            self._lock = RootLock(place) if lock is None else None
-            roll_forward(place, disk)
-            disk.remove_tree(place / WORK)
-            self._shell = place / WORK / "build"
-            disk.make_folder(self._shell)
-        else:
-            if lock is not None:
+        # Only one process may move something into a folder piece by piece.
+        is_moved_in = self._is_inside or bool(_names(place))
+        self._lock = RootLock(place) if lock is None and is_moved_in else None
+        self._shell_lock: RootLock | None = None
+        self._shell = place / WORK / "build"
+        try:
+            if lock is not None or self._lock is not None:
                 roll_forward(place, disk)
-            disk.make_folder(place.parent)
-            remove_abandoned(place)
-            self._shell = Path(tempfile.mkdtemp(prefix=_prefix(place), dir=place.parent))
-            self._lock = RootLock(self._shell, shown_as=place)
+            if self._is_inside:
+                disk.remove_tree(place / WORK)
+                disk.make_folder(self._shell)
+            else:
+                disk.make_folder(place.parent)
+                remove_abandoned(place)
+                self._shell = Path(tempfile.mkdtemp(prefix=_prefix(place), dir=place.parent))
+                self._shell_lock = RootLock(self._shell, shown_as=place)
+        except BaseException:
+            self.close()
+            raise
         self.folder = self._shell / place.name
 
     def lock_new(self) -> RootLock:
         """Make the folder, and return a lock that is going to be that of the place; for something new."""
         self._disk.make_folder(self.folder)
-        if not self._is_inside:
+        if self._lock is None:
             return RootLock(self.folder, shown_as=self.place)
-        assert self._lock is not None
         lock, self._lock = self._lock, None
         return lock
 
@@ -97,8 +103,9 @@ class Workspace:
         for folder in (self.place / WORK, self.place / layout.STAGING) if self._is_inside else ():
             with contextlib.suppress(OSError):
                 folder.rmdir()
-        if self._lock is not None:
-            self._lock.release()
+        for lock in (self._lock, self._shell_lock):
+            if lock is not None:
+                lock.release()
 
     def __enter__(self) -> "Workspace":
         """Return the workspace itself."""
@@ -118,7 +125,8 @@ def making(target: Path, disk: Disk, refuse: Callable[[], None]) -> Iterator[Wor
         disk: how to write.
         refuse: raises if something is at the place; called before and after the block.
     """
-    remove_abandoned(target.resolve())
+    remove_abandoned(real(target))
+    complete_interrupted(target)
     refuse()
     with Workspace(target, disk) as space:
         token = _done.set(None)  # what is done in the workspace is not in force yet
@@ -182,7 +190,7 @@ def refuse_inside(target: Path, source: Path) -> None:
     Raises:
         ConfigError: `target` lies in `source`.
     """
-    if source.resolve() in target.resolve().parents:
+    if real(source) in real(target).parents:
         raise ConfigError(f"{target} lies in {source}, which is to stay as it is. Choose a place beside it.")
 
 
@@ -201,7 +209,7 @@ def remove_abandoned(place: Path) -> None:
 
 def clean(place: Path) -> None:
     """Remove what killed processes left of content that never came to its place; the caller has locked the place."""
-    remove_abandoned(place.resolve())
+    remove_abandoned(real(place))
     _clean_inside(place)
 
 
@@ -221,7 +229,7 @@ def roll_forward(place: Path, disk: Disk) -> bool:
         return False
     new, old = place / WORK / "new", place / WORK / "old"
     disk.make_folder(old)
-    for name in filter(None, (place / _MARKER).read_text(encoding="utf-8").split("\n")):
+    for name in filter(None, os.fsdecode((place / _MARKER).read_bytes()).split("\0")):
         if os.path.lexists(place / name):
             disk.move(place / name, old / name)
     # Without its metadata it is no dataset, so they come last.
@@ -329,11 +337,10 @@ def _move_in(new: Path, place: Path, disk: Disk, replaced: Replaced) -> None:
     goes = sorted(_others(place, new)) if replaced == "all" else []
     disk.move(new, work / "new")
     try:
-        disk.write(work / "ready.tmp", "\n".join(goes).encode())
+        disk.write(work / "ready.tmp", os.fsencode("\0".join(goes)))
         disk.move(work / "ready.tmp", place / _MARKER)
     except BaseException:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(work / "new")
+        _clean_inside(place)
         raise
     with _decided(place):
         roll_forward(place, disk)
@@ -405,6 +412,11 @@ def uninterrupted() -> Iterator[None]:
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
+def real(path: Path) -> Path:
+    """Return a path without symbolic links; unlike `Path.resolve`, one that leads to itself is no error here."""
+    return Path(os.path.realpath(path))
+
+
 def _prefix(place: Path) -> str:
     return f".{place.name}.bhd-"
 
@@ -419,7 +431,8 @@ def must_be_inside(place: Path) -> bool:
         return False
     current = Path.cwd()
     is_current = current == place or place in current.parents  # a shell, too, would stand in a folder that is gone
-    return is_current or os.path.ismount(place) or not os.access(place.parent, os.W_OK | os.X_OK)
+    is_long = len(os.fsencode(_prefix(place))) > _LONGEST
+    return is_current or is_long or os.path.ismount(place) or not os.access(place.parent, os.W_OK | os.X_OK)
 
 
 def _link_tree(source: Path, target: Path, disk: Disk) -> None:

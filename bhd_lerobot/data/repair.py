@@ -11,7 +11,7 @@ from bhd_lerobot.data.compact import compact
 from bhd_lerobot.data.disk import Disk, RootLock, write_errors
 from bhd_lerobot.data.fix import compute_stats
 from bhd_lerobot.data.parquet_rescue import is_cut_off, is_parquet
-from bhd_lerobot.data.publish import remove_abandoned, roll_forward
+from bhd_lerobot.data.publish import real, remove_abandoned, roll_forward
 from bhd_lerobot.data.repair_info import adopt_info, give_back
 from bhd_lerobot.data.salvage import salvage
 from bhd_lerobot.data.salvage_films import whole_frames
@@ -165,7 +165,7 @@ def _repair_with(root: Path, donor: Path, disk: Disk, lock: RootLock) -> RepairR
 def _repair_foreign(root: Path, disk: Disk, lock: RootLock, *completed: str) -> RepairReport:
     """Mend what another program wrote: nothing if all of it can be read, and else everything that is whole."""
     with write_errors("repair the dataset", root, "Its files are as they were."):
-        remove_abandoned(root.resolve())
+        remove_abandoned(real(root))
         if roll_forward(root, disk):
             completed += ("a change that was interrupted while its files were moved in",)
         disk.remove_tree(root / layout.STAGING)  # of an attempt that was interrupted
@@ -238,7 +238,7 @@ def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[Datas
     Raises:
         DatasetCorruptError: a file of a saved episode cannot be read; nothing was dropped then.
     """
-    remove_abandoned(root.resolve())
+    remove_abandoned(real(root))
     completed = ["a change that was interrupted while its files were moved in"] if roll_forward(root, disk) else []
     state = load_state(root)
     dropped: list[str] = []

@@ -189,6 +189,36 @@ def test_where_names_cannot_be_exchanged_the_content_is_moved_in(
     assert leftovers(root.parent) == []
 
 
+def test_odd_places(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(DatasetExistsError, match="link to nothing"):
+        keep(root, [0], tmp_path / "loop")
+    long = tmp_path / ("x" * 250)  # too long for a hidden folder beside it
+    shutil.copytree(root, long)
+    delete(long, [1])
+    assert len(content(long)) == 2
+    line = record(tmp_path / "two\nlines", [0, 1])
+    delete(line, [0])
+    assert len(content(line)) == 1
+    (tmp_path / "left/.bhd/compact/build").mkdir(parents=True)  # of an attempt that was killed
+    with support.create(tmp_path / "left") as recorder:
+        support.record(recorder)
+        with pytest.raises(DatasetLockedError):
+            RootLock(tmp_path / "left")
+    assert support.read_back(tmp_path / "left") == 1
+
+
+def test_names_with_any_character_go_when_all_is_replaced(root: Path, tmp_path: Path) -> None:
+    """As a pull into a mount point does."""
+    new = record(tmp_path / "new", [3])
+    odd = [b"two\nlines", b"\xff", "ä".encode(), b"-rf"]
+    for name in odd:
+        Path(os.fsdecode(os.fsencode(root) + b"/" + name)).touch()
+    publish._move_in(new, root, Disk(), "all")
+    assert sorted(os.listdir(root)) == ["data", "meta"]
+    assert len(content(root)) == 1
+
+
 # --- who else is there ------------------------------------------------------------------------------------------------
 
 
@@ -216,6 +246,23 @@ def test_workspaces_of_killed_processes_are_removed_and_those_of_living_ones_sta
     lock.release()
     assert not repair(root)
     assert leftovers(root.parent) == []
+
+
+def test_two_that_move_into_one_folder_do_not_meet(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = root.with_name("parts")
+    (folder / "mine").mkdir(parents=True)
+    write = Disk.write
+
+    def meanwhile(self: Disk, path: Path, content: bytes) -> None:
+        if path.name == "info.json" and "/a/" in str(path):
+            with pytest.raises(DatasetLockedError):
+                split(root.with_name("e"), {"c": [0], "d": [1]}, folder)
+        write(self, path, content)
+
+    record(root.with_name("e"), [4, 5])
+    monkeypatch.setattr(Disk, "write", meanwhile)
+    split(root, {"a": [0], "b": [1]}, folder)
+    assert sorted(os.listdir(folder)) == ["a", "b", "mine"]
 
 
 # --- a move that was decided ------------------------------------------------------------------------------------------
