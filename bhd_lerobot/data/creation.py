@@ -82,7 +82,6 @@ def build_root(root: Path, fill: Callable[[Path], None], disk: Disk, remedy: str
             making(root, disk, refuse) as space,
         ):
             lock = space.lock_new()
-            space.folder.chmod(0o755)
             fill(space.folder)
     except BaseException:
         if lock is not None:

@@ -105,15 +105,6 @@ class Disk:
         for folder in {one.parent, other.parent}:
             self._flush_folder(folder)
 
-    def hard_link(self, source: Path, target: Path) -> None:
-        """Give a file a second name.
-
-        Raises:
-            OSError: the file system cannot do that.
-        """
-        _before_step("link", target)
-        os.link(source, target)
-
     def link(self, source: Path, target: Path) -> None:
         """Give a file a second name, or copy it where the file system cannot do that."""
         _before_step("link", target)
@@ -210,37 +201,19 @@ class RootLock:
         """Take the lock if it is not held; return whether it was taken now."""
         if self._handle is not None:
             return False
-        while True:
-            handle = self.open(self._root)
-            if os.path.samestat(os.fstat(handle), os.stat(self._root)):
-                break
-            os.close(handle)  # an edit has put another folder there since it was opened
-        self._handle = handle
-        # The folder may be renamed while it is locked; a second time it is taken under its final name.
-        self._root = self._shown_as
-        return True
-
-    def open(self, folder: Path) -> int:
-        """Return a handle on another folder, locked as well, for `replace`.
-
-        Raises:
-            DatasetLockedError: somebody else works there.
-        """
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        handle = os.open(self._root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(handle)
             raise DatasetLockedError(
-                f"{self._shown_as} is being written by another recorder or repair. Wait until it ends"
+                f"{self._shown_as} is being recorded, repaired or edited by another process. Wait until it ends"
                 f"{', or choose another root' if self._is_choice else ''}."
             ) from None
-        return handle
-
-    def replace(self, handle: int) -> None:
-        """Hold the lock of another folder from now on, which has taken the place of the first."""
-        self.release()
         self._handle = handle
+        # The folder may be renamed while it is locked; a second time it is taken under its final name.
+        self._root = self._shown_as
+        return True
 
     def release(self) -> None:
         """Give the lock back; a second call does nothing."""

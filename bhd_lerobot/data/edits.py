@@ -239,11 +239,20 @@ def rewrite(root: Path, request: Mapping[str, Any], change: Callable[[DatasetSta
 
 def _repeated(root: Path, request: Mapping[str, Any]) -> EditReport | None:
     """Return the report of the edit that made the dataset what it is, if nobody was told and it is the one meant."""
-    path = root / layout.UNREPORTED
-    if not path.is_file() or read_json(path).get("request") != json.loads(json.dumps(request)):
+    if (last := _unreported(root)) is None or last.get("request") != json.loads(json.dumps(request)):
         return None
     state = _state_of(root)
     return EditReport(root, state.num_episodes, state.num_frames, is_repeated=True)
+
+
+def _unreported(root: Path) -> dict[str, Any] | None:
+    """Return the edit that made the dataset what it is, if nobody was told of it."""
+    path = root / layout.UNREPORTED
+    if not path.is_file():
+        return None
+    last, edits = read_json(path), edits_of(root)
+    # What was put into the place of the dataset since is not what the edit made of it.
+    return last if edits and edits[-1].get("time") == last.get("time") else None
 
 
 def check_reported(root: Path) -> None:
@@ -252,12 +261,10 @@ def check_reported(root: Path) -> None:
     Raises:
         DatasetError: an edit changed it, and was killed before it said so.
     """
-    path = root / layout.UNREPORTED
-    if not path.is_file():
+    if (last := _unreported(root)) is None:
         return
-    last = read_json(path)
     asked = ", ".join(f"{name} {value}" for name, value in dict(last.get("request") or {}).items())
-    path.unlink(missing_ok=True)
+    (root / layout.UNREPORTED).unlink(missing_ok=True)
     raise DatasetError(
         f"{root} is not what it was: an edit ({asked}) that was interrupted at {last.get('time')} had been completed, "
         f"so episodes may have other numbers now. Look at `bhd-data info {quoted(root)}`, then repeat this command. "

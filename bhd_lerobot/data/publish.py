@@ -1,43 +1,50 @@
-"""New content for a folder, which takes its place in one step that a kill cannot leave half done.
+"""New content for a folder, which comes to its place completely or not at all, whenever its process is killed.
 
-It is made in a hidden folder beside the place. Where nothing is at the place, a rename puts it there; where a dataset
-is, the two folders exchange their names, which Linux does in one step, so that nobody ever sees something between the
-old content and the new one.
+Where nothing is, it is made in a hidden folder beside the place, which then gets the place's name: one rename.
 
-Where that cannot be had (a mount point, a folder whose parent cannot be written, a file system without an exchange of
-names, the current folder of this process), the content is moved piece by piece: a marker is written first, and from
-there on the move is decided. Every command that finds the marker completes the move, and says so.
+Where a dataset is, its folders `meta`, `data` and `videos` are replaced, and everything else stays what and where it
+is: the folder itself, other people's files, mount points. The new folders are made in the staging folder. Then a marker
+is written, from which on the change is decided, and each new folder exchanges its name with the old one, which Linux
+does in one step; where a file system cannot do that, with two renames. A kill in between leaves new and old side by
+side. Every command that finds the marker completes the change first, and says so. Stock LeRobot, which does not know of
+it, would mix them; so ``info.json`` has no valid version until all of them are there.
 """
 
 import contextlib
 import errno
 import glob
+import json
 import logging
 import os
+import re
 import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, Literal
+from typing import Any
 
 from bhd_lerobot.data import layout
-from bhd_lerobot.data.disk import Disk, RootLock, write_errors
-from bhd_lerobot.errors import ConfigError, DatasetLockedError
+from bhd_lerobot.data.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError
 
 WORK = Path(layout.STAGING, "compact")  # the name that versions before had, so that what they left is found
 PULL = Path(layout.STAGING, "pull")  # where a download comes together, if nothing can be put beside its place
 _WORKSPACES = {WORK.name, PULL.name}
 _MARKER = WORK / "ready"
 _LONGEST = 240  # bytes of a name, to which a random part is added
-_NO_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.EBUSY, errno.EXDEV, errno.EPERM, errno.EACCES)
+_NO_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP)
+_ORDER = {"data": 1, "meta": 2}  # the metadata come last; whatever else there is, first
+UNFINISHED_VERSION = "a change was interrupted; complete it with: bhd-data repair"
+"""`codebase_version` meanwhile. LeRobot refuses a dataset of no valid version, and shows the text."""
 
 
 class Workspace:
-    """A hidden folder in which something is made before it takes its place.
+    """A hidden folder in which something is made before it comes to its place.
 
     It is locked while this process lives. What an exception leaves in it is removed by `close`, what a kill leaves by
     the next workspace of the same place.
@@ -48,37 +55,34 @@ class Workspace:
     """
 
     def __init__(self, place: Path, disk: Disk, lock: RootLock | None = None) -> None:
-        """Make the folder; a move of new content that was interrupted is completed first.
+        """Make the folder; a change that was interrupted is completed first.
 
         Args:
             place: a folder, or where one is going to be made.
             disk: how to write.
-            lock: of the dataset that is there, some folders of which are going to be replaced; it holds the new one
-                afterwards. None if something new is made.
+            lock: of the dataset that is there, some folders of which are going to be replaced. None if something new is
+                made.
 
         Raises:
             DatasetLockedError: another process makes something in this folder.
             OSError: nothing can be written there.
         """
         self.place = place = real(place)
-        self._disk, self._replaced = disk, lock
-        self._is_inside = must_be_inside(place)
-        # Only one process may move something into a folder piece by piece.
-        is_moved_in = self._is_inside or bool(_names(place))
-        self._lock = RootLock(place) if lock is None and is_moved_in else None
+        self._disk, self._is_new = disk, lock is None
+        self._is_inside = lock is not None or bool(_names(place)) or is_fixed(place)
+        # Only one process may move something into a folder.
+        self._lock = RootLock(place) if self._is_new and self._is_inside else None
         self._shell_lock: RootLock | None = None
         self._shell = place / WORK / "build"
         try:
-            if lock is not None or self._lock is not None:
-                roll_forward(place, disk)
             if self._is_inside:
+                roll_forward(place, disk)
                 disk.remove_tree(place / WORK)
                 disk.make_folder(self._shell)
             else:
                 disk.make_folder(place.parent)
                 remove_abandoned(place)
-                self._shell = Path(tempfile.mkdtemp(prefix=_prefix(place), dir=place.parent))
-                self._shell_lock = RootLock(self._shell, shown_as=place)
+                self._shell, self._shell_lock = _make_shell(place)
         except BaseException:
             self.close()
             raise
@@ -93,9 +97,23 @@ class Workspace:
         return lock
 
     def publish(self, done: str) -> None:
-        """Let the folder take its place, as `publish` says."""
-        replaced: Replaced = "nothing" if self._replaced is None else "parts"
-        publish(self.folder, self.place, self._disk, done=done, replaced=replaced, lock=self._replaced)
+        """Let the folder come to its place, or what is in it to the places of the same names.
+
+        Signals that would end the process wait until it is done.
+
+        Args:
+            done: what has been done then, a sentence without a full stop; see `noting_what_is_done`.
+
+        Raises:
+            OSError: it could not be done; what was at the place is as it was.
+            DatasetWriteError: it could not be completed, and will be by the next command.
+        """
+        if self._is_inside:
+            move_in(self.folder, self.place, self._disk, done=done, is_new=self._is_new)
+            return
+        with uninterrupted():
+            self._disk.move(self.folder, self.place)  # fails if somebody else has put something there meanwhile
+            note_done(done)
 
     def close(self) -> None:
         """Remove the workspace and all that is left in it; a second call does nothing."""
@@ -138,35 +156,47 @@ def making(target: Path, disk: Disk, refuse: Callable[[], None]) -> Iterator[Wor
         space.publish(f"{target} had been made")
 
 
-type Replaced = Literal["nothing", "parts", "all"]
-"""What new content replaces: nothing, the parts of a dataset that have the same names, or all that is there."""
-
-
-def publish(new: Path, place: Path, disk: Disk, *, done: str, replaced: Replaced, lock: RootLock | None = None) -> None:
-    """Let a folder take its place, or what is in it the places of the same names.
+def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = False, goes: Collection[str] = ()) -> None:
+    """Let what is in a folder come to the places of the same names in another one, which the caller has locked.
 
     Signals that would end the process wait until it is done.
 
     Args:
         new: the folder, on the same file system.
-        place: where it is going to lie.
+        place: the other one.
         disk: how to write.
         done: what has been done then, a sentence without a full stop; see `noting_what_is_done`.
-        replaced: what of that which is there.
-        lock: of the dataset that is there, which is going to be that of the new one; None if the new folder is locked.
+        is_new: nothing may be at these places.
+        goes: what else goes.
 
     Raises:
         OSError: it could not be done; what is at the place is as it was.
         DatasetWriteError: it could not be completed, and will be by the next command.
     """
-    is_inside = must_be_inside(place)
+    work = place / WORK
+    if not new.is_relative_to(work):
+        disk.remove_tree(work)
+        disk.make_folder(work)
+    _check_movable(place, [*_names(new), *goes], is_new)
     with uninterrupted():
-        if not is_inside and not _names(place):
-            disk.move(new, place)
-        elif is_inside or replaced == "nothing" or not _exchange(new, place, disk, replaced, lock):
-            _move_in(new, place, disk, replaced)
-        if (sentences := _done.get()) is not None:
-            sentences.append(done)
+        disk.move(new, work / "new")
+        inodes = {name: (work / "new" / name).lstat().st_ino for name in _names(work / "new")}
+        plan = {"root": place.stat().st_ino, "new": inodes, "goes": sorted(goes), "is_new": is_new}
+        try:
+            disk.write(work / "ready.tmp", json.dumps(plan).encode())
+            disk.move(work / "ready.tmp", place / _MARKER)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                (work / "new").rename(new)
+            disk.try_remove_tree(work / "ready.tmp")
+            raise
+        sentences = _done.get()
+        before = None if sentences is None else list(sentences)
+        note_done(f"the change of {place} is decided, and the next command completes it")
+        with _decided(place):
+            roll_forward(place, disk)
+        if sentences is not None and before is not None:
+            sentences[:] = [*before, done]
 
 
 def is_free(place: Path) -> bool:
@@ -178,7 +208,7 @@ def is_free(place: Path) -> bool:
         return not place.is_symlink()
     if not place.is_dir() or is_decided(place):
         return False
-    nothing = {"lost+found"} if os.path.ismount(place) else set()
+    nothing = {"lost+found"} if real(place) in _mounts() else set()
     if not has_unfinished_episodes(place):
         nothing.add(layout.STAGING)
     return _names(place) <= nothing
@@ -196,11 +226,14 @@ def refuse_inside(target: Path, source: Path) -> None:
 
 def remove_abandoned(place: Path) -> None:
     """Remove the workspaces that killed processes left beside a place, or in it; those of living ones are locked."""
+    ours = re.compile(re.escape(_prefix(place)) + "[a-z0-9_]{8}")  # as `tempfile` names them
     for folder in place.parent.glob(f"{glob.escape(_prefix(place))}*"):
-        with contextlib.suppress(OSError, DatasetLockedError):
-            RootLock(folder).release()
-            shutil.rmtree(folder)
-    if (place / WORK).exists():
+        if ours.fullmatch(folder.name):
+            with contextlib.suppress(OSError, DatasetLockedError):
+                lock = RootLock(folder)
+                shutil.rmtree(folder)
+                lock.release()
+    if os.path.exists(place / WORK):
         with contextlib.suppress(OSError, DatasetLockedError):
             lock = RootLock(place)
             _clean_inside(place)
@@ -219,25 +252,29 @@ def has_unfinished_episodes(root: Path) -> bool:
 
 
 def is_decided(place: Path) -> bool:
-    """Tell whether new content was being moved in when its process was killed."""
-    return (place / _MARKER).exists()
+    """Tell whether a change was being carried out when its process was killed."""
+    return os.path.isfile(place / _MARKER)
 
 
 def roll_forward(place: Path, disk: Disk) -> bool:
-    """Complete a move that had been decided; return whether there was one. The caller has locked the place."""
+    """Complete a change that had been decided; return whether there was one. The caller has locked the place.
+
+    Raises:
+        DatasetCorruptError: the marker is not one of this folder.
+        OSError: the disk refuses.
+    """
     if not is_decided(place):
         return False
+    plan = _read_plan(place)
     new, old = place / WORK / "new", place / WORK / "old"
     disk.make_folder(old)
-    for name in filter(None, os.fsdecode((place / _MARKER).read_bytes()).split("\0")):
+    for name in plan.goes:
         if os.path.lexists(place / name):
-            disk.move(place / name, old / name)
-    # Without its metadata it is no dataset, so they come last.
-    for name in sorted(_names(new), key=lambda name: (name == "meta", name == "data", name)):
-        # If the old one is gone already, the kill came between these two renames.
-        if os.path.lexists(place / name):
-            disk.move(place / name, old / name)
-        disk.move(new / name, place / name)
+            disk.move(place / name, _unused(old / name))
+    if "meta" in plan.new and not _is_there(place / "meta", plan.new["meta"]):
+        _invalidate(place, disk)
+    for name in sorted({*_names(new), *plan.new}, key=lambda name: (_ORDER.get(name, 0), name)):
+        _replace(new / name, place / name, old / name, plan, disk)
     disk.remove(place / _MARKER)
     disk.try_remove_tree(place / WORK)
     with contextlib.suppress(OSError):
@@ -246,13 +283,14 @@ def roll_forward(place: Path, disk: Disk) -> bool:
 
 
 def complete_interrupted(place: Path) -> bool:
-    """Complete a move that a killed process had decided, and say so; for everybody who is about to read a dataset.
+    """Complete a change that a killed process had decided, and say so; for everybody who is about to read a dataset.
 
     Returns:
         Whether there was one.
 
     Raises:
         DatasetLockedError: the process lives.
+        DatasetCorruptError: it is a change of another folder.
         DatasetWriteError: it cannot be completed.
     """
     if not is_decided(place):
@@ -282,91 +320,131 @@ def link_others(
             (take or disk.link)(path, new / path.relative_to(old))
 
 
+# --- a change ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What the marker says.
+
+    Attributes:
+        new: inodes of what comes, by name; empty of versions before, which did not exchange names.
+        goes: names of what goes.
+        is_new: nothing may be at these places.
+    """
+
+    new: dict[str, int] = field(default_factory=dict)
+    goes: tuple[str, ...] = ()
+    is_new: bool = False
+
+
+def _read_plan(place: Path) -> _Plan:
+    """Read the marker. It may have come with a dataset of somebody else's, so it is believed only in its own folder.
+
+    Raises:
+        DatasetCorruptError: it is another one's.
+    """
+    staging = place / layout.STAGING
+    if any(path.is_symlink() for path in (staging, *(place / WORK / name for name in ("", "ready", "new", "old")))):
+        raise _foreign_marker(place)
+    content = (place / _MARKER).read_bytes()
+    if not content:
+        return _Plan()  # of a version before
+    try:
+        told = json.loads(content)
+        plan = _Plan({str(k): int(v) for k, v in told["new"].items()}, tuple(map(str, told["goes"])), told["is_new"])
+        is_own = told["root"] == place.stat().st_ino
+    except (ValueError, TypeError, KeyError, AttributeError):
+        raise _foreign_marker(place) from None
+    if not is_own or any(name in ("", ".", "..") or "/" in name for name in (*plan.new, *plan.goes)):
+        raise _foreign_marker(place)
+    return plan
+
+
+def _foreign_marker(place: Path) -> DatasetCorruptError:
+    return DatasetCorruptError(
+        f"{place / WORK} holds a change that was interrupted in another folder, or that somebody made up; it is not "
+        "completed here. If this is a copy of a dataset, complete the change in the original and copy that; or move "
+        f"{place / layout.STAGING} away, and look at what is left with `bhd-data check`."
+    )
+
+
+def _replace(new: Path, target: Path, old: Path, plan: _Plan, disk: Disk) -> None:
+    """Let one thing of the new content come to its place, wherever a kill has left it and what it replaces."""
+    if _is_there(target, plan.new.get(new.name)):
+        if os.path.lexists(new):  # what was there, after an exchange
+            disk.move(new, _unused(old))
+        return
+    if not os.path.lexists(new):
+        return
+    if not os.path.lexists(target):
+        disk.move(new, target)
+        return
+    if plan.is_new:
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target))
+    try:
+        if not plan.new:
+            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+        disk.swap(new, target)
+        disk.move(new, _unused(old))
+    except OSError as error:
+        if error.errno not in _NO_EXCHANGE:
+            raise
+        disk.move(target, _unused(old))
+        disk.move(new, target)
+
+
+def _is_there(path: Path, inode: int | None) -> bool:
+    return inode is not None and os.path.lexists(path) and path.lstat().st_ino == inode
+
+
+def _unused(path: Path) -> Path:
+    """Return a path at which nothing is."""
+    number = 1
+    while os.path.lexists(path):
+        path, number = path.with_name(f"{path.name.partition('~')[0]}~{number}"), number + 1
+    return path
+
+
+def _invalidate(place: Path, disk: Disk) -> None:
+    """Let LeRobot refuse a dataset while its folders are exchanged."""
+    info = place / layout.INFO
+    try:
+        content = json.loads(info.read_bytes())
+        content["codebase_version"] = UNFINISHED_VERSION
+    except (OSError, ValueError, TypeError):
+        return  # nobody can load it anyhow
+    disk.write(place / WORK / "info.json", to_json(content))
+    disk.move(place / WORK / "info.json", info)
+
+
+def _check_movable(place: Path, names: Collection[str], is_new: bool) -> None:
+    """Check that a change can be carried out, before it is decided.
+
+    Raises:
+        OSError: it cannot.
+    """
+    mounts = _mounts()
+    for name in names:
+        path = place / name
+        if not os.path.lexists(path):
+            continue
+        number = 0
+        if is_new:
+            number = errno.EEXIST
+        elif any(path == mount or path in mount.parents for mount in mounts):
+            number = errno.EBUSY  # a mount point stays, or its content would be taken for the dataset's and removed
+        elif path.is_dir() and not path.is_symlink() and not os.access(path, os.W_OK):
+            number = errno.EACCES
+        if number:
+            raise OSError(number, os.strerror(number), str(path))
+
+
 def _clean_inside(place: Path) -> None:
-    if not is_decided(place):
+    if not is_decided(place) and not (place / layout.STAGING).is_symlink():
         Disk().try_remove_tree(place / WORK)
         with contextlib.suppress(OSError):
             (place / layout.STAGING).rmdir()
-
-
-# --- both ways of replacing -------------------------------------------------------------------------------------------
-
-
-def _exchange(new: Path, old: Path, disk: Disk, replaced: Replaced, lock: RootLock | None) -> bool:
-    """Exchange the names of two folders and remove what is the old one then; return False if that cannot be done."""
-    others = [old / name for name in sorted(_others(old, new))] if replaced == "parts" else []
-    try:
-        for path in others:
-            _link_tree(path, new / path.name, disk)
-        _copy_attributes(old, new)
-        handle = None if lock is None else lock.open(new)
-    except OSError:
-        _drop(new, others)
-        return False
-    try:
-        disk.swap(new, old)
-    except OSError as error:
-        if handle is not None:
-            os.close(handle)
-        _drop(new, others)
-        if error.errno in _NO_EXCHANGE:
-            return False
-        raise
-    if lock is not None and handle is not None:
-        lock.replace(handle)
-    # From here on the new content is in force. What somebody put among the rest in the meantime comes along.
-    new, old = old, new
-    with contextlib.suppress(OSError):
-        for name in _others(old, new) if replaced == "parts" else ():
-            (old / name).rename(new / name)
-    if not old.parent.name.startswith(_prefix(new)):
-        # A folder that goes on to be used after a kill: what is being removed must not be taken for what is in it.
-        with contextlib.suppress(OSError):
-            aside = Path(tempfile.mkdtemp(prefix=_prefix(new), dir=new.parent))
-            old = old.rename(aside / "old").parent
-    disk.try_remove_tree(old)
-    return True
-
-
-def _move_in(new: Path, place: Path, disk: Disk, replaced: Replaced) -> None:
-    """Move what is in a folder to the place, piece by piece; from the marker on it is decided."""
-    work = place / WORK
-    if not new.is_relative_to(work):
-        disk.remove_tree(work)
-        disk.make_folder(work)
-    goes = sorted(_others(place, new)) if replaced == "all" else []
-    disk.move(new, work / "new")
-    try:
-        disk.write(work / "ready.tmp", os.fsencode("\0".join(goes)))
-        disk.move(work / "ready.tmp", place / _MARKER)
-    except BaseException:
-        _clean_inside(place)
-        raise
-    with _decided(place):
-        roll_forward(place, disk)
-
-
-def _others(old: Path, new: Path) -> set[str]:
-    """Return what is in a dataset and not in its new content."""
-    kept = {"lost+found"} if os.path.ismount(old) else set()
-    return _names(old) - _names(new) - kept - {layout.STAGING}
-
-
-def _copy_attributes(old: Path, new: Path) -> None:
-    """Let the same people look into a folder."""
-    shutil.copystat(old, new)
-    owner = old.stat()
-    os.chown(new, owner.st_uid, owner.st_gid)
-
-
-def _drop(new: Path, others: list[Path]) -> None:
-    """Remove the links to what stays, so that the folder holds only what is new."""
-    for path in others:
-        link = new / path.name
-        if link.is_dir() and not link.is_symlink():
-            shutil.rmtree(link)
-        else:
-            link.unlink(missing_ok=True)
 
 
 # --- signals ----------------------------------------------------------------------------------------------------------
@@ -383,6 +461,12 @@ def noting_what_is_done() -> Iterator[list[str]]:
         yield sentences
     finally:
         _done.reset(token)
+
+
+def note_done(sentence: str) -> None:
+    """Note what has come into force; see `noting_what_is_done`."""
+    if (sentences := _done.get()) is not None:
+        sentences.append(sentence)
 
 
 @contextlib.contextmanager
@@ -405,8 +489,8 @@ def uninterrupted() -> Iterator[None]:
     finally:
         for one, handler in former.items():
             signal.signal(one, handler)
-        for number in waiting[:1]:
-            signal.raise_signal(number)
+    for number in waiting[:1]:  # an error ends the command anyway, and says more
+        signal.raise_signal(number)
 
 
 # --- parts ------------------------------------------------------------------------------------------------------------
@@ -417,6 +501,36 @@ def real(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
+def is_fixed(place: Path) -> bool:
+    """Tell whether a folder, given without symbolic links, cannot be replaced, so that its content must be moved in."""
+    if not place.is_dir():
+        return False
+    with contextlib.suppress(FileNotFoundError):  # the current folder may have been removed
+        current = Path.cwd()
+        if current == place or place in current.parents:  # a shell, too, would stand in a folder that is gone
+            return True
+    is_long = len(os.fsencode(_prefix(place))) > _LONGEST
+    return is_long or place in _mounts() or not os.access(place.parent, os.W_OK | os.X_OK)
+
+
+def _mounts() -> set[Path]:
+    """Return all mount points, also of folders of the same file system, which `os.path.ismount` does not see."""
+    try:
+        lines = Path("/proc/self/mountinfo").read_bytes().splitlines()
+    except OSError:
+        return set()
+    places = (line.split(b" ")[4] for line in lines)
+    return {Path(os.fsdecode(re.sub(rb"\\([0-7]{3})", lambda m: bytes([int(m[1], 8)]), place))) for place in places}
+
+
+def _make_shell(place: Path) -> tuple[Path, RootLock]:
+    """Make a hidden folder beside a place and lock it."""
+    while True:
+        shell = Path(tempfile.mkdtemp(prefix=_prefix(place), dir=place.parent))
+        with contextlib.suppress(FileNotFoundError, DatasetLockedError):  # somebody who cleans up was quicker
+            return shell, RootLock(shell, shown_as=place)
+
+
 def _prefix(place: Path) -> str:
     return f".{place.name}.bhd-"
 
@@ -425,40 +539,9 @@ def _names(folder: Path) -> set[str]:
     return set(os.listdir(folder)) if folder.is_dir() else set()
 
 
-def must_be_inside(place: Path) -> bool:
-    """Tell whether a folder cannot be renamed, so that its new content must be made in it."""
-    if not place.is_dir():
-        return False
-    current = Path.cwd()
-    is_current = current == place or place in current.parents  # a shell, too, would stand in a folder that is gone
-    is_long = len(os.fsencode(_prefix(place))) > _LONGEST
-    return is_current or is_long or os.path.ismount(place) or not os.access(place.parent, os.W_OK | os.X_OK)
-
-
-def _link_tree(source: Path, target: Path, disk: Disk) -> None:
-    """Give a file a second name, or every file of a folder.
-
-    Raises:
-        OSError: it cannot have one, or it is neither a file nor a folder nor a link.
-    """
-    if source.is_symlink():
-        target.symlink_to(os.readlink(source))
-    elif source.is_dir():
-        if os.path.ismount(source):
-            raise OSError(errno.EXDEV, os.strerror(errno.EXDEV), str(source))
-        target.mkdir()
-        for path in sorted(source.iterdir()):
-            _link_tree(path, target / path.name, disk)
-        shutil.copystat(source, target)
-    elif source.is_file():
-        disk.hard_link(source, target)
-    else:
-        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL), str(source))
-
-
 @contextlib.contextmanager
 def _decided(place: Path) -> Iterator[None]:
-    """Say of an error that the move goes on as soon as its cause is removed."""
+    """Say of an error that the change goes on as soon as its cause is removed."""
     consequence = "The change is decided, and the next command completes it."
     with write_errors("complete a change", place, consequence):
         yield

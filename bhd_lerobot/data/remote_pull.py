@@ -118,6 +118,7 @@ class _Pull:
         self._staging = Staging(self._root)
         locks = [RootLock(self._staging.folder, self._root)]
         try:
+            self._staging.recover()
             if self._root.is_dir():
                 locks.append(RootLock(self._root))
                 clean(self._root)

@@ -10,7 +10,7 @@ from pathlib import Path
 from bhd_lerobot.data import layout
 from bhd_lerobot.data.assemble import EDITS
 from bhd_lerobot.data.disk import Disk
-from bhd_lerobot.data.publish import PULL, must_be_inside, publish, uninterrupted
+from bhd_lerobot.data.publish import PULL, is_fixed, move_in, note_done, uninterrupted
 from bhd_lerobot.data.remote import MANIFEST, SUBSET, is_recorded
 from bhd_lerobot.errors import DatasetError
 
@@ -37,7 +37,7 @@ class Staging:
         """
         self._root = root
         # Where nothing can be put beside the dataset, its staging folder is the place.
-        self.folder = folder = root / PULL if must_be_inside(root) else root.with_name(f".{root.name}.pull")
+        self.folder = folder = root / PULL if is_fixed(root) else root.with_name(f".{root.name}.pull")
         is_empty = folder.is_dir() and not any(folder.iterdir())
         is_ours = is_empty or (folder / _MARKER).exists()
         if os.path.lexists(folder) and not (is_ours and _is_own(folder)):
@@ -50,6 +50,13 @@ class Staging:
         self.is_new = not self.folder.exists()
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / _MARKER).touch()
+
+    def recover(self) -> None:
+        """Undo what version 0.1 left when it was killed between two renames; who calls it has locked the folder."""
+        old = self._root.with_name(f".{self._root.name}.old")
+        if (old / _MARKER).is_file() and not self._root.exists() and _is_own(old):
+            old.rename(self._root)
+            (self._root / _MARKER).unlink(missing_ok=True)
 
     def take(self, path: str) -> None:
         """Link a file of the dataset into the folder, in the place of what an attempt for another version left."""
@@ -86,13 +93,19 @@ class Staging:
         _remove_others(folder, wanted)
         if note is not None:
             (folder / SUBSET).write_bytes(note)
-        is_replaced = root.is_dir() and any(path.name != layout.STAGING for path in root.iterdir())
-        for path in _foreign(root, wanted) if is_replaced else ():
-            _link(root / path, folder / path)
+        names = {path.name for path in folder.iterdir()}
+        if not root.is_dir() or not any(root.iterdir()):
+            with uninterrupted():
+                Disk().move(folder, root)
+                note_done(f"{root} had been pulled")
+                (root / _MARKER).unlink(missing_ok=True)
+            return
+        # What is in none of these folders stays where it is.
+        for path in _foreign(root, wanted):
+            if (folder / Path(path).parts[0]).is_dir():
+                _link(root / path, folder / path)
         with uninterrupted():
-            if is_replaced:
-                (root / _MARKER).touch()  # it is going to be in the place of the folder for a moment
-            publish(folder, root, Disk(), done=f"{root} had been pulled", replaced="all")
+            move_in(folder, root, Disk(), done=f"{root} had been pulled", goes={"data", "videos", MANIFEST} - names)
             (root / _MARKER).unlink(missing_ok=True)
 
 
@@ -119,7 +132,18 @@ def _link(source: Path, target: Path) -> None:
 
 def _foreign(root: Path, wanted: Iterable[str]) -> list[str]:
     """Return what in a folder belongs to no dataset, folders before what is in them: notes, for example, or `.git`."""
-    ours = {*wanted, _MARKER, SUBSET, MANIFEST, EDITS, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY}
+    ours = {
+        *wanted,
+        _MARKER,
+        SUBSET,
+        MANIFEST,
+        EDITS,
+        layout.INFO,
+        layout.STATS,
+        layout.TASKS,
+        layout.IDENTITY,
+        layout.UNREPORTED,
+    }
     found: list[str] = []
     for place, folders, files in os.walk(root):
         inside = Path(place).relative_to(root)

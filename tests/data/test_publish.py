@@ -1,5 +1,6 @@
 """New content takes its place in one step, wherever that is; the sweeps say what happens when it is disturbed."""
 
+import json
 import logging
 import os
 import shutil
@@ -10,6 +11,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from bhd_lerobot.data import disk, layout, publish
 from bhd_lerobot.data.check_dataset import check_dataset
@@ -56,37 +58,49 @@ def test_what_others_put_into_a_dataset_stays_as_it_was(root: Path) -> None:
     assert leftovers(root.parent) == []
 
 
-def test_what_somebody_adds_while_the_names_are_exchanged_comes_along(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    swap = Disk.swap
+def test_what_others_write_during_an_edit_stays(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anywhere below the dataset but in its own three folders; also by a rename, as editors save."""
+    (root / "own").mkdir()
+    (root / "own/notes").write_text("old")
+    inode = root.stat().st_ino
+    count = 0
 
-    def late(self: Disk, one: Path, other: Path) -> None:
-        (root / "late.txt").write_text("mine")
-        swap(self, one, other)
+    def write(action: str, path: Path) -> None:
+        nonlocal count
+        count += 1
+        (root / f"own/{count}").touch()
+        (root / "own/next").write_text(str(count))
+        (root / "own/next").rename(root / "own/notes")
+        (root / "late.txt").write_text(str(count))
 
-    monkeypatch.setattr(Disk, "swap", late)
+    monkeypatch.setattr(disk, "_before_step", write)
     delete(root, [1])
-    assert (root / "late.txt").read_text() == "mine"
+    assert len(list((root / "own").iterdir())) == count + 1
+    assert (root / "own/notes").read_text() == (root / "late.txt").read_text() == str(count)
+    assert root.stat().st_ino == inode, "who stands in it, or has mounted it, sees the new content"
 
 
-def test_nobody_ever_sees_anything_between_the_old_content_and_the_new_one(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Between any two changes of the disk the dataset is the old one or the new one, as a stock LeRobot reads it."""
+def test_nobody_ever_takes_a_mixture_for_the_dataset(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between any two changes of the disk a stock LeRobot finds the old dataset or the new one, or is refused."""
     old = content(root)
     new = [old[0], old[2]]
     seen: list[int] = []
 
     def look(action: str, path: Path) -> None:
-        found = content(root)
-        assert found in (old, new)
-        seen.append(len(found))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(disk, "_before_step", lambda *_: None)
+            if json.loads((root / "meta/info.json").read_text())["codebase_version"].startswith("v3."):
+                found = content(root)
+                assert found in (old, new)
+                seen.append(len(found))
+            else:
+                with pytest.raises(Exception, match="bhd-data repair"):
+                    LeRobotDatasetMetadata("t/t", root=root)
+                seen.append(0)
 
     monkeypatch.setattr(disk, "_before_step", look)
     delete(root, [1])
-    assert set(seen) == {2, 3}
-    assert seen == sorted(seen, reverse=True)
+    assert list(dict.fromkeys(seen)) == [3, 0, 2]
 
 
 def test_the_current_folder_is_not_put_aside(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,6 +164,20 @@ delete(place, [0])
 assert data.main(["pull", f"file://{{root}}", "--root", str(place), "--replace", "--verify"]) == 0
 assert support.read_back(place) == 3
 assert sorted(os.listdir(place)) == ["data", "lost+found", "meta"], os.listdir(place)
+assert os.system(f"umount {{place}} && mount --bind {{root.parent / 'again'}} {{place}}") == 0
+delete(place, [1])
+assert support.read_back(root) == 3 and len(os.listdir(place / "meta")) > 3
+other = root.parent / "bound"
+other.mkdir()
+assert os.system(f"mount --bind {{root}} {{other}}") == 0
+delete(root, [2])  # from outside of the container
+assert support.read_back(other) == 2
+assert os.system(f"umount {{other}} && mkdir {{root}}/kept && mount -t tmpfs tmpfs {{root}}/kept") == 0
+assert os.system(f"mount --bind {{root}}/data {{root}}/data") == 0
+before = sorted(os.listdir(root / "data/chunk-000"))
+assert data.main(["delete", str(root), "--episodes=0"]) == 2
+assert sorted(os.listdir(root / "data/chunk-000")) == before and not (root / ".bhd").exists()
+assert support.read_back(root) == 2
 print("all of it")
 """
     (tmp_path / "volume").mkdir()
@@ -168,28 +196,17 @@ print("all of it")
     assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["all of it"]), done.stderr
 
 
-@pytest.mark.parametrize("reason", ["a folder that links cannot reach", "a file system without an exchange of names"])
-def test_where_names_cannot_be_exchanged_the_content_is_moved_in(
-    root: Path, monkeypatch: pytest.MonkeyPatch, reason: str
-) -> None:
-    inode = root.stat().st_ino
-    (root / "own").mkdir()
-    if "links" in reason:
-        os.mkfifo(root / "own/pipe")
-    else:
+def test_where_names_cannot_be_exchanged_the_content_is_moved_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(22, "Invalid argument")
 
-        def refuse(*_: object) -> None:
-            raise OSError(22, "Invalid argument")
-
-        monkeypatch.setattr(Disk, "swap", refuse)
-        (root / "own/notes").write_text("mine")
+    monkeypatch.setattr(Disk, "swap", refuse)
     delete(root, [1])
-    assert (len(content(root)), root.stat().st_ino) == (2, inode)
-    assert len(list((root / "own").iterdir())) == 1
+    assert len(content(root)) == 2
     assert leftovers(root.parent) == []
 
 
-def test_odd_places(root: Path, tmp_path: Path) -> None:
+def test_odd_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(DatasetExistsError, match="link to nothing"):
         keep(root, [0], tmp_path / "loop")
@@ -200,6 +217,10 @@ def test_odd_places(root: Path, tmp_path: Path) -> None:
     line = record(tmp_path / "two\nlines", [0, 1])
     delete(line, [0])
     assert len(content(line)) == 1
+    monkeypatch.chdir(tmp_path / "two\nlines")
+    shutil.rmtree(tmp_path / "two\nlines")
+    delete(long, [0])  # from a current folder that is gone
+    assert len(content(long)) == 1
     (tmp_path / "left/.bhd/compact/build").mkdir(parents=True)  # of an attempt that was killed
     with support.create(tmp_path / "left") as recorder:
         support.record(recorder)
@@ -208,44 +229,45 @@ def test_odd_places(root: Path, tmp_path: Path) -> None:
     assert support.read_back(tmp_path / "left") == 1
 
 
-def test_names_with_any_character_go_when_all_is_replaced(root: Path, tmp_path: Path) -> None:
-    """As a pull into a mount point does."""
-    new = record(tmp_path / "new", [3])
-    odd = [b"two\nlines", b"\xff", "ä".encode(), b"-rf"]
-    for name in odd:
-        Path(os.fsdecode(os.fsencode(root) + b"/" + name)).touch()
-    publish._move_in(new, root, Disk(), "all")
-    assert sorted(os.listdir(root)) == ["data", "meta"]
-    assert len(content(root)) == 1
-
-
 # --- who else is there ------------------------------------------------------------------------------------------------
 
 
-def test_a_lock_goes_along_and_a_lock_on_what_was_put_aside_is_none(root: Path) -> None:
-    handle = os.open(root, os.O_RDONLY)  # of somebody who is about to lock it
-    lock = RootLock(root)
-    with publish.Workspace(root, Disk(), lock) as space:
-        shutil.copytree(root / "meta", space.folder / "meta")
-        space.publish("it had been made")
-    assert os.fstat(handle).st_ino != root.stat().st_ino
-    with pytest.raises(DatasetLockedError):
-        RootLock(root)
-    lock.release()
-    RootLock(root).release()
-    os.close(handle)
+def test_what_somebody_else_makes_at_the_same_place_stays(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    move = Disk.move
+    places = (tmp_path / "new", tmp_path / "empty", tmp_path / "fixed")
+    for place in places:
+        if place.name != "new":
+            place.mkdir()
+
+        def late(self: Disk, source: Path, target: Path, place: Path = place) -> None:
+            if target in (place, place / publish.WORK / "new"):
+                (place / "meta").mkdir(parents=True)
+                (place / "meta/theirs").touch()
+            move(self, source, target)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Disk, "move", late)
+            if place.name == "fixed":
+                patch.setattr(publish, "is_fixed", lambda path: path.name == "fixed")
+            with pytest.raises(DatasetError):
+                keep(root, [0], place)
+        assert (place / "meta/theirs").exists()
+        assert not (place / "meta/info.json").exists()
 
 
 def test_workspaces_of_killed_processes_are_removed_and_those_of_living_ones_stay(root: Path) -> None:
-    (root.parent / ".d.bhd-old/d/data").mkdir(parents=True)
-    living = root.parent / ".d.bhd-new"
+    (root.parent / ".d.bhd-0a1b2c3_/d/data").mkdir(parents=True)
+    (root.parent / ".d.bhd-notes").mkdir()  # of somebody else
+    living = root.parent / ".d.bhd-00000000"
     living.mkdir()
     lock = RootLock(living)
     delete(root, [1])
-    assert leftovers(root.parent) == [".d.bhd-new"]
+    assert leftovers(root.parent) == [".d.bhd-00000000", ".d.bhd-notes"]
     lock.release()
     assert not repair(root)
-    assert leftovers(root.parent) == []
+    assert leftovers(root.parent) == [".d.bhd-notes"]
 
 
 def test_two_that_move_into_one_folder_do_not_meet(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -313,6 +335,31 @@ def test_while_its_process_lives_it_is_waited_for(root: Path) -> None:
     lock.release()
 
 
+@pytest.mark.parametrize("how", ["of another folder", "a path", "a link", "a link to the staging folder", "no JSON"])
+def test_a_marker_that_came_with_a_dataset_of_somebody_else_moves_nothing(root: Path, how: str) -> None:
+    victim = root.parent / "victim"
+    (victim / "meta").mkdir(parents=True)
+    half_moved(root)
+    (root / publish.WORK / "old/data").rename(root / "data")
+    plan = {"root": root.stat().st_ino, "new": {}, "goes": [], "is_new": False}
+    if how == "of another folder":
+        plan |= {"root": 1, "goes": ["data"]}
+    elif how == "a path":
+        plan |= {"goes": ["../victim"]}
+    elif how == "a link":
+        shutil.rmtree(root / publish.WORK / "new")
+        (root / publish.WORK / "new").symlink_to(victim)
+    elif how == "a link to the staging folder":
+        (root / ".bhd").rename(root / "elsewhere")
+        (root / ".bhd").symlink_to("elsewhere")
+    (root / publish.WORK / "ready").write_text("{" if how == "no JSON" else json.dumps(plan))
+    before = names(root.parent)
+    for command in ("info", "check", "repair"):
+        assert data.main([command, str(root)]) == 2
+    assert data.main(["delete", str(root), "--episodes=0"]) == 2
+    assert names(root.parent) == before
+
+
 # --- an edit that nobody was told of ----------------------------------------------------------------------------------
 
 
@@ -334,6 +381,12 @@ def test_an_edit_that_nobody_was_told_of_is_recognised(root: Path, tmp_path: Pat
     assert content(root) == [first, last]
     assert data.main(["delete", str(root), "--episodes=1"]) == 0  # now it is meant
     assert content(root) == [first]
+
+    with pytest.raises(KilledError):
+        delete(record(tmp_path / "e", [0, 1, 2]), [1], killed)
+    told = json.loads((tmp_path / "e" / layout.UNREPORTED).read_text())
+    (root / layout.UNREPORTED).write_text(json.dumps({**told, "time": "2001"}))  # it is not about this content
+    mark(root, [0], outcome="success")
 
     with pytest.raises(KilledError):
         mark(root, [0], outcome="failure", note="why", tell=killed)
@@ -398,6 +451,21 @@ def test_ctrl_c_at_the_end_of_an_edit_says_that_it_was_made(root: Path, monkeypa
     said = capsys.readouterr().err
     assert "had been completed" in said
     assert "nothing was changed" not in said
+    assert len(content(root)) == 2
+
+
+def test_an_error_and_ctrl_c_at_once_do_not_say_that_nothing_was_changed(root: Path, monkeypatch, capsys) -> None:
+    def refuse(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Disk, "swap", refuse)
+        assert data.main(["delete", str(root), "--episodes=1"]) == 2
+    said = capsys.readouterr().err
+    assert "The change is decided, and the next command completes it." in said
+    assert "nothing was changed" not in said
+    assert data.main(["info", str(root), "--short"]) == 0
     assert len(content(root)) == 2
 
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.data.bag_export import ExportOptions, export_bags
+from bhd_lerobot.data.publish import UNFINISHED_VERSION
 from bhd_lerobot.data.ros2_views import RobotView
 from tests.data import support
 from tests.data.edit_support import record
@@ -28,7 +29,7 @@ class Operation:
         argv: the command line, in that folder.
         target: what the command makes or changes.
         is_new: whether nothing is there before.
-        places: how the new content comes to its place; see `bhd_lerobot.data.publish`.
+        places: "no exchange" of names by the file system, or a "fixed" folder, such as a mount point.
         repeated: exit status of the same command again, when it had been completed.
         says: what it says of that.
     """
@@ -38,7 +39,7 @@ class Operation:
     argv: Callable[[Path], list[str]]
     target: str
     is_new: bool = False
-    places: tuple[str, ...] = ("beside",)
+    places: tuple[str, ...] = ("plain",)
     repeated: int = 0
     says: str = ""
 
@@ -94,8 +95,9 @@ def _edit(*words: str) -> Callable[[Path], list[str]]:
     return lambda folder: [words[0], str(folder / "d 1"), *words[1:]]
 
 
-ANYWHERE = ("beside", "inside", "no exchange")
-EXISTS = {"is_new": True, "repeated": 2, "says": "exists already"}
+ANYWHERE = ("plain", "no exchange")
+NEW_ANYWHERE = ("plain", "fixed")
+EXISTS = {"is_new": True, "repeated": 2, "says": "exists already", "places": NEW_ANYWHERE}
 OPERATIONS = (
     Operation(
         "delete", dataset, _edit("delete", "--episodes=1"), "d 1", places=ANYWHERE, says="nothing was changed now"
@@ -104,7 +106,14 @@ OPERATIONS = (
     Operation("fix", _without_stats, _edit("check", "--fix"), "d 1"),
     Operation("repair", _killed, _edit("repair"), "d 1", places=ANYWHERE),
     Operation("resume", _killed, lambda folder: ["record", str(folder / "d 1"), "5"], "d 1"),
-    Operation("record", lambda folder: None, lambda folder: ["record", str(folder / "d 1"), "2"], "d 1", is_new=True),
+    Operation(
+        "record",
+        lambda folder: None,
+        lambda folder: ["record", str(folder / "d 1"), "2"],
+        "d 1",
+        is_new=True,
+        places=NEW_ANYWHERE,
+    ),
     Operation(
         "merge",
         _two,
@@ -154,15 +163,23 @@ OPERATIONS = (
         lambda folder: ["pull", f"file://{folder}/afar", "--root", str(folder / "new")],
         "new",
         is_new=True,
+        places=NEW_ANYWHERE,
     ),
     Operation(
         "pull in the place of another",
         _afar_and_here,
         lambda folder: ["pull", f"file://{folder}/afar", "--root", str(folder / "d 1"), "--replace", "--verify"],
         "d 1",
-        places=ANYWHERE,
+        places=(*ANYWHERE, "fixed"),
     ),
 )
+
+
+REFUSED = "refused by LeRobot"
+
+
+class RefusedError(Exception):
+    """LeRobot would not load it."""
 
 
 def content(place: Path) -> str:
@@ -176,6 +193,8 @@ def content(place: Path) -> str:
         if any(path.name == NOTES for path in place.glob("*")):
             found.append(place / NOTES)
         return _digest([path for path in found if path not in hidden]) if found else "nothing"
+    except RefusedError:
+        return REFUSED
     except (OSError, KeyError, ValueError, pa.ArrowException) as error:
         return f"broken: {error!r}"
 
@@ -188,6 +207,8 @@ def _digest(found: list[Path]) -> str:
             continue
         root = path.parents[1]
         info = json.loads(path.read_text(encoding="utf-8"))
+        if info["codebase_version"] == UNFINISHED_VERSION:
+            raise RefusedError
         rows = pa.concat_tables([_light(one) for one in sorted(root.glob("meta/episodes/*/*.parquet"))]).to_pylist()
         rows = [row for row in rows if row["episode_index"] < info["total_episodes"]]
         data = pa.concat_tables([pq.read_table(one) for one in sorted(root.glob("data/*/*.parquet"))])

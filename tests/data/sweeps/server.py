@@ -88,9 +88,10 @@ def run(job: dict[str, Any]) -> None:
     with open(job["output"], "wb") as output:
         os.dup2(output.fileno(), 1)
         os.dup2(output.fileno(), 2)
-    if job["place"] == "inside":
-        publish.must_be_inside = lambda place: place.is_dir()
-        remote_staging.must_be_inside = publish.must_be_inside
+    if job["place"] == "fixed":
+        os.makedirs(job["target"], exist_ok=True)
+        publish.is_fixed = lambda place: str(place) == job["target"]
+        remote_staging.is_fixed = publish.is_fixed
     elif job["place"] == "no exchange":
 
         def swap(*_: object) -> None:
