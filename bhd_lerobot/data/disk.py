@@ -191,7 +191,7 @@ class RootLock:
             is_choice: whether another root would do as well, which is said then.
 
         Raises:
-            DatasetLockedError: another recorder or repair works on this root.
+            DatasetLockedError: another process records, repairs or edits it.
         """
         self._root, self._shown_as, self._is_choice = root, shown_as or root, is_choice
         self._handle: int | None = None

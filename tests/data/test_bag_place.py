@@ -112,7 +112,7 @@ def test_a_living_attempt_keeps_its_folder_and_the_first_to_end_has_the_place(tm
 
 
 def test_what_ended_after_the_last_step_is_removed_though_the_place_is_taken(tmp_path: Path) -> None:
-    (tmp_path / ".d.bhd-killed" / "d").mkdir(parents=True)
+    (tmp_path / ".d.bhd-killed00" / "d").mkdir(parents=True)
     (tmp_path / ".d.other").mkdir()
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "note").write_text("mine")

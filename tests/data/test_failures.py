@@ -200,7 +200,7 @@ def test_an_empty_folder_becomes_a_dataset(tmp_path: Path) -> None:
 def test_what_is_being_recorded_is_not_called_in_the_way(tmp_path: Path) -> None:
     with support.create(tmp_path / "d") as recorder:
         support.record(recorder)
-        with pytest.raises(DatasetLockedError, match="is being written"):
+        with pytest.raises(DatasetLockedError, match="is being recorded, repaired or edited"):
             support.create(tmp_path / "d")
 
 
@@ -209,7 +209,7 @@ def test_only_one_writer_at_a_time(tmp_path: Path) -> None:
     recorder = support.create(root)
     support.record(recorder)
     for call in (support.resume, repair):
-        with pytest.raises(DatasetLockedError, match="another recorder"):
+        with pytest.raises(DatasetLockedError, match="by another process"):
             call(root)
     recorder.finalize()
     with support.resume(root) as again:
