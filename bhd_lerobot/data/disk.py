@@ -215,6 +215,10 @@ class RootLock:
         self._root = self._shown_as
         return True
 
+    def close(self) -> None:
+        """Give the lock back, as `release` does; for `contextlib.closing`."""
+        self.release()
+
     def release(self) -> None:
         """Give the lock back; a second call does nothing."""
         if self._handle is not None:

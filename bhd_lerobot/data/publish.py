@@ -229,15 +229,11 @@ def remove_abandoned(place: Path) -> None:
     ours = re.compile(re.escape(_prefix(place)) + "[a-z0-9_]{8}")  # as `tempfile` names them
     for folder in place.parent.glob(f"{glob.escape(_prefix(place))}*"):
         if ours.fullmatch(folder.name):
-            with contextlib.suppress(OSError, DatasetLockedError):
-                lock = RootLock(folder)
+            with contextlib.suppress(OSError, DatasetLockedError), contextlib.closing(RootLock(folder)):
                 shutil.rmtree(folder)
-                lock.release()
     if os.path.exists(place / WORK):
-        with contextlib.suppress(OSError, DatasetLockedError):
-            lock = RootLock(place)
+        with contextlib.suppress(OSError, DatasetLockedError), contextlib.closing(RootLock(place)):
             _clean_inside(place)
-            lock.release()
 
 
 def clean(place: Path) -> None:

@@ -77,6 +77,10 @@ def _carry_out(options: argparse.Namespace, done: Sequence[str]) -> int:
     except BhdError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except PermissionError as error:
+        where = error.filename2 or error.filename
+        print(f"error: {error.strerror}: {where}. Check the permissions of this path.", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print(f"Stopped; {', '.join(done) or options.stopped}.", file=sys.stderr)
         return INTERRUPTED
