@@ -35,7 +35,7 @@ from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedEr
 WORK = Path(layout.STAGING, "compact")  # the name that versions before had, so that what they left is found
 PULL = Path(layout.STAGING, "pull")  # where a download comes together, if nothing can be put beside its place
 _WORKSPACES = {WORK.name, PULL.name}
-_MARKER = WORK / "ready"
+_MARKER, _INVALID = WORK / "ready", WORK / "info.json"
 _LONGEST = 240  # bytes of a name, to which a random part is added
 _NO_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP)
 _ORDER = {"data": 1, "meta": 2}  # the metadata come last; whatever else there is, first
@@ -179,16 +179,21 @@ def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = Fal
         disk.make_folder(work)
     _check_movable(place, [*_names(new), *goes], is_new)
     with uninterrupted():
-        disk.move(new, work / "new")
-        inodes = {name: (work / "new" / name).lstat().st_ino for name in _names(work / "new")}
-        plan = {"root": place.stat().st_ino, "new": inodes, "goes": sorted(goes), "is_new": is_new}
-        try:
+        try:  # from the marker on there are only renames, which a full disk allows
+            disk.make_folder(work / "old")
+            if (new / layout.INFO).is_file():
+                _write_invalid_info(place, disk)
+            disk.move(new, work / "new")
+            inodes = {name: (work / "new" / name).lstat().st_ino for name in _names(work / "new")}
+            plan = {"root": place.stat().st_ino, "new": inodes, "goes": sorted(goes), "is_new": is_new}
             disk.write(work / "ready.tmp", json.dumps(plan).encode())
             disk.move(work / "ready.tmp", place / _MARKER)
         except BaseException:
             with contextlib.suppress(OSError):
                 (work / "new").rename(new)
-            disk.try_remove_tree(work / "ready.tmp")
+                for name in ("ready.tmp", _INVALID.name):
+                    (work / name).unlink(missing_ok=True)
+                (work / "old").rmdir()
             raise
         sentences = _done.get()
         before = None if sentences is None else list(sentences)
@@ -267,8 +272,8 @@ def roll_forward(place: Path, disk: Disk) -> bool:
     for name in plan.goes:
         if os.path.lexists(place / name):
             disk.move(place / name, _unused(old / name))
-    if "meta" in plan.new and not _is_there(place / "meta", plan.new["meta"]):
-        _invalidate(place, disk)
+    if (place / _INVALID).is_file() and not _is_there(place / "meta", plan.new.get("meta")):
+        disk.move(place / _INVALID, place / layout.INFO)
     for name in sorted({*_names(new), *plan.new}, key=lambda name: (_ORDER.get(name, 0), name)):
         _replace(new / name, place / name, old / name, plan, disk)
     disk.remove(place / _MARKER)
@@ -402,16 +407,14 @@ def _unused(path: Path) -> Path:
     return path
 
 
-def _invalidate(place: Path, disk: Disk) -> None:
-    """Let LeRobot refuse a dataset while its folders are exchanged."""
-    info = place / layout.INFO
+def _write_invalid_info(place: Path, disk: Disk) -> None:
+    """Write the ``info.json`` with which LeRobot refuses a dataset while its folders are exchanged."""
     try:
-        content = json.loads(info.read_bytes())
+        content = json.loads((place / layout.INFO).read_bytes())
         content["codebase_version"] = UNFINISHED_VERSION
     except (OSError, ValueError, TypeError):
         return  # nobody can load it anyhow
-    disk.write(place / WORK / "info.json", to_json(content))
-    disk.move(place / WORK / "info.json", info)
+    disk.write(place / _INVALID, to_json(content))
 
 
 def _check_movable(place: Path, names: Collection[str], is_new: bool) -> None:

@@ -142,7 +142,7 @@ from bhd_lerobot.data.edits import delete, keep, split
 from bhd_lerobot.runs import data
 root, place = Path({str(root)!r}), Path({str(tmp_path / "volume")!r})
 def empty():
-    os.system(f"umount {{place}} 2>/dev/null")
+    os.system(f"umount --lazy {{place}} 2>/dev/null")
     assert os.system(f"mount -t tmpfs tmpfs {{place}}") == 0
     (place / "lost+found").mkdir()
     return place
@@ -164,7 +164,7 @@ delete(place, [0])
 assert data.main(["pull", f"file://{{root}}", "--root", str(place), "--replace", "--verify"]) == 0
 assert support.read_back(place) == 3
 assert sorted(os.listdir(place)) == ["data", "lost+found", "meta"], os.listdir(place)
-assert os.system(f"umount {{place}} && mount --bind {{root.parent / 'again'}} {{place}}") == 0
+assert os.system(f"umount --lazy {{place}} && mount --bind {{root.parent / 'again'}} {{place}}") == 0
 delete(place, [1])
 assert support.read_back(root) == 3 and len(os.listdir(place / "meta")) > 3
 other = root.parent / "bound"
@@ -172,7 +172,7 @@ other.mkdir()
 assert os.system(f"mount --bind {{root}} {{other}}") == 0
 delete(root, [2])  # from outside of the container
 assert support.read_back(other) == 2
-assert os.system(f"umount {{other}} && mkdir {{root}}/kept && mount -t tmpfs tmpfs {{root}}/kept") == 0
+assert os.system(f"umount --lazy {{other}} && mkdir {{root}}/kept && mount -t tmpfs tmpfs {{root}}/kept") == 0
 assert os.system(f"mount --bind {{root}}/data {{root}}/data") == 0
 before = sorted(os.listdir(root / "data/chunk-000"))
 assert data.main(["delete", str(root), "--episodes=0"]) == 2

@@ -41,7 +41,7 @@ def test_a_dataset_that_changes_is_noticed_and_read_again(tmp_path) -> None:
         finally:
             lock.release()
         assert status == 409
-        assert "being written" in content.decode()
+        assert "being recorded, repaired or edited" in content.decode()
 
 
 def test_an_empty_dataset(tmp_path) -> None:
@@ -76,7 +76,7 @@ def test_damaged_missing_and_locked_datasets_are_refused(base, tmp_path) -> None
         ViewedDataset(tmp_path / "none")
     lock = RootLock(base)
     try:
-        with pytest.raises(DatasetLockedError, match="being written"):
+        with pytest.raises(DatasetLockedError, match="being recorded, repaired or edited"):
             ViewedDataset(base)
     finally:
         lock.release()
