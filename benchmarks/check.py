@@ -16,8 +16,8 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from benchmarks._spread import ratios, spread, write
-from bhd_lerobot.data.check_dataset import check_dataset
-from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 
 GOAL = 1e6  # frames a second
 FPS = 25

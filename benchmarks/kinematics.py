@@ -22,7 +22,7 @@ from eaik.IK_DH import DhRobot
 from bhd_lerobot.bodies.body import ArmChain
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.kinematics import ArmKinematics
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 
 try:
     import ur_analytic_ik  # has no wheels for every platform

@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks._spread import spread, write
-from bhd_lerobot.data.loader import BatchLoader, TableDataset
+from bhd_lerobot.datasets.loader.loader import BatchLoader, TableDataset
 
 BATCH, CHUNK, WORKERS = 64, 50, (0, 2)
 NAMES = ("ours", *(f"LeRobot, {n} workers" for n in WORKERS))
@@ -58,7 +58,7 @@ def record_dataset(root: Path, config: str, episodes: int, options: tuple[str, .
         *options,
     ]
     done = subprocess.run(
-        [sys.executable, "-m", "bhd_lerobot.runs.record", *arguments], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "bhd_lerobot.recording.record", *arguments], capture_output=True, text=True, check=False
     )
     return done.stderr.strip() if done.returncode else ""
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks._spread import ratios, spread, write
 from benchmarks.check import record
-from bhd_lerobot.data.edits import merge
-from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.datasets.edit.edits import merge
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 
 CAMERA = "observation.images.front"
 

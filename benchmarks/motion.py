@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
-from bhd_lerobot.control.poses import pose_vectors
+from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 

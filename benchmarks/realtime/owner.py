@@ -59,7 +59,7 @@ class OwnerSpec:
 
     def robot_config(self) -> Any:
         """Return the robot's configuration, on the wall clock."""
-        from bhd_lerobot.robots.config_realtime import RealtimeConfig
+        from bhd_lerobot.robots.host.config import RealtimeConfig
         from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
         from bhd_lerobot.robots.config_ur5 import UR5Config
 
@@ -169,8 +169,8 @@ class Episodes:
 
     def __init__(self, simulation: Any, spec: OwnerSpec) -> None:
         from benchmarks.realtime.owner_brain import SwayBrain
-        from bhd_lerobot.data.features import dataset_features
-        from bhd_lerobot.data.recorder import DatasetRecorder
+        from bhd_lerobot.datasets.format.features import dataset_features
+        from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 
         self._simulation, self._brain = simulation, SwayBrain(with_network=spec.network)
         if simulation.camera_names:
@@ -200,10 +200,10 @@ class Episodes:
 
     def run(self, seconds: float) -> dict[str, Any]:
         """Record one episode; return what is to be said of it."""
-        from bhd_lerobot.data import features as keys
-        from bhd_lerobot.runs.episode import EpisodeLoop
-        from bhd_lerobot.runs.episode_types import EpisodeSpec
-        from bhd_lerobot.runs.provenance import episode_metadata
+        from bhd_lerobot.datasets.format import features as keys
+        from bhd_lerobot.rollout.episode import EpisodeLoop
+        from bhd_lerobot.rollout.types import EpisodeSpec
+        from bhd_lerobot.rollout.provenance import episode_metadata
 
         task, recorder = self._task(seconds), self._recorder
         loop = EpisodeLoop(self._simulation, task, self._brain)
@@ -231,7 +231,7 @@ class Episodes:
 
 def work(spec: OwnerSpec, lines: Lines) -> None:
     """Start the robot, and do what the lines say until they end."""
-    from bhd_lerobot.runs.registry import make_robot
+    from bhd_lerobot.rollout.registry import make_robot
 
     config = spec.robot_config()
     with contextlib.closing(make_robot(config)) as simulation:

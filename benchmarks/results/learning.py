@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.results.runner import FailedError, Runner
 from benchmarks.results.section import Row, Section
-from bhd_lerobot.runs.eval_statistics import mean_difference, ratio_of_means
+from bhd_lerobot.evaluation.statistics import mean_difference, ratio_of_means
 
 EPISODES = 500
 TOOL = ("--robot.action_space=tool", "--robot.tool_pose=true")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body, MobileBase
-from bhd_lerobot.control.base_controller import BaseController
+from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.fifo import CommandFifo, StateRing

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Body, MobileBase
 from bhd_lerobot.errors import ActionError
-from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.task import Task
 
 

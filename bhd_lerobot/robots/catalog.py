@@ -7,8 +7,8 @@ from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.live_simulation import make_live
-from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.robots.host.realtime import make_live
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 

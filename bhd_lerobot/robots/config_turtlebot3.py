@@ -8,7 +8,7 @@ from bhd_lerobot.bodies.arenas import ARENAS
 from bhd_lerobot.bodies.body import MobileBase, Rates
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.robots.config_realtime import CLOCKS, RealtimeConfig
+from bhd_lerobot.robots.host.config import CLOCKS, RealtimeConfig
 from bhd_lerobot.sim.lidar import check_beams
 
 

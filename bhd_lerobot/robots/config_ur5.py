@@ -7,7 +7,7 @@ from lerobot.robots.config import RobotConfig
 from bhd_lerobot.bodies.body import Arm, Rates
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.robots.config_realtime import CLOCKS, RealtimeConfig
+from bhd_lerobot.robots.host.config import CLOCKS, RealtimeConfig
 
 CONTROLS = ("servo", "impedance")
 ACTION_SPACES = ("joint", "tool")

@@ -16,8 +16,8 @@ from bhd_lerobot.control.commands import CommandResult
 from bhd_lerobot.control.estop import POLL_S, EstopInputs, Source, check_source
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
-from bhd_lerobot.robots.live_simulation import LiveSimulation, make_live
-from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.robots.host.realtime import LiveSimulation, make_live
+from bhd_lerobot.robots.host.simulation import Simulation
 
 # Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator; one that
 # thinks for itself finds its robot here. Weak, so that a forgotten robot is freed.

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
-from bhd_lerobot.control.base_controller import BaseController
+from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.robots.simulation import FrameReport, Simulation
+from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
 from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.world import World

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.kinematics import ArmKinematics
-from bhd_lerobot.control.poses import pose_vectors
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import ArmTruth, Event, Outcome

@@ -15,7 +15,7 @@ from benchmarks.realtime.stamps import (
     reference_speed,
 )
 from bhd_lerobot.control.messages import Mode
-from bhd_lerobot.control.plant_link import PlantPhase, PlantShape
+from bhd_lerobot.realtime.plant_link import PlantPhase, PlantShape
 
 PERIOD = 1_000_000
 START = 5_000_000_000

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
-from bhd_lerobot.control.mailbox import Mailbox
-from bhd_lerobot.control.plan_link import PlanServer
-from bhd_lerobot.control.planner import Plan
-from bhd_lerobot.control.trajectory import PlanFailure, Trajectory
+from bhd_lerobot.realtime.mailbox import Mailbox
+from bhd_lerobot.realtime.plan_link import PlanServer
+from bhd_lerobot.control.motion.planner import Plan
+from bhd_lerobot.control.motion.trajectory import PlanFailure, Trajectory
 
 RECORD = np.dtype([("number", np.int64), ("flag", np.bool_), ("copies", np.int64, (100,))])  # 809 bytes: not aligned
 CAPACITY = 4

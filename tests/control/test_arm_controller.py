@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.arm_controller import ArmController
+from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Reason, Request, SendResult, Setpoint, Watchdog

@@ -5,11 +5,11 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
-from bhd_lerobot.control.compliance import Compliance, critical_damping
-from bhd_lerobot.control.dynamics import ArmDynamics
-from bhd_lerobot.control.equilibrium import Equilibrium, EquilibriumLimits
-from bhd_lerobot.control.rotations import rotation_matrices, rotation_vectors
-from bhd_lerobot.control.wrench import ContactObserver, tool_wrench
+from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics
+from bhd_lerobot.control.arm.equilibrium import Equilibrium, EquilibriumLimits
+from bhd_lerobot.control.geometry.rotations import rotation_matrices, rotation_vectors
+from bhd_lerobot.control.arm.wrench import ContactObserver, tool_wrench
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.control.diff_drive import DiffDrive
+from bhd_lerobot.control.base.diff_drive import DiffDrive
 
 DRIVE = turtlebot3_burger().drive
 RADIUS, SEPARATION = 0.033, 0.160

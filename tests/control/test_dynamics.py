@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
-from bhd_lerobot.control.dynamics import ArmDynamics
-from bhd_lerobot.control.kinematics import ArmKinematics
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
 
 ARM = ur5(actuation="torque")

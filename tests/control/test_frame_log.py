@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.control.fifo import StateRing
-from bhd_lerobot.control.frame_log import FrameCollector, FrameLog
+from bhd_lerobot.realtime.frame_log import FrameCollector, FrameLog
 
 STATE = np.dtype([(name, np.int64) for name in ("tick", "stretch", "due_ns", "start_ns", "executed")])
 F = 5  # ticks in a frame

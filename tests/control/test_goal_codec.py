@@ -5,9 +5,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.command_check import check
+from bhd_lerobot.control.motion.command_check import check
 from bhd_lerobot.control.commands import MOTIONS, BrainCommand, CommandResult, Feedback, GoalPhase, Pose, ResultCode
-from bhd_lerobot.control.goal_codec import (
+from bhd_lerobot.control.motion.goal_codec import (
     FEEDBACK_DTYPE,
     MESSAGE_BYTES,
     NAME_BYTES,

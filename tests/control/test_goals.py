@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.control.commands import GoalPhase, ResultCode
-from bhd_lerobot.control.goals import GoalManager
-from bhd_lerobot.control.kinematics import ArmKinematics
-from bhd_lerobot.control.planner import GoalPlanner
+from bhd_lerobot.control.motion.goals import GoalManager
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.motion.planner import GoalPlanner
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, joints, moved
 
 FAR = joints(2.0)

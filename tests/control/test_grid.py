@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.grid import TickGrid
+from bhd_lerobot.realtime.grid import TickGrid
 from bhd_lerobot.errors import ConfigError
 
 PERIOD = 1000

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.compliance import Compliance
-from bhd_lerobot.control.impedance import ImpedanceController
+from bhd_lerobot.control.arm.compliance import Compliance
+from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Setpoint
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.kinematics import ArmKinematics
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
 
 ARM = ur5()

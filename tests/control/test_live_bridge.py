@@ -9,12 +9,12 @@ import pytest
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.fifo import StateRing
-from bhd_lerobot.control.live_block import LiveBlock, LiveLayout, Phase, Word
-from bhd_lerobot.control.live_bridge import LiveBridge
-from bhd_lerobot.control.mailbox import Mailbox
+from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Phase, Word
+from bhd_lerobot.realtime.bridge import LiveBridge
+from bhd_lerobot.realtime.mailbox import Mailbox
 from bhd_lerobot.control.messages import Mode, Reason
-from bhd_lerobot.control.realtime import LoopLimits, RealtimeLoop
-from bhd_lerobot.control.requests import EVENT_DTYPE, RequestClient, RequestServer, request_dtype
+from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
+from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestServer, request_dtype
 from bhd_lerobot.errors import ConfigError
 from tests.control.support import BODY, PerfectPlant
 

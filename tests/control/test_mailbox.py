@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.mailbox import Mailbox
+from bhd_lerobot.realtime.mailbox import Mailbox
 from bhd_lerobot.errors import ConfigError
 from tests.control.mail_support import CAPACITY, RECORD, record, shared_block, start
 

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
-from bhd_lerobot.control.plan_link import PlanLink, PlanServer
-from bhd_lerobot.control.planner import GoalPlanner, Plan
-from bhd_lerobot.control.planning import MIN_LEAD
-from bhd_lerobot.control.trajectory import PlanFailure, State
+from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
+from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
+from bhd_lerobot.control.motion.planning import MIN_LEAD
+from bhd_lerobot.control.motion.trajectory import PlanFailure, State
 from bhd_lerobot.errors import ConfigError
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, joints, moved
 from tests.control.mail_support import DURATION_S, RampPlanner, shared_block, start

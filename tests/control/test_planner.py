@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
-from bhd_lerobot.control.kinematics import ArmKinematics, IkResult
-from bhd_lerobot.control.planner import GoalPlanner, Plan, PlanFailure
-from bhd_lerobot.control.trajectory import State
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics, IkResult
+from bhd_lerobot.control.motion.planner import GoalPlanner, Plan, PlanFailure
+from bhd_lerobot.control.motion.trajectory import State
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, LIMITS, ZEROS, joints, moved
 
 PLANNER = GoalPlanner(ARM, HZ, KINEMATICS)

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.arm_controller import ArmController
+from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.commands import BrainCommand, GoalPhase, ResultCode
-from bhd_lerobot.control.goals import GoalManager
-from bhd_lerobot.control.planner import GoalPlanner, Plan
-from bhd_lerobot.control.planning import MIN_LEAD, MOST_LEADS, InlinePlanning, lead_ticks
+from bhd_lerobot.control.motion.goals import GoalManager
+from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
+from bhd_lerobot.control.motion.planning import MIN_LEAD, MOST_LEADS, InlinePlanning, lead_ticks
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.trajectory import PlanFailure, State
+from bhd_lerobot.control.motion.trajectory import PlanFailure, State
 from bhd_lerobot.errors import ConfigError
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, broken_limit, joints, moved
 from tests.control.test_goal_properties import actions, follow

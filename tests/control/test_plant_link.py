@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.plant_link import CommandGuard, PlantLink, PlantPhase, PlantShape, RemotePlant
+from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, PlantShape, RemotePlant
 
 SHAPE = PlantShape(joints=2, positions=9, velocities=8, features=300, touches=1, kept=4)
 MS = 1_000_000

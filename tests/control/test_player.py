@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.player import TrajectoryPlayer
-from bhd_lerobot.control.trajectory import State, Trajectory
+from bhd_lerobot.control.motion.player import TrajectoryPlayer
+from bhd_lerobot.control.motion.trajectory import State, Trajectory
 
 
 def rows_of(ticks: int, seed: int = 0, dof: int = 2) -> np.ndarray:

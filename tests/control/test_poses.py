@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.control.commands import Pose
-from bhd_lerobot.control.poses import pose_vectors, quaternion_columns
+from bhd_lerobot.control.geometry.poses import pose_vectors, quaternion_columns
 
 DOWN = np.array([0.0, 1.0, 0.0, 0.0])  # wxyz: half a turn about x
 

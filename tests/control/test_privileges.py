@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from bhd_lerobot.control.privileges import (
+from bhd_lerobot.realtime.privileges import (
     GRANT_BANDWIDTH,
     GRANT_LATENCY_FILE,
     Grant,
@@ -23,7 +23,7 @@ from bhd_lerobot.control.privileges import (
     RealtimeSettings,
     describe_refusals,
 )
-from bhd_lerobot.control.system_calls import CAP_IPC_LOCK, CAP_SYS_NICE, MCL_CURRENT, MCL_FUTURE, SystemCalls
+from bhd_lerobot.realtime.system_calls import CAP_IPC_LOCK, CAP_SYS_NICE, MCL_CURRENT, MCL_FUTURE, SystemCalls
 from bhd_lerobot.errors import ConfigError, RealtimeError
 
 FIFO = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -297,8 +297,8 @@ GIVE_UP = """
 """
 START = """
     import gc, json, os, sys
-    from bhd_lerobot.control.privileges import Privileges, RealtimeSettings
-    from bhd_lerobot.control.system_calls import SystemCalls
+    from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
+    from bhd_lerobot.realtime.system_calls import SystemCalls
     calls = SystemCalls()
     before = [calls.scheduler(), calls.timer_slack(), sorted(calls.affinity())]
 """

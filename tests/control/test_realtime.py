@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.grid import Slot, TickGrid
-from bhd_lerobot.control.live_block import WORDS, Phase, Word
+from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.realtime.block import WORDS, Phase, Word
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, Request, Watchdog
-from bhd_lerobot.control.realtime import LoopLimits, RealtimeLoop
+from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
 from tests.control.support import TICK_NS, Rig
 
 MS = 1_000_000

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.arm_controller import ArmController
+from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
-from bhd_lerobot.control.mailbox import Mailbox
+from bhd_lerobot.realtime.mailbox import Mailbox
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, Request
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.requests import EVENT_DTYPE, RequestClient, RequestKind, RequestServer, request_dtype
+from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestKind, RequestServer, request_dtype
 from bhd_lerobot.errors import RealtimeError
 from tests.control import support
 from tests.control.goal_rig import ARM, HOME, HZ, joints

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from bhd_lerobot.control import safety
+from bhd_lerobot.control.base import limits
 
 N = 5
 ANY = st.floats(-1e6, 1e6) | st.floats(-3, 3) | st.sampled_from([0.0, -0.0, 0.22, 2.84, 1e300, -1e300])
@@ -17,14 +17,14 @@ PER_SPEED, PER_YAW, WHEEL_LIMIT = 1 / 0.033, 0.08 / 0.033, 6.9
 def test_velocity(requested: np.ndarray, limit: np.ndarray) -> None:
     before = requested.copy()
     out, changed = np.empty_like(requested), np.zeros((N, 2), np.bool_)
-    safety.limit_velocity(requested, limit, out, changed)
+    limits.limit_velocity(requested, limit, out, changed)
     np.testing.assert_array_equal(requested, before)
     assert (np.abs(out) <= limit).all()
     np.testing.assert_array_equal(changed, np.abs(requested) > limit)  # flagged if and only if it had to change
     np.testing.assert_array_equal(out[~changed], requested[~changed])
     np.testing.assert_array_equal(np.sign(out), np.sign(requested))
     again, changed_again = np.empty_like(out), np.zeros((N, 2), np.bool_)
-    safety.limit_velocity(out, limit, again, changed_again)
+    limits.limit_velocity(out, limit, again, changed_again)
     assert again.tobytes() == out.tobytes()
     assert not changed_again.any()
 
@@ -32,7 +32,7 @@ def test_velocity(requested: np.ndarray, limit: np.ndarray) -> None:
 @given(requested=NEAR, previous=NEAR, largest=arrays(np.float64, (N, 2), elements=st.floats(1e-3, 1)))
 def test_change(requested: np.ndarray, previous: np.ndarray, largest: np.ndarray) -> None:
     out, changed = np.empty_like(requested), np.zeros((N, 2), np.bool_)
-    arrived = safety.limit_change(requested, previous, largest, out, changed)
+    arrived = limits.limit_change(requested, previous, largest, out, changed)
     assert (np.abs(out - previous) <= largest * (1 + 1e-12) + 1e-15).all()
     assert ((out - previous) * (requested - previous) >= 0).all()  # towards what was asked for,
     assert (np.abs(out - previous) <= np.abs(requested - previous) + 1e-15).all()  # and not past it
@@ -41,7 +41,7 @@ def test_change(requested: np.ndarray, previous: np.ndarray, largest: np.ndarray
     assert arrived == (not changed.any())
     # In place of the previous command, as the cerebellum has it.
     in_place = previous.copy()
-    safety.limit_change(requested, in_place, largest, in_place, np.zeros((N, 2), np.bool_))
+    limits.limit_change(requested, in_place, largest, in_place, np.zeros((N, 2), np.bool_))
     assert in_place.tobytes() == out.tobytes()
 
 
@@ -52,7 +52,7 @@ def test_change_arrives_exactly_after_the_ticks_that_it_takes(
     command, changed = start.copy(), np.zeros((N, 2), np.bool_)
     ticks = 1 + int(np.ceil((np.abs(requested - start) / largest).max()))
     for _ in range(ticks):
-        arrived = safety.limit_change(requested, command, largest, command, changed)
+        arrived = limits.limit_change(requested, command, largest, command, changed)
     assert arrived
     assert command.tobytes() == requested.tobytes()
 
@@ -60,7 +60,7 @@ def test_change_arrives_exactly_after_the_ticks_that_it_takes(
 @given(twist=arrays(np.float64, (N, 2), elements=st.floats(-10, 10)))
 def test_wheel_speed(twist: np.ndarray) -> None:
     limited, changed = twist.copy(), np.zeros(N, np.bool_)
-    any_limited = safety.limit_wheel_speed(limited, PER_SPEED, PER_YAW, WHEEL_LIMIT, changed)
+    any_limited = limits.limit_wheel_speed(limited, PER_SPEED, PER_YAW, WHEEL_LIMIT, changed)
     np.testing.assert_array_equal(limited[:, 1], twist[:, 1])  # turning is kept
     fastest = np.abs(limited[:, 0]) * PER_SPEED + np.abs(limited[:, 1]) * PER_YAW
     possible = np.abs(twist[:, 1]) * PER_YAW <= WHEEL_LIMIT
@@ -74,14 +74,14 @@ def test_wheel_speed(twist: np.ndarray) -> None:
     held = changed & possible
     np.testing.assert_allclose(fastest[held], WHEEL_LIMIT, rtol=1e-9)
     again, changed_again = limited.copy(), np.zeros(N, np.bool_)
-    assert not safety.limit_wheel_speed(again, PER_SPEED, PER_YAW, WHEEL_LIMIT, changed_again)
+    assert not limits.limit_wheel_speed(again, PER_SPEED, PER_YAW, WHEEL_LIMIT, changed_again)
     assert again.tobytes() == limited.tobytes()
 
 
 @given(speeds=COMMANDS, measured=NEAR, largest=st.floats(0.1, 20))
 def test_effort(speeds: np.ndarray, measured: np.ndarray, largest: float) -> None:
     limited, changed = speeds.copy(), np.zeros((N, 2), np.bool_)
-    safety.limit_effort(limited, measured, largest, changed)
+    limits.limit_effort(limited, measured, largest, changed)
     assert (np.abs(limited - measured) <= largest * (1 + 1e-12)).all()
     np.testing.assert_array_equal(changed, np.abs(speeds - measured) > largest)
     np.testing.assert_array_equal(limited[~changed], speeds[~changed])
@@ -91,10 +91,10 @@ def test_effort(speeds: np.ndarray, measured: np.ndarray, largest: float) -> Non
 @given(requested=COMMANDS, limit=LIMITS)
 def test_flags_are_kept_until_they_are_taken(requested: np.ndarray, limit: np.ndarray) -> None:
     everything = np.ones((N, 2), np.bool_)
-    safety.limit_velocity(requested, limit, np.empty_like(requested), everything)
-    safety.limit_change(requested, requested.copy(), np.ones((N, 2)), np.empty_like(requested), everything)
-    safety.limit_effort(requested.copy(), requested, 1.0, everything)
+    limits.limit_velocity(requested, limit, np.empty_like(requested), everything)
+    limits.limit_change(requested, requested.copy(), np.ones((N, 2)), np.empty_like(requested), everything)
+    limits.limit_effort(requested.copy(), requested, 1.0, everything)
     assert everything.all()
     one = np.ones(N, np.bool_)
-    safety.limit_wheel_speed(np.zeros((N, 2)), PER_SPEED, PER_YAW, WHEEL_LIMIT, one)
+    limits.limit_wheel_speed(np.zeros((N, 2)), PER_SPEED, PER_YAW, WHEEL_LIMIT, one)
     assert one.all()

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.setpoints import SetpointFilter
+from bhd_lerobot.control.arm.setpoints import SetpointFilter
 
 LIMITS = ur5().limits
 LOWER, UPPER = np.array(LIMITS.lower), np.array(LIMITS.upper)

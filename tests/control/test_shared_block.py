@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bhd_lerobot.control import shared_block
-from bhd_lerobot.control.shared_block import SharedBlock, check_platform, names, sweep
+from bhd_lerobot.realtime import shared_memory
+from bhd_lerobot.realtime.shared_memory import SharedBlock, check_platform, names, sweep
 from bhd_lerobot.errors import ConfigError, RealtimeError
 
 HOLD = """
 import sys, time
-from bhd_lerobot.control.shared_block import SharedBlock
+from bhd_lerobot.realtime.shared_memory import SharedBlock
 block = SharedBlock.{how}
 memory = block.section("a")
 memory[0] = 7
@@ -36,7 +36,7 @@ def name() -> Iterator[str]:
 
 def files(name: str) -> list[Path]:
     """Return the files of blocks of a name."""
-    return list(shared_block.FOLDER.glob(f"{shared_block.PREFIX}{name}.*"))
+    return list(shared_memory.FOLDER.glob(f"{shared_memory.PREFIX}{name}.*"))
 
 
 def hold(name: str, how: str) -> subprocess.Popen[str]:
@@ -116,7 +116,7 @@ def test_no_room_is_said_before_anything_is_used(name: str) -> None:
 
 
 def test_a_file_that_is_no_block_is_refused(name: str) -> None:
-    path = shared_block.FOLDER / f"{shared_block.PREFIX}{name}.{'0' * 16}"
+    path = shared_memory.FOLDER / f"{shared_memory.PREFIX}{name}.{'0' * 16}"
     path.touch(0o600)
     for content in (b"", b"something else entirely"):
         path.write_bytes(content)
@@ -153,7 +153,7 @@ def test_files_of_others_are_neither_in_the_way_nor_read_nor_removed(name: str) 
     content = files(name)[0].read_bytes()
     for kind in ("folder", "pipe", "link", "socket", "open to all", "of another user"):
         for at, planted in enumerate((f"{name}-x", f"{name}-x.{'0' * 16}", f"{name}.{'0' * 16}", name)):
-            path = shared_block.FOLDER / f"{shared_block.PREFIX}{planted}"
+            path = shared_memory.FOLDER / f"{shared_memory.PREFIX}{planted}"
             if not plant(path, kind, content.replace(b"real", b"fake")):
                 continue
             try:
@@ -186,8 +186,8 @@ def test_a_block_is_for_its_user_alone_and_its_file_cannot_be_foreseen(name: str
 
 
 def test_what_a_killed_run_left_is_removed_at_the_next_start_and_what_lives_is_kept(name: str) -> None:
-    old = shared_block.FOLDER / f"{shared_block.PREFIX}{name}-old"  # as version 0.1 called it
-    other = shared_block.FOLDER / f"{shared_block.PREFIX}{name}-notes"  # another program's
+    old = shared_memory.FOLDER / f"{shared_memory.PREFIX}{name}-old"  # as version 0.1 called it
+    other = shared_memory.FOLDER / f"{shared_memory.PREFIX}{name}-notes"  # another program's
     dead, living = (hold(f"{name}-{what}", f"create({f'{name}-{what}'!r}, {{'a': 8}}, {{}})") for what in "dl")
     try:
         kill(dead)
@@ -212,7 +212,7 @@ def test_what_a_killed_run_left_is_removed_at_the_next_start_and_what_lives_is_k
 
 def test_of_several_that_start_at_once_no_two_have_the_name(name: str) -> None:
     code = (
-        "import sys\nfrom bhd_lerobot.control.shared_block import SharedBlock\nfrom bhd_lerobot.errors import "
+        "import sys\nfrom bhd_lerobot.realtime.shared_memory import SharedBlock\nfrom bhd_lerobot.errors import "
         "RealtimeError\nsys.stdin.read(1)\ntry:\n    block = SharedBlock.create(sys.argv[1], {'a': 8}, {})\n"
         "    print('made', flush=True)\nexcept RealtimeError as error:\n    print(error, flush=True)\nsys.stdin.read(1)"
     )

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bhd_lerobot.control import line as line_module
+from bhd_lerobot.control.motion import line as line_module
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.line import Line, ToolLimits, along_line
-from bhd_lerobot.control.player import TrajectoryPlayer
-from bhd_lerobot.control.trajectory import (
+from bhd_lerobot.control.motion.line import Line, ToolLimits, along_line
+from bhd_lerobot.control.motion.player import TrajectoryPlayer
+from bhd_lerobot.control.motion.trajectory import (
     MotionLimits,
     PlanFailure,
     State,

@@ -10,12 +10,13 @@ import kill_server  # run as a script, so this folder is on the path
 import mcap.writer  # noqa: F401  as kill_server says
 import rosbags.rosbag2  # noqa: F401
 
-from bhd_lerobot.data import bag_write, disk
-from bhd_lerobot.data.bag_export import ExportOptions, export_bags
-from bhd_lerobot.data.bag_find import find_bags
-from bhd_lerobot.data.bag_restore import restore
-from bhd_lerobot.data.ros2_types import type_store
-from bhd_lerobot.data.ros2_views import RobotView
+from bhd_lerobot.rosbag.storage import write
+from bhd_lerobot.datasets.storage import disk
+from bhd_lerobot.rosbag.exporter.export import ExportOptions, export_bags
+from bhd_lerobot.rosbag.storage.find import find_bags
+from bhd_lerobot.rosbag.importer.restore import restore
+from bhd_lerobot.rosbag.messages.types import type_store
+from bhd_lerobot.rosbag.messages.views import RobotView
 
 type_store()
 plain_run = kill_server.run
@@ -44,13 +45,13 @@ def run(job: dict[str, Any]) -> None:
 
 def stepped(name: str, before_step: Any) -> None:
     """Let a method of the writer of bags count as a step."""
-    plain = getattr(bag_write.BagWriter, name)
+    plain = getattr(write.BagWriter, name)
 
     def method(*arguments: Any) -> Any:
         before_step()
         return plain(*arguments)
 
-    setattr(bag_write.BagWriter, name, method)
+    setattr(write.BagWriter, name, method)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.data import disk
-from bhd_lerobot.data.check_dataset import Severity, check_dataset
+from bhd_lerobot.datasets.storage import disk
+from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
 from tests.data import support
 
 NUMBERS = ("episode_index", "index", "task_index")

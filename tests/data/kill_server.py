@@ -17,7 +17,10 @@ import pandas as pd  # noqa: F401
 import pyarrow.dataset  # noqa: F401
 import support  # run as a script, so this folder is on the path
 
-from bhd_lerobot.data import disk, edits, mark, repair
+from bhd_lerobot.datasets.storage import disk
+from bhd_lerobot.datasets.edit import edits
+from bhd_lerobot.datasets.edit import mark
+from bhd_lerobot.datasets.recovery import repair
 
 
 def edit(job: dict[str, Any]) -> None:

@@ -10,9 +10,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.collate import lerobot_collate_fn
 from torch.utils.data import default_collate
 
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.schema import LANGUAGE
-from bhd_lerobot.data.video import VideoSettings
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.datasets.format.schema import LANGUAGE
+from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.tasks.task import Event
 
 FPS = 10

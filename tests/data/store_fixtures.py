@@ -6,7 +6,7 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from bhd_lerobot.data.remote_store import StoreDataset
+from bhd_lerobot.datasets.remote.store import StoreDataset
 from tests.data import support
 
 EPISODES = 3

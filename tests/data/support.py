@@ -7,9 +7,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.data.episode import EpisodeWriter
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.datasets.writer.episode import EpisodeWriter
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 
 FPS = 10
 CAMERA = "observation.images.front"

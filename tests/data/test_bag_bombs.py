@@ -12,9 +12,9 @@ import lz4.frame
 import pytest
 from backports import zstd
 
-from bhd_lerobot.data import bag_unpack
-from bhd_lerobot.data.bag_find import find_bags
-from bhd_lerobot.data.bag_unpack import Budget
+from bhd_lerobot.rosbag.storage import unpack
+from bhd_lerobot.rosbag.storage.find import find_bags
+from bhd_lerobot.rosbag.storage.unpack import Budget
 from bhd_lerobot.errors import DatasetError
 from tests.data.bag_support import drive, write
 
@@ -28,7 +28,7 @@ CHILD = """
 import json, resource, sys
 from pathlib import Path
 from bhd_lerobot.data import bag_unpack
-from bhd_lerobot.data.bag_find import find_bags
+from bhd_lerobot.rosbag.storage.find import find_bags
 from bhd_lerobot.errors import BhdError
 bag_unpack.LEAST_BYTES = 32 << 20
 bag_unpack.zstd()
@@ -250,7 +250,7 @@ def test_a_full_temporary_folder_is_an_error_with_a_remedy(tmp_path: Path) -> No
 
 def test_the_bound_grows_with_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A recording that compresses well, as that of a robot that stands still, is read."""
-    monkeypatch.setattr(bag_unpack, "LEAST_BYTES", 0)
+    monkeypatch.setattr(unpack, "LEAST_BYTES", 0)
     whole = write(tmp_path / "b", drive(seconds=20)) / "b.mcap"
     packed = tmp_path / "b.mcap.zstd"
     packed.write_bytes(zstd.compress(whole.read_bytes()))

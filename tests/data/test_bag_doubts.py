@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bhd_lerobot.data.bag_doubts import pace, told_pace, told_speeds
-from bhd_lerobot.data.resample import NANO
+from bhd_lerobot.rosbag.importer.warnings import pace, told_pace, told_speeds
+from bhd_lerobot.rosbag.importer.resample import NANO
 
 RECEIVED = np.arange(300) * NANO // 5  # a minute at 5 Hz
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import yaml
 
-from bhd_lerobot.data.bag_find import find_bags, publishers_of
-from bhd_lerobot.data.bag_qos import offered
+from bhd_lerobot.rosbag.storage.find import find_bags, publishers_of
+from bhd_lerobot.rosbag.storage.qos import offered
 from bhd_lerobot.errors import DatasetError
 from tests.data.bag_support import STORE, drive, write
 

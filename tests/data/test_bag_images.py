@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bhd_lerobot.data.bag_images import COMPRESSED, IMAGE, decode_image, encode_image
-from bhd_lerobot.data.bag_read import Messages, Topic
-from bhd_lerobot.data.bag_sound import sound_messages
-from bhd_lerobot.data.ros2_parts import Frames
+from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, decode_image, encode_image
+from bhd_lerobot.rosbag.storage.read import Messages, Topic
+from bhd_lerobot.rosbag.importer.decodable import sound_messages
+from bhd_lerobot.rosbag.messages.parts import Frames
 from bhd_lerobot.errors import DatasetError
 from tests.data.bag_support import STORE, T, header
 

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.data.bag_export import ExportOptions, export_bags
-from bhd_lerobot.data.bag_find import find_bags
-from bhd_lerobot.data.bag_place import complete_or_not
-from bhd_lerobot.data.bag_restore import restore
-from bhd_lerobot.data.check_dataset import check_dataset
-from bhd_lerobot.data.disk import Disk
-from bhd_lerobot.data.findings import Severity
-from bhd_lerobot.data.read import read_episode
-from bhd_lerobot.data.ros2_views import RobotView
+from bhd_lerobot.rosbag.exporter.export import ExportOptions, export_bags
+from bhd_lerobot.rosbag.storage.find import find_bags
+from bhd_lerobot.rosbag.storage.place import complete_or_not
+from bhd_lerobot.rosbag.importer.restore import restore
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.storage.disk import Disk
+from bhd_lerobot.datasets.validate.findings import Severity
+from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.rosbag.messages.views import RobotView
 from bhd_lerobot.errors import DatasetExistsError, DatasetWriteError
 from tests.data import support
 from tests.data.kill_support import KillServer

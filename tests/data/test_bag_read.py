@@ -11,7 +11,7 @@ from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
-from bhd_lerobot.data.bag_find import find_bags
+from bhd_lerobot.rosbag.storage.find import find_bags
 from bhd_lerobot.errors import DatasetError
 from tests.data.bag_support import STORE, drive, write
 

@@ -16,10 +16,10 @@ import pytest
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from bhd_lerobot.data.check_dataset import CHECKS, DatasetCheck, Finding, Severity, check_dataset
-from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Finding, Severity, check_dataset
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.runs import data
+from bhd_lerobot.cli.data import main
 from tests.data import loader_support
 
 FPS, EPISODES, CAMERA = 10, 6, "observation.images.front"
@@ -451,7 +451,7 @@ def test_what_lerobot_edited_has_warnings_of_statistics_that_no_policy_reads(
     for name in ("deleted", "merged", "first", "last"):
         found = [one for one in bad(check_dataset(folder / name)) if one.check == "stats"]
         assert {one.severity for one in found} <= {Severity.WARNING}, (name, found)
-        assert data.main(["check", str(folder / name)]) == 0
+        assert main.main(["check", str(folder / name)]) == 0
         assert all(one.where in capsys.readouterr().out.replace("\n", "") for one in found[:1])
         stale |= {one.where.removeprefix("meta/stats.json: ") for one in found}
     assert {"index", "episode_index"} <= stale <= {"index", "episode_index", "task_index"}

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from bhd_lerobot.data.check_dataset import check_dataset
-from bhd_lerobot.data.check_stats import Moments, wrong_statistic
-from bhd_lerobot.data.findings import Severity
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.validate.statistics import Moments, wrong_statistic
+from bhd_lerobot.datasets.validate.findings import Severity
 
 NAMES = ["wrist_2.pos", "offset.pos", "swing.pos", "zero.pos", "steady.pos"]
 FEATURES = {"observation.state": {"dtype": "float32", "shape": (5,), "names": NAMES}}

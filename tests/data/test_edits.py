@@ -12,15 +12,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bhd_lerobot.data import assemble, layout
-from bhd_lerobot.data.check_dataset import check_dataset
-from bhd_lerobot.data.disk import Disk, RootLock
-from bhd_lerobot.data.edits import delete, edits_of, keep, merge, split
-from bhd_lerobot.data.fix import fix
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.mark import mark
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.repair import repair
+from bhd_lerobot.datasets.assembly import assemble
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock
+from bhd_lerobot.datasets.edit.edits import delete, edits_of, keep, merge, split
+from bhd_lerobot.datasets.recovery.fix import fix
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.errors import (
     ConfigError,
     DatasetCorruptError,
@@ -139,7 +140,7 @@ def test_files_that_stay_are_linked(tmp_path: Path) -> None:
 def test_many_files_stay_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where a file is full the next one is begun, for data and for films."""
     parts = [record(tmp_path / f"d{i}", [i, i + 1], video=True) for i in range(3)]
-    monkeypatch.setattr("bhd_lerobot.data.assemble_files.MEBIBYTE", 10)
+    monkeypatch.setattr("bhd_lerobot.datasets.assembly.files.MEBIBYTE", 10)
     merge(parts, tmp_path / "all")
     assert len(list((tmp_path / "all/data").rglob("*.parquet"))) == 3
     assert len(list((tmp_path / "all/videos").rglob("*.mp4"))) == 3

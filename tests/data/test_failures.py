@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bhd_lerobot.data import disk
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.repair import repair
-from bhd_lerobot.data.video import VideoSettings
+from bhd_lerobot.datasets.storage import disk
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.datasets.recovery.repair import repair
+from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.errors import (
     DatasetCorruptError,
     DatasetError,

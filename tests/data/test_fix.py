@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bhd_lerobot.data.check_dataset import Severity, check_dataset
-from bhd_lerobot.data.fix import fix, is_fixable
-from bhd_lerobot.data.recorder import RootLock
+from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
+from bhd_lerobot.datasets.recovery.fix import fix, is_fixable
+from bhd_lerobot.datasets.writer.recorder import RootLock
 from bhd_lerobot.errors import DatasetLockedError
 from tests.data.edit_support import content, record
 

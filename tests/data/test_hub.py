@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.data import hub as hub_module
-from bhd_lerobot.data import layout
-from bhd_lerobot.data.hub import HubDataset
-from bhd_lerobot.data.remote_pull import pull
-from bhd_lerobot.data.remote_push import push
-from bhd_lerobot.data.remote_subset import files_of
-from bhd_lerobot.data.source import local_metadata
+from bhd_lerobot.datasets.remote import hub as hub_module
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.remote.hub import HubDataset
+from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.remote.push import push
+from bhd_lerobot.datasets.remote.subset import files_of
+from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.errors import (
     ConfigError,
     DatasetError,

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from lerobot.datasets.utils import DatasetInfo
 
-from bhd_lerobot.data.edits import keep
-from bhd_lerobot.data.info import COUNTS, InfoError, checked_info, parse_object
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.repair import repair
-from bhd_lerobot.data.table import open_metadata
+from bhd_lerobot.datasets.edit.edits import keep
+from bhd_lerobot.datasets.format.info import COUNTS, InfoError, checked_info, parse_object
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.recovery.repair import repair
+from bhd_lerobot.datasets.loader.table import open_metadata
 from bhd_lerobot.errors import DatasetError
 from tests.data import edit_support
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.data.repair import repair
+from bhd_lerobot.datasets.recovery.repair import repair
 from tests.data import support
 from tests.data.kill_support import KillServer
 from tests.waiting import until

@@ -9,9 +9,9 @@ import torch
 from torch.utils.data import DataLoader
 from torchvision.transforms import v2
 
-from bhd_lerobot.data import frame_cache
-from bhd_lerobot.data.loader import BatchLoader, FrameTable, TableDataset, make_loader
-from bhd_lerobot.data.video import VideoSettings
+from bhd_lerobot.datasets.loader import frame_cache
+from bhd_lerobot.datasets.loader.loader import BatchLoader, FrameTable, TableDataset, make_loader
+from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.errors import DatasetError
 from tests.data import loader_support as support
 from tests.data.loader_support import FPS, FRONT, PHOTO, WRIST

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from bhd_lerobot.data.order import BatchOrder
+from bhd_lerobot.datasets.loader.order import BatchOrder
 from bhd_lerobot.errors import ConfigError
 
 SAMPLES = torch.arange(100, 137)

@@ -11,8 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from bhd_lerobot.data import frame_cache
-from bhd_lerobot.data.loader import (
+from bhd_lerobot.datasets.loader import frame_cache
+from bhd_lerobot.datasets.loader.loader import (
     BatchLoader,
     EpisodeFilter,
     FrameTable,
@@ -23,8 +23,8 @@ from bhd_lerobot.data.loader import (
     make_loader,
     split_episodes,
 )
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.table import open_metadata
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.datasets.loader.table import open_metadata
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetError
 from tests.data import loader_support as support
 from tests.data.loader_support import FPS, FRONT, WRIST
@@ -291,7 +291,7 @@ def test_memory_that_runs_out_leads_to_the_fallback(
     if part == "images":
         monkeypatch.setattr(frame_cache.FrameCache, "_decode_all", fail)
     else:
-        monkeypatch.setattr("bhd_lerobot.data.table._read", fail)
+        monkeypatch.setattr("bhd_lerobot.datasets.loader.table._read", fail)
     said: list[str] = []
     loaders = make_loader("t/t", root=filmed, batch_size=4, say=said.append)
     assert f"Memory ran out while the {part}" in said[0]

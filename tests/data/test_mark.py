@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from bhd_lerobot import tasks
-from bhd_lerobot.data.edits import edits_of
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.mark import mark
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.repair import repair
+from bhd_lerobot.datasets.edit.edits import edits_of
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
 from tests.data import support

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.data.parquet_rescue import rescue
-from bhd_lerobot.data.thrift_compact import Field, Reader, encode
+from bhd_lerobot.datasets.format.parquet_rescue import rescue
+from bhd_lerobot.datasets.format.thrift_compact import Field, Reader, encode
 
 SCHEMA = pa.schema(
     [

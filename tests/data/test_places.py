@@ -12,19 +12,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.data import layout
-from bhd_lerobot.data.bag_restore import _create
-from bhd_lerobot.data.check_dataset import check_dataset
-from bhd_lerobot.data.edits import keep, merge, split
-from bhd_lerobot.data.places import LINKED_FOLDERS, check_inside, check_links, wrong_info, wrong_name, wrong_path
-from bhd_lerobot.data.remote import RemoteFile
-from bhd_lerobot.data.remote_info import parse_info
-from bhd_lerobot.data.remote_pull import pull
-from bhd_lerobot.data.repair import repair
-from bhd_lerobot.data.salvage_columns import read_info
-from bhd_lerobot.data.source import local_metadata
-from bhd_lerobot.data.state import load_state
-from bhd_lerobot.data.table import open_metadata
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.rosbag.importer.restore import _create
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.edit.edits import keep, merge, split
+from bhd_lerobot.datasets.storage.places import LINKED_FOLDERS, check_inside, check_links, wrong_info, wrong_name, wrong_path
+from bhd_lerobot.datasets.remote.listing import RemoteFile
+from bhd_lerobot.datasets.remote.info import parse_info
+from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.recovery.repair import repair
+from bhd_lerobot.datasets.recovery.columns import read_info
+from bhd_lerobot.datasets.loader.source import local_metadata
+from bhd_lerobot.datasets.format.state import load_state
+from bhd_lerobot.datasets.loader.table import open_metadata
 from bhd_lerobot.errors import BhdError, DatasetError
 from tests.data import support
 from tests.data.edit_support import content, record

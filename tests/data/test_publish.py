@@ -13,16 +13,18 @@ from pathlib import Path
 import pytest
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from bhd_lerobot.data import disk, layout, publish
-from bhd_lerobot.data.check_dataset import check_dataset
-from bhd_lerobot.data.disk import Disk, RootLock
-from bhd_lerobot.data.edits import delete, keep, merge, split
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.mark import mark
-from bhd_lerobot.data.repair import repair
-from bhd_lerobot.data.table import open_metadata
+from bhd_lerobot.datasets.storage import disk
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage import atomic
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock
+from bhd_lerobot.datasets.edit.edits import delete, keep, merge, split
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.datasets.recovery.repair import repair
+from bhd_lerobot.datasets.loader.table import open_metadata
 from bhd_lerobot.errors import DatasetError, DatasetExistsError, DatasetLockedError
-from bhd_lerobot.runs import data
+from bhd_lerobot.cli.data import main
 from tests.data import support
 from tests.data.edit_support import content, record
 from tests.data.sweeps.operations import leftovers
@@ -106,7 +108,7 @@ def test_nobody_ever_takes_a_mixture_for_the_dataset(root: Path, monkeypatch: py
 def test_the_current_folder_is_not_put_aside(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(root)
     inode = root.stat().st_ino
-    assert data.main(["delete", ".", "--episodes=1"]) == 0
+    assert main.main(["delete", ".", "--episodes=1"]) == 0
     assert (root.stat().st_ino, Path.cwd(), len(content(root))) == (inode, root, 2)
     assert leftovers(root.parent) == []
 
@@ -138,7 +140,7 @@ import os, sys
 from pathlib import Path
 sys.path[:0] = [{str(folder)!r}]
 import support
-from bhd_lerobot.data.edits import delete, keep, split
+from bhd_lerobot.datasets.edit.edits import delete, keep, split
 from bhd_lerobot.runs import data
 root, place = Path({str(root)!r}), Path({str(tmp_path / "volume")!r})
 def empty():
@@ -242,7 +244,7 @@ def test_what_somebody_else_makes_at_the_same_place_stays(
             place.mkdir()
 
         def late(self: Disk, source: Path, target: Path, place: Path = place) -> None:
-            if target in (place, place / publish.WORK / "new"):
+            if target in (place, place / atomic.WORK / "new"):
                 (place / "meta").mkdir(parents=True)
                 (place / "meta/theirs").touch()
             move(self, source, target)
@@ -250,7 +252,7 @@ def test_what_somebody_else_makes_at_the_same_place_stays(
         with monkeypatch.context() as patch:
             patch.setattr(Disk, "move", late)
             if place.name == "fixed":
-                patch.setattr(publish, "is_fixed", lambda path: path.name == "fixed")
+                patch.setattr(atomic, "is_fixed", lambda path: path.name == "fixed")
             with pytest.raises(DatasetError):
                 keep(root, [0], place)
         assert (place / "meta/theirs").exists()
@@ -292,16 +294,16 @@ def test_two_that_move_into_one_folder_do_not_meet(root: Path, monkeypatch: pyte
 
 def half_moved(root: Path) -> None:
     """Leave a dataset as a process does that is killed between the renames of an edit."""
-    new = root / publish.WORK / "new"
+    new = root / atomic.WORK / "new"
     other = root.with_name("other")
     shutil.copytree(root, other)
     delete(other, [1])
     shutil.copytree(other / "meta", new / "meta")
     shutil.copytree(other / "data", new / "data")
     shutil.rmtree(other)
-    (root / publish.WORK / "old").mkdir()
-    (root / "data").rename(root / publish.WORK / "old/data")
-    (root / publish.WORK / "ready").touch()
+    (root / atomic.WORK / "old").mkdir()
+    (root / "data").rename(root / atomic.WORK / "old/data")
+    (root / atomic.WORK / "ready").touch()
 
 
 @pytest.mark.parametrize(
@@ -312,9 +314,9 @@ def half_moved(root: Path) -> None:
         open_metadata,
         lambda root: merge([root, record(root.with_name("e"), [5])], root.with_name("all")),
         lambda root: split(root, {"a": [0], "b": [1]}, root.with_name("parts")),
-        lambda root: data.main(["info", str(root)]),
-        lambda root: data.main(["export", str(root), "--output", str(root.with_name("bags"))]),
-        lambda root: data.main(["repair", str(root)]),
+        lambda root: main.main(["info", str(root)]),
+        lambda root: main.main(["export", str(root), "--output", str(root.with_name("bags"))]),
+        lambda root: main.main(["repair", str(root)]),
     ],
     ids=["info", "check", "loader", "merge", "split", "bhd-data info", "export", "repair"],
 )
@@ -340,23 +342,23 @@ def test_a_marker_that_came_with_a_dataset_of_somebody_else_moves_nothing(root: 
     victim = root.parent / "victim"
     (victim / "meta").mkdir(parents=True)
     half_moved(root)
-    (root / publish.WORK / "old/data").rename(root / "data")
+    (root / atomic.WORK / "old/data").rename(root / "data")
     plan = {"root": root.stat().st_ino, "new": {}, "goes": [], "is_new": False}
     if how == "of another folder":
         plan |= {"root": 1, "goes": ["data"]}
     elif how == "a path":
         plan |= {"goes": ["../victim"]}
     elif how == "a link":
-        shutil.rmtree(root / publish.WORK / "new")
-        (root / publish.WORK / "new").symlink_to(victim)
+        shutil.rmtree(root / atomic.WORK / "new")
+        (root / atomic.WORK / "new").symlink_to(victim)
     elif how == "a link to the staging folder":
         (root / ".bhd").rename(root / "elsewhere")
         (root / ".bhd").symlink_to("elsewhere")
-    (root / publish.WORK / "ready").write_text("{" if how == "no JSON" else json.dumps(plan))
+    (root / atomic.WORK / "ready").write_text("{" if how == "no JSON" else json.dumps(plan))
     before = names(root.parent)
     for command in ("info", "check", "repair"):
-        assert data.main([command, str(root)]) == 2
-    assert data.main(["delete", str(root), "--episodes=0"]) == 2
+        assert main.main([command, str(root)]) == 2
+    assert main.main(["delete", str(root), "--episodes=0"]) == 2
     assert names(root.parent) == before
 
 
@@ -376,10 +378,10 @@ def test_an_edit_that_nobody_was_told_of_is_recognised(root: Path, tmp_path: Pat
     first, _, last = content(root)
     with pytest.raises(KilledError):
         delete(root, [1], killed)
-    assert data.main(["delete", str(root), "--episodes=1"]) == 0
+    assert main.main(["delete", str(root), "--episodes=1"]) == 0
     assert "interrupted before, after it had been completed: nothing was changed now" in capsys.readouterr().out
     assert content(root) == [first, last]
-    assert data.main(["delete", str(root), "--episodes=1"]) == 0  # now it is meant
+    assert main.main(["delete", str(root), "--episodes=1"]) == 0  # now it is meant
     assert content(root) == [first]
 
     with pytest.raises(KilledError):
@@ -447,7 +449,7 @@ def test_ctrl_c_at_the_end_of_an_edit_says_that_it_was_made(root: Path, monkeypa
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(Disk, "swap", disturbed)
-    assert data.main(["delete", str(root), "--episodes=1"]) == 130
+    assert main.main(["delete", str(root), "--episodes=1"]) == 130
     said = capsys.readouterr().err
     assert "had been completed" in said
     assert "nothing was changed" not in said
@@ -461,11 +463,11 @@ def test_an_error_and_ctrl_c_at_once_do_not_say_that_nothing_was_changed(root: P
 
     with monkeypatch.context() as patch:
         patch.setattr(Disk, "swap", refuse)
-        assert data.main(["delete", str(root), "--episodes=1"]) == 2
+        assert main.main(["delete", str(root), "--episodes=1"]) == 2
     said = capsys.readouterr().err
     assert "The change is decided, and the next command completes it." in said
     assert "nothing was changed" not in said
-    assert data.main(["info", str(root), "--short"]) == 0
+    assert main.main(["info", str(root), "--short"]) == 0
     assert len(content(root)) == 2
 
 

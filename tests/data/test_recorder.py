@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bhd_lerobot.data.places import wrong_name
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.video import VideoSettings
+from bhd_lerobot.datasets.storage.places import wrong_name
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.errors import ConfigError, DatasetError, FrameError
 from tests.data import support
 
@@ -247,7 +247,7 @@ def test_values_are_copied(tmp_path: Path) -> None:
 
 
 def test_resuming_appends_and_touches_full_files_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from bhd_lerobot.data import layout
+    from bhd_lerobot.datasets.storage import layout
 
     # Limits of a few kilobytes, so that every file is full soon.
     monkeypatch.setattr(layout, "DATA_FILES_SIZE_IN_MB", 0.012)

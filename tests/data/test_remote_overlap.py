@@ -8,13 +8,13 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from bhd_lerobot.data import hub as hub_module
-from bhd_lerobot.data import layout
-from bhd_lerobot.data.edits import delete
-from bhd_lerobot.data.remote import Item
-from bhd_lerobot.data.remote_pull import pull
-from bhd_lerobot.data.remote_push import push
-from bhd_lerobot.data.remote_store import StoreDataset
+from bhd_lerobot.datasets.remote import hub as hub_module
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.edit.edits import delete
+from bhd_lerobot.datasets.remote.listing import Item
+from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.remote.push import push
+from bhd_lerobot.datasets.remote.store import StoreDataset
 from bhd_lerobot.errors import DatasetExistsError, TransferError
 from tests.data import support
 from tests.data.store_fixtures import stored

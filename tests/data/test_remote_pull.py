@@ -8,13 +8,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bhd_lerobot.data import layout, remote_pull
-from bhd_lerobot.data.disk import RootLock
-from bhd_lerobot.data.edits import delete
-from bhd_lerobot.data.hub import HubDataset
-from bhd_lerobot.data.remote import SUBSET
-from bhd_lerobot.data.remote_pull import pull
-from bhd_lerobot.data.remote_subset import files_of, read_subset
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.remote import pull as remote_pull
+from bhd_lerobot.datasets.storage.disk import RootLock
+from bhd_lerobot.datasets.edit.edits import delete
+from bhd_lerobot.datasets.remote.hub import HubDataset
+from bhd_lerobot.datasets.remote.listing import SUBSET
+from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.remote.subset import files_of, read_subset
 from bhd_lerobot.errors import (
     DatasetCorruptError,
     DatasetError,

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.data import layout
-from bhd_lerobot.data.card import is_generated, sign
-from bhd_lerobot.data.disk import RootLock
-from bhd_lerobot.data.hub import HubDataset
-from bhd_lerobot.data.remote import MANIFEST
-from bhd_lerobot.data.remote_pull import pull
-from bhd_lerobot.data.remote_push import Card, push
-from bhd_lerobot.data.remote_store import StoreDataset
-from bhd_lerobot.data.state import DatasetState
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.remote.card import is_generated, sign
+from bhd_lerobot.datasets.storage.disk import RootLock
+from bhd_lerobot.datasets.remote.hub import HubDataset
+from bhd_lerobot.datasets.remote.listing import MANIFEST
+from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.remote.push import Card, push
+from bhd_lerobot.datasets.remote.store import StoreDataset
+from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.errors import (
     DatasetCorruptError,
     DatasetError,

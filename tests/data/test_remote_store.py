@@ -7,13 +7,14 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from bhd_lerobot.data import layout, remote_store
-from bhd_lerobot.data.edits import delete
-from bhd_lerobot.data.remote import MANIFEST
-from bhd_lerobot.data.remote_pull import pull
-from bhd_lerobot.data.remote_push import push
-from bhd_lerobot.data.remote_store import StoreDataset
-from bhd_lerobot.data.remote_subset import read_subset
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.remote import store as remote_store
+from bhd_lerobot.datasets.edit.edits import delete
+from bhd_lerobot.datasets.remote.listing import MANIFEST
+from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.remote.push import push
+from bhd_lerobot.datasets.remote.store import StoreDataset
+from bhd_lerobot.datasets.remote.subset import read_subset
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError
 from tests.data import support
 from tests.data.store_fixtures import KEYS, stored, use_s3

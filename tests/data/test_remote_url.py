@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.data.remote_store import StoreDataset
+from bhd_lerobot.datasets.remote.store import StoreDataset
 from bhd_lerobot.errors import BhdError, ConfigError, TransferError
 
 

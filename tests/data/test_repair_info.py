@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.repair import repair
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.runs import data
+from bhd_lerobot.cli.data import main
 from tests.data import support
 from tests.data.edit_support import assert_sound, content, record
 
@@ -48,10 +48,10 @@ def test_the_advice_works(
     recorded, other = datasets
     root = Path(shutil.copytree(recorded, tmp_path / "d"))
     break_it(root / "meta/info.json")
-    assert data.main([command, str(root)]) == 2
+    assert main.main([command, str(root)]) == 2
     advice = re.search(r"`bhd-data (repair .* --info) OTHER`", capsys.readouterr().err)
     assert advice is not None
-    assert data.main([*advice[1].split(), str(other)]) == 0
+    assert main.main([*advice[1].split(), str(other)]) == 0
     assert "3 episodes, 18 frames" in capsys.readouterr().out
     assert content(root) == content(recorded)
     assert_sound(root)
@@ -103,11 +103,11 @@ def test_a_wrong_count_of_frames_leads_to_check_fix(recorded: Path, tmp_path: Pa
     root = Path(shutil.copytree(recorded, tmp_path / "d"))
     info = json.loads((root / "meta/info.json").read_text())
     (root / "meta/info.json").write_text(json.dumps({**info, "total_frames": 7}))
-    assert data.main(["repair", str(root)]) == 2
+    assert main.main(["repair", str(root)]) == 2
     advice = re.search(r"`bhd-data (check .* --fix)`", capsys.readouterr().err)
     assert advice is not None
-    assert data.main(advice[1].split()) == 0
-    assert data.main(["repair", str(root)]) == 0
+    assert main.main(advice[1].split()) == 0
+    assert main.main(["repair", str(root)]) == 0
     assert content(root) == content(recorded)
 
 
@@ -130,9 +130,9 @@ def test_a_folder_of_datasets_names_them(recorded: Path, other: Path, tmp_path: 
         shutil.copytree(other, tmp_path / name)
     (tmp_path / "link").symlink_to(tmp_path / "gone")
     for command in ("info", "check", "repair", "view"):
-        assert data.main([command, str(tmp_path)]) == 2
+        assert main.main([command, str(tmp_path)]) == 2
         assert "It holds some; name one: a, b." in capsys.readouterr().err
-        assert data.main([command, str(tmp_path / "link")]) == 2
+        assert main.main([command, str(tmp_path / "link")]) == 2
         assert "is a broken link" in capsys.readouterr().err
-        assert data.main([command, str(other / "meta/info.json")]) == 2
+        assert main.main([command, str(other / "meta/info.json")]) == 2
         assert "is a file" in capsys.readouterr().err

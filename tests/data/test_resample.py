@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.data.resample import NANO, apart, clock_jumps, grids, message_times, newest
-from bhd_lerobot.data.resample_scan import Sweep, clean_ranges, nearest_beams, resampled_scans
+from bhd_lerobot.rosbag.importer.resample import NANO, apart, clock_jumps, grids, message_times, newest
+from bhd_lerobot.rosbag.importer.scan import Sweep, clean_ranges, nearest_beams, resampled_scans
 from bhd_lerobot.errors import DatasetError
 
 MS = 10**6

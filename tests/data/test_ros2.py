@@ -7,13 +7,13 @@ import pytest
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
-from bhd_lerobot.data import ros2_types as types
-from bhd_lerobot.data.bag_episode import scan_stream
-from bhd_lerobot.data.ros2_base import ScanPart
-from bhd_lerobot.data.ros2_cdr import encode
-from bhd_lerobot.data.ros2_cdr_read import decode
-from bhd_lerobot.data.ros2_parts import Frames, header, header_stamps
-from bhd_lerobot.data.ros2_split import parts_of
+from bhd_lerobot.rosbag.messages import types
+from bhd_lerobot.rosbag.exporter.episode import scan_stream
+from bhd_lerobot.rosbag.messages.base import ScanPart
+from bhd_lerobot.rosbag.messages.cdr import encode
+from bhd_lerobot.rosbag.messages.cdr_read import decode
+from bhd_lerobot.rosbag.messages.parts import Frames, header, header_stamps
+from bhd_lerobot.rosbag.messages.split import parts_of
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.tasks.task import Event
 from tests.data.bag_support import STORE, odometry, scan

@@ -16,11 +16,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bhd_lerobot.data.check_dataset import Severity, check_dataset
-from bhd_lerobot.data.disk import Disk
-from bhd_lerobot.data.edits import edits_of, keep
-from bhd_lerobot.data.mark import mark
-from bhd_lerobot.data.repair import repair, settle
+from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
+from bhd_lerobot.datasets.storage.disk import Disk
+from bhd_lerobot.datasets.edit.edits import edits_of, keep
+from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.datasets.recovery.repair import repair, settle
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError, DatasetWriteError
 from tests.data.edit_support import Episode, assert_sound, content
 from tests.data.kill_support import KillServer

@@ -11,15 +11,16 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from bhd_lerobot.data import disk, salvage_guard
-from bhd_lerobot.data.check_dataset import check_dataset
-from bhd_lerobot.data.edits import delete, edits_of, keep
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.mark import mark
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.repair import repair
+from bhd_lerobot.datasets.storage import disk
+from bhd_lerobot.datasets.recovery import guard
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.edit.edits import delete, edits_of, keep
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetEditedError, DatasetError
-from bhd_lerobot.runs import data
+from bhd_lerobot.cli.data import main
 from bhd_lerobot.tasks.task import Event
 from tests.data import support
 from tests.data.edit_support import assert_sound, content, record
@@ -194,7 +195,7 @@ def test_what_the_disk_does_not_give_out_is_not_given_up(
             return open(path, *args, **options)
 
         with monkeypatch.context() as patched:
-            patched.setattr(salvage_guard, "open", refuse, raising=False)
+            patched.setattr(guard, "open", refuse, raising=False)
             with pytest.raises(DatasetError, match=r"\.mp4 cannot be read: Permission denied.*Nothing was changed"):
                 repair(root)
         assert snapshot(root) == before
@@ -249,7 +250,7 @@ def test_info_of_another_is_not_needed_and_the_advice_works(recorded: Path, tmp_
     cut(500)(root / DATA)
     with pytest.raises(ConfigError, match="Leave --info out"):
         repair(root, recorded)
-    assert data.main(["repair", str(root)]) == 0
+    assert main.main(["repair", str(root)]) == 0
     assert "4 episodes, 26 frames" in capsys.readouterr().out or content(root) == content(recorded)
 
 
@@ -272,7 +273,7 @@ def test_what_an_interruption_left_is_told_apart(recorded: Path, tmp_path: Path)
 def test_a_reader_is_not_sent_to_another_root(tmp_path: Path, capsys) -> None:
     with support.create(tmp_path / "d") as recorder:
         support.record(recorder)
-        assert data.main(["repair", str(tmp_path / "d")]) == 2
+        assert main.main(["repair", str(tmp_path / "d")]) == 2
         told = capsys.readouterr().err
         assert "Wait until it ends." in told
         assert "another root" not in told

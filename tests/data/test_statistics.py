@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from bhd_lerobot.data import statistics
+from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.errors import FrameError
 
 SHAPES = st.tuples(st.integers(1, 60), st.integers(1, 40))

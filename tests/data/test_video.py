@@ -9,8 +9,9 @@ import av
 import numpy as np
 import pytest
 
-from bhd_lerobot.data import statistics, video
-from bhd_lerobot.data.video import CameraEncoder, VideoSettings
+from bhd_lerobot.datasets.format import statistics
+from bhd_lerobot.datasets.format import video
+from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.errors import FrameError
 
 SIZE = (32, 48)

@@ -9,7 +9,7 @@ import av
 import numpy as np
 import pytest
 
-from bhd_lerobot.data.video_splice import splice
+from bhd_lerobot.datasets.format.video_splice import splice
 from bhd_lerobot.errors import DatasetCorruptError, UnsupportedDatasetError
 from tests.data.edit_support import pictures
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.control.messages import Mode, Watchdog
-from bhd_lerobot.data import features as keys
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.envs.gym_env import BhdEnv
 from bhd_lerobot.envs.settings import make_settings
 from bhd_lerobot.envs.stage import Stage
 from bhd_lerobot.robots.catalog import make_simulation
-from bhd_lerobot.runs.episode import EpisodeLoop
-from bhd_lerobot.runs.episode_types import EpisodeSpec
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.catalog import make_task
 from bhd_lerobot.tasks.task import Event, episode_seed
 from tests.envs.support import NAMES, short, some_actions

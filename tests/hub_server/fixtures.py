@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from bhd_lerobot.data import layout
-from bhd_lerobot.data.hub import HubDataset
-from bhd_lerobot.data.remote_push import PushReport, push
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.remote.hub import HubDataset
+from bhd_lerobot.datasets.remote.push import PushReport, push
 from tests.data import support
 from tests.hub_server.client import real_client
 from tests.hub_server.server import HubServer

@@ -13,8 +13,8 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from numpy.typing import NDArray
 
 from bhd_lerobot.policies.brain import Observation
-from bhd_lerobot.policies.contract import PolicyContract
-from bhd_lerobot.policies.learned import LearnedBrain, LearnedBrainConfig
+from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
 
 STATE = ("x.vel", "theta.vel", *(f"scan_{i:03}.pos" for i in range(12)))

@@ -14,9 +14,9 @@ from lerobot.scripts import lerobot_eval, lerobot_rollout, lerobot_train
 from numpy.typing import NDArray
 
 from bhd_lerobot.envs.vector import BhdVectorEnv
-from bhd_lerobot.policies.learned import LearnedBrain
+from bhd_lerobot.policies.learned.brain import LearnedBrain
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot
-from bhd_lerobot.runs import evaluate
+from bhd_lerobot.evaluation import evaluate
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _PROGRAMS: dict[str, Callable[[], None]] = {

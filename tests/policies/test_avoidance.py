@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.avoidance import AvoidanceBrain, AvoidanceConfig
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain, AvoidanceConfig
 from bhd_lerobot.policies.brain import Observation
 
 ACTIONS = ("x.vel", "theta.vel")

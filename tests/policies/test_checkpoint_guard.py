@@ -12,9 +12,11 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.processor import PolicyProcessorPipeline
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.checkpoint_guard import PROCESSOR_FILES, check_checkpoint
-from bhd_lerobot.runs import evaluate, record, train
-from bhd_lerobot.runs.rl.parts import _from_checkpoint
+from bhd_lerobot.policies.learned.checkpoint_guard import PROCESSOR_FILES, check_checkpoint
+from bhd_lerobot.evaluation import evaluate
+from bhd_lerobot.recording import record
+from bhd_lerobot.training import train
+from bhd_lerobot.training.rl.parts import _from_checkpoint
 from tests.policies import learned_rig as rig
 from tests.runs.train_support import MLP, make_dataset, options, run_train
 
@@ -38,7 +40,7 @@ def evil_steps(marker: Path) -> list[dict[str, Any]]:
         {"class": "lerobot.os.system", "config": shell},
         {"class": "lerobot..os.system", "config": shell},
         {"class": "lerobot_elsewhere.Popen", "config": arguments},
-        {"class": "bhd_lerobot.runs.provenance.subprocess.run", "config": arguments},
+        {"class": "bhd_lerobot.rollout.provenance.subprocess.run", "config": arguments},
         {"class": "Popen", "config": arguments},
         {"class": ["subprocess", "Popen"], "config": arguments},
         {"registry_name": "subprocess.Popen", "config": arguments},

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.contract import CONTRACT_FILE, PolicyContract, find_checkpoint
+from bhd_lerobot.policies.learned.contract import CONTRACT_FILE, PolicyContract, find_checkpoint
 
 CONTRACT = PolicyContract(
     robot_type="turtlebot3",

@@ -10,23 +10,23 @@ import pytest
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import CommandResult, ResultCode
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.avoidance import AvoidanceConfig
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomConfig
 from bhd_lerobot.policies.brain import Chunk, Mixed, Observation
-from bhd_lerobot.policies.corrected import LEARNER_DRIVES, CorrectedBrain, CorrectedConfig
-from bhd_lerobot.policies.gap_follower import GapFollowerConfig
-from bhd_lerobot.policies.goal_expert import GoalExpert
-from bhd_lerobot.policies.learned import LearnedBrainConfig
-from bhd_lerobot.policies.pick import PickBrain, PickBrainConfig
-from bhd_lerobot.policies.reach import ReachBrainConfig
-from bhd_lerobot.policies.watches import (
+from bhd_lerobot.policies.dagger.brain import LEARNER_DRIVES, CorrectedBrain, CorrectedConfig
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
+from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
+from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
+from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
+from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
+from bhd_lerobot.policies.dagger.takeover import (
     ArmCollisionWatch,
     BaseCollisionWatch,
     DisagreementWatch,
     StallWatch,
     collision_watch,
 )
-from bhd_lerobot.runs.registry import make_brain, robot_of_brain
+from bhd_lerobot.rollout.registry import make_brain, robot_of_brain
 from bhd_lerobot.tasks.pick import ENVIRONMENT
 from tests.policies.arm_desk import BOX, CUP, Desk, scene
 

@@ -7,14 +7,14 @@ from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.avoidance import AvoidanceBrain
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.brain import Brain, Observation
-from bhd_lerobot.policies.clearance import LIDAR_X, QUANTUM, ClearanceTable, Level, make_paths
-from bhd_lerobot.policies.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.policies.navigation.clearance import LIDAR_X, QUANTUM, ClearanceTable, Level, make_paths
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
-from bhd_lerobot.runs.episode import EpisodeLoop
-from bhd_lerobot.runs.episode_types import EpisodeSpec
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import Outcome, episode_seed
 

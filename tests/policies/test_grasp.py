@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
-from bhd_lerobot.control.forward_kinematics import ForwardKinematics
-from bhd_lerobot.policies.grasp import SeenObject, neutral_yaw, plan_grasp, pointing_down, read_objects
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
+from bhd_lerobot.policies.manipulation.grasp import SeenObject, neutral_yaw, plan_grasp, pointing_down, read_objects
 
 angles = st.floats(-math.pi, math.pi)
 

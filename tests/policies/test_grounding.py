@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS
-from bhd_lerobot.policies.grounding import DISTANCE_MARGIN, SIZE_MARGIN, Description, descriptions, fitting
-from bhd_lerobot.policies.lexicon import Relation
-from bhd_lerobot.policies.planner import SceneObject
+from bhd_lerobot.policies.language.grounding import DISTANCE_MARGIN, SIZE_MARGIN, Description, descriptions, fitting
+from bhd_lerobot.policies.language.lexicon import Relation
+from bhd_lerobot.policies.manipulation.skills import SceneObject
 
 SIDES = (Relation.LEFT, Relation.RIGHT)
 MOST: dict[Relation, Callable[[SceneObject], float]] = {

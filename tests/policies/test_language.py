@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS
 from bhd_lerobot.errors import ConfigError, InstructionError
-from bhd_lerobot.policies.grounding import DISTANCE_MARGIN, Description
-from bhd_lerobot.policies.language import MAX_LENGTH, RulePlanner, chinese, describe, instructions_for, parse
-from bhd_lerobot.policies.lexicon import CHINESE, ENGLISH, Relation
-from bhd_lerobot.policies.planner import Plan, Planner, SceneObject, Skill
+from bhd_lerobot.policies.language.grounding import DISTANCE_MARGIN, Description
+from bhd_lerobot.policies.language.instruction import MAX_LENGTH, RulePlanner, chinese, describe, instructions_for, parse
+from bhd_lerobot.policies.language.lexicon import CHINESE, ENGLISH, Relation
+from bhd_lerobot.policies.manipulation.skills import Plan, Planner, SceneObject, Skill
 
 COMMA, STOP, ASK, SHOUT = "\uff0c", "\u3002", "\uff1f", "\uff01"  # full width
 

@@ -8,13 +8,13 @@ import pytest
 
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS, TableObject
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
-from bhd_lerobot.data import features as keys
-from bhd_lerobot.policies.language_brain import LanguageBrain, LanguageBrainConfig
-from bhd_lerobot.policies.planner import Plan, SceneObject, Skill, TextPlanner, make_plan
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
+from bhd_lerobot.policies.manipulation.skills import Plan, SceneObject, Skill, TextPlanner, make_plan
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.runs.episode import EpisodeLoop
-from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig

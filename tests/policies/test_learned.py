@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from bhd_lerobot.policies.brain import Chunk, Observation
-from bhd_lerobot.policies.learned import LearnedBrain
-from bhd_lerobot.policies.learned_inference import StockInference
+from bhd_lerobot.policies.learned.brain import LearnedBrain
+from bhd_lerobot.policies.learned.inference import StockInference
 from tests.policies.learned_rig import ACTIONS, KINDS, Stock, make_brain, observations, save_policy
 
 FRAMES = 11

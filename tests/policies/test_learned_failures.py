@@ -14,11 +14,11 @@ from safetensors.torch import load_file, save_file
 
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.brain import Observation
-from bhd_lerobot.policies.contract import CONTRACT_FILE, PolicyContract
-from bhd_lerobot.policies.learned import LearnedBrain, LearnedBrainConfig
-from bhd_lerobot.runs.config_record import RecordConfig
-from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.registry import action_names_of, brains_for, make_brain, robot_of_brain
+from bhd_lerobot.policies.learned.contract import CONTRACT_FILE, PolicyContract
+from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.rollout.registry import action_names_of, brains_for, make_brain, robot_of_brain
 from tests.policies import learned_rig as rig
 
 

@@ -11,12 +11,12 @@ from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation
-from bhd_lerobot.policies.goal_map import CELL, GoalMap
-from bhd_lerobot.policies.navigator import GOAL, NavigatorBrain, NavigatorConfig
+from bhd_lerobot.policies.navigation.goal_map import CELL, GoalMap
+from bhd_lerobot.policies.navigation.navigator import GOAL, NavigatorBrain, NavigatorConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
-from bhd_lerobot.runs.episode import EpisodeLoop
-from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 

@@ -11,11 +11,11 @@ from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.commands import CommandResult, ResultCode
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Goals, Observation
-from bhd_lerobot.policies.pick import PickBrain, PickBrainConfig
+from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.runs.episode import EpisodeLoop
-from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.tabletop import TableObject
 from bhd_lerobot.errors import BhdError, ConfigError, InstructionError
-from bhd_lerobot.policies.planner import (
+from bhd_lerobot.policies.manipulation.skills import (
     LAST,
     NEXT,
     Plan,

@@ -9,11 +9,11 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Goals, Observation
-from bhd_lerobot.policies.reach import ReachBrain, ReachBrainConfig
+from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.runs.episode import EpisodeLoop
-from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.reach import ENVIRONMENT, ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig

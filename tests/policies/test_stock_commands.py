@@ -8,9 +8,9 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.contract import CONTRACT_FILE
+from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
 from bhd_lerobot.robots.simulated_robot import connected_robots
-from bhd_lerobot.runs import train
+from bhd_lerobot.training import train
 from bhd_lerobot.tasks.task import episode_seed
 from tests.policies.learned_rig import save_policy
 from tests.policies.stock_rig import (

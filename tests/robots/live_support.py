@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.control.fifo import RingReader
-from bhd_lerobot.control.live_block import LiveBlock
+from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.control.messages import Mode, Watchdog
-from bhd_lerobot.control.shared_block import FOLDER, PREFIX, names
-from bhd_lerobot.robots.config_realtime import RealtimeConfig
+from bhd_lerobot.realtime.shared_memory import FOLDER, PREFIX, names
+from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.live_state import WATCHDOGS
+from bhd_lerobot.robots.host.state import WATCHDOGS
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
 from tests.waiting import until
 

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
-from bhd_lerobot.control.frame_log import FrameLog
-from bhd_lerobot.control.live_block import Word
+from bhd_lerobot.realtime.frame_log import FrameLog
+from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.control.messages import Mode, Watchdog
-from bhd_lerobot.control.shared_block import sweep
+from bhd_lerobot.realtime.shared_memory import sweep
 from bhd_lerobot.errors import RealtimeError
-from bhd_lerobot.runs.record import main
+from bhd_lerobot.recording.record import main
 from tests.robots.live_support import (
     States,
     drive,

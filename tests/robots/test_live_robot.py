@@ -9,9 +9,9 @@ import pytest
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from bhd_lerobot.control.estop import EstopInputs
-from bhd_lerobot.control.live_block import LiveBlock, Word
+from bhd_lerobot.realtime.block import LiveBlock, Word
 from bhd_lerobot.control.messages import Mode
-from bhd_lerobot.control.shared_block import names
+from bhd_lerobot.realtime.shared_memory import names
 from bhd_lerobot.errors import CommandRefusedError, ConfigError, RealtimeError
 from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3

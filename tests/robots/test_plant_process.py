@@ -19,22 +19,22 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.grid import Slot, TickGrid
-from bhd_lerobot.control.live_block import LiveBlock, Word
+from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.realtime.block import LiveBlock, Word
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.plant_link import CommandGuard, PlantLink, PlantPhase, RemotePlant
-from bhd_lerobot.control.shared_block import names
+from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, RemotePlant
+from bhd_lerobot.realtime.shared_memory import names
 from bhd_lerobot.errors import ConfigError, RealtimeError
-from bhd_lerobot.robots.config_realtime import RealtimeConfig
+from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.live_state import WATCHDOGS
-from bhd_lerobot.robots.plant_process import SensedWorld
-from bhd_lerobot.robots.remote_plant import RemoteSimulation, plant_shape
-from bhd_lerobot.robots.remote_plant_loop import PlantLoop, PlantTick
-from bhd_lerobot.robots.remote_plant_stop import ServoStop, WheelStop, make_stop
-from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.robots.host.state import WATCHDOGS
+from bhd_lerobot.robots.host.plant_process import SensedWorld
+from bhd_lerobot.robots.host.remote_plant import RemoteSimulation, plant_shape
+from bhd_lerobot.robots.host.plant_loop import PlantLoop, PlantTick
+from bhd_lerobot.robots.host.plant_stop import ServoStop, WheelStop, make_stop
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
 from bhd_lerobot.robots.ur5 import UR5

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.control.fifo import StateRing
-from bhd_lerobot.control.grid import TickGrid
+from bhd_lerobot.realtime.grid import TickGrid
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.live_state import LIMITS, StatePublisher, raised, state_dtype
-from bhd_lerobot.robots.simulation import Simulation
+from bhd_lerobot.robots.host.state import LIMITS, StatePublisher, raised, state_dtype
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
 from bhd_lerobot.robots.ur5 import UR5
 

@@ -1,14 +1,14 @@
 """`bhd-data import` in tests."""
 
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.runs import data
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.cli.data import main
 
 TASK = "--task=Drive around."
 
 
 def run(source, root, *arguments):
     """Import and return the status."""
-    return data.main(["import", str(source), "--repo_id=t/t", f"--root={root}", TASK, *arguments])
+    return main.main(["import", str(source), "--repo_id=t/t", f"--root={root}", TASK, *arguments])
 
 
 def imported(source, root, *arguments):

@@ -6,10 +6,10 @@ from pathlib import Path
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from bhd_lerobot.runs.config_record import RecordConfig
-from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.record import record
-from bhd_lerobot.runs.record_report import RecordResult
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.recording.record import record
+from bhd_lerobot.recording.report import RecordResult
 
 
 def options(root: Path, **overrides: object) -> list[str]:

@@ -9,11 +9,11 @@ import pytest
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.avoidance import AvoidanceConfig
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
-from bhd_lerobot.runs.bhd_brain import BhdBrain
-from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
+from bhd_lerobot.teleoperators.bhd_brain import BhdBrain
+from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 
 
 @pytest.fixture

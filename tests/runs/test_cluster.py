@@ -18,16 +18,16 @@ import pytest
 from rich.console import Console
 
 from bhd_lerobot.control.tolerance import TimingTolerance
-from bhd_lerobot.data.video import count_frames
+from bhd_lerobot.datasets.format.video import count_frames
 from bhd_lerobot.errors import ActionError, ClusterError
-from bhd_lerobot.runs import cluster_loop
-from bhd_lerobot.runs import evaluate as evaluate_module
-from bhd_lerobot.runs import record as record_module
-from bhd_lerobot.runs.cluster_config import RayConfig
-from bhd_lerobot.runs.cluster_crew import Crew
-from bhd_lerobot.runs.cluster_job import Job
-from bhd_lerobot.runs.cluster_loop import open_crew
-from bhd_lerobot.runs.cluster_task import Task
+from bhd_lerobot.cluster import loop
+from bhd_lerobot.evaluation import evaluate as evaluate_module
+from bhd_lerobot.recording import record as record_module
+from bhd_lerobot.cluster.config import RayConfig
+from bhd_lerobot.cluster.crew import Crew
+from bhd_lerobot.cluster.job import Job
+from bhd_lerobot.cluster.loop import open_crew
+from bhd_lerobot.cluster.task import Task
 from tests.runs import cluster_fakes as fakes
 from tests.runs.support import options, run_record
 from tests.runs.test_evaluate import FAILING, run_eval
@@ -151,7 +151,7 @@ def test_a_recording_is_the_same_although_a_worker_and_a_machine_die(cluster, tm
         cluster.remove_node(machine, allow_graceful=False)
 
     # When the eighth is saved, 42 are missing, and no more than 16 of them can be on their way or waiting to be saved.
-    monkeypatch.setattr(cluster_loop, "Crew", Seen)
+    monkeypatch.setattr(loop, "Crew", Seen)
     after_saves(monkeypatch, {3: kill_a_worker, 8: kill_its_machine})
     many = {"dataset__num_episodes": 50, "n_envs": 2, "dataset__episode_time_s": 5}
     result, printed = run_record(tmp_path / "ray", **on(cluster, ray__episodes_per_task=2), **many)
@@ -182,7 +182,7 @@ def test_a_killed_driver_leaves_good_episodes_and_no_processes(ray_folder, tmp_p
     many = {"dataset__num_episodes": 400, "dataset__episode_time_s": 5}
     arguments = options(tmp_path / "ray", engine="ray", ray__num_workers=1, **many)
     driver = subprocess.Popen(
-        [sys.executable, "-m", "bhd_lerobot.runs.record", *arguments],
+        [sys.executable, "-m", "bhd_lerobot.recording.record", *arguments],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -292,8 +292,8 @@ class TestOneWorker:
                 policy.rename(tmp_path / "hidden")  # as if the worker were on another machine
             return found
 
-        read = cluster_loop.read_checkpoints
-        monkeypatch.setattr(cluster_loop, "read_checkpoints", read_and_hide)
+        read = loop.read_checkpoints
+        monkeypatch.setattr(loop, "read_checkpoints", read_and_hide)
         result, _ = run_eval(tmp_path / "ray", **on(cluster), **same)
         assert result.exit_status == 0
         assert (tmp_path / "hidden").is_dir()

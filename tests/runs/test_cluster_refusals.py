@@ -11,19 +11,20 @@ from types import SimpleNamespace
 import pytest
 
 from bhd_lerobot.errors import ClusterError, ConfigError
-from bhd_lerobot.runs import cluster as cluster_module
-from bhd_lerobot.runs import cluster_config, cluster_remote
-from bhd_lerobot.runs.cluster_config import RayConfig
+from bhd_lerobot.cluster import cluster as cluster_module
+from bhd_lerobot.cluster import config
+from bhd_lerobot.cluster import remote
+from bhd_lerobot.cluster.config import RayConfig
 from tests.runs.support import run_record
 
 
 def test_a_machine_without_our_package_can_say_so(tmp_path):
     cloudpickle = pytest.importorskip("ray.cloudpickle")
-    cloudpickle.register_pickle_by_value(cluster_remote)
+    cloudpickle.register_pickle_by_value(remote)
     try:
-        (tmp_path / "worker").write_bytes(cloudpickle.dumps(cluster_remote.RemoteWorker))
+        (tmp_path / "worker").write_bytes(cloudpickle.dumps(remote.RemoteWorker))
     finally:
-        cloudpickle.unregister_pickle_by_value(cluster_remote)
+        cloudpickle.unregister_pickle_by_value(remote)
     program = (
         "import sys; sys.modules['bhd_lerobot'] = None\n"
         "import importlib.util, pickle; importlib.util.find_spec = lambda name: None\n"
@@ -58,7 +59,7 @@ def test_options_that_a_cluster_cannot_honour_are_refused(tmp_path):
 
 
 def test_without_ray_the_command_to_install_it_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster_config, "importlib", SimpleNamespace(util=SimpleNamespace(find_spec=lambda _: None)))
+    monkeypatch.setattr(config, "importlib", SimpleNamespace(util=SimpleNamespace(find_spec=lambda _: None)))
     with pytest.raises(ConfigError, match=r"pip install -e '\.\[ray\]'"):
         run_record(tmp_path / "data", engine="ray")
 

@@ -3,8 +3,8 @@
 import pytest
 
 from bhd_lerobot.errors import BhdError, ConfigError
-from bhd_lerobot.runs.config_record import RecordConfig
-from bhd_lerobot.runs.configuration import describe, encode, parse, run
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import describe, encode, parse, run
 
 REQUIRED = ["--robot.type=turtlebot3", "--dataset.repo_id=a/b", "--brain.type=avoidance", "--task.type=avoid"]
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.runs import data
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.cli.data import main
 from tests.data import support
 from tests.runs.support import run_record
 
@@ -28,7 +28,7 @@ def recorded(tmp_path_factory):
 
 def test_info_shows_outcome_and_timing_of_every_episode(recorded, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
-    assert data.main(["info", str(recorded)]) == 0
+    assert main.main(["info", str(recorded)]) == 0
     text = capsys.readouterr().out
     for part in ("turtlebot3, 10 frames/s", "finalised", "avoidance", "late p99", "overruns", "control.applied_action"):
         assert part in text
@@ -36,7 +36,7 @@ def test_info_shows_outcome_and_timing_of_every_episode(recorded, capsys, monkey
 
 
 def test_info_as_json_holds_everything(recorded, capsys):
-    assert data.main(["info", "--root", str(recorded), "--json"]) == 0
+    assert main.main(["info", "--root", str(recorded), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert [episode["index"] for episode in summary["episodes"]] == [0, 1, 2]
     for episode in summary["episodes"]:
@@ -49,19 +49,19 @@ def test_info_as_json_holds_everything(recorded, capsys):
 def test_info_of_several_datasets(recorded, tmp_path, capsys):
     other = tmp_path / "[b]other"  # square brackets are not markup
     run_record(other, dataset__num_episodes=1, robot__beams=18)
-    assert data.main(["info", "--short", str(recorded), str(other)]) == 0
+    assert main.main(["info", "--short", str(recorded), str(other)]) == 0
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith(f"{recorded}: turtlebot3, 3 episodes, 90 frames, 9 s, ")
     assert first.endswith(" MB, timeout 3")
     assert second.startswith(f"{other}: turtlebot3, 1 episodes, 30 frames, 3 s, ")
     # One that is none does not hide the others.
-    assert data.main(["info", str(tmp_path / "none"), str(recorded), "--short"]) == 2
+    assert main.main(["info", str(tmp_path / "none"), str(recorded), "--short"]) == 2
     captured = capsys.readouterr()
     assert captured.out == first + "\n"
     assert "does not exist" in captured.err
-    assert data.main(["info", "--json", str(recorded), str(other)]) == 0
+    assert main.main(["info", "--json", str(recorded), str(other)]) == 0
     assert [one["root"] for one in json.loads(capsys.readouterr().out)] == [str(recorded), str(other)]
-    assert data.main(["info", str(other), str(recorded)]) == 0
+    assert main.main(["info", str(other), str(recorded)]) == 0
     told = capsys.readouterr().out
     assert str(other) in told.replace("\n", "")
     assert told.count("Features") == 2
@@ -77,7 +77,7 @@ def test_an_empty_dataset_is_called_empty(tmp_path, capsys):
         *((2, ["timing"]), (2, ["filter", "--outcome", "all", *new]), (2, ["split", "--parts", "a=0.5", *new])),
         *((2, ["delete", "--episodes", "0"]), (2, ["mark", "--episodes", "0", "--outcome", "failure"])),
     ):
-        assert data.main([command[0], str(root), *command[1:]]) == status
+        assert main.main([command[0], str(root), *command[1:]]) == status
         captured = capsys.readouterr()
         assert "empty" in captured.out + captured.err, command
     assert not (tmp_path / "new").exists()
@@ -86,7 +86,7 @@ def test_an_empty_dataset_is_called_empty(tmp_path, capsys):
 def test_a_dataset_is_named_in_one_way(recorded, capsys, monkeypatch):
     monkeypatch.setenv("HF_LEROBOT_HOME", str(recorded.parent))
     for arguments in (["--repo_id", "d"], ["--root", str(recorded)], [str(recorded)]):
-        assert data.main(["repair", *arguments]) == 0
+        assert main.main(["repair", *arguments]) == 0
     capsys.readouterr()
     for arguments in (
         [str(recorded), "--repo_id", "t/t"],
@@ -95,7 +95,7 @@ def test_a_dataset_is_named_in_one_way(recorded, capsys, monkeypatch):
         [],
     ):
         with pytest.raises(SystemExit) as stop:
-            data.main(["repair", *arguments])
+            main.main(["repair", *arguments])
         assert stop.value.code == 2
         error = capsys.readouterr().err
         assert "name the dataset, in one way: its folder (ROOT or --root), or --repo_id" in error
@@ -104,7 +104,7 @@ def test_a_dataset_is_named_in_one_way(recorded, capsys, monkeypatch):
 
 def test_help_names_every_value_by_what_it_is():
     """Not by the name that the program has for it, such as ROOT_OPTION."""
-    (commands,) = (one for one in data._parser()._actions if isinstance(one, argparse._SubParsersAction))
+    (commands,) = (one for one in main._parser()._actions if isinstance(one, argparse._SubParsersAction))
     for name in ["info", "timing", "check", "repair", "mark", "merge", "filter", "delete", "split", "view"]:
         for action in commands.choices[name]._actions:
             assert action.nargs == 0 or (action.metavar and action.help), f"{name}: {action.dest}"
@@ -112,7 +112,7 @@ def test_help_names_every_value_by_what_it_is():
 
 
 def test_repair_of_a_sound_dataset_has_nothing_to_do(recorded, capsys):
-    assert data.main(["repair", str(recorded)]) == 0
+    assert main.main(["repair", str(recorded)]) == 0
     assert "nothing to do" in capsys.readouterr().out
 
 
@@ -121,7 +121,7 @@ def test_repair_reports_what_it_dropped(recorded, tmp_path, capsys):
     shutil.copytree(recorded, root)
     leftover = root / "data" / "chunk-000" / "file-007.parquet"
     leftover.write_bytes(b"half an episode")
-    assert data.main(["repair", str(root)]) == 0
+    assert main.main(["repair", str(root)]) == 0
     assert "file-007.parquet" in capsys.readouterr().out
     assert not leftover.exists()
 
@@ -133,29 +133,29 @@ def test_a_corrupted_file_is_named_left_alone_and_repaired(recorded, tmp_path, c
     content = bytearray(path.read_bytes())
     content[-50:] = bytes(50)
     path.write_bytes(content)
-    assert data.main(["info", str(root)]) == 2
+    assert main.main(["info", str(root)]) == 2
     error = capsys.readouterr().err
     assert path.name in error
     assert path.read_bytes() == content
-    assert data.main(["repair", str(root)]) == 0
+    assert main.main(["repair", str(root)]) == 0
     out = capsys.readouterr().out
     assert path.name in out
     assert "lost: nothing" in out
     assert (tmp_path / "d.damaged-1" / path.relative_to(root)).read_bytes() == content
-    assert data.main(["check", str(root)]) == 0
+    assert main.main(["check", str(root)]) == 0
 
 
 def test_no_dataset_and_no_argument(tmp_path, capsys):
-    assert data.main(["info", str(tmp_path / "none")]) == 2
+    assert main.main(["info", str(tmp_path / "none")]) == 2
     assert "does not exist" in capsys.readouterr().err
     with pytest.raises(SystemExit) as stop:
-        data.main(["info"])
+        main.main(["info"])
     assert stop.value.code == 2
 
 
 @pytest.mark.parametrize("arguments", [["info"], ["info", "--json"], ["check"]])
 def test_output_that_nobody_reads_ends_the_command_without_a_word(recorded, arguments):
-    command = [sys.executable, "-m", "bhd_lerobot.runs.data", *arguments, str(recorded)]
+    command = [sys.executable, "-m", "bhd_lerobot.cli.data.main", *arguments, str(recorded)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     reading, writing = os.pipe()
     os.close(reading)
@@ -175,18 +175,18 @@ def test_a_recording_that_goes_on_is_no_interrupted_one(tmp_path, capsys, monkey
     support.record(recorder)
     told = "not finalised: it is being recorded or changed at this moment"
     for command in (["info"], ["info", "--short"]):
-        assert data.main([*command, str(root)]) == 0
+        assert main.main([*command, str(root)]) == 0
         assert told in capsys.readouterr().out
     for command in ("check", "repair", "view"):
-        assert data.main([command, str(root)]) == 2
+        assert main.main([command, str(root)]) == 2
         assert "being" in capsys.readouterr().err
     recorder._lock.release()  # as if it had been killed
-    assert data.main(["info", "--short", str(root)]) == 0
+    assert main.main(["info", "--short", str(root)]) == 0
     assert "an interrupted recording; `bhd-data repair` finishes it" in capsys.readouterr().out
-    assert data.main(["repair", str(root)]) == 0
-    assert data.main(["check", str(root)]) == 0
+    assert main.main(["repair", str(root)]) == 0
+    assert main.main(["check", str(root)]) == 0
     capsys.readouterr()
-    assert data.main(["info", "--short", str(root)]) == 0
+    assert main.main(["info", "--short", str(root)]) == 0
     assert "not finalised" not in capsys.readouterr().out
 
 
@@ -201,6 +201,6 @@ def test_a_recording_that_goes_on_is_no_interrupted_one(tmp_path, capsys, monkey
 )
 def test_a_slip_of_the_keyboard_is_told_the_nearest_name(line, said, capsys):
     with pytest.raises(SystemExit) as ended:
-        data.main(line.split())
+        main.main(line.split())
     assert ended.value.code == 2
     assert said in capsys.readouterr().err

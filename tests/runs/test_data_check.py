@@ -9,8 +9,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS
-from bhd_lerobot.runs import data, data_check, data_repair
-from bhd_lerobot.runs.data_check import limits_of
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.cli.data import check
+from bhd_lerobot.cli.data import repair
+from bhd_lerobot.cli.data.check import limits_of
 from tests.runs.support import run_record
 
 
@@ -33,12 +35,12 @@ def broken(recorded: Path, tmp_path: Path, value: float) -> Path:
 
 
 def test_what_was_just_recorded_is_sound(recorded: Path, capsys) -> None:
-    assert data.main(["check", str(recorded)]) == 0
+    assert main.main(["check", str(recorded)]) == 0
     assert "sound, no errors" in capsys.readouterr().out
 
 
 def test_as_json(recorded: Path, capsys) -> None:
-    assert data.main(["check", str(recorded), "--json"]) == 0
+    assert main.main(["check", str(recorded), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["sound"] is True
     assert told["episodes"] == 3
@@ -48,20 +50,20 @@ def test_as_json(recorded: Path, capsys) -> None:
 def test_errors_and_with_strict_warnings_end_with_status_1(recorded: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     root = broken(recorded, tmp_path, 0.5)
-    assert data.main(["check", str(root)]) == 1  # statistics are not those of the data
+    assert main.main(["check", str(root)]) == 1  # statistics are not those of the data
     text = capsys.readouterr().out
     assert "the robot's limits are -0.22 and 0.22" in text
     assert "not sound, 1 error, " in text
     shutil.rmtree(root)
     root = Path(shutil.copytree(recorded, tmp_path / "d"))
     (root / "data/chunk-000/file-009.parquet").write_bytes(b"left")
-    assert data.main(["check", str(root)]) == 0
-    assert data.main(["check", str(root), "--strict"]) == 1
+    assert main.main(["check", str(root)]) == 0
+    assert main.main(["check", str(root), "--strict"]) == 1
     assert "file-009" in capsys.readouterr().out
 
 
 def test_no_dataset_is_status_2(tmp_path: Path, capsys) -> None:
-    assert data.main(["check", str(tmp_path)]) == 2
+    assert main.main(["check", str(tmp_path)]) == 2
     assert "is not a LeRobot dataset" in capsys.readouterr().err
 
 
@@ -91,7 +93,7 @@ def test_ctrl_c_is_a_line_and_status_130(recorded: Path, capsys, monkeypatch, co
     def interrupted(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
-    module = {"check": data_check, "repair": data_repair}[command]
+    module = {"check": check, "repair": repair}[command]
     monkeypatch.setattr(module, command, interrupted)
-    assert data.main([command, str(recorded)]) == 130
+    assert main.main([command, str(recorded)]) == 130
     assert capsys.readouterr().err == f"Stopped; {said}.\n"

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.data.inspect import dataset_info
+from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.runs import data
-from bhd_lerobot.runs.data_edit import parts_of
-from bhd_lerobot.runs.episode_list import parse_episodes, short
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.cli.data.edit import parts_of
+from bhd_lerobot.cli.data.episode_list import parse_episodes, short
 from tests.data.edit_support import content, record
 
 
@@ -22,22 +22,22 @@ def recorded(tmp_path_factory) -> Path:
 def test_merge_filter_delete_split_mark(recorded: Path, tmp_path: Path, capsys) -> None:
     whole = content(recorded)
     two = shutil.copytree(recorded, tmp_path / "two")
-    assert data.main(["merge", str(recorded), str(two), "--output", str(tmp_path / "all")]) == 0
+    assert main.main(["merge", str(recorded), str(two), "--output", str(tmp_path / "all")]) == 0
     assert content(tmp_path / "all") == whole + whole
-    assert data.main(["delete", str(tmp_path / "all"), "--episodes", "0-5"]) == 0
+    assert main.main(["delete", str(tmp_path / "all"), "--episodes", "0-5"]) == 0
     assert content(tmp_path / "all") == whole
-    assert data.main(["mark", str(two), "--episodes", "1,3-4", "--outcome", "stuck", "--note", "wheel"]) == 0
+    assert main.main(["mark", str(two), "--episodes", "1,3-4", "--outcome", "stuck", "--note", "wheel"]) == 0
     assert [one.metadata["outcome"] for one in dataset_info(two).episodes].count("stuck") == 3
-    assert data.main(["filter", str(two), "--outcome", "success", "--output", str(tmp_path / "good")]) == 0
+    assert main.main(["filter", str(two), "--outcome", "success", "--output", str(tmp_path / "good")]) == 0
     assert content(tmp_path / "good") == [whole[0], whole[2], whole[5]]
     arguments = ["filter", str(two), "--episodes", "0-3", "--outcome", "stuck,timeout", "--output", str(tmp_path / "s")]
-    assert data.main(arguments) == 0
+    assert main.main(arguments) == 0
     assert [one.task for one in content(tmp_path / "s")] == [whole[1].task, whole[3].task]
-    assert data.main(["filter", str(recorded), "--min_score", "1", "--output", str(tmp_path / "best")]) == 0
+    assert main.main(["filter", str(recorded), "--min_score", "1", "--output", str(tmp_path / "best")]) == 0
     assert content(tmp_path / "best") == whole[4:]
-    assert data.main(["split", str(recorded), "--parts", "train=0.5,val=0.5", "--output", str(tmp_path / "p")]) == 0
+    assert main.main(["split", str(recorded), "--parts", "train=0.5,val=0.5", "--output", str(tmp_path / "p")]) == 0
     assert content(tmp_path / "p/train") + content(tmp_path / "p/val") == whole
-    assert data.main(["split", str(recorded), "--parts", "a=0,5;b=1-2", "--output", str(tmp_path / "q")]) == 0
+    assert main.main(["split", str(recorded), "--parts", "a=0,5;b=1-2", "--output", str(tmp_path / "q")]) == 0
     assert content(tmp_path / "q/a") == [whole[0], whole[5]]
     out = capsys.readouterr().out
     assert f"{tmp_path / 'all'}: 12 episodes" in out
@@ -45,16 +45,16 @@ def test_merge_filter_delete_split_mark(recorded: Path, tmp_path: Path, capsys) 
 
 
 def test_repair_of_a_sound_dataset(recorded: Path, capsys) -> None:
-    assert data.main(["repair", str(recorded)]) == 0
+    assert main.main(["repair", str(recorded)]) == 0
     assert "nothing to do" in capsys.readouterr().out
 
 
 def test_check_with_fix(recorded: Path, tmp_path: Path, capsys) -> None:
     root = shutil.copytree(recorded, tmp_path / "d")
     (root / "meta/stats.json").unlink()
-    assert data.main(["check", str(root), "--no-videos"]) == 1
+    assert main.main(["check", str(root), "--no-videos"]) == 1
     assert "bhd-data check --fix" in " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert data.main(["check", str(root), "--fix", "--json"]) == 0
+    assert main.main(["check", str(root), "--fix", "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["sound"] is True
     assert captured.err.startswith("fixed meta/stats.json")
@@ -92,7 +92,7 @@ def test_check_with_fix(recorded: Path, tmp_path: Path, capsys) -> None:
 def test_bad_input_ends_in_a_message(recorded: Path, tmp_path: Path, capsys, arguments: list[str], words: str) -> None:
     names = {"R": str(recorded), "X": str(tmp_path / "x"), "N": str(tmp_path / "none")}
     before = {path: path.stat().st_mtime_ns for path in recorded.rglob("*")}
-    assert data.main([names.get(one, one) for one in arguments]) == 2
+    assert main.main([names.get(one, one) for one in arguments]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
     assert {path: path.stat().st_mtime_ns for path in recorded.rglob("*")} == before

@@ -19,15 +19,15 @@ from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5 as ur5_body
-from bhd_lerobot.control.forward_kinematics import ForwardKinematics
-from bhd_lerobot.data import bag_write
-from bhd_lerobot.data.features import dataset_features
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.read import read_episode
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.data.state import load_state
-from bhd_lerobot.runs import data
-from bhd_lerobot.runs.data_export import robot_view
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
+from bhd_lerobot.rosbag.storage import write
+from bhd_lerobot.datasets.format.features import dataset_features
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.datasets.format.state import load_state
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.cli.data.export import robot_view
 from tests.data import support
 from tests.runs.support import run_record
 
@@ -60,7 +60,7 @@ def toy(tmp_path_factory):
 
 
 def export(root, output, *arguments):
-    assert data.main(["export", str(root), f"--output={output}", *arguments]) == 0
+    assert main.main(["export", str(root), f"--output={output}", *arguments]) == 0
     return output
 
 
@@ -99,9 +99,9 @@ def test_a_dataset_comes_back_to_the_bit_and_is_sound(request, tmp_path, robot, 
     root = request.getfixturevalue(robot)
     bags = export(root, tmp_path / "bags", *layout)
     assert (bags / "metadata.yaml").exists() == bool(layout)
-    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
+    assert main.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
     same_dataset(root, tmp_path / "back")
-    assert data.main(["check", str(tmp_path / "back")]) == 0
+    assert main.main(["check", str(tmp_path / "back")]) == 0
 
 
 @pytest.mark.parametrize("layout", [[], ["--one_bag"]])
@@ -122,7 +122,7 @@ def test_episodes_that_turn_round_come_back_whatever_the_one_before_did(tmp_path
             writer.set_columns(columns)
             recorder.save(writer, task="turn", metadata={})
     bags = export(root, tmp_path / "bags", *layout)
-    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
+    assert main.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
     same_dataset(root, tmp_path / "back")
 
 
@@ -138,7 +138,7 @@ def test_texts_integers_and_pictures_of_an_unknown_robot_come_back(toy, tmp_path
             assert (message.height, message.width, message.step, message.encoding) == (32, 48, 144, "rgb8")
             assert abs(np.frombuffer(message.data, np.uint8).mean() - support.grey(1, frame)) < 3
     assert len(topics[image]) == support.length(1)
-    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
+    assert main.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
     assert support.verify(tmp_path / "back", 2, video=True, stats=True) == 2
     same_dataset(toy, tmp_path / "back")
 
@@ -438,8 +438,8 @@ def test_nothing_is_left_when_the_disk_refuses(turtlebot3, tmp_path, monkeypatch
     def refuse(*arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(bag_write.BagWriter, "write", refuse)
-    assert data.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}"]) == 2
+    monkeypatch.setattr(write.BagWriter, "write", refuse)
+    assert main.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}"]) == 2
     assert "No space left" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -455,13 +455,13 @@ def test_nothing_is_left_when_the_disk_refuses(turtlebot3, tmp_path, monkeypatch
     ],
 )
 def test_what_cannot_be_exported_is_refused(turtlebot3, tmp_path, capsys, arguments, told):
-    assert data.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}", *arguments]) == 2
+    assert main.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}", *arguments]) == 2
     assert told in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
 def test_bags_do_not_get_into_the_dataset(turtlebot3, capsys):
-    assert data.main(["export", str(turtlebot3), f"--output={turtlebot3 / 'bags'}"]) == 2
+    assert main.main(["export", str(turtlebot3), f"--output={turtlebot3 / 'bags'}"]) == 2
     assert "which is to stay as it is" in capsys.readouterr().err
     assert not (turtlebot3 / "bags").exists()
 
@@ -469,17 +469,17 @@ def test_bags_do_not_get_into_the_dataset(turtlebot3, capsys):
 def test_what_is_there_is_not_overwritten(turtlebot3, tmp_path, capsys):
     (tmp_path / "bags").mkdir()
     (tmp_path / "bags" / "note").write_text("mine")
-    assert data.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}"]) == 2
+    assert main.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}"]) == 2
     assert "exists already" in capsys.readouterr().err
     assert os.listdir(tmp_path / "bags") == ["note"]
-    assert data.main(["export", str(tmp_path / "none"), f"--output={tmp_path / 'b'}"]) == 2
+    assert main.main(["export", str(tmp_path / "none"), f"--output={tmp_path / 'b'}"]) == 2
 
 
 def test_bags_of_ours_that_lost_messages_are_refused_not_shortened(turtlebot3, tmp_path, capsys):
     bags = export(turtlebot3, tmp_path / "bags", "--episodes=0")
     path = bags / "episode_000000" / "episode_000000.mcap"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 2
+    assert main.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 2
     error = capsys.readouterr().err
     for part in ("lacks", "messages of an episode", "ends at byte", "--resample"):
         assert part in error
@@ -493,7 +493,7 @@ def test_a_number_that_was_changed_is_noticed(turtlebot3, tmp_path, capsys):
     content = bytearray(path.read_bytes())
     content[content.index(action) + 6] ^= 1
     path.write_bytes(content)
-    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 2
+    assert main.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 2
     error = capsys.readouterr().err
     assert "of episode 0 is not what was exported" in error
     assert "--resample" in error
@@ -503,19 +503,19 @@ def test_a_number_that_was_changed_is_noticed(turtlebot3, tmp_path, capsys):
 def test_bags_of_two_datasets_do_not_become_one(turtlebot3, ur5, tmp_path, capsys):
     one, other = export(turtlebot3, tmp_path / "a"), export(ur5, tmp_path / "b")
     arguments = ["import", str(one), str(other), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]
-    assert data.main(arguments) == 2
+    assert main.main(arguments) == 2
     assert "differs" in capsys.readouterr().err
     assert not (tmp_path / "back").exists()
-    assert data.main(["import", str(one), "--repo_id=t/t", f"--root={tmp_path / 'back'}", "--fps=5"]) == 2
+    assert main.main(["import", str(one), "--repo_id=t/t", f"--root={tmp_path / 'back'}", "--fps=5"]) == 2
     assert "--fps is for bags of a real robot" in capsys.readouterr().err
 
 
 def test_an_episode_that_was_marked_later_comes_back(turtlebot3, tmp_path):
     root = tmp_path / "d"
     shutil.copytree(turtlebot3, root)
-    assert data.main(["mark", str(root), "--episodes=1", "--outcome=failure"]) == 0
+    assert main.main(["mark", str(root), "--episodes=1", "--outcome=failure"]) == 0
     bags = export(root, tmp_path / "bags")
-    assert data.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
+    assert main.main(["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]) == 0
     assert load_state(tmp_path / "back").rows[1]["bhd/outcome"] == "failure"
     assert read_episode(tmp_path / "back", 1)["event"][-1] == 11
 
@@ -533,11 +533,11 @@ def test_nothing_heavy_is_imported_before_it_is_needed():
 def test_an_arm_is_not_resampled_as_a_base_and_comes_back_without(ur5, tmp_path, capsys):
     bags = export(ur5, tmp_path / "bags", "--episodes=0")
     named = ["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'd'}"]
-    assert data.main([*named, "--resample", "--task=Reach."]) == 2
+    assert main.main([*named, "--resample", "--task=Reach."]) == 2
     error = " ".join(capsys.readouterr().err.split())
     assert "is of the robot 'ur5'" in error
     assert "is for bags of a TurtleBot3" in error
     assert "Leave --resample out" in error
     assert "--scan" not in error
     assert os.listdir(tmp_path) == ["bags"]
-    assert data.main(named) == 0
+    assert main.main(named) == 0

@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.runs import data
-from bhd_lerobot.runs.view.dataset import ViewedDataset
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.apps.view.dataset import ViewedDataset
 from tests.data import loader_support, support
 from tests.runs import fuzz_support
 from tests.runs.support import run_record
@@ -41,7 +41,7 @@ def sources(tmp_path_factory) -> list[Path]:
     """An edited recording of ours, one with videos, an unfinished one, and one of LeRobot's."""
     folder = tmp_path_factory.mktemp("sources")
     run_record(folder / "recorded", dataset__episode_time_s=1)
-    data.main(["mark", str(folder / "recorded"), "--episodes=2", "--outcome=stuck"])
+    main.main(["mark", str(folder / "recorded"), "--episodes=2", "--outcome=stuck"])
     (path,) = (folder / "recorded/meta/episodes").rglob("*.parquet")
     table = pq.read_table(path)
     for name, told in (("interventions", [[1, 3, "a person"]]), ("realtime", [dict.fromkeys(GRANT, "x")])):
@@ -64,7 +64,7 @@ def seeds() -> Sequence[int]:
 def run(arguments: list[str]) -> int | str:
     """Return a command's exit status, or that it ended in something else than a message."""
     try:
-        return data.main(arguments)
+        return main.main(arguments)
     except SystemExit as ended:
         return ended.code or 0
 

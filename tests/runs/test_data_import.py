@@ -7,11 +7,11 @@ import shutil
 import numpy as np
 import pytest
 
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.read import read_episode
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.format.read import read_episode
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import observation_names
-from bhd_lerobot.runs import data
+from bhd_lerobot.cli.data import main
 from tests.data import bag_support as bags
 from tests.data.bag_support import NANO, START, drive, without, write
 from tests.runs.import_support import TASK, imported, refused, run
@@ -46,7 +46,7 @@ def test_humble_and_jazzy_in_both_storages_become_what_was_measured(tmp_path, st
     assert not columns["control.late"].any()
     assert (columns["control.mode"] == 3).all()
     assert columns["next.done"].tolist() == [False] * (episode.frames - 1) + [True]
-    assert data.main(["check", str(tmp_path / "d")]) == 0
+    assert main.main(["check", str(tmp_path / "d")]) == 0
 
 
 def test_the_schema_is_that_of_our_recordings(tmp_path, plain):
@@ -127,7 +127,7 @@ def test_gaps_are_flagged_or_begin_an_episode(tmp_path, capsys):
     assert f"{total} of {info.frames} frames, in " in told
     assert columns["control.time"][-1] < 3.3
     assert [json.loads(one.metadata["source"])["why"] for one in info.episodes] == ["start", "gap"]
-    assert data.main(["check", str(tmp_path / "d")]) == 0
+    assert main.main(["check", str(tmp_path / "d")]) == 0
     one = imported(source, tmp_path / "one", "--max_gap=2")
     assert len(one.episodes) == 1
 
@@ -370,7 +370,7 @@ def test_several_bags_become_several_episodes(tmp_path, plain):
     info = imported(folder, tmp_path / "d")
     assert [json.loads(one.metadata["source"])["bag"] for one in info.episodes] == ["drive_0", "drive_1"]
     arguments = ["import", str(plain), str(folder), "--repo_id=t/t", f"--root={tmp_path / 'e'}", TASK]
-    assert data.main(arguments) == 0
+    assert main.main(arguments) == 0
     assert len(dataset_info(tmp_path / "e").episodes) == 3
 
 
@@ -427,13 +427,13 @@ def test_an_outcome_is_taken_or_marked_later(tmp_path, plain):
     )
     assert not columns["event"][:-1].any()
     assert "outcome" not in imported(plain, tmp_path / "e").episodes[0].metadata
-    assert data.main(["mark", str(tmp_path / "e"), "--episodes=0", "--outcome=collision"]) == 0
+    assert main.main(["mark", str(tmp_path / "e"), "--episodes=0", "--outcome=collision"]) == 0
     assert dataset_info(tmp_path / "e").episodes[0].metadata["outcome"] == "collision"
 
 
 def test_an_exported_bag_can_be_treated_as_a_robots(tmp_path, plain):
     imported(plain, tmp_path / "d")
-    assert data.main(["export", str(tmp_path / "d"), f"--output={tmp_path / 'bags'}"]) == 0
+    assert main.main(["export", str(tmp_path / "d"), f"--output={tmp_path / 'bags'}"]) == 0
     assert run(tmp_path / "bags", tmp_path / "back", "--resample") == 0
     ours, theirs = read_episode(tmp_path / "d", 0), read_episode(tmp_path / "back", 0)
     for key in ("observation.state", "action"):
@@ -476,7 +476,7 @@ def test_a_dataset_that_is_there_stays(tmp_path, plain, capsys):
 
 def test_a_bag_that_is_named_twice_is_refused(tmp_path, plain, capsys):
     arguments = ["import", str(plain), f"{plain}/../plain", "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
-    assert data.main(arguments) == 2
+    assert main.main(arguments) == 2
     assert "must not be named twice" in capsys.readouterr().err
 
 
@@ -484,7 +484,7 @@ def test_a_bag_that_is_named_twice_is_refused(tmp_path, plain, capsys):
 def test_random_damage_is_read_or_refused_and_never_a_surprise(tmp_path, source):
     if source == "ours":
         assert run(write(tmp_path / "bag", drive(seconds=2)), tmp_path / "d") == 0
-        assert data.main(["export", str(tmp_path / "d"), f"--output={tmp_path / 'bags'}", "--one_bag"]) == 0
+        assert main.main(["export", str(tmp_path / "d"), f"--output={tmp_path / 'bags'}", "--one_bag"]) == 0
         (path,) = (tmp_path / "bags").glob("*.mcap")
     else:
         (path,) = (one for one in write(tmp_path / "bag", drive(seconds=2), source).iterdir() if one.suffix != ".yaml")
@@ -498,7 +498,7 @@ def test_random_damage_is_read_or_refused_and_never_a_surprise(tmp_path, source)
         damaged.write_bytes(content.tobytes())
         root = tmp_path / f"out_{seed}"
         arguments = ["import", str(damaged), "--repo_id=t/t", f"--root={root}"] + [TASK] * (source != "ours")
-        status = data.main(arguments)
+        status = main.main(arguments)
         statuses.add(status)
         assert status in (0, 2)
         assert root.exists() == (status == 0)
@@ -510,6 +510,6 @@ def test_a_bag_that_cannot_be_used_leaves_no_dataset(tmp_path, plain, capsys):
     good = tmp_path / "good"
     shutil.copytree(plain, good)
     arguments = ["import", str(good), str(bad), "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
-    assert data.main(arguments) == 2
+    assert main.main(arguments) == 2
     assert "no topic /odom" in capsys.readouterr().err
     assert not (tmp_path / "d").exists()

@@ -11,9 +11,9 @@ import pytest
 from PIL import Image
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.read import read_episode
-from bhd_lerobot.runs import data
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.cli.data import main
 from tests.data import bag_support as bags
 from tests.data.bag_support import NANO, START, STORE, changed, drive, write
 from tests.runs.import_support import TASK, imported, refused, run
@@ -272,14 +272,14 @@ def test_the_same_drive_is_not_imported_twice(tmp_path, plain, messages, capsys)
     (tmp_path / "hard.mcap").hardlink_to(plain / "plain.mcap")
     for other in (plain / "plain.mcap", tmp_path / "link", tmp_path / "hard.mcap", plain.parent):
         arguments = ["import", str(plain), str(other), "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
-        assert data.main(arguments) == 2
+        assert main.main(arguments) == 2
         error = capsys.readouterr().err
         assert "are the same recording: both have the file" in error
         assert str(plain) in error
     shutil.copytree(plain, tmp_path / "copy")
     for other in (tmp_path / "copy", write(tmp_path / "converted", messages, "sqlite3")):
         arguments = ["import", str(plain), str(other), "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
-        assert data.main(arguments) == 2
+        assert main.main(arguments) == 2
         error = capsys.readouterr().err
         assert f"{plain} and {other} hold the same drive" in error
         assert not (tmp_path / "d").exists()

@@ -8,11 +8,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bhd_lerobot.data import layout
-from bhd_lerobot.data.remote import MANIFEST, SUBSET
-from bhd_lerobot.runs import data
-from bhd_lerobot.runs.config_train import BhdTrainConfig
-from bhd_lerobot.runs.configuration import parse
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.remote.listing import MANIFEST, SUBSET
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.training.config import BhdTrainConfig
+from bhd_lerobot.rollout.configuration import parse
 from tests.hub_server.server import HubServer
 from tests.runs.train_support import make_dataset
 
@@ -25,15 +25,15 @@ def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_some_episodes_by_number_and_by_outcome(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
-    assert data.main(["push", str(lesson), "me/d"]) == 0
+    assert main.main(["push", str(lesson), "me/d"]) == 0
     capsys.readouterr()
-    assert data.main(["pull", "me/d", f"--root={tmp_path / 'a'}", "--episodes=0,3-4"]) == 0
+    assert main.main(["pull", "me/d", f"--root={tmp_path / 'a'}", "--episodes=0,3-4"]) == 0
     said = capsys.readouterr().out
     assert "3 episodes of 6: 0,3-4" in said
     assert '--dataset.episodes="[0, 3, 4]"' in said
-    assert data.main(["pull", "me/d", f"--root={tmp_path / 'b'}", "--outcome=success", "--min_score=0.3"]) == 0
+    assert main.main(["pull", "me/d", f"--root={tmp_path / 'b'}", "--outcome=success", "--min_score=0.3"]) == 0
     assert "2 episodes of 6: 4-5" in capsys.readouterr().out
-    assert data.main(["pull", "me/d", f"--root={tmp_path / 'c'}", "--outcome=fault"]) == 2
+    assert main.main(["pull", "me/d", f"--root={tmp_path / 'c'}", "--outcome=fault"]) == 2
     assert "No episode of me/d is left after filtering" in capsys.readouterr().err
     assert not [one for one in tmp_path.iterdir() if "c" in one.name]
 
@@ -43,9 +43,9 @@ def test_the_command_that_is_suggested_is_one_that_works(lesson: Path, tmp_path:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     url, target = f"file://{tmp_path}/shelf", tmp_path / "my copy"
-    assert data.main(["push", str(lesson), url, "--no_card"]) == 0
+    assert main.main(["push", str(lesson), url, "--no_card"]) == 0
     capsys.readouterr()
-    assert data.main(["pull", url, f"--root={target}", "--episodes=1,3-4"]) == 0
+    assert main.main(["pull", url, f"--root={target}", "--episodes=1,3-4"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"{target}: 3 episodes of 6: 1,3-4"
     assert "hold all 6. Name yours where you load them" in lines[-2]
@@ -60,14 +60,14 @@ def test_the_command_that_is_suggested_is_one_that_works(lesson: Path, tmp_path:
 
 def test_what_was_compared_by_size_only_is_told(lesson: Path, tmp_path: Path, capsys) -> None:
     url = f"file://{tmp_path}/shelf"
-    assert data.main(["push", str(lesson), url, "--no_card"]) == 0
+    assert main.main(["push", str(lesson), url, "--no_card"]) == 0
     (tmp_path / "shelf" / MANIFEST).unlink()
     pull = ["pull", url, f"--root={tmp_path / 'e'}"]
-    assert data.main(pull) == 0
+    assert main.main(pull) == 0
     assert "by size" not in capsys.readouterr().out
-    assert data.main(pull) == 0
+    assert main.main(pull) == 0
     assert f"compared by size only, because no checksums are listed at {url}; --verify" in capsys.readouterr().out
-    assert data.main([*pull, "--verify"]) == 0
+    assert main.main([*pull, "--verify"]) == 0
     assert "by size" not in capsys.readouterr().out
 
 
@@ -86,7 +86,7 @@ def test_what_was_compared_by_size_only_is_told(lesson: Path, tmp_path: Path, ca
 def test_odd_metadata_end_in_words(hub: HubServer, lesson: Path, tmp_path: Path, capsys, change: tuple) -> None:
     """Whatever lies there, no traceback: an error, or all of it as it is there, and that it is not sound."""
     name, broken = change
-    assert data.main(["push", str(lesson), "me/d", "--no_card"]) == 0
+    assert main.main(["push", str(lesson), "me/d", "--no_card"]) == 0
     files = hub.dataset("me/d").files()
     if isinstance(broken, dict):
         sink = pa.BufferOutputStream()
@@ -96,7 +96,7 @@ def test_odd_metadata_end_in_words(hub: HubServer, lesson: Path, tmp_path: Path,
     for number, select in enumerate(([], ["--episodes=0"], ["--outcome=success"])):
         capsys.readouterr()
         target = tmp_path / f"e{number}"
-        status = data.main(["pull", "me/d", f"--root={target}", *select])
+        status = main.main(["pull", "me/d", f"--root={target}", *select])
         said = capsys.readouterr()
         assert said.err.startswith("error: ") == (status == 2) != target.exists()
         if status != 2:

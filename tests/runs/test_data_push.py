@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 import yaml
 
-from bhd_lerobot.data.card import is_generated
-from bhd_lerobot.data.check_dataset import check_dataset
-from bhd_lerobot.data.inspect import dataset_info
+from bhd_lerobot.datasets.remote.card import is_generated
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import TransferError
-from bhd_lerobot.runs import data
-from bhd_lerobot.runs import record as record_module
-from bhd_lerobot.runs.data_check import limits_of
-from bhd_lerobot.runs.data_transfer import repeat_line
-from bhd_lerobot.runs.eval_statistics import wilson
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.recording import record as record_module
+from bhd_lerobot.cli.data.check import limits_of
+from bhd_lerobot.hub.transfer import repeat_line
+from bhd_lerobot.evaluation.statistics import wilson
 from tests.hub_server.fixtures import content
 from tests.hub_server.server import Fault, HubServer
 from tests.runs.support import options as record_options
@@ -60,11 +60,11 @@ def text_of(hub: HubServer, name: str, path: str = "README.md") -> str:
 
 def test_there_and_back(hub: HubServer, recorded: Path, tmp_path: Path, capsys) -> None:
     before = content(recorded)
-    assert data.main(["push", str(recorded), "me/avoid"]) == 0
+    assert main.main(["push", str(recorded), "me/avoid"]) == 0
     assert "me/avoid: 4 episodes\n  sent" in capsys.readouterr().out
-    assert data.main(["push", str(recorded), "--repo_id=me/avoid"]) == 0
+    assert main.main(["push", str(recorded), "--repo_id=me/avoid"]) == 0
     assert "nothing to send" in capsys.readouterr().out
-    assert data.main(["pull", "me/avoid", f"--root={tmp_path / 'e'}"]) == 0
+    assert main.main(["pull", "me/avoid", f"--root={tmp_path / 'e'}"]) == 0
     assert "fetched" in capsys.readouterr().out
     assert content(recorded) == before
     assert {**content(tmp_path / "e")} == before | {
@@ -72,12 +72,12 @@ def test_there_and_back(hub: HubServer, recorded: Path, tmp_path: Path, capsys) 
     }
     assert not [one for one in check_dataset(tmp_path / "e", limits_of).findings if one.severity.word == "error"]
     # The card came along; to push what was pulled sends nothing.
-    assert data.main(["push", str(tmp_path / "e"), "me/avoid"]) == 0
+    assert main.main(["push", str(tmp_path / "e"), "me/avoid"]) == 0
     assert "nothing to send" in capsys.readouterr().out
 
 
 def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) -> None:
-    assert data.main(["push", str(recorded), "me/avoid", "--tags=roaming,small", "--licence=mit"]) == 0
+    assert main.main(["push", str(recorded), "me/avoid", "--tags=roaming,small", "--licence=mit"]) == 0
     card = text_of(hub, "me/avoid")
     assert is_generated(card)
     front = yaml.safe_load(card.split("---\n")[1])
@@ -113,29 +113,29 @@ def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) ->
 def test_pictures_of_cameras_and_of_curves(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
     films = make_dataset(tmp_path / "films", episodes=2, camera=True)
     for root, said in ((films, "as `observation.images.front` saw it"), (lesson, "what was observed, and the actions")):
-        assert data.main(["push", str(root), f"me/{root.name}"]) == 0
+        assert main.main(["push", str(root), f"me/{root.name}"]) == 0
         assert said in text_of(hub, f"me/{root.name}")
         assert hub.dataset(f"me/{root.name}").files()["preview.png"].content.startswith(b"\x89PNG")
 
 
 def test_an_edited_card_is_kept_and_that_is_said(hub: HubServer, lesson: Path, capsys) -> None:
-    assert data.main(["push", str(lesson), "me/d"]) == 0
+    assert main.main(["push", str(lesson), "me/d"]) == 0
     card = hub.dataset("me/d").files()["README.md"]
     card.content = card.content.replace(b"# d", b"# A fine dataset")
-    assert data.main(["push", str(lesson), "me/d"]) == 0
+    assert main.main(["push", str(lesson), "me/d"]) == 0
     assert "README.md was edited by somebody and is left as it is; --replace_card" in capsys.readouterr().out
     assert "# A fine dataset" in text_of(hub, "me/d")
-    assert data.main(["push", str(lesson), "me/d", "--replace-card"]) == 0
+    assert main.main(["push", str(lesson), "me/d", "--replace-card"]) == 0
     assert "# A fine dataset" not in text_of(hub, "me/d")
 
 
 def test_a_url(recorded: Path, tmp_path: Path, capsys) -> None:
     url = f"file://{tmp_path}/shelf/avoid"
-    assert data.main(["push", str(recorded), url]) == 0
+    assert main.main(["push", str(recorded), url]) == 0
     assert f"bhd-data pull {url} --root=data/here" in (tmp_path / "shelf/avoid/README.md").read_text()
-    assert data.main(["push", str(recorded), url]) == 0
+    assert main.main(["push", str(recorded), url]) == 0
     assert "nothing to send" in capsys.readouterr().out
-    assert data.main(["pull", url, f"--root={tmp_path / 'e'}"]) == 0
+    assert main.main(["pull", url, f"--root={tmp_path / 'e'}"]) == 0
     assert content(tmp_path / "e").items() >= content(recorded).items()
 
 
@@ -182,7 +182,7 @@ def test_a_url(recorded: Path, tmp_path: Path, capsys) -> None:
 )
 @pytest.mark.usefixtures("hub")
 def test_bad_arguments(lesson: Path, empty: Path, capsys, arguments: list[str], words: str) -> None:
-    assert data.main([str(lesson) if one == "ROOT" else one for one in arguments]) == 2
+    assert main.main([str(lesson) if one == "ROOT" else one for one in arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert words in error
@@ -192,19 +192,19 @@ def test_bad_arguments(lesson: Path, empty: Path, capsys, arguments: list[str], 
 
 def test_a_failure_says_what_is_kept_and_how_to_repeat(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
     hub.expired.add("hf_me")
-    assert data.main(["push", str(lesson), "me/d", "--branch=b", "--private", "--tags=a b,c"]) == 2
+    assert main.main(["push", str(lesson), "me/d", "--branch=b", "--private", "--tags=a b,c"]) == 2
     error = capsys.readouterr().err
     assert f"The dataset at {lesson} is unchanged" in error
     command = error.strip().splitlines()[-1].strip()
     hub.expired.clear()
-    assert data.main(shlex.split(command)[1:]) == 0  # as printed
+    assert main.main(shlex.split(command)[1:]) == 0  # as printed
     assert hub.dataset("me/d").private
     assert "meta/info.json" in hub.dataset("me/d").files("b")
     hub.expired.add("hf_me")
-    assert data.main(["pull", "me/d", f"--root={tmp_path / 'my e'}", "--revision=b", "--episodes=1"]) == 2
+    assert main.main(["pull", "me/d", f"--root={tmp_path / 'my e'}", "--revision=b", "--episodes=1"]) == 2
     command = capsys.readouterr().err.strip().splitlines()[-1].strip()
     hub.expired.clear()
-    assert data.main(shlex.split(command)[1:]) == 0
+    assert main.main(shlex.split(command)[1:]) == 0
     assert (tmp_path / "my e" / "meta/info.json").is_file()
 
 
@@ -212,7 +212,7 @@ def test_ctrl_c_ends_a_stalled_upload_at_once(hub: HubServer, lesson: Path) -> N
     gate = threading.Event()
     hub.faults = [Fault("^PUT", times=-1, wait=gate)]
     environment = {**os.environ, "HF_HUB_DISABLE_XET": "1"}
-    command = [sys.executable, "-m", "bhd_lerobot.runs.data", "push", str(lesson), "me/d", "--no-card"]
+    command = [sys.executable, "-m", "bhd_lerobot.cli.data.main", "push", str(lesson), "me/d", "--no-card"]
     process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
     try:
         until(lambda: hub.asked("^PUT"))
@@ -257,8 +257,8 @@ def test_recording_does_not_begin_what_cannot_be_uploaded(hub: HubServer, tmp_pa
 
 
 def test_training_on_what_was_pulled_begins_with_the_same_loss(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
-    assert data.main(["push", str(lesson), "me/d"]) == 0
-    assert data.main(["pull", "me/d", f"--root={tmp_path / 'pulled'}"]) == 0
+    assert main.main(["push", str(lesson), "me/d"]) == 0
+    assert main.main(["pull", "me/d", f"--root={tmp_path / 'pulled'}"]) == 0
     short = {"steps": 2, "log_freq": 1, "save_freq": 0, "save_checkpoint": "false"}
     run_train(train_options(lesson, tmp_path / "one", MLP, **short))
     run_train(train_options(tmp_path / "pulled", tmp_path / "two", MLP, **short))
@@ -294,7 +294,7 @@ def test_streaming_gives_the_same_samples(hub: HubServer, recorded: Path, monkey
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 
-    assert data.main(["push", str(recorded), "me/avoid"]) == 0
+    assert main.main(["push", str(recorded), "me/avoid"]) == 0
     monkeypatch.setattr(datasets.config, "HF_ENDPOINT", hub.url)
     monkeypatch.setattr(datasets.config, "HF_HUB_OFFLINE", False)
     deltas = {"action": [0.0, 0.1, 0.2]}
@@ -316,20 +316,20 @@ def test_streaming_gives_the_same_samples(hub: HubServer, recorded: Path, monkey
 def test_a_name_that_looks_like_a_folder_is_told(hub: HubServer, lesson: Path, empty: Path, capsys) -> None:
     """`store/c3` may be meant as the folder beside this one; nothing in its form says which."""
     (empty / "store").mkdir()
-    assert data.main(["push", str(lesson), "store/c3"]) == 2
+    assert main.main(["push", str(lesson), "store/c3"]) == 2
     error = capsys.readouterr().err
     assert f"store/c3 is taken for a name on the Hub. The folder here would be file://{empty}/store/c3\n" in error
     assert "no permission" in error
-    assert data.main(["push", str(lesson), f"file://{empty}/store/c3"]) == 0
-    assert data.main(["pull", "store/c3", "--root=x"]) == 2
+    assert main.main(["push", str(lesson), f"file://{empty}/store/c3"]) == 0
+    assert main.main(["pull", "store/c3", "--root=x"]) == 2
     assert "is taken for a name on the Hub" in capsys.readouterr().err
     shutil.copytree(lesson, empty / "me" / "d")
-    assert data.main(["push", "me/d", "me/d"]) == 0  # the dataset itself: nobody means to copy it onto itself
+    assert main.main(["push", "me/d", "me/d"]) == 0  # the dataset itself: nobody means to copy it onto itself
     assert "is taken for" not in capsys.readouterr().err
 
 
 def test_the_command_to_repeat_says_all_that_was_asked_for(tmp_path: Path) -> None:
-    parser = data._parser()
+    parser = main._parser()
     for words in (
         "push A me/d --branch=b --tag=t --private --tags=a,b --licence=mit --no-card --replace-card --replace",
         "push --root=A --repo_id=me/d --public",
@@ -355,13 +355,13 @@ def test_the_command_to_repeat_says_all_that_was_asked_for(tmp_path: Path) -> No
 def test_a_picture_of_the_users_is_on_the_card(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
     mine = Path(shutil.copytree(lesson, tmp_path / "d"))
     (mine / "preview.png").write_bytes(b"mine")
-    assert data.main(["push", str(mine), "me/d"]) == 0
+    assert main.main(["push", str(mine), "me/d"]) == 0
     assert hub.dataset("me/d").files()["preview.png"].content == b"mine"
     assert "![A picture of the dataset](preview.png)" in text_of(hub, "me/d")
     (mine / "preview.png").unlink()
     hub.dataset("me/d").files().pop("README.md")
     capsys.readouterr()
-    assert data.main(["push", str(mine), "me/d"]) == 0
+    assert main.main(["push", str(mine), "me/d"]) == 0
     assert "its preview.png was put there by somebody and is left as it is; --replace_card" in capsys.readouterr().out
-    assert data.main(["push", str(mine), "me/d", "--replace_card"]) == 0
+    assert main.main(["push", str(mine), "me/d", "--replace_card"]) == 0
     assert hub.dataset("me/d").files()["preview.png"].content.startswith(b"\x89PNG")

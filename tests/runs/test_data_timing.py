@@ -10,12 +10,13 @@ from PIL import Image
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
-from bhd_lerobot.data import features as keys
-from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.runs import data, timing_report
-from bhd_lerobot.runs.timing_plots import draw_timing
-from bhd_lerobot.runs.timing_tables import fitting, ms, ticks
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.datasets.timing import report as timing_report
+from bhd_lerobot.datasets.timing.plots import draw_timing
+from bhd_lerobot.datasets.timing.tables import fitting, ms, ticks
 from tests.runs.support import data_columns, run_record
 
 RATES = Rates(500, 500, 25)
@@ -132,7 +133,7 @@ def test_limits_that_differ_are_not_shown_as_one(measured):
 def test_the_tables_hold_what_was_measured(measured, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "170")
     picture = tmp_path / "new" / "t.png"
-    assert data.main(["timing", str(measured), "--output", str(picture)]) == 0
+    assert main.main(["timing", str(measured), "--output", str(picture)]) == 0
     text = capsys.readouterr().out
     for part in ("wall clock", "3600 run", "6 of 180 (3.3%)", "max 1.50 ms", "tolerated 1.00 ms", "9 frames or states"):
         assert part in text
@@ -145,7 +146,7 @@ def test_the_tables_hold_what_was_measured(measured, tmp_path, capsys, monkeypat
 @pytest.mark.parametrize("width", [20, 80, 100, 170])
 def test_a_narrow_terminal_gets_fewer_columns_and_none_cut_off(measured, tmp_path, capsys, monkeypatch, width):
     monkeypatch.setenv("COLUMNS", str(width))
-    assert data.main(["timing", str(measured), "--output", str(tmp_path / "t.svg")]) == 0
+    assert main.main(["timing", str(measured), "--output", str(tmp_path / "t.svg")]) == 0
     text = capsys.readouterr().out
     assert max(map(len, text.splitlines())) <= max(width, len(str(tmp_path)) + 20)
     assert ("inference [ms]" in text) == (width >= 170)
@@ -156,7 +157,7 @@ def test_a_narrow_terminal_gets_fewer_columns_and_none_cut_off(measured, tmp_pat
 def test_one_episode(measured, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
-    assert data.main(["timing", str(measured), "--episode", "1"]) == 0
+    assert main.main(["timing", str(measured), "--episode", "1"]) == 0
     text = capsys.readouterr().out
     assert "episode 1" in text
     assert "2 of 60" in text
@@ -165,7 +166,7 @@ def test_one_episode(measured, tmp_path, capsys, monkeypatch):
 
 def test_json_holds_everything_and_draws_only_if_asked(measured, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert data.main(["timing", str(measured), "--json"]) == 0
+    assert main.main(["timing", str(measured), "--json"]) == 0
     values = json.loads(capsys.readouterr().out)
     assert [one["index"] for one in values["episodes"]] == [0, 1, 2]
     assert values["clock"] == "realtime"
@@ -173,14 +174,14 @@ def test_json_holds_everything_and_draws_only_if_asked(measured, tmp_path, capsy
     assert values["episodes"][1]["realtime"] == GRANTS
     assert values["episodes"][0]["interval"]["max"] == pytest.approx(1 / RATES.fps)
     assert list(tmp_path.iterdir()) == []
-    assert data.main(["timing", str(measured), "--json", "--output", "t.pdf"]) == 0
+    assert main.main(["timing", str(measured), "--json", "--output", "t.pdf"]) == 0
     json.loads(capsys.readouterr().out)
     assert (tmp_path / "t.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_a_simulated_recording_says_so(simulated, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
-    assert data.main(["timing", str(simulated), "--output", str(tmp_path / "t.png")]) == 0
+    assert main.main(["timing", str(simulated), "--output", str(tmp_path / "t.png")]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "Time was simulated" in text
     assert "frame interval" in text
@@ -192,11 +193,11 @@ def test_a_simulated_recording_says_so(simulated, tmp_path, capsys, monkeypatch)
 def test_info_tells_the_timing_where_there_is_room(measured, simulated, capsys, monkeypatch):
     for width, seen in ((80, ("late frames", "skipped")), (170, ("late frames", "late p99", "drops", "age max"))):
         monkeypatch.setenv("COLUMNS", str(width))
-        assert data.main(["info", str(measured)]) == 0
+        assert main.main(["info", str(measured)]) == 0
         text = capsys.readouterr().out
         assert "wall-clock time: 6 of 180 frames" in text
         assert all(part in text for part in seen)
-    assert data.main(["info", str(simulated)]) == 0
+    assert main.main(["info", str(simulated)]) == 0
     assert "simulated time" in capsys.readouterr().out
 
 
@@ -211,9 +212,9 @@ def test_a_dataset_from_before_these_columns_loads(tmp_path, capsys, monkeypatch
     features = {k: v for k, v in FEATURES.items() if k not in (keys.SKIPPED, keys.INFERENCE_TIME, keys.LATE)}
     columns[keys.LATENESS][:] = 0
     save(tmp_path / "old", [(columns, {"timing": json.dumps(old)})], features)
-    assert data.main(["info", str(tmp_path / "old")]) == 0
+    assert main.main(["info", str(tmp_path / "old")]) == 0
     assert "late frames" in capsys.readouterr().out
-    assert data.main(["timing", str(tmp_path / "old"), "--json"]) == 0
+    assert main.main(["timing", str(tmp_path / "old"), "--json"]) == 0
     values = json.loads(capsys.readouterr().out)
     assert (values["clock"], values["all"]["frames"], values["all"]["late_frames"]) == ("lockstep", FRAMES, 0)
 
@@ -237,9 +238,9 @@ def test_what_holds_no_timing_is_named(tmp_path, metadata, words):
 def test_a_dataset_of_another_program(tmp_path, capsys):
     feature = {"x": {"dtype": "float32", "shape": (1,), "names": None}}
     save(tmp_path / "d", [({"x": np.zeros(5, np.float32)}, {})], feature)
-    assert data.main(["info", str(tmp_path / "d")]) == 0
+    assert main.main(["info", str(tmp_path / "d")]) == 0
     capsys.readouterr()
-    assert data.main(["timing", str(tmp_path / "d")]) == 2
+    assert main.main(["timing", str(tmp_path / "d")]) == 2
     assert "another program recorded it" in capsys.readouterr().err
 
 
@@ -260,12 +261,12 @@ def test_bad_arguments_are_named_and_nothing_is_written(measured, tmp_path, caps
         ([str(measured), "--output", "t.txt"], ".png, .pdf, .svg"),
         ([str(measured), "--output", "file/t.png"], "cannot be written"),
     ):
-        assert data.main(["timing", *arguments]) == 2
+        assert main.main(["timing", *arguments]) == 2
         assert words in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
     for arguments in ([], ["d", "--episode", "one"]):
         with pytest.raises(SystemExit) as stop:
-            data.main(["timing", *arguments])
+            main.main(["timing", *arguments])
         assert stop.value.code == 2
 
 

@@ -9,28 +9,29 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.policies.contract import PolicyContract
-from bhd_lerobot.runs import demo, demo_lessons
-from bhd_lerobot.runs.config_eval import EvalConfig
-from bhd_lerobot.runs.config_record import RecordConfig
-from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.signals import StopRequest
-from bhd_lerobot.runs.train_arguments import parse_train
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.apps.demo import demo
+from bhd_lerobot.apps.demo import lessons
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.rollout.signals import StopRequest
+from bhd_lerobot.training.arguments import parse_train
 
 SMALL = {"episodes": 2, "steps": 4, "trials": 2, "film": False}  # films are the slowest part, and tested elsewhere
 AVOID = replace(
-    demo_lessons.AVOID,
+    lessons.AVOID,
     **SMALL,
     world=("--robot.type=turtlebot3", "--robot.beams=36", "--task.type=avoid", "--task.duration_s=2", "--threads=1"),
 )
 REACH = replace(
-    demo_lessons.REACH,
+    lessons.REACH,
     **SMALL,
     early_steps=2,
-    world=(*demo_lessons.REACH.world, "--threads=1"),
+    world=(*lessons.REACH.world, "--threads=1"),
 )
-PICK = replace(demo_lessons.PICK, episodes=1, film=False, options=("--threads=1",))
+PICK = replace(lessons.PICK, episodes=1, film=False, options=("--threads=1",))
 
 
 @pytest.fixture
@@ -163,7 +164,7 @@ def test_a_failure_in_a_step_gives_its_message_and_status_2(small, tmp_path, mon
     assert "max_objects" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("one", demo_lessons.LESSONS, ids=lambda one: one.name)
+@pytest.mark.parametrize("one", lessons.LESSONS, ids=lambda one: one.name)
 def test_whole_size_command_lines_are_valid(one, tmp_path):
     recorded = parse(RecordConfig, one.recorded(tmp_path))
     assert recorded.dataset.num_episodes == one.episodes

@@ -16,10 +16,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.privileges import GRANT_BANDWIDTH, RealtimeSettings
-from bhd_lerobot.runs import doctor, doctor_checks, doctor_child, wakeup
-from bhd_lerobot.runs.doctor_child import Outcome, run_child
-from bhd_lerobot.runs.doctor_findings import COMPLAINTS, Finding, Status, complain, markdown_table
+from bhd_lerobot.realtime.privileges import GRANT_BANDWIDTH, RealtimeSettings
+from bhd_lerobot.apps.doctor import doctor
+from bhd_lerobot.apps.doctor import checks as doctor_checks
+from bhd_lerobot.apps.doctor import child as doctor_child
+from bhd_lerobot.apps.doctor import latency_test
+from bhd_lerobot.apps.doctor.child import Outcome, run_child
+from bhd_lerobot.apps.doctor.findings import COMPLAINTS, Finding, Status, complain, markdown_table
 
 ROOT = Path(__file__).resolve().parents[2]
 GIB = 2**30
@@ -46,8 +49,8 @@ def grants(**refused: str) -> Outcome:
 
 
 def wakeups(p99: float) -> Outcome:
-    histogram = (1000, *[0] * len(wakeup.BINS_US))
-    return value((wakeup.WakeUps(1000, 1000, 0, p99 / 2, p99, 2 * p99, histogram), grants().value))
+    histogram = (1000, *[0] * len(latency_test.BINS_US))
+    return value((latency_test.WakeUps(1000, 1000, 0, p99 / 2, p99, 2 * p99, histogram), grants().value))
 
 
 PLUGINS = value({"robots": ["so101", "turtlebot3", "ur5"], "teleoperators": ["bhd_brain"]})
@@ -60,7 +63,7 @@ VIDEO = value({"bytes": 3000, "pyav": "15.1.0", "libavcodec": "61.19.101", "shar
 
 TRIALS = """
 import os, signal, sys
-from bhd_lerobot.control.privileges import RealtimeSettings
+from bhd_lerobot.realtime.privileges import RealtimeSettings
 from bhd_lerobot.runs import wakeup
 
 def noisy():
@@ -174,7 +177,7 @@ PERIOD = 1_000_000
 def walk(points: int, delays: list[int]) -> tuple[np.ndarray, VirtualTime]:
     lateness = np.zeros(points, np.int64)
     virtual = VirtualTime(delays)
-    woken = wakeup.walk_grid(lateness, PERIOD, virtual.clock, virtual.sleep)
+    woken = latency_test.walk_grid(lateness, PERIOD, virtual.clock, virtual.sleep)
     return lateness[:woken], virtual
 
 
@@ -197,7 +200,7 @@ def test_what_is_late_is_skipped_and_the_phase_is_kept(delays: list[int]) -> Non
         point += 1 + int(late) // PERIOD
     np.testing.assert_array_equal(woken - lateness, start + np.array(due) * PERIOD)
     np.testing.assert_array_equal(lateness[: len(delays)], delays[: len(lateness)])
-    summary = wakeup.summarise(lateness, 1000, points)
+    summary = latency_test.summarise(lateness, 1000, points)
     assert summary.missed == points - len(lateness)
     assert sum(summary.histogram) + summary.missed == points
 
@@ -210,10 +213,10 @@ def test_an_oversleep_of_three_and_a_half_periods_misses_three_points() -> None:
 
 def test_the_summary_counts_in_bins_and_takes_quantiles() -> None:
     lateness = np.array([5_000] * 98 + [10_000, 10_001])
-    summary = wakeup.summarise(lateness, 1000, 100)
+    summary = latency_test.summarise(lateness, 1000, 100)
     assert summary.histogram == (99, 1, *[0] * 9)
     assert (summary.p50, summary.p99, summary.max) == pytest.approx((5e-6, 10e-6, 10.001e-6))
-    assert wakeup.summarise(np.array([11_000_000]), 1000, 1).histogram[-1] == 1
+    assert latency_test.summarise(np.array([11_000_000]), 1000, 1).histogram[-1] == 1
 
 
 # --- a sound machine -------------------------------------------------------------------------------------------------
@@ -410,7 +413,7 @@ def test_the_documentation_has_the_same_table() -> None:
     text = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     begin, end = text.index("<!-- doctor: begin"), text.index("<!-- doctor: end -->")
     table = text[text.index("\n", begin) + 1 : end]
-    assert table == markdown_table(), "paste what bhd_lerobot.runs.doctor_findings.markdown_table() returns"
+    assert table == markdown_table(), "paste what bhd_lerobot.apps.doctor.findings.markdown_table() returns"
     assert all(line.count(" | ") == 4 for line in table.splitlines()[2:])
 
 

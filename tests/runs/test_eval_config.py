@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.avoidance import AvoidanceConfig
-from bhd_lerobot.policies.gap_follower import GapFollowerConfig
-from bhd_lerobot.runs.config_eval import EvalConfig
-from bhd_lerobot.runs.configuration import describe, encode, parse
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.rollout.configuration import describe, encode, parse
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "eval").glob("*.yaml"))
 BASE = ["--robot.type=turtlebot3", "--task.type=avoid"]

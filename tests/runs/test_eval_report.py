@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.arenas import make_arena
-from bhd_lerobot.runs import eval_plots, eval_run
-from bhd_lerobot.runs.eval_metrics import EpisodeMetrics
-from bhd_lerobot.runs.eval_plots import OUTCOMES, telling_episodes
-from bhd_lerobot.runs.eval_results import summarise, write_json
-from bhd_lerobot.runs.eval_statistics import Estimate
-from bhd_lerobot.runs.eval_text import number, percent, sentences
-from bhd_lerobot.runs.plots import Trajectory
+from bhd_lerobot.evaluation import plots
+from bhd_lerobot.evaluation import run
+from bhd_lerobot.evaluation.metrics import EpisodeMetrics
+from bhd_lerobot.evaluation.plots import OUTCOMES, telling_episodes
+from bhd_lerobot.evaluation.results import summarise, write_json
+from bhd_lerobot.evaluation.statistics import Estimate
+from bhd_lerobot.evaluation.text import number, percent, sentences
+from bhd_lerobot.rollout.plots import Trajectory
 from bhd_lerobot.tasks.task import Event
 from tests.runs.test_evaluate import FAILING, run_eval
 
@@ -109,14 +110,14 @@ def test_films_are_h264_in_the_page_or_the_page_says_why_there_are_none(page):
     by_brain = {label: [one for one in films if one.name.startswith(label)] for label in result.results.brains}
     for label, one in result.results.brains.items():
         failed = one.episodes - one.successes
-        assert len(by_brain[label]) == (min(failed, eval_run.FILMS) or 1)
+        assert len(by_brain[label]) == (min(failed, run.FILMS) or 1)
     with av.open(str(films[0])) as container:
         assert container.streams.video[0].codec_context.name == "h264"
     assert text.count("<video") == len(films) == text.count('poster="data:image/jpeg')
 
 
 def test_films_that_are_too_large_stay_beside_the_page(tmp_path, monkeypatch):
-    monkeypatch.setattr("bhd_lerobot.runs.eval_report.FILM_BYTES", 10)
+    monkeypatch.setattr("bhd_lerobot.evaluation.report.FILM_BYTES", 10)
     result, _ = run_eval(tmp_path, only="[old]", videos=None, n_episodes=1)
     text = result.report.read_text()
     assert "<video" not in text
@@ -131,7 +132,7 @@ def test_a_brain_without_a_rival_has_no_paired_section(tmp_path):
 
 
 def test_labels_and_problems_are_text_not_markup(tmp_path, monkeypatch):
-    monkeypatch.setattr("bhd_lerobot.runs.eval_run.measure", _with_problem(eval_run.measure))
+    monkeypatch.setattr("bhd_lerobot.evaluation.run.measure", _with_problem(run.measure))
     result, _ = run_eval(tmp_path, only="[old]", n_episodes=2, task__min_path_m=100)
     text = result.report.read_text()
     assert "<b>no</b> cup &" not in text
@@ -191,4 +192,4 @@ def test_infinity_and_nan_become_null_in_json(tmp_path):
 
 def test_charts_are_the_same_bytes_twice():
     brains = summarise({}, {}, {"a": [metrics("a", n, n / 9) for n in range(9)]}, 9, "a").brains
-    assert eval_plots.forest(brains, "a") == eval_plots.forest(brains, "a")
+    assert plots.forest(brains, "a") == plots.forest(brains, "a")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from bhd_lerobot.runs.eval_statistics import (
+from bhd_lerobot.evaluation.statistics import (
     discordance,
     mean,
     mean_difference,

@@ -11,14 +11,14 @@ import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 
-from bhd_lerobot.data.inspect import dataset_info
+from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import BhdError, ConfigError
-from bhd_lerobot.policies.avoidance import AvoidanceBrain
-from bhd_lerobot.policies.gap_follower import GapFollowerBrain
-from bhd_lerobot.runs import evaluate as evaluate_module
-from bhd_lerobot.runs.config_eval import EvalConfig
-from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.evaluate import EvalResult, evaluate, main
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
+from bhd_lerobot.evaluation import evaluate as evaluate_module
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate, main
 from bhd_lerobot.tasks.task import episode_seed
 from tests.runs.support import run_record
 
@@ -154,7 +154,7 @@ def test_runs_are_recorded_as_a_dataset_for_each_brain(whole, tmp_path):
 
 
 def test_a_failed_episode_is_run_again_by_the_command_in_the_report(whole, tmp_path):
-    from bhd_lerobot.runs.eval_report import replay_command
+    from bhd_lerobot.evaluation.report import replay_command
 
     config = parse(EvalConfig, [f"--config_path={whole[0] / 'config.yaml'}"])
     failed = next(one for one in whole[1].results.episodes if not one.success)

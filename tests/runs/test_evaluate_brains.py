@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.contract import PolicyContract
+from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from tests.runs.test_evaluate import FAILING, results, run_eval
 

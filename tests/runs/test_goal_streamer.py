@@ -9,14 +9,14 @@ import pytest
 
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.language_brain import LanguageBrainConfig
-from bhd_lerobot.policies.pick import PickBrainConfig
-from bhd_lerobot.policies.reach import ReachBrainConfig
+from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
+from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
+from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5 import UR5
-from bhd_lerobot.runs.bhd_brain import BhdBrain
-from bhd_lerobot.runs.config_bhd_brain import BhdBrainConfig
-from bhd_lerobot.runs.goal_streamer import GoalStreamer
+from bhd_lerobot.teleoperators.bhd_brain import BhdBrain
+from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
+from bhd_lerobot.teleoperators.goal_streamer import GoalStreamer
 
 CONFIG = UR5Config()
 ARM, RATES = CONFIG.body(), CONFIG.rates

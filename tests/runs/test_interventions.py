@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.data import features as keys
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.baselines import NoopConfig, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Goals, Mixed, Observation
-from bhd_lerobot.policies.corrected import CorrectedBrain, CorrectedConfig
-from bhd_lerobot.policies.gap_follower import GapFollowerBrain, GapFollowerConfig
-from bhd_lerobot.policies.pick import PickBrainConfig
-from bhd_lerobot.policies.reach import ReachBrain, ReachBrainConfig
+from bhd_lerobot.policies.dagger.brain import CorrectedBrain, CorrectedConfig
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
+from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.runs.drivers import DriverLog, flagged, spans
-from bhd_lerobot.runs.episode import EpisodeLoop
-from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
-from bhd_lerobot.runs.registry import make_brain, make_simulation, make_task
-from bhd_lerobot.runs.replay import Replay
+from bhd_lerobot.rollout.drivers import DriverLog, flagged, spans
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.rollout.registry import make_brain, make_simulation, make_task
+from bhd_lerobot.rollout.replay import Replay
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.pick import PickConfig
 from bhd_lerobot.tasks.reach import ReachConfig
@@ -229,7 +229,7 @@ def test_the_dataset_is_the_same_for_any_number_of_simulations_and_replays_bit_e
 def test_training_finds_the_flagged_frames(tmp_path: Path) -> None:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-    from bhd_lerobot.data.selection import intervention_weights
+    from bhd_lerobot.datasets.loader.selection import intervention_weights
 
     root = tmp_path / "d"
     run_record(root, **AVOID, brain__patience_s=1, dataset__num_episodes=2)

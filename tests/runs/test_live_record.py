@@ -18,14 +18,14 @@ import pytest
 from rich.console import Console
 
 from bhd_lerobot.control.messages import Mode
-from bhd_lerobot.control.shared_block import names, sweep
-from bhd_lerobot.data.inspect import dataset_info
-from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.realtime.shared_memory import names, sweep
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, RealtimeError
-from bhd_lerobot.runs.config_record import RecordConfig
-from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.record import record
-from bhd_lerobot.runs.record_report import ESTOP_STATUS, RecordResult
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.recording.record import record
+from bhd_lerobot.recording.report import ESTOP_STATUS, RecordResult
 from bhd_lerobot.tasks.avoid import AvoidTask
 from bhd_lerobot.tasks.task import Event
 from tests.robots.live_support import is_alive, is_gone, unique
@@ -150,7 +150,7 @@ class Program:
 _MAIN = """
 import fcntl, sys, termios
 fcntl.ioctl(0, termios.TIOCSCTTY)
-from bhd_lerobot.runs.record import main
+from bhd_lerobot.recording.record import main
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -16,14 +16,14 @@ from lerobot.utils import visualization_utils as helpers
 from rich.console import Console
 
 from bhd_lerobot.control.messages import Mode
-from bhd_lerobot.data import features as keys
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.simulation import Simulation
-from bhd_lerobot.runs import live_view as module
-from bhd_lerobot.runs.config_record import RecordConfig
-from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.live_view import PACKAGES, LiveView, check_options, live_view, points
-from bhd_lerobot.runs.registry import make_simulation
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.recording import live_view as module
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.recording.live_view import PACKAGES, LiveView, check_options, live_view, points
+from bhd_lerobot.rollout.registry import make_simulation
 from tests.runs.support import data_columns, options, run_record
 
 
@@ -184,7 +184,7 @@ def test_a_viewer_that_goes_away_keeps_nobody_from_ending(tmp_path: Path) -> Non
     program = (
         "import socket\n"
         "from bhd_lerobot.runs import live_view\n"
-        "from bhd_lerobot.runs.record import main\n"
+        "from bhd_lerobot.recording.record import main\n"
         "live_view._END_S = 0.5\n"
         "server = socket.create_server(('127.0.0.1', 0))\n"
         "start = live_view.RerunExtras.__init__\n"
@@ -290,7 +290,7 @@ def test_a_recording_is_the_same_with_and_without_a_view(sent: Helpers, tmp_path
 def test_rerun_is_not_imported_unless_it_is_wanted(tmp_path: Path) -> None:
     program = (
         "import sys\n"
-        "from bhd_lerobot.runs.record import main\n"
+        "from bhd_lerobot.recording.record import main\n"
         f"assert main({options(tmp_path / 'd', dataset__num_episodes=1, dataset__episode_time_s=1)!r}) == 0\n"
         "print(sorted({'rerun', 'foxglove'} & set(sys.modules)))\n"
     )

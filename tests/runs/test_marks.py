@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bhd_lerobot.data import features as keys
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.runs.episode import EpisodeLoop
-from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
-from bhd_lerobot.runs.marks import Marks
-from bhd_lerobot.runs.registry import make_simulation, make_task
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.rollout.registry import make_simulation, make_task
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.task import OUTCOMES, Event
 
@@ -124,11 +124,11 @@ def test_in_the_loop_an_intervention_flags_its_frames() -> None:
 
 def test_keys_of_a_terminal_reach_a_recording(tmp_path: Path) -> None:
     """`s` in a terminal ends an episode on the wall clock, minutes before its time is up."""
-    from bhd_lerobot.data.inspect import dataset_info
+    from bhd_lerobot.datasets.format.summary import dataset_info
 
     ours, theirs = pty.openpty()
     code = "import os, sys; os.setsid(); import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); " + (
-        "from bhd_lerobot.runs.record import main; sys.exit(main())"
+        "from bhd_lerobot.recording.record import main; sys.exit(main())"
     )
     root = Path(__file__).resolve().parents[2]
     arguments = [

@@ -16,22 +16,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bhd_lerobot.control import shared_block
+from bhd_lerobot.realtime import shared_memory
 from bhd_lerobot.control.commands import Feedback, GoalPhase
-from bhd_lerobot.control.frame_log import FrameLog
-from bhd_lerobot.control.goal_codec import encode_feedback
-from bhd_lerobot.control.live_block import LiveBlock, LiveLayout, Phase, Word
+from bhd_lerobot.realtime.frame_log import FrameLog
+from bhd_lerobot.control.motion.goal_codec import encode_feedback
+from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Phase, Word
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
-from bhd_lerobot.control.shared_block import SharedBlock, names
+from bhd_lerobot.realtime.shared_memory import SharedBlock, names
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
-from bhd_lerobot.robots.live_state import LIMITS, WATCHDOGS, state_dtype
-from bhd_lerobot.runs import monitor
-from bhd_lerobot.runs.config_record import RecordConfig
-from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.monitor import Keys, find, main, watch
-from bhd_lerobot.runs.monitor_state import CELLS, DECADES, Count, Sampler, cells
-from bhd_lerobot.runs.registry import make_simulation
+from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS, state_dtype
+from bhd_lerobot.apps.monitor import monitor
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.apps.monitor.monitor import Keys, find, main, watch
+from bhd_lerobot.apps.monitor.state import CELLS, DECADES, Count, Sampler, cells
+from bhd_lerobot.rollout.registry import make_simulation
 from tests.runs.support import options
 from tests.waiting import until
 
@@ -149,20 +149,20 @@ def test_who_watches_does_not_hold_the_name() -> None:
 
 
 def files(name: str) -> list[Path]:
-    return list(shared_block.FOLDER.glob(f"{shared_block.PREFIX}{name}.*"))
+    return list(shared_memory.FOLDER.glob(f"{shared_memory.PREFIX}{name}.*"))
 
 
 def test_what_nobody_holds_any_more_is_not_watched() -> None:
     name = f"{NAME}-dead"
     code = (
-        "import os; from bhd_lerobot.control.shared_block import SharedBlock\n"
+        "import os; from bhd_lerobot.realtime.shared_memory import SharedBlock\n"
         f"SharedBlock.create({name!r}, {{'words': 512}}, {{}}); os._exit(9)"
     )
     subprocess.run([sys.executable, "-c", code], check=False)
     assert files(name)
     with pytest.raises(RealtimeError, match="nobody holds it any more"):
         SharedBlock.watch(name)
-    shared_block.sweep()
+    shared_memory.sweep()
     assert not files(name)
 
 
@@ -425,7 +425,7 @@ def test_watching_shows_until_the_user_leaves(robot: Robot) -> None:
 # It is to be its controlling terminal, in whose foreground it is.
 LOGIN = (
     "import os, sys; os.login_tty(int(sys.argv[1]))\n"
-    "from bhd_lerobot.runs.monitor import main; sys.exit(main(sys.argv[2:]))"
+    "from bhd_lerobot.apps.monitor.monitor import main; sys.exit(main(sys.argv[2:]))"
 )
 
 
@@ -511,6 +511,6 @@ def test_a_stop_does_not_wait_for_a_picture() -> None:
 
 
 def test_it_starts_fast_because_it_imports_little() -> None:
-    code = "import sys, bhd_lerobot.runs.monitor; print(*sorted({'torch', 'lerobot', 'mujoco'} & set(sys.modules)))"
+    code = "import sys, bhd_lerobot.apps.monitor.monitor; print(*sorted({'torch', 'lerobot', 'mujoco'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []

@@ -9,10 +9,10 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
-from bhd_lerobot.robots.live_state import LIMITS, WATCHDOGS
-from bhd_lerobot.runs import monitor_state
-from bhd_lerobot.runs.monitor_state import CELLS, DECADES, Count, Dimension, MonitorState, Spread
-from bhd_lerobot.runs.monitor_view import KEYS, bars, duration, one_line, render, unit
+from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS
+from bhd_lerobot.apps.monitor import state as monitor_state
+from bhd_lerobot.apps.monitor.state import CELLS, DECADES, Count, Dimension, MonitorState, Spread
+from bhd_lerobot.apps.monitor.view import KEYS, bars, duration, one_line, render, unit
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "gripper")
 

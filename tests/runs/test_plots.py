@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from bhd_lerobot.bodies.arenas import make_arena
-from bhd_lerobot.runs import plots
+from bhd_lerobot.rollout import plots
 
 
 @pytest.mark.parametrize(("count", "pages"), [(1, 1), (2, 1), (7, 1), (9, 3)])

@@ -13,12 +13,12 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from bhd_lerobot.data.inspect import dataset_info
+from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetExistsError, DatasetMismatchError, RenderingError
-from bhd_lerobot.runs import record as record_module
-from bhd_lerobot.runs.config_record import RecordConfig
-from bhd_lerobot.runs.configuration import encode, parse
-from bhd_lerobot.runs.episode import EpisodeLoop
+from bhd_lerobot.recording import record as record_module
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import encode, parse
+from bhd_lerobot.rollout.episode import EpisodeLoop
 from tests.runs.support import data_columns, episode_rows, options, run_record
 
 
@@ -134,7 +134,7 @@ def test_resume_refuses_another_recording_and_shows_the_difference(tmp_path, cha
 
 
 def _start(root: Path, **overrides) -> subprocess.Popen:
-    command = [sys.executable, "-m", "bhd_lerobot.runs.record", *options(root, **overrides)]
+    command = [sys.executable, "-m", "bhd_lerobot.recording.record", *options(root, **overrides)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -8,9 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.runs import replay as module
-from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.replay import Replay, ReplayConfig
+from bhd_lerobot.rollout import replay as module
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.rollout.replay import Replay, ReplayConfig
 from tests.runs.support import run_record
 
 

@@ -9,12 +9,12 @@ pytest.importorskip("stable_baselines3")
 from bhd_lerobot.envs.course import STREAM
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.runs.rl.adapter import RlVecEnv
-from bhd_lerobot.runs.rl.build import make_learner
-from bhd_lerobot.runs.rl.config import RewardConfig, RlConfig, parse_rl
-from bhd_lerobot.runs.rl.features import ActionUnits, FeatureStack
-from bhd_lerobot.runs.rl.parts import RlParts, make_parts
-from bhd_lerobot.runs.rl.shaping import Shaping, pose_potential
+from bhd_lerobot.training.rl.adapter import RlVecEnv
+from bhd_lerobot.training.rl.build import make_learner
+from bhd_lerobot.training.rl.config import RewardConfig, RlConfig, parse_rl
+from bhd_lerobot.training.rl.features import ActionUnits, FeatureStack
+from bhd_lerobot.training.rl.parts import RlParts, make_parts
+from bhd_lerobot.training.rl.shaping import Shaping, pose_potential
 from bhd_lerobot.tasks.task import Event
 
 N = 3

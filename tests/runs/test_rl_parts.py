@@ -12,8 +12,8 @@ from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
 from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN
 from bhd_lerobot.policies.mlp.yaw_mlp import OBS_YAW
-from bhd_lerobot.runs.rl.config import parse_rl
-from bhd_lerobot.runs.rl.parts import seeing_all
+from bhd_lerobot.training.rl.config import parse_rl
+from bhd_lerobot.training.rl.parts import seeing_all
 
 WIDTH, BEAMS, TOLD = 14, 8, 9  # two numbers, the beams, four more numbers; what the task tells
 IGNORED = [0, 11, 13]

@@ -16,19 +16,19 @@ pytest.importorskip("stable_baselines3")
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.policies.brain import Observation
-from bhd_lerobot.policies.contract import PolicyContract
-from bhd_lerobot.policies.learned import LearnedBrain, LearnedBrainConfig
+from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
-from bhd_lerobot.runs.rl import checkpoint
-from bhd_lerobot.runs.rl import train as module
-from bhd_lerobot.runs.rl.adapter import RlVecEnv
-from bhd_lerobot.runs.rl.build import make_learner
-from bhd_lerobot.runs.rl.config import RlConfig, is_rl, parse_rl
-from bhd_lerobot.runs.rl.features import ActionUnits, FeatureStack
-from bhd_lerobot.runs.rl.parts import make_parts, single_action
-from bhd_lerobot.runs.rl.shaping import Shaping
-from bhd_lerobot.runs.rl.train import RlResult, main, train
+from bhd_lerobot.training.rl import checkpoint
+from bhd_lerobot.training.rl import train as module
+from bhd_lerobot.training.rl.adapter import RlVecEnv
+from bhd_lerobot.training.rl.build import make_learner
+from bhd_lerobot.training.rl.config import RlConfig, is_rl, parse_rl
+from bhd_lerobot.training.rl.features import ActionUnits, FeatureStack
+from bhd_lerobot.training.rl.parts import make_parts, single_action
+from bhd_lerobot.training.rl.shaping import Shaping
+from bhd_lerobot.training.rl.train import RlResult, main, train
 
 # How much the network's rows may differ when they are computed beside others, in m/s and rad/s.
 TOLERANCE = 2e-6
@@ -334,7 +334,7 @@ def test_the_shipped_configurations_are_valid(name: str) -> None:
 
 
 def test_bhd_train_hands_over_what_names_an_algorithm(tmp_path: Path, capsys) -> None:
-    from bhd_lerobot.runs.train import main as bhd_train
+    from bhd_lerobot.training.train import main as bhd_train
 
     assert bhd_train(options(tmp_path / "run", steps=0)) == 2
     assert "steps is 0" in capsys.readouterr().err
@@ -381,7 +381,7 @@ def test_weights_that_are_no_numbers_end_the_run(tmp_path: Path, monkeypatch: py
             one.data.fill_(float("nan"))
         raise ValueError("the distribution's mean is nan")
 
-    monkeypatch.setattr("bhd_lerobot.runs.rl.build.learn", spoil)
+    monkeypatch.setattr("bhd_lerobot.training.rl.build.learn", spoil)
     with pytest.raises(BhdError, match=r"weights are not finite .*000000000 is intact.*--ppo\.lr"):
         run(tmp_path / "run")
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError
-from bhd_lerobot.runs.config_record import RecordConfig
-from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.run_folder import run_folder
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.rollout.run_folder import run_folder
 from tests.runs.support import options, run_record
 from tests.runs.test_evaluate import run_eval
 

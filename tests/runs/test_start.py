@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.runs import data, start
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.cli import start
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]
@@ -21,7 +22,7 @@ def started(folder: Path, program: str, *, ignored: bool = False) -> subprocess.
     """Run a module that interrupts itself as the console scripts run ours."""
     (folder / "slow.py").write_text(program)
     how = "signal.SIG_IGN" if ignored else "signal.default_int_handler"
-    command = f"import signal, sys; signal.signal(signal.SIGINT, {how}); import bhd_lerobot.runs.start as s; "
+    command = f"import signal, sys; signal.signal(signal.SIGINT, {how}); import bhd_lerobot.cli.start as s; "
     environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
     return subprocess.run(
         [sys.executable, "-c", command + "sys.exit(s.run('slow'))"],
@@ -87,14 +88,14 @@ def test_every_command_begins_this_way(script: str, monkeypatch: pytest.MonkeyPa
     assert begin() == 3
     (module,) = begun
     assert callable(importlib.import_module(module).main)
-    assert SCRIPTS[script] == f"bhd_lerobot.runs.start:{begin.__name__}"
+    assert SCRIPTS[script] == f"bhd_lerobot.cli.start:{begin.__name__}"
 
 
 @pytest.mark.parametrize(
     ("program", "slow"),
     [
-        ("import bhd_lerobot.runs.start, bhd_lerobot.runs.data", "numpy torch lerobot rich yaml pyarrow mujoco"),
-        ("import bhd_lerobot.runs.data as d; d._parser()", "torch lerobot pandas mujoco pinocchio matplotlib ray"),
+        ("import bhd_lerobot.cli.start, bhd_lerobot.cli.data.main", "numpy torch lerobot rich yaml pyarrow mujoco"),
+        ("import bhd_lerobot.cli.data.main as d; d._parser()", "torch lerobot pandas mujoco pinocchio matplotlib ray"),
     ],
     ids=["before Ctrl-C is minded", "for the help"],
 )
@@ -118,7 +119,7 @@ def test_the_handler_before_comes_back() -> None:
             assert signal.getsignal(signal.SIGINT) is start._leave
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         with pytest.raises(SystemExit):
-            data.main(["--help"])
+            main.main(["--help"])
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, former)

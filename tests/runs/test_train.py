@@ -15,11 +15,11 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_train
 
 from bhd_lerobot.errors import BhdError, ConfigError, MemoryBudgetError
-from bhd_lerobot.runs import train as train_module
-from bhd_lerobot.runs import train_checkpoint
-from bhd_lerobot.runs.train import main
-from bhd_lerobot.runs.train_arguments import parse_train
-from bhd_lerobot.runs.train_log import MetricsFile
+from bhd_lerobot.training import train as train_module
+from bhd_lerobot.training import checkpoint
+from bhd_lerobot.training.train import main
+from bhd_lerobot.training.arguments import parse_train
+from bhd_lerobot.training.log import MetricsFile
 from tests.runs.train_support import ACT, MLP, curve, make_dataset, options, run_train
 
 
@@ -107,13 +107,13 @@ def test_a_resumed_run_continues_to_the_same_bits(
     class KilledError(Exception):
         pass
 
-    save = train_checkpoint.save
+    save = checkpoint.save
 
     def killed(*args, **kwargs):
         save(*args, **kwargs)
         raise KilledError
 
-    monkeypatch.setattr(train_checkpoint, "save", killed)
+    monkeypatch.setattr(checkpoint, "save", killed)
     with pytest.raises(KilledError):
         run_train(options(data, tmp_path / "cut", **common))
     monkeypatch.undo()
@@ -130,7 +130,7 @@ def test_a_resumed_run_continues_to_the_same_bits(
 
 def spawn(arguments: list[str]) -> subprocess.Popen:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "bhd_lerobot.runs.train", *arguments]
+    command = [sys.executable, "-m", "bhd_lerobot.training.train", *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
 
 
@@ -187,7 +187,7 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(
 ) -> None:
     run = tmp_path / "run"
     calls = []
-    flush = train_checkpoint._flush
+    flush = checkpoint._flush
 
     class Killed(BaseException):
         pass
@@ -199,7 +199,7 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(
             raise Killed
         flush(folder)
 
-    monkeypatch.setattr(train_checkpoint, "_flush", die_the_second_time)
+    monkeypatch.setattr(checkpoint, "_flush", die_the_second_time)
     with pytest.raises(Killed):
         run_train(options(data, run))
     monkeypatch.undo()
@@ -213,14 +213,14 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(
 def test_a_full_disk_ends_with_the_checkpoint_before_intact(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    save = train_checkpoint.save_checkpoint
+    save = checkpoint.save_checkpoint
 
     def full(folder: Path, step: int, *args, **kwargs):
         save(folder, step, *args, **kwargs)
         if step == 20:
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(train_checkpoint, "save_checkpoint", full)
+    monkeypatch.setattr(checkpoint, "save_checkpoint", full)
     with pytest.raises(BhdError, match=r"checkpoint of step 20 .* No space left"):
         run_train(options(data, tmp_path / "run"))
     assert sorted(one.name for one in (tmp_path / "run" / "checkpoints").iterdir()) == ["000010", "last"]

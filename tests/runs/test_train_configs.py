@@ -10,7 +10,7 @@ from lerobot.policies.factory import make_policy
 from bhd_lerobot.robots.catalog import make_robot
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.runs.train_arguments import parse_train
+from bhd_lerobot.training.arguments import parse_train
 from tests.runs.train_support import MLP, make_dataset, options, run_train
 
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "train"

@@ -11,10 +11,10 @@ import torch
 from lerobot.policies.act.modeling_act import ACTPolicy
 
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
-from bhd_lerobot.runs import train_output
-from bhd_lerobot.runs.train import main
-from bhd_lerobot.runs.train_arguments import parse_train
-from bhd_lerobot.runs.train_log import MetricsFile
+from bhd_lerobot.training import output
+from bhd_lerobot.training.train import main
+from bhd_lerobot.training.arguments import parse_train
+from bhd_lerobot.training.log import MetricsFile
 from tests.runs.train_support import ACT, MLP, curve, make_dataset, options, poison, run_train
 
 
@@ -229,7 +229,7 @@ def test_metrics_that_cannot_be_written_leave_the_checkpoint(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(MetricsFile, "append", full)
-    monkeypatch.setattr(train_output, "draw_loss", no_picture)
+    monkeypatch.setattr(output, "draw_loss", no_picture)
     with pytest.raises(BhdError, match=r"metrics of step 15 .*No space left.*000010 is intact.*resume"):
         run_train(options(data, tmp_path / "run", MLP))
     monkeypatch.undo()

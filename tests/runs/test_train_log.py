@@ -2,8 +2,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from bhd_lerobot.runs import train_log
-from bhd_lerobot.runs.train_log import MetricsFile, draw_loss, read_metrics
+from bhd_lerobot.training import log
+from bhd_lerobot.training.log import MetricsFile, draw_loss, read_metrics
 
 ROWS = [{"step": step, "loss": 1 / step, "lr": 1e-3, "held_out_loss": 2 / step} for step in (10, 20, 30)]
 
@@ -40,7 +40,7 @@ def drawn(rows: list[dict], path: Path, monkeypatch) -> Figure:
             super().__init__(*args, **kwargs)
             figures.append(self)
 
-    monkeypatch.setattr(train_log, "Figure", Spy)
+    monkeypatch.setattr(log, "Figure", Spy)
     draw_loss(rows, path, "toy")
     assert path.stat().st_size > 1000
     return figures[0]

@@ -5,13 +5,13 @@ from dataclasses import asdict
 
 import pytest
 
-from bhd_lerobot.policies.contract import PolicyContract
+from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.simulation import describe
-from bhd_lerobot.runs.config_eval import EvalConfig
-from bhd_lerobot.runs.configuration import parse
-from bhd_lerobot.runs.train_summary import how_to_evaluate
+from bhd_lerobot.robots.host.simulation import describe
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.training.summary import how_to_evaluate
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.catalog import robot_of_task
 from bhd_lerobot.tasks.config_task import TaskConfig

@@ -10,10 +10,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from bhd_lerobot.data.inspect import dataset_info
+from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, RenderingError
-from bhd_lerobot.runs.provenance import scene_from_json
-from bhd_lerobot.runs.replay import Replay
+from bhd_lerobot.rollout.provenance import scene_from_json
+from bhd_lerobot.rollout.replay import Replay
 from tests.runs.support import data_columns, episode_rows, options, run_record
 
 PICK = {
@@ -169,7 +169,7 @@ def test_an_instruction_without_a_matching_object_is_not_carried_out_and_says_wh
 def test_killed_and_resumed_is_the_same_as_undisturbed(recorded, tmp_path):
     root = tmp_path / "killed"
     many = {**PICK, **SPOKEN, "resume": "true"}
-    command = [sys.executable, "-m", "bhd_lerobot.runs.record", *options(root, **many)]
+    command = [sys.executable, "-m", "bhd_lerobot.recording.record", *options(root, **many)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE)
     while process.poll() is None:
         try:

@@ -21,12 +21,13 @@ import pytest
 from aiohttp import web
 from matplotlib.image import imread
 
-from bhd_lerobot.data.state import load_state
+from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.runs import data, data_view
-from bhd_lerobot.runs.view.dataset import stamp_of
-from bhd_lerobot.runs.view.guard import TOKEN_HEADER, is_loopback
-from bhd_lerobot.runs.view.server import STATIC
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.cli.data import view
+from bhd_lerobot.apps.view.dataset import stamp_of
+from bhd_lerobot.apps.view.guard import TOKEN_HEADER, is_loopback
+from bhd_lerobot.apps.view.server import STATIC
 from tests.data.loader_support import PHOTO, images, length
 from tests.runs.view_support import Served, episode, served
 
@@ -69,13 +70,13 @@ def test_a_link_out_of_the_dataset_is_not_served(base: Path, stock: Path, tmp_pa
     with pytest.raises(DatasetError, match=r"is a link to .*secret, outside of the dataset"), served(root):
         pass
     root = Path(shutil.copytree(stock, tmp_path / "stock"))
-    data = next((root / "data").glob("*/*.parquet"))
-    table = pq.read_table(data)
+    main = next((root / "data").glob("*/*.parquet"))
+    table = pq.read_table(main)
     key = next(name for name in table.column_names if name == PHOTO)
     place = table.schema.get_field_index(key)
     for path in (str(secret), "../secret"):
         column = pa.array([{"bytes": None, "path": path}] * table.num_rows, table.schema.field(place).type)
-        pq.write_table(table.set_column(place, table.schema.field(place), column), data)
+        pq.write_table(table.set_column(place, table.schema.field(place), column), main)
         with served(root) as server:
             status, _, said = server.ask(f"/api/episodes/0/images/{key}/0")
             assert (status, b"password" in said) == (409, False)
@@ -272,7 +273,7 @@ def test_the_command_serves_opens_a_browser_and_ends_with_a_signal(base, capsys,
     monkeypatch.setattr(webbrowser, "open", look)
     monkeypatch.setenv("DISPLAY", ":7")
     former = signal.getsignal(signal.SIGINT)
-    assert data.main(["view", str(base), "--port", "0"]) == 128 + number
+    assert main.main(["view", str(base), "--port", "0"]) == 128 + number
     assert signal.getsignal(signal.SIGINT) is former
     ((url, status, page),) = seen
     assert status == 200
@@ -290,9 +291,9 @@ def test_ctrl_c_before_the_address_ends_in_the_same_way(base, capsys, monkeypatc
         await start(site)
 
     monkeypatch.setattr(web.TCPSite, "start", interrupted)
-    assert data.main(["view", str(base), "--port", "0", "--no-browser"]) == 130
-    monkeypatch.setattr(data_view, "Terminal", lambda: os.kill(os.getpid(), signal.SIGINT))
-    assert data.main(["view", str(base), "--port", "0", "--no-browser"]) == 130
+    assert main.main(["view", str(base), "--port", "0", "--no-browser"]) == 130
+    monkeypatch.setattr(view, "Terminal", lambda: os.kill(os.getpid(), signal.SIGINT))
+    assert main.main(["view", str(base), "--port", "0", "--no-browser"]) == 130
     assert "Stopped" in capsys.readouterr().err
 
 
@@ -301,7 +302,7 @@ def test_a_port_in_use_is_named_with_the_remedy(base, capsys) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert data.main(["view", str(base), "--no-browser", "--port", str(port)]) == 2
+        assert main.main(["view", str(base), "--no-browser", "--port", str(port)]) == 2
     error = capsys.readouterr().err
     assert f"--port {port}" in error
     assert "--port 0" in error
@@ -309,10 +310,10 @@ def test_a_port_in_use_is_named_with_the_remedy(base, capsys) -> None:
 
 @pytest.mark.parametrize("port", ["-1", "65536"])
 def test_impossible_ports(base, capsys, port) -> None:
-    assert data.main(["view", str(base), "--port", port]) == 2
+    assert main.main(["view", str(base), "--port", port]) == 2
     assert "between 0 and 65535" in capsys.readouterr().err
 
 
 def test_nothing_to_show(tmp_path, capsys) -> None:
-    assert data.main(["view", str(tmp_path / "none"), "--port", "0"]) == 2
+    assert main.main(["view", str(tmp_path / "none"), "--port", "0"]) == 2
     assert "does not exist" in capsys.readouterr().err

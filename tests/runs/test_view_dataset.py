@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bhd_lerobot.data.disk import RootLock
-from bhd_lerobot.data.recorder import DatasetRecorder
+from bhd_lerobot.datasets.storage.disk import RootLock
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError
-from bhd_lerobot.runs.view.dataset import ViewedDataset
-from bhd_lerobot.runs.view.packing import unpack
+from bhd_lerobot.apps.view.dataset import ViewedDataset
+from bhd_lerobot.apps.view.packing import unpack
 from tests.data.loader_support import FRONT, record_ours
 from tests.runs.view_support import served
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.runs.view.packing import unpack
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.apps.view.packing import unpack
 from tests.data.loader_support import FRONT, PHOTO, WRIST, images, length, record_ours, record_stock
 from tests.runs.view_support import Served, served
 

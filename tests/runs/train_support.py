@@ -10,10 +10,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from bhd_lerobot.data.recorder import DatasetRecorder
-from bhd_lerobot.runs.train import TrainResult, train
-from bhd_lerobot.runs.train_arguments import parse_train
-from bhd_lerobot.runs.train_log import TIMING
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.training.train import TrainResult, train
+from bhd_lerobot.training.arguments import parse_train
+from bhd_lerobot.training.log import TIMING
 
 FPS = 10
 NAMES = ["a.pos", "b.pos", "c.pos", "a.vel"]

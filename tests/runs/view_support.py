@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from aiohttp import web
 
-from bhd_lerobot.runs.view.dataset import ViewedDataset
-from bhd_lerobot.runs.view.guard import TOKEN_HEADER
-from bhd_lerobot.runs.view.packing import unpack
-from bhd_lerobot.runs.view.server import HOST, application
+from bhd_lerobot.apps.view.dataset import ViewedDataset
+from bhd_lerobot.apps.view.guard import TOKEN_HEADER
+from bhd_lerobot.apps.view.packing import unpack
+from bhd_lerobot.apps.view.server import HOST, application
 
 
 class Served:

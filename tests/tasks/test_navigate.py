@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.arenas import CLEARANCE, ROBOT_RADIUS, Arena, make_arena, random_arena
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.runs.provenance import scene_from_json, scene_to_json
+from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.tasks.geodesic import WayField, interpolate, way_lengths
 from bhd_lerobot.tasks.navigate import ENVIRONMENT, NavigateConfig, NavigateTask, goal_in_robot
 from bhd_lerobot.tasks.task import BaseTruth, Event

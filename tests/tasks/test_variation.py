@@ -11,18 +11,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, Variation
-from bhd_lerobot.data import features as keys
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
-from bhd_lerobot.policies.language_brain import LanguageBrainConfig
-from bhd_lerobot.policies.pick import PickBrainConfig
-from bhd_lerobot.policies.reach import ReachBrainConfig
+from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
+from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
+from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.latency import MAX_LATENCY
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.runs.episode import EpisodeLoop
-from bhd_lerobot.runs.episode_types import Episode, EpisodeSpec
-from bhd_lerobot.runs.provenance import scene_from_json, scene_to_json
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.variation import MAX_LATENCY_S, RandomisationConfig, draw_object_changes, draw_variation

@@ -11,7 +11,7 @@ from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
-from bhd_lerobot.control.poses import quaternion_columns
+from bhd_lerobot.control.geometry.poses import quaternion_columns
 from bhd_lerobot.errors import ConfigError, unknown_name
 
 ACTIVATIONS = ("relu", "tanh", "gelu", "silu", "elu")

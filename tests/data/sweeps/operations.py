@@ -10,9 +10,9 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.data.bag_export import ExportOptions, export_bags
-from bhd_lerobot.data.publish import UNFINISHED_VERSION
-from bhd_lerobot.data.ros2_views import RobotView
+from bhd_lerobot.rosbag.exporter.export import ExportOptions, export_bags
+from bhd_lerobot.datasets.storage.atomic import UNFINISHED_VERSION
+from bhd_lerobot.rosbag.messages.views import RobotView
 from tests.data import support
 from tests.data.edit_support import record
 

@@ -21,9 +21,12 @@ import pyarrow.dataset  # noqa: F401
 import rosbags.rosbag2  # noqa: F401
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata  # noqa: F401
 
-from bhd_lerobot.data import disk, publish, remote_staging
-from bhd_lerobot.data.ros2_types import type_store
-from bhd_lerobot.runs import data, data_transfer  # noqa: F401
+from bhd_lerobot.datasets.storage import disk
+from bhd_lerobot.datasets.storage import atomic
+from bhd_lerobot.datasets.remote import staging
+from bhd_lerobot.rosbag.messages.types import type_store
+from bhd_lerobot.cli.data import main as data
+from bhd_lerobot.hub import transfer  # noqa: F401
 from tests.data import support
 
 REMOVALS = ("os.remove", "os.rmdir")
@@ -90,8 +93,8 @@ def run(job: dict[str, Any]) -> None:
         os.dup2(output.fileno(), 2)
     if job["place"] == "fixed":
         os.makedirs(job["target"], exist_ok=True)
-        publish.is_fixed = lambda place: str(place) == job["target"]
-        remote_staging.is_fixed = publish.is_fixed
+        atomic.is_fixed = lambda place: str(place) == job["target"]
+        staging.is_fixed = atomic.is_fixed
     elif job["place"] == "no exchange":
 
         def swap(*_: object) -> None:

@@ -1,0 +1,231 @@
+"""`bhd-monitor`: watch a robot that runs on the wall clock, from another terminal, and stop it."""
+
+import argparse
+import json
+import math
+import os
+import select
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.live import Live
+
+from bhd_lerobot.control.estop_terminal import KeyTerminal, standard_input
+from bhd_lerobot.realtime.block import LiveBlock
+from bhd_lerobot.realtime.shared_memory import names
+from bhd_lerobot.errors import BhdError, ConfigError, RealtimeError
+from bhd_lerobot.apps.monitor.state import MonitorState, Sampler
+from bhd_lerobot.apps.monitor.view import KEYS, WIDTH, one_line, render
+
+_REFRESH_S = 0.125
+_LOOK_S = 0.5  # that a single snapshot measures rates over
+_LINE_S = 1.0  # between two lines where there is no terminal
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="bhd-monitor",
+        description="Watch a robot that runs on the wall clock (--robot.clock=realtime). Keys: e or space is an "
+        "emergency stop, at once and without a question; q quits. Exit status: 0, 1 if the robot was killed or lost "
+        "its brain meanwhile, 2 if there is no such robot.",
+    )
+    parser.add_argument("id", nargs="?", metavar="ID", help="robot.id of the robot; the only one that runs if left out")
+    parser.add_argument("--once", action="store_true", help="print one snapshot and leave")
+    parser.add_argument("--json", action="store_true", help="as JSON: one snapshot, or one a second with --seconds")
+    parser.add_argument("--seconds", type=float, help="leave after so long [s]")
+    return parser
+
+
+def running() -> list[LiveBlock]:
+    """Return the robots that run, to be closed by the caller."""
+    found = []
+    for name in names():
+        try:
+            block = LiveBlock.watch(name)
+        except (RealtimeError, KeyError, TypeError, ValueError):  # gone in the meantime, or the block of something else
+            continue
+        if "made_ns" in block.about and "commands" in block.about:
+            found.append(block)
+        else:
+            block.close()
+    return found
+
+
+def find(name: str | None) -> LiveBlock:
+    """Return the block of a running robot.
+
+    Args:
+        name: the robot's id; the only one that runs if None.
+
+    Raises:
+        RealtimeError: there is none, or several; the message lists those that run.
+    """
+    blocks = running()
+    chosen = [block for block in blocks if name in (None, block.name)]
+    for block in blocks:
+        if len(chosen) != 1 or block is not chosen[0]:
+            block.close()
+    if len(chosen) == 1:
+        return chosen[0]
+    listed = ", ".join(f"{block.name} ({block.about['robot']})" for block in blocks) or "none"
+    if not blocks:
+        what = "No robot runs on the wall clock" if name is None else f"No running robot is called {name!r}"
+        raise RealtimeError(f"{what}. Running: none. Start one with --robot.clock=realtime and --robot.id=NAME.")
+    if name is None:
+        raise RealtimeError(f"Several robots run: {listed}. Say which: bhd-monitor ID.")
+    raise RealtimeError(f"No running robot is called {name!r}. Running: {listed}.")
+
+
+class Keys:
+    """Keys of a terminal, on a thread of their own: a stop does not wait for a picture that is being drawn.
+
+    Args:
+        estop: what an emergency stop does.
+        descriptor: the terminal's; keys are left alone if None.
+
+    Attributes:
+        quit: set when the user wants to leave.
+        pressed: how often the emergency stop was pressed.
+    """
+
+    def __init__(self, estop: Callable[[], None], descriptor: int | None) -> None:
+        self.quit = threading.Event()
+        self.pressed = 0
+        self._estop = estop
+        self._terminal = KeyTerminal(descriptor) if descriptor is not None and KeyTerminal.usable(descriptor) else None
+        self._wake, self._waker = os.pipe()
+        self._thread = threading.Thread(target=self._work, name="bhd-monitor-keys", daemon=True)
+        if self._terminal is not None:
+            self._thread.start()
+
+    @property
+    def there(self) -> bool:
+        """Whether there is a terminal to press keys in."""
+        return self._terminal is not None
+
+    def _work(self) -> None:
+        terminal = self._terminal
+        while terminal is not None:
+            ready, _, _ = select.select([terminal.descriptor, self._wake], [], [])
+            if self._wake in ready:
+                return
+            try:
+                keys = os.read(terminal.descriptor, 64)
+            except OSError:
+                keys = b""
+            if any(key in b" eE" for key in keys):
+                self._estop()
+                self.pressed += 1
+            if not keys or any(key in b"qQ\x04" for key in keys):
+                self.quit.set()
+            if not keys:
+                return
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Give the terminal back."""
+        os.write(self._waker, b"\0")
+        if self._terminal is not None:
+            self._thread.join(1.0)
+            self._terminal.restore()
+        os.close(self._wake)
+        os.close(self._waker)
+
+
+def watch(
+    sampler: Sampler, show: Callable[[MonitorState], None], keys: Keys, period_s: float, end: float
+) -> str | None:
+    """Show states until the user leaves, time is up, or the robot ends; return in words how it ended, or None.
+
+    Args:
+        sampler: where states come from.
+        show: shows one.
+        keys: when the user leaves.
+        period_s: between two states [s].
+        end: when time is up, monotonic [s].
+    """
+    while True:
+        ended = sampler.end()
+        show(sampler.sample())
+        if ended is not None:
+            return ended
+        left = end - time.monotonic()
+        if left <= 0 or keys.quit.wait(min(period_s, left)):
+            return None
+
+
+def _live(block: LiveBlock, sampler: Sampler, console: Console, end: float) -> str | None:
+    with Keys(block.set_estop, standard_input()) as keys:
+        offered = KEYS if keys.there else "No keys: standard input is no terminal. Ctrl-C: quit"
+        with Live(console=console, screen=True, auto_refresh=False) as live:
+
+            def show(state: MonitorState) -> None:
+                message = "EMERGENCY STOP was set here   q: quit" if keys.pressed and state.estop else ""
+                live.update(render(state, height=console.height, message=message, keys=offered), refresh=True)
+
+            return watch(sampler, show, keys, _REFRESH_S, end)
+
+
+def _print(block: LiveBlock, sampler: Sampler, options: argparse.Namespace, console: Console) -> str | None:
+    once = options.once or (options.json and options.seconds is None)
+    if once and sampler.end() is None:
+        sampler.sample()
+        time.sleep(_LOOK_S)
+        state = sampler.sample()
+        if options.json:
+            print(json.dumps(state.as_dict(), indent=1, ensure_ascii=False))
+        else:
+            console.print(render(state, keys=""))
+        return None
+
+    def show(state: MonitorState) -> None:
+        print(json.dumps(state.as_dict(), ensure_ascii=False) if options.json else one_line(state), flush=True)
+
+    with Keys(block.set_estop, None) as keys:
+        return watch(sampler, show, keys, _LINE_S, _end(options.seconds))
+
+
+def _end(seconds: float | None) -> float:
+    return time.monotonic() + seconds if seconds is not None else math.inf
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `bhd-monitor`; return the exit status."""
+    options = _parser().parse_args(arguments)
+    console = Console(highlight=False)
+    try:
+        if options.seconds is not None and not 0 < options.seconds < math.inf:
+            raise ConfigError(f"--seconds is {options.seconds:g}; it must be positive and finite.")
+        block = find(options.id)
+    except BhdError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    try:
+        sampler = Sampler(block)
+        if console.is_terminal and not (options.once or options.json):
+            ended = _live(block, sampler, console, _end(options.seconds))
+        else:
+            console = console if console.is_terminal else Console(highlight=False, width=WIDTH)
+            ended = _print(block, sampler, options, console)
+    except KeyboardInterrupt:
+        return 130
+    finally:
+        block.close()
+    if ended is None:
+        return 0
+    print(f"The robot {block.name!r} {'has ended.' if ended == 'ended' else f'{ended}.'}", file=sys.stderr)
+    return 0 if ended == "ended" else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,323 @@
+"""What `bhd-monitor` shows, as plain values, and how it is read from the block of a running robot."""
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bhd_lerobot.control.fifo import StateRing
+from bhd_lerobot.realtime.frame_log import FrameLog
+from bhd_lerobot.control.motion.goal_codec import decode_feedback
+from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
+from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Reason, Watchdog
+from bhd_lerobot.control.timing import TimingStatistics
+from bhd_lerobot.errors import ConfigError
+
+LIMITS = tuple(limit.name or "" for limit in Limit if limit)
+WATCHDOGS = tuple(watchdog.name or "" for watchdog in Watchdog if watchdog)
+REASONS = tuple(reason.name for reason in Reason)
+"""Names of what the states count, in their order."""
+HEARTBEATS = {
+    "brain": Word.BRAIN_ALIVE,
+    "cerebellum": Word.CEREBELLUM_ALIVE,
+    "recorder": Word.RECORDER_ALIVE,
+    "plant": Word.PLANT_ALIVE,
+}
+POSE = ("x", "y", "yaw")
+
+DECADES, CELLS = 6, 5
+"""A histogram has so many decades from 1 us on, and so many cells in each."""
+_FINE = 20 // CELLS  # bins of `TimingStatistics` in a cell
+_WINDOW_NS = 2 * NANOSECONDS  # over which rates are measured
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How a time is distributed over the ticks of the episode [s].
+
+    Attributes:
+        p50: half the ticks took no longer.
+        p99: 99 % of them took no longer.
+        max: the longest.
+        histogram: ticks by logarithmic cells: the first holds all up to 1.6 us, the last all from 0.63 s on.
+    """
+
+    p50: float
+    p99: float
+    max: float
+    histogram: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """One dimension of the command, in its own unit.
+
+    Attributes:
+        name: the command's name.
+        requested: the setpoint taken last; None if there was none or a goal is followed.
+        applied: what the cerebellum commands, after all limits.
+        measured: where the robot really is.
+    """
+
+    name: str
+    requested: float | None
+    applied: float
+    measured: float
+
+
+@dataclass(frozen=True)
+class Count:
+    """How often something happened in the episode, and how often in a second at present; None if that is unknown."""
+
+    count: int
+    per_second: float | None
+
+
+@dataclass(frozen=True)
+class MonitorState:
+    """A running robot at one moment. Times in seconds, rates in Hz; None: unknown or without meaning at present.
+
+    Attributes:
+        id: the robot's id.
+        robot: its type.
+        clock: whose time it lives in.
+        uptime: since it was started.
+        phase: what the loop does, a name of `Phase`.
+        episode: number of the stretch of ticks that runs or ran last, from 1; 0 before the first.
+        episode_time: how long that has been running.
+        mode: name of the cerebellum's `Mode`.
+        estop: the word of the emergency stop is set.
+        estop_latched: the cerebellum has latched it.
+        control_rate: measured; over the last two seconds, as all rates.
+        control_hz: wanted.
+        frame_rate: frames that the recorder takes, measured.
+        fps: wanted.
+        command_rate: setpoints that the cerebellum takes, measured.
+        executed: ticks of the episode.
+        skipped: ticks of it that were left out.
+        overruns: ticks of it that ended after the next was due.
+        catch_up_lost: ticks by which the simulated world fell behind.
+        recorder_drops: states that the recorder lost.
+        lateness: of the ticks' starts.
+        duration: of the ticks.
+        fifo_fill: commands that wait.
+        fifo_capacity: commands that may wait.
+        command_age: of the setpoint that is followed.
+        observation_age: of the newest observation's oldest reading.
+        dimensions: the command.
+        limits: interventions of the limiter by name of `Limit`, counted once a frame.
+        watchdogs: by name of `Watchdog`.
+        refusals: commands refused, by name of `Reason`; those that occurred.
+        alive: since the last sign of life of each process; None if it is not watched.
+        goal: the fields of the `Feedback` about the goal that is followed.
+        pose: odometry x, y [m] and yaw [rad] of a robot that drives.
+    """
+
+    id: str
+    robot: str
+    clock: str
+    uptime: float
+    phase: str
+    episode: int
+    episode_time: float | None
+    mode: str | None
+    estop: bool
+    estop_latched: bool
+    control_rate: float | None
+    control_hz: int
+    frame_rate: float | None
+    fps: int
+    command_rate: float | None
+    executed: int
+    skipped: int
+    overruns: int
+    catch_up_lost: int
+    recorder_drops: int
+    lateness: Spread | None
+    duration: Spread | None
+    fifo_fill: int
+    fifo_capacity: int
+    command_age: float | None
+    observation_age: float | None
+    dimensions: tuple[Dimension, ...] = ()
+    limits: dict[str, Count] = field(default_factory=dict)
+    watchdogs: dict[str, Count] = field(default_factory=dict)
+    refusals: dict[str, int] = field(default_factory=dict)
+    alive: dict[str, float | None] = field(default_factory=dict)
+    goal: dict[str, Any] | None = None
+    pose: dict[str, float] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON; what is not finite is None."""
+        plain: dict[str, Any] = _finite(asdict(self))
+        return plain
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+class Sampler:
+    """Reads the block of a running robot; changes nothing in it.
+
+    Args:
+        block: the block, from `LiveBlock.watch`.
+        clock: monotonic time [ns], the robot's.
+    """
+
+    def __init__(self, block: LiveBlock, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._block, self._clock = block, clock
+        self._started = int(block.about["made_ns"])
+        self._statistics = block.section("statistics") if block.has("statistics") else None
+        self._frames: StateRing | None = None
+        if block.has("frames"):
+            capacity, memory = block.about["frames"], block.section("frames")
+            self._frames = StateRing(FrameLog(block.state_dtype, capacity, memory).dtype, capacity, memory)
+        self._past: deque[_Counts] = deque()
+        self._spreads: tuple[Spread | None, Spread | None] = (None, None)
+
+    def end(self) -> str | None:
+        """Return in words how the robot ended, ``"ended"`` if that was in order, or None if it still runs."""
+        words = self._block.words
+        if words[Word.PHASE] == Phase.ENDED:
+            # The brain's process asks for both; a loop that finds itself alone has at most one of them.
+            if words[Word.END] and words[Word.PAUSE]:
+                return "ended"
+            return "came to rest and ended by itself: its brain's process is gone"
+        return None if self._block.is_held else "is gone without having ended: its processes were killed"
+
+    def sample(self) -> MonitorState:
+        """Return what is so now."""
+        block, words, about = self._block, self._block.words.copy(), self._block.about
+        state: Any = block.ring.latest()
+        now = self._clock()
+        phase = Phase(int(words[Word.PHASE]))
+        running = phase == Phase.RUNNING
+        rates = self._rates(now, words, state)
+        self._spreads = self._read_spreads()
+        moment = {} if state is None else self._of_state(state, now, running, rates)
+        return MonitorState(
+            id=block.name,
+            robot=str(about.get("robot", "?")),
+            clock="realtime",
+            uptime=(now - self._started) / NANOSECONDS,
+            phase=phase.name,
+            episode=int(words[Word.STRETCH]),
+            episode_time=max(0, now - int(words[Word.START])) / NANOSECONDS if running else None,
+            estop=bool(words[Word.ESTOP]),
+            control_rate=rates.get("executed"),
+            control_hz=int(about["control_hz"]),
+            frame_rate=rates.get("frames"),
+            fps=int(about["fps"]),
+            command_rate=rates.get("setpoints"),
+            executed=int(words[Word.EXECUTED]),
+            skipped=int(words[Word.SKIPPED]),
+            overruns=int(words[Word.OVERRUNS]),
+            catch_up_lost=int(words[Word.CATCH_UP_LOST]),
+            recorder_drops=int(words[Word.RECORDER_DROPS]),
+            lateness=self._spreads[0],
+            duration=self._spreads[1],
+            fifo_fill=len(block.fifo),
+            fifo_capacity=block.fifo.capacity,
+            alive={
+                name: max(0, now - int(words[word])) / NANOSECONDS if words[word] else None
+                for name, word in HEARTBEATS.items()
+            },
+            **{"mode": None, "estop_latched": False, "command_age": None, "observation_age": None} | moment,
+        )
+
+    def _of_state(self, state: Any, now: int, running: bool, rates: dict[str, float]) -> dict[str, Any]:
+        """Return what a published state says."""
+        mode = Mode(int(state["mode"][0]))
+        goal = decode_feedback(state["feedback"]) if "feedback" in state.dtype.names else None
+        by_setpoint = mode == Mode.TRACKING and goal is None
+        requested = state["requested"][0].tolist() if int(state["setpoints"]) and goal is None else None
+        age = (int(state["command_age_ns"]) + now - int(state["due_ns"])) / NANOSECONDS
+        seen = (int(state["oldest_ns"]) + now - int(state["sensed_ns"])) / NANOSECONDS
+        values = zip(self._block.about["commands"], state["command"][0].tolist(), state["measured"][0], strict=True)
+        refusals = dict(zip(REASONS, state["refusals"].tolist(), strict=True))
+        counts = {
+            key: {name: Count(int(n), rates.get(f"{key}.{name}")) for name, n in zip(names, state[key], strict=True)}
+            for key, names in (("limits", LIMITS), ("watchdogs", WATCHDOGS))
+        }
+        return {
+            "mode": mode.name,
+            "estop_latched": bool(state["emergency_stop"][0]),
+            "command_age": max(0.0, age) if by_setpoint and running else None,
+            "observation_age": max(0.0, seen) if running else None,
+            "dimensions": tuple(
+                Dimension(name, None if requested is None else requested[i], applied, float(measured))
+                for i, (name, applied, measured) in enumerate(values)
+            ),
+            **counts,
+            "refusals": {name: n for name, n in refusals.items() if n and name != Reason.ACCEPTED.name},
+            "goal": goal and {**asdict(goal), "phase": goal.phase.name},
+            "pose": dict(zip(POSE, state["odometry"][0].tolist(), strict=False)),
+        }
+
+    def _rates(self, now: int, words: Any, state: Any) -> dict[str, float]:
+        """Return how often things happen in a second, over the window that lies within the present stretch."""
+        stretch = int(words[Word.STRETCH])
+        if state is None or int(state["stretch"]) != stretch or words[Word.PHASE] != Phase.RUNNING:
+            self._past.clear()
+            return {}
+        counts = {"executed": int(state["executed"]), "setpoints": int(state["setpoints"])}
+        for key, names in (("limits", LIMITS), ("watchdogs", WATCHDOGS)):
+            counts |= {f"{key}.{name}": int(n) for name, n in zip(names, state[key], strict=True)}
+        if self._frames is not None:
+            counts["frames"] = len(self._frames)
+        newest = _Counts(stretch, now, int(state["start_ns"]), counts)
+        past = self._past
+        while past and (past[0].stretch != stretch or (len(past) > 1 and now - past[1].now > _WINDOW_NS)):
+            past.popleft()
+        past.append(newest)
+        oldest = past[0]
+        if newest.now - oldest.now < NANOSECONDS // 10:
+            return {}
+        rates = {key: (n - oldest.counts[key]) * NANOSECONDS / (now - oldest.now) for key, n in counts.items()}
+        # Ticks are counted to the tick: by when they started, unless the newest is long ago and the loop hangs.
+        if newest.started > oldest.started and now - newest.started < NANOSECONDS // 4:
+            ticks = counts["executed"] - oldest.counts["executed"]
+            rates["executed"] = ticks * NANOSECONDS / (newest.started - oldest.started)
+        return rates
+
+    def _read_spreads(self) -> tuple[Spread | None, Spread | None]:
+        if self._statistics is None:
+            return None, None
+        try:
+            view = TimingStatistics.view(self._statistics)
+        except ConfigError:  # the process has not begun to count, or begins anew at this very moment
+            return self._spreads
+        copy = view.copy()
+        view.release()
+        if not copy.ticks:
+            return None, None
+        total = copy.summary(clock="realtime")
+        _, lateness, duration = copy.histograms
+        return (
+            Spread(total.lateness_p50, total.lateness_p99, total.lateness_max, cells(lateness)),
+            Spread(total.duration_p50, total.duration_p99, total.duration_max, cells(duration)),
+        )
+
+
+@dataclass(frozen=True)
+class _Counts:
+    stretch: int
+    now: int
+    started: int
+    counts: dict[str, int]
+
+
+def cells(histogram: Any) -> tuple[int, ...]:
+    """Return a histogram of `TimingStatistics`, shape (142,), by the cells that are shown, shape (DECADES * CELLS,)."""
+    # Bin 0 is all up to 1 us, and bin i ends at 1 us x 10^(i / 20).
+    index = np.clip((np.arange(len(histogram)) - 1) // _FINE, 0, DECADES * CELLS - 1)
+    return tuple(np.bincount(index, weights=histogram, minlength=DECADES * CELLS).astype(int).tolist())

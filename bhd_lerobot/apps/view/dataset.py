@@ -1,0 +1,288 @@
+"""A dataset that is looked at: read once, and again when its files have changed."""
+
+import hashlib
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import RootLock
+from bhd_lerobot.datasets.format.episode_table import PREFIX
+from bhd_lerobot.datasets.format.expected import wrong_values
+from bhd_lerobot.datasets.edit.mark import possible_outcomes
+from bhd_lerobot.datasets.storage.places import check_inside
+from bhd_lerobot.datasets.format.state import UNREADABLE, DatasetState, Row, corrupt, load_state, slot_of
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.apps.view.episode import packed_episode
+from bhd_lerobot.apps.view.marking import mark_episode
+from bhd_lerobot.tasks.task import OUTCOMES
+
+_CACHED_BYTES = 128 * 2**20  # of packed episodes: some hundred of an arm, enough to go back and forth
+# What LeRobot counts with; the page knows it without being told for every frame.
+_COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
+
+@dataclass(frozen=True)
+class _Content:
+    """What was read, the stamp of the files that it was read from, and what the page knows of all episodes."""
+
+    state: DatasetState
+    stamp: str
+    summary: dict[str, Any]
+
+
+class ViewedDataset:
+    """The dataset behind the page. Every method may be called from any thread.
+
+    Args:
+        root: where it lies.
+
+    Raises:
+        DatasetError: there is no dataset.
+        DatasetLockedError: it is being recorded or repaired.
+        DatasetCorruptError: a file is missing or cannot be read.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._lock = threading.Lock()
+        self._packed: OrderedDict[tuple[str, int], bytes] = OrderedDict()
+        self._content = self._read()
+
+    def _read(self) -> _Content:
+        info = self.root / layout.INFO
+        if info.is_file():
+            RootLock(self.root).release()
+        stamp = stamp_of(self.root)
+        try:
+            state = load_state(self.root, films=False)  # a missing film is said in its place on the page
+            if not state.info["fps"] > 0:
+                raise corrupt(info, f"its fps is {state.info['fps']!r}")
+            return _Content(state, stamp, _summary(state, stamp))
+        except (AttributeError, KeyError, TypeError) as error:  # JSON, but of another shape
+            raise corrupt(info, f"it does not describe a dataset ({type(error).__name__}: {error})") from error
+
+    @property
+    def stamp(self) -> str:
+        """The stamp of the files that were read; another one than `stamp_of` gives once they have changed."""
+        return self._content.stamp
+
+    @property
+    def state(self) -> DatasetState:
+        """What was read."""
+        return self._content.state
+
+    def reload(self) -> None:
+        """Read the dataset again if its files have changed.
+
+        Raises:
+            DatasetError: it is gone, is being written, or cannot be read; what was read before stays.
+        """
+        with self._lock:
+            if stamp_of(self.root) != self._content.stamp:
+                self._content = self._read()
+                self._packed.clear()
+
+    def _check_unchanged(self) -> None:
+        if stamp_of(self.root) != self._content.stamp:
+            raise DatasetError(
+                f"{self.root} has changed on disk since it was read, so an episode may have another number now. "
+                "Load it again."
+            )
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the page knows of all episodes, column by column."""
+        return self._content.summary
+
+    def packed(self, index: int) -> bytes:
+        """Return an episode as `packing` makes bytes of it.
+
+        Raises:
+            DatasetError: there is no such episode, or the dataset has changed on disk.
+            DatasetCorruptError: its file cannot be read.
+        """
+        content = self._content
+        key = (content.stamp, index)
+        with self._lock:  # one reader at a time: two processors are not made faster by ten
+            self._check_unchanged()
+            if key in self._packed:
+                self._packed.move_to_end(key)
+                return self._packed[key]
+            row = _row(content.state, index)
+            packed = packed_episode(content.state, row, _table(content.state, row))
+            self._packed[key] = packed
+            while sum(map(len, self._packed.values())) > _CACHED_BYTES and len(self._packed) > 1:
+                self._packed.popitem(last=False)
+            return packed
+
+    def mark(self, index: int, wanted: Any) -> None:
+        """Mark an episode, and read the dataset again; see `mark_episode`.
+
+        Raises:
+            ConfigError: what is wanted is no mark.
+            DatasetError: there is no such episode, or the dataset cannot be changed; it is as it was.
+        """
+        with self._lock:
+            self._check_unchanged()
+            mark_episode(self.root, index, wanted)
+            self._content = self._read()
+            self._packed.clear()
+
+    def film(self, key: str, slot: layout.Slot) -> Path | None:
+        """Return the file of a camera's film, or None if there is no such camera or file.
+
+        Raises:
+            DatasetError: a link leads out of the dataset. It is looked at each time: links can be made meanwhile.
+        """
+        if key not in self.state.video_keys:
+            return None
+        path = check_inside(self.root, self.root / layout.video_file(key, slot))
+        return path if path.is_file() else None
+
+    def image(self, index: int, key: str, frame: int) -> bytes | None:
+        """Return the picture of a camera whose images lie in the data files, or None if there is no such picture.
+
+        Raises:
+            DatasetError: there is no such episode, or the dataset has changed on disk.
+            DatasetCorruptError: its file cannot be read.
+        """
+        feature = self.state.info["features"].get(key)
+        row = _row(self.state, index)
+        if feature is None or feature["dtype"] != "image" or not 0 <= frame < row["length"]:
+            return None
+        with self._lock:
+            self._check_unchanged()
+            stored = _table(self.state, row, [key])[key][frame].as_py() or {}
+        if stored.get("bytes"):
+            return bytes(stored["bytes"])
+        if not stored.get("path"):
+            return None
+        beside = check_inside(self.root, self.root / stored["path"])
+        return beside.read_bytes() if beside.is_file() else None
+
+
+def stamp_of(root: Path) -> str:
+    """Return what changes with every episode that is recorded, marked or removed; empty if there is no dataset.
+
+    Every writer replaces ``info.json`` last, or a file of ``meta/episodes``; both are looked at.
+    """
+    digest = hashlib.blake2b(digest_size=12)
+    found = False
+    for path in [root / layout.INFO, *sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet"))]:
+        try:
+            about = path.stat()
+        except OSError:
+            continue
+        found = True
+        digest.update(f"{path.name} {about.st_mtime_ns} {about.st_size} {about.st_ino}\n".encode())
+    return digest.hexdigest() if found else ""
+
+
+def _summary(state: DatasetState, stamp: str) -> dict[str, Any]:
+    tasks: dict[str, int] = {}
+    columns: dict[str, list[Any]] = {
+        "frames": [row["length"] for row in state.rows],
+        "task": [tasks.setdefault(_instruction(row), len(tasks)) for row in state.rows],
+        "outcome": [_outcome(row) for row in state.rows],
+        "score": [row.get(f"{PREFIX}score") for row in state.rows],
+        "late": [_late_frames(row) for row in state.rows],
+        "interventions": [_listed(row.get(f"{PREFIX}interventions")) for row in state.rows],
+    }
+    return {
+        "name": state.root.resolve().name,
+        "root": str(state.root),
+        "stamp": stamp,
+        "robot": state.info.get("robot_type"),
+        "fps": state.info["fps"],
+        "frames": state.num_frames,
+        "cameras": [_camera(key, feature) for key, feature in state.info["features"].items() if _is_film(feature)],
+        "unfinished": (state.root / layout.STAGING).exists(),
+        "tasks": list(tasks),
+        "outcomes": _possible(state),
+        "takes_interventions": keys.EVENT in state.info["features"],
+        "episodes": columns,
+    }
+
+
+def _possible(state: DatasetState) -> list[str]:
+    """Return the outcomes that some episode can be marked with, in their usual order."""
+    possible = {name for row in state.rows for name in possible_outcomes(state, row)}
+    return [name for name in OUTCOMES if name in possible]
+
+
+def _row(state: DatasetState, index: int) -> Row:
+    if not 0 <= index < state.num_episodes:
+        raise DatasetError(f"There is no episode {index} in {state.root}; it has {state.num_episodes}.")
+    return state.rows[index]
+
+
+def _table(state: DatasetState, row: Row, columns: Sequence[str] | None = None) -> pa.Table:
+    """Return an episode's columns, by default all that are neither images nor counters."""
+    path = state.root / layout.data_file(slot_of(row, "data"))
+    try:
+        if columns is None:
+            there = pq.read_schema(path).names
+            features = state.info["features"]
+            columns = [k for k in there if k in features and k not in _COUNTERS and features[k]["dtype"] != "image"]
+        table = pq.read_table(
+            path,
+            columns=[*columns, "episode_index"],
+            filters=[("episode_index", "=", row["episode_index"])],
+            page_checksum_verification=True,
+        )
+    except UNREADABLE as error:
+        raise corrupt(path, error) from error
+    if wrong := wrong_values(table):
+        raise corrupt(path, wrong)
+    if table.num_rows != row["length"]:
+        raise corrupt(path, f"episode {row['episode_index']} has {table.num_rows} of {row['length']} frames")
+    return table.drop_columns(["episode_index"]) if "episode_index" not in columns else table
+
+
+def _instruction(row: Row) -> str:
+    return ", ".join(row.get("tasks") or [])
+
+
+def _outcome(row: Row) -> str:
+    """Return how an episode ended; empty if nobody has said so."""
+    if row.get(f"{PREFIX}outcome"):
+        return str(row[f"{PREFIX}outcome"])
+    success = row.get(f"{PREFIX}success")
+    return "" if success is None else "success" if success else "failure"
+
+
+def _late_frames(row: Row) -> int | None:
+    try:
+        return int(json.loads(row[f"{PREFIX}timing"])["late_frames"])
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _listed(text: Any) -> int:
+    try:
+        return len(json.loads(text))
+    except (TypeError, ValueError):
+        return 0
+
+
+def _is_film(feature: dict[str, Any]) -> bool:
+    return feature["dtype"] in ("video", "image")
+
+
+def _camera(key: str, feature: dict[str, Any]) -> dict[str, Any]:
+    about = feature.get("info") or feature.get("video_info") or {}
+    return {
+        "key": key,
+        "label": key.removeprefix("observation.images.").removeprefix("observation."),
+        "kind": feature["dtype"],
+        "codec": about.get("video.codec"),
+        "shape": list(feature["shape"]),
+    }

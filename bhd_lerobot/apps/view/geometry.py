@@ -1,0 +1,125 @@
+"""Where the robot and what is around it were in every frame, for the views from above and from the side."""
+
+import functools
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.state import Row
+from bhd_lerobot.apps.view.groups import names_of, scan_of
+
+Arrays = dict[str, NDArray]
+_AWAY_M = 10.0  # an object this high floats where nobody sees it: it is not there
+_ARM_STATE = 6 + 2 + 7 * MAX_OBJECTS  # numbers of a UR5's position state
+_BASE_STATE = 9  # numbers of a TurtleBot3's
+
+
+def scene_of(row: Row) -> dict[str, Any] | None:
+    """Return what was around the robot, as it was recorded; None if nothing readable was."""
+    try:
+        scene = json.loads(row["bhd/scene"])
+    except (KeyError, TypeError, ValueError):
+        return None
+    if not isinstance(scene, dict):
+        return None
+    if "extent" in scene and "shapes" in scene:
+        return {"kind": "arena", **scene}
+    if "objects" in scene:
+        return {"kind": "table", **scene, "colours": COLOURS}
+    return None
+
+
+def views_of(
+    robot: str | None, features: Mapping[str, Any], columns: Mapping[str, NDArray]
+) -> tuple[dict[str, Any], Arrays]:
+    """Return what is known about the robot's place: a description, and arrays by name.
+
+    Arrays of a base: ``base`` (frames, 3), x, y [m] and yaw [rad] in the world. Of an arm, in the base frame:
+    ``capsules`` (frames, capsules, 6), the two ends [m] of each; ``tool`` (frames, 3) [m]; and ``objects``
+    (frames, objects, 7), position [m] and unit quaternion w, x, y, z, NaN where there is none.
+
+    Args:
+        robot: the robot's type.
+        features: the dataset's features.
+        columns: an episode's numeric columns, each of shape (frames, numbers).
+    """
+    observed = columns.get(keys.OBSERVATION_STATE)
+    names = names_of(features[keys.OBSERVATION_STATE], observed.shape[1]) if observed is not None else []
+    physics = columns.get(keys.PHYSICS_STATE)
+    about: dict[str, Any] = {}
+    arrays: Arrays = {}
+    scan = scan_of(names)
+    if scan is not None:
+        lidar = turtlebot3_burger().lidar if robot == "turtlebot3" else None
+        about["scan"] = {
+            "column": keys.OBSERVATION_STATE,
+            "first": scan[0],
+            "beams": scan[1],
+            "range_max": lidar.range_max if lidar else None,
+            "x": -0.032 if robot == "turtlebot3" else 0.0,  # of the scanner before the wheel axis [m]
+        }
+    if robot == "ur5" and (joints := _joints(names, observed, physics)) is not None:
+        capsules = _ur5().chain.capsules
+        palm = next(number for number, one in enumerate(capsules) if one.name == "palm")
+        about["arm"] = {"radii": [one.radius for one in capsules], "hand": palm}
+        arrays |= _arm(*joints)
+        if physics is not None and physics.shape[1] > _ARM_STATE:
+            arrays["objects"] = _objects(physics)
+    elif robot == "turtlebot3" and physics is not None and physics.shape[1] > _BASE_STATE:
+        about["base"] = {"from": "simulator", "radius": turtlebot3_burger().radius}
+        w, x, y, z = physics[:, 3:7].T
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        arrays["base"] = np.column_stack([physics[:, :2], yaw]).astype(np.float32)
+    elif observed is not None and {"x.pos", "y.pos", "theta.pos"} <= set(names):
+        about["base"] = {"from": "odometry", "radius": turtlebot3_burger().radius if robot == "turtlebot3" else 0.1}
+        arrays["base"] = observed[:, [names.index(name) for name in ("x.pos", "y.pos", "theta.pos")]]
+    return about, arrays
+
+
+@functools.cache
+def _ur5() -> Arm:
+    return ur5()
+
+
+def _joints(
+    names: list[str], observed: NDArray | None, physics: NDArray | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return joint positions (frames, 6) and the gripper's opening (frames,), of the simulator if it is there."""
+    if physics is not None and physics.shape[1] > _ARM_STATE:
+        return physics[:, :6].astype(np.float64), physics[:, 6:8].sum(axis=1).astype(np.float64)
+    wanted = [f"{joint}.pos" for joint in _ur5().chain.joints]
+    if observed is None or not set(wanted) <= set(names):
+        return None
+    opening = observed[:, names.index("gripper.pos")] if "gripper.pos" in names else np.zeros(len(observed))
+    return observed[:, [names.index(name) for name in wanted]].astype(np.float64), opening.astype(np.float64)
+
+
+def _arm(joints: NDArray[np.float64], opening: NDArray[np.float64]) -> Arrays:
+    chain = _ur5().chain
+    kinematics = ForwardKinematics(chain)
+    frames = kinematics.frames(joints)
+    capsules = np.empty((len(joints), len(chain.capsules), 2, 3), np.float32)
+    for number, one in enumerate(chain.capsules):
+        frame = frames[:, one.frame]
+        for end, point in enumerate((one.start, one.end)):
+            local = np.tile(np.asarray(point, np.float64), (len(joints), 1))
+            if one.name.startswith("finger"):  # drawn where the fingers are; the collision checks take them as open
+                local[:, 1] = np.sign(point[1]) * (opening / 2 + one.radius)
+            capsules[:, number, end] = np.einsum("fij,fj->fi", frame[:, :3, :3], local) + frame[:, :3, 3]
+    tool = kinematics.tool(joints)[:, :3, 3]
+    return {"capsules": capsules.reshape(len(joints), -1, 6), "tool": tool.astype(np.float32)}
+
+
+def _objects(physics: NDArray) -> NDArray[np.float32]:
+    objects = physics[:, 8:_ARM_STATE].reshape(len(physics), MAX_OBJECTS, 7).astype(np.float32)
+    objects[objects[..., 2] > _AWAY_M] = np.nan
+    return objects

@@ -1,0 +1,155 @@
+"""The web server of `bhd-data view`: the page, the dataset as the page wants it, and the films."""
+
+import asyncio
+import re
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from aiohttp import web
+
+from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.apps.view.dataset import ViewedDataset, stamp_of
+from bhd_lerobot.apps.view.guard import add_headers, guard, new_token
+from bhd_lerobot.apps.view.packing import to_json
+
+HOST = "127.0.0.1"
+STATIC = Path(__file__).parent / "static"
+_DATASET: web.AppKey[ViewedDataset] = web.AppKey("dataset", ViewedDataset)
+_TOKEN: web.AppKey[str] = web.AppKey("token", str)
+_NUMBER = re.compile(r"[0-9]{1,9}")
+
+
+def application(dataset: ViewedDataset) -> web.Application:
+    """Return the server's application."""
+    token = new_token()
+    app = web.Application(middlewares=[guard(token), _tell_errors], client_max_size=64 * 1024)
+    app[_DATASET], app[_TOKEN] = dataset, token
+    app.on_response_prepare.append(add_headers)
+    app.router.add_get("/", _page)
+    app.router.add_get("/favicon.ico", _no_icon)
+    app.router.add_get("/api/dataset", _dataset)
+    app.router.add_get("/api/stamp", _stamp)
+    app.router.add_get("/api/episodes/{index}", _episode)
+    app.router.add_post("/api/episodes/{index}/mark", _mark)
+    app.router.add_get("/api/episodes/{index}/images/{key}/{frame}", _image)
+    app.router.add_get("/films/{key}/{chunk}/{file}.mp4", _film)
+    app.router.add_static("/static", STATIC)
+    return app
+
+
+async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None]) -> signal.Signals:
+    """Serve the page until SIGINT or SIGTERM; return which it was.
+
+    Args:
+        dataset: what is shown.
+        port: on 127.0.0.1; 0 for any free one.
+        ready: is told the page's address as soon as it can be opened.
+
+    Raises:
+        ConfigError: the port cannot be had.
+    """
+    runner = web.AppRunner(application(dataset), access_log=None, shutdown_timeout=0.5)
+    await runner.setup()
+    loop = asyncio.get_running_loop()
+    stop: asyncio.Future[signal.Signals] = loop.create_future()
+    signals = (signal.SIGINT, signal.SIGTERM)
+
+    def end(number: signal.Signals) -> None:
+        if not stop.done():
+            stop.set_result(number)
+
+    try:
+        for one in signals:
+            loop.add_signal_handler(one, end, one)
+        try:
+            await web.TCPSite(runner, HOST, port).start()
+        except OSError as error:
+            raise ConfigError(
+                f"--port {port}: nothing can be served there on {HOST} ({error.strerror or error}). "
+                "Choose another port, or --port 0 for any that is free."
+            ) from error
+        ready(f"http://{HOST}:{runner.addresses[0][1]}/")
+        return await stop
+    finally:
+        for one in signals:
+            loop.remove_signal_handler(one)
+        await runner.cleanup()
+
+
+@web.middleware
+async def _tell_errors(request: web.Request, handler: Any) -> web.StreamResponse:
+    """Tell the page what went wrong as it tells a terminal."""
+    try:
+        response: web.StreamResponse = await handler(request)
+    except BhdError as error:
+        return web.json_response({"error": str(error)}, status=409)
+    return response
+
+
+async def _page(request: web.Request) -> web.Response:
+    text = (STATIC / "index.html").read_text(encoding="utf-8").replace("{{token}}", request.app[_TOKEN])
+    return web.Response(text=text, content_type="text/html", headers={"Cache-Control": "no-store"})
+
+
+async def _no_icon(request: web.Request) -> web.Response:
+    return web.Response(status=204)
+
+
+async def _dataset(request: web.Request) -> web.Response:
+    dataset = request.app[_DATASET]
+    await asyncio.to_thread(dataset.reload)
+    text = await asyncio.to_thread(lambda: to_json(dataset.summary()))
+    response = web.Response(text=text, content_type="application/json")
+    response.enable_compression()
+    return response
+
+
+async def _stamp(request: web.Request) -> web.Response:
+    dataset = request.app[_DATASET]
+    now = await asyncio.to_thread(stamp_of, dataset.root)
+    return web.json_response({"shown": dataset.stamp, "now": now})
+
+
+async def _episode(request: web.Request) -> web.Response:
+    dataset = request.app[_DATASET]
+    etag = f'"{dataset.stamp}-{request.app[_TOKEN][:8]}"'  # another server's packing may be another one
+    if request.headers.get("If-None-Match") == etag:
+        return web.Response(status=304, headers={"ETag": etag})
+    packed = await asyncio.to_thread(dataset.packed, _number(request, "index"))
+    return web.Response(body=packed, content_type="application/octet-stream", headers={"ETag": etag})
+
+
+async def _film(request: web.Request) -> web.StreamResponse:
+    slot = _number(request, "chunk"), _number(request, "file")
+    path = request.app[_DATASET].film(request.match_info["key"], slot)
+    if path is None:
+        raise web.HTTPNotFound(text="There is no such film.\n")
+    return web.FileResponse(path, headers={"Content-Type": "video/mp4"})  # it knows ranges and conditions
+
+
+async def _image(request: web.Request) -> web.Response:
+    dataset, key = request.app[_DATASET], request.match_info["key"]
+    content = await asyncio.to_thread(dataset.image, _number(request, "index"), key, _number(request, "frame"))
+    if content is None:
+        raise web.HTTPNotFound(text="There is no such picture.\n")
+    kind = "image/png" if content.startswith(b"\x89PNG") else "image/jpeg"
+    return web.Response(body=content, content_type=kind)
+
+
+async def _mark(request: web.Request) -> web.Response:
+    dataset, index = request.app[_DATASET], _number(request, "index")
+    try:
+        wanted = await request.json()
+    except ValueError as error:
+        raise web.HTTPBadRequest(text=f"The request is not JSON: {error}\n") from error
+    await asyncio.to_thread(dataset.mark, index, wanted)
+    return web.json_response({"stamp": dataset.stamp})
+
+
+def _number(request: web.Request, name: str) -> int:
+    text = request.match_info[name]
+    if not _NUMBER.fullmatch(text):
+        raise web.HTTPNotFound(text=f"{name} is {text[:40]!r}; it must be a whole number.\n")
+    return int(text)

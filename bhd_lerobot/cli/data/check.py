@@ -1,0 +1,126 @@
+"""What `bhd-data check` prints, and which limits it knows."""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bhd_lerobot.bodies.body import Arm, MobileBase, PositionLimits
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Severity, check_dataset
+from bhd_lerobot.datasets.validate.values import Limits
+from bhd_lerobot.datasets.recovery.fix import fix
+from bhd_lerobot.datasets.format.summary import is_being_written
+from bhd_lerobot.errors import DatasetLockedError
+from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
+
+# No option of a robot changes its limits, and its configuration takes seconds to import.
+_BODIES: dict[str | None, Callable[[], Arm | MobileBase]] = {"turtlebot3": turtlebot3_burger, "ur5": ur5}
+_COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
+
+
+def add_to(commands: Commands) -> None:
+    """Add `check`."""
+    help_text = "is a dataset sound? Exit status 0 if it is, 1 if not; changes nothing without --fix"
+    command = add_command(commands, "check", help_text, _run)
+    command.add_argument("--json", action="store_true", help="print everything as JSON")
+    command.add_argument("--strict", action="store_true", help="a warning is enough for exit status 1")
+    command.add_argument("--no-videos", action="store_true", help="leave the films out, which take longest")
+    command.add_argument(
+        "--fix", action="store_true", help="compute statistics and counts anew where they are wrong, and check again"
+    )
+
+
+def _run(options: argparse.Namespace) -> int:
+    root, videos = root_of(options), not options.no_videos
+    if options.fix:
+        for line in fix(root, check_dataset(root, limits_of, videos=videos).findings):
+            print(f"fixed {line}", file=sys.stderr if options.json else sys.stdout)
+    return check(root, Terminal(), as_json=options.json, is_strict=options.strict, videos=videos)
+
+
+def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, videos: bool) -> int:
+    """Check a dataset and print what was found; return 0 if it is sound and 1 if it is not.
+
+    Args:
+        root: the dataset.
+        console: where it is printed.
+        as_json: print plain values.
+        is_strict: a warning is enough to call it unsound.
+        videos: read the films, too.
+
+    Raises:
+        DatasetLockedError: it is being recorded or changed.
+        DatasetError: there is no dataset that could be checked.
+    """
+    if is_being_written(root):
+        raise DatasetLockedError(
+            f"{root} is being recorded or changed at this moment, so it is neither sound nor not. Check it when "
+            "that has ended."
+        )
+    found = check_dataset(root, limits_of, videos=videos)
+    is_sound = found.worst < (Severity.WARNING if is_strict else Severity.ERROR)
+    if as_json:
+        print(json.dumps(_plain(found, is_sound), indent=1))
+    else:
+        _print(found, console, is_sound)
+    return 0 if is_sound else 1
+
+
+def limits_of(robot_type: str | None) -> Limits:
+    """Return what a robot of ours keeps to: the ranges of its joints, or the largest speeds of a base."""
+    if robot_type not in _BODIES:
+        return {}
+    body = _BODIES[robot_type]()
+    limits = body.limits
+    if isinstance(limits, PositionLimits):
+        low, high = np.asarray(limits.lower), np.asarray(limits.upper)
+    else:
+        high = np.asarray(limits.velocity)
+        low = -high
+    ranges = dict(zip(limits.names, zip(low.tolist(), high.tolist(), strict=True), strict=True))
+    # What a base measures, slip and all, may be a little more than what it is asked for.
+    return {keys.APPLIED_ACTION: ranges, **({keys.OBSERVATION_STATE: ranges} if isinstance(body, Arm) else {})}
+
+
+def _print(found: DatasetCheck, console: Console, is_sound: bool) -> None:
+    if found.findings:
+        table = Table(title=str(found.root), title_justify="left")
+        for heading in ("", "check", "where", "what"):
+            table.add_column(heading, overflow="fold")
+        for one in found.findings:
+            colour = _COLOURS[one.severity]
+            what = escape(one.what + (f". {one.remedy}" if one.remedy else ""))
+            table.add_row(f"[{colour}]{one.severity.word}[/]", one.check, escape(one.where), what)
+        console.print(table)
+    errors, warnings = found.count(Severity.ERROR), found.count(Severity.WARNING)
+    console.print(
+        f"{found.root}: {found.episodes} episodes, {found.frames} frames: "
+        f"{'sound' if is_sound else 'not sound'}, {_some(errors, 'error')}, {_some(warnings, 'warning')}.",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+def _some(count: int, name: str) -> str:
+    return f"{count or 'no'} {name}{'' if count == 1 else 's'}"
+
+
+def _plain(found: DatasetCheck, is_sound: bool) -> dict[str, object]:
+    return {
+        "root": str(found.root),
+        "sound": is_sound,
+        "episodes": found.episodes,
+        "frames": found.frames,
+        "checks": list(CHECKS),
+        "findings": [{**asdict(one), "severity": one.severity.word} for one in found.findings],
+    }

@@ -1,0 +1,203 @@
+"""`bhd-data export`: episodes as ROS 2 bags, and what is known of our robots beside their data."""
+
+import argparse
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import ArmChain, WheelDrive
+from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.geometry.poses import pose_vectors
+from bhd_lerobot.rosbag.exporter.export import START_S, ExportOptions, export_bags
+from bhd_lerobot.rosbag.storage.write import FORMATS
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.rosbag.messages.arm import ARM_FRAME, TOOL_FRAME
+from bhd_lerobot.rosbag.messages.base import FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME, BaseNoise
+from bhd_lerobot.rosbag.messages.views import JointFrame, RobotView, StaticFrame
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.cli.data.command import Commands, add_command, root_of
+from bhd_lerobot.cli.data.episode_list import parse_episodes
+
+_BASE_LINK = (0.0, 0.0, 0.010)  # [m] over the floor, turtlebot3_burger.urdf
+_CASTER = (-0.081, 0.0, -0.004)  # [m] in base_link, the same
+_WHEEL_TURN = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)  # their z axes are the axles, the same; it rounds to 1.57 rad
+_WHEELS = {"wheel_left_joint": ("qpos_7", "qvel_6"), "wheel_right_joint": ("qpos_8", "qvel_7")}
+
+# Universal Robots' ROS 2 description, ur_macro.xacro: base_link is as REP-103 wants it, x to the front; the frames
+# of the controller, base and base_link_inertia, look back. The flange's x axis points out of it, as tool0's z does.
+_ORIGIN, _HALF_TURN = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+_WRISTS = ("wrist_1_link", "wrist_2_link", "wrist_3_link")
+
+
+def add_to(commands: Commands) -> None:
+    """Add `export`."""
+    help_text = "write episodes as ROS 2 bags, which ros2 bag play, Foxglove and `bhd-data import` read"
+    command = add_command(commands, "export", help_text, _run)
+    command.set_defaults(stopped="no bag was written")
+    command.add_argument("--format", choices=FORMATS, default="mcap", help="storage of the bags (default: mcap)")
+    command.add_argument("--output", type=Path, required=True, help="folder to make: of a bag for each episode")
+    command.add_argument("--episodes", metavar="LIST", help="which, such as 0,3,5-9; all if left out")
+    command.add_argument("--one_bag", action="store_true", help="all episodes in one bag, which is --output itself")
+    command.add_argument("--twist", action="store_true", help="commands of a base as Twist instead of TwistStamped")
+    command.add_argument("--compressed_images", action="store_true", help="pictures as JPEG instead of raw")
+    command.add_argument(
+        "--start_time", type=float, default=START_S, metavar="S",
+        help=f"when the first episode starts, seconds since 1970 (default: {START_S})",
+    )  # fmt: skip
+
+
+def _run(options: argparse.Namespace) -> int:
+    if not 0 <= options.start_time < 2**31 - 1:  # ROS counts seconds in 32 bits
+        raise ConfigError(f"--start_time is {options.start_time}; it must be from 0 to {2**31 - 2}.")
+    root = root_of(options)
+    info = dataset_info(root)
+    report = export_bags(
+        root,
+        options.output.expanduser(),
+        view=robot_view(info.robot_type, info.recording),
+        repo_id=options.repo_id or "",
+        options=ExportOptions(
+            storage=options.format,
+            episodes=None if options.episodes is None else parse_episodes(options.episodes),
+            one_bag=options.one_bag,
+            bare_twist=options.twist,
+            compressed_images=options.compressed_images,
+            start_s=options.start_time,
+        ),
+    )
+    what = "1 episode" if report.episodes == 1 else f"{report.episodes} episodes"
+    bags = "1 bag" if len(report.bags) == 1 else f"{len(report.bags)} bags"
+    print(
+        f"{options.output}: {what}, {report.messages} messages, in {bags}. Look at one: ros2 bag play {report.bags[0]}"
+    )
+    return 0
+
+
+def robot_view(robot_type: str | None, recording: Mapping[str, Any] | None = None) -> RobotView:
+    """Return what is known of a robot; nothing of those that are not ours.
+
+    Args:
+        robot_type: the robot of the dataset.
+        recording: what the dataset says of its recording. If it says that the robot was simulated, the noise is known.
+    """
+    if robot_type == "turtlebot3":
+        robot = (recording or {}).get("robot")
+        return _turtlebot3(is_simulated=isinstance(robot, dict) and robot.get("type") == robot_type)
+    if robot_type == "ur5":
+        return _ur5()
+    return RobotView()
+
+
+def _turtlebot3(*, is_simulated: bool) -> RobotView:
+    body = turtlebot3_burger()
+    model = ElementTree.fromstring(body.mjcf)
+    camera = _find(model, "camera", "front")
+    return RobotView(
+        lidar=body.lidar,
+        noise=_base_noise(body.drive) if is_simulated else None,
+        frames=(
+            StaticFrame(FOOTPRINT_FRAME, "base_link", _BASE_LINK),
+            StaticFrame("base_link", "caster_back_link", _CASTER, _WHEEL_TURN),
+            _on_base_link(SCAN_FRAME, _place(_find(model, "body", "lds"))),
+            _on_base_link(IMU_FRAME, _place(_find(model, "site", "imu"))),
+            _on_base_link("front_optical_frame", _place(camera), _optical(camera)),
+        ),
+        joints=tuple(
+            JointFrame(**vars(_on_base_link(f"{wheel}_link", _place(_find(model, "body", wheel)), _WHEEL_TURN)),
+                       joint=f"{wheel}_joint")
+            for wheel in body.drive.joints
+        ),
+        fovy={"front": math.radians(float(camera.get("fovy", "nan")))},
+        wheels=_WHEELS,
+    )  # fmt: skip
+
+
+def _base_noise(drive: WheelDrive) -> BaseNoise:
+    """Return the noise of the simulated base. Its speed sensors and gyroscope have none but that of single precision.
+
+    Of odometry it is the rounding of the encoders' counts, at the start and now, each uniform over one count. Slip is
+    not in it: nobody knows that.
+    """
+    count = 2 * math.pi * drive.wheel_radius / drive.encoder_ticks
+    wheel = count * math.sqrt(2 / 12)
+    rounding = 2.0**-24 / math.sqrt(3)
+    return BaseNoise(
+        distance=wheel / math.sqrt(2),
+        yaw=wheel * math.sqrt(2) / drive.wheel_separation,
+        speed=MAX_LINEAR * rounding,
+        turn=MAX_ANGULAR * rounding,
+        gyro=MAX_ANGULAR * rounding,
+    )
+
+
+def _ur5() -> RobotView:
+    body = ur5()
+    model = ElementTree.fromstring(body.mjcf)
+    camera = _find(model, "camera", "wrist")
+    ahead = _place(camera) - _place(_find(model, "site", "tool"))
+    return RobotView(
+        frames=(
+            StaticFrame("base_link", "base_link_inertia", _ORIGIN, _HALF_TURN),
+            StaticFrame("base_link", ARM_FRAME, _ORIGIN, _HALF_TURN),
+            StaticFrame("wrist_3_link", "flange", _ORIGIN, (0.5, -0.5, -0.5, -0.5)),
+            StaticFrame("flange", "tool0", _ORIGIN, (0.5, 0.5, 0.5, 0.5)),
+            StaticFrame("tool0", TOOL_FRAME, body.chain.tool),
+            StaticFrame(TOOL_FRAME, "wrist_optical_frame", _three(ahead), _optical(camera)),
+        ),
+        joints=_links(body.chain),
+        fovy={"wrist": math.radians(float(camera.get("fovy", "nan")))},
+    )
+
+
+def _links(chain: ArmChain) -> tuple[JointFrame, ...]:
+    """Return the links of an arm as `ur_description` has them: each turns about its own z axis.
+
+    That of joint i is Denavit-Hartenberg frame i - 1, moved along its z axis by d of the joint, and turned.
+    """
+    names = ("base_link_inertia", "shoulder_link", "upper_arm_link", "forearm_link", *_WRISTS)
+    links, length, twist = [], 0.0, 0.0
+    for parent, child, joint, a, d, alpha in zip(
+        names, names[1:], chain.joints, chain.a, chain.d, chain.alpha, strict=False
+    ):
+        place = (length, round(-math.sin(twist) * d, 12), round(math.cos(twist) * d, 12))
+        turn = (math.cos(twist / 2), math.sin(twist / 2), 0.0, 0.0)
+        links.append(JointFrame(parent, child, place, turn, joint=f"{joint}_joint"))
+        length, twist = a, alpha
+    return tuple(links)
+
+
+def _find(model: ElementTree.Element, kind: str, name: str) -> ElementTree.Element:
+    found = model.find(f".//{kind}[@name='{name}']")
+    assert found is not None, (kind, name)
+    return found
+
+
+def _place(element: ElementTree.Element) -> NDArray[np.float64]:
+    return np.array([float(number) for number in element.get("pos", "0 0 0").split()])
+
+
+def _three(numbers: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = numbers.tolist()
+    return x, y, z
+
+
+def _on_base_link(
+    child: str, place: NDArray[np.float64], rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+) -> StaticFrame:
+    return StaticFrame("base_link", child, _three(np.round(place - np.array(_BASE_LINK), 9)), rotation)
+
+
+def _optical(camera: ElementTree.Element) -> tuple[float, float, float, float]:
+    """Return how a camera's optical frame (z ahead, x right, y down) is turned, a quaternion wxyz."""
+    axes = np.array([float(number) for number in camera.get("xyaxes", "").split()]).reshape(2, 3)
+    right, up = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    frame = np.eye(4)
+    frame[:3, :3] = np.stack([right, -up, np.cross(up, right)], axis=1)  # MuJoCo's cameras look along -z
+    w, x, y, z = pose_vectors(frame)[3:].tolist()
+    return w, x, y, z

@@ -1,0 +1,215 @@
+"""`bhd-data info`: what is in a dataset."""
+
+import argparse
+import json
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bhd_lerobot.control.timing import TimingSummary
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info, is_being_written
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, roots_of
+from bhd_lerobot.datasets.timing.report import timing_of
+from bhd_lerobot.datasets.timing.tables import fitting, ms
+
+
+def add_to(commands: Commands) -> None:
+    """Add `info`."""
+    help_text = "what is in a dataset: features, and outcome and timing of every episode; changes nothing"
+    command = add_command(commands, "info", help_text, _run, takes_several=True)
+    how = command.add_mutually_exclusive_group()
+    how.add_argument("--short", action="store_true", help="a line for each dataset")
+    how.add_argument("--json", action="store_true", help="everything as JSON; of several datasets, a list")
+
+
+def _run(options: argparse.Namespace) -> int:
+    roots = roots_of(options)
+    if options.short:
+        return short(roots)
+    if options.json:
+        told = [_plain(dataset_info(root)) for root in roots]
+        print(
+            json.dumps(told if len(told) > 1 else told[0], indent=1, default=str)
+        )  # who calls the recorder chooses the metadata
+        return 0
+    for root in roots:
+        info(root, Terminal())
+    return 0
+
+
+def short(roots: Sequence[Path]) -> int:
+    """Print a line for each dataset; return the exit status: 2 if one of them is none, after all were told."""
+    status = 0
+    for root in roots:
+        try:
+            print(_line(dataset_info(root)))
+        except DatasetError as error:
+            print(f"error: {error}", file=sys.stderr)
+            status = 2
+    return status
+
+
+def _line(summary: DatasetSummary) -> str:
+    parts = [
+        str(summary.robot_type),
+        *_amount(summary),
+        f"{summary.size / 1e6:.1f} MB",
+        _outcomes(summary),
+        _unfinished(summary),
+    ]
+    return f"{summary.root}: {', '.join(part for part in parts if part)}"
+
+
+def _unfinished(summary: DatasetSummary) -> str:
+    """Return why a dataset is not finalised; empty if it is."""
+    if is_being_written(summary.root):
+        return "not finalised: it is being recorded or changed at this moment"
+    return "" if summary.compact else "not finalised: an interrupted recording; `bhd-data repair` finishes it"
+
+
+def _amount(summary: DatasetSummary) -> list[str]:
+    if not summary.episodes:
+        return ["empty: no episodes"]
+    seconds = summary.frames / summary.fps
+    return [f"{len(summary.episodes)} episodes", f"{summary.frames} frames", f"{seconds:.0f} s"]
+
+
+def _outcomes(summary: DatasetSummary) -> str:
+    outcomes = Counter(str(e.metadata["outcome"]) for e in summary.episodes if "outcome" in e.metadata)
+    return ", ".join(f"{name} {count}" for name, count in outcomes.most_common())
+
+
+def info(root: Path, console: Console) -> None:
+    """Print what is in a dataset.
+
+    Raises:
+        DatasetError: there is none, or a file cannot be read.
+    """
+    summary = dataset_info(root)
+    state = _unfinished(summary) or "finalised"
+    table = Table(title=escape(str(summary.root)), title_justify="left", show_header=False)
+    table.add_row("robot", escape(f"{summary.robot_type}, {summary.fps} frames/s"))
+    table.add_row("content", ", ".join(_amount(summary)))
+    table.add_row("files", f"{summary.files}, {summary.size / 1e6:.1f} MB, {escape(state)}")
+    table.add_row("tasks", escape("; ".join(summary.tasks)))
+    for part in ("brain", "task"):
+        if part in summary.recording:
+            chosen = summary.recording[part]
+            table.add_row(part, escape(", ".join(f"{key} {value}" for key, value in chosen.items())))
+    if "seed" in summary.recording:
+        table.add_row("seed", f"{summary.recording['seed']} ({summary.recording.get('split')})")
+    timings = [timing_of(episode) for episode in summary.episodes]
+    if any(timings):
+        table.add_row("timing", _timing([t for t in timings if t is not None]))
+    if outcomes := _outcomes(summary):
+        table.add_row("outcomes", escape(outcomes))
+    console.print(table)
+    features = Table(title="Features", title_justify="left")
+    for heading in ("key", "type", "shape", "meaning"):
+        features.add_column(heading)
+    for key, feature in summary.features.items():
+        # Units stand in square brackets, which rich would take for markup.
+        features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), escape(meaning_of(key, feature)))
+    console.print(features)
+    if not summary.episodes:
+        return
+    episodes = Table(title="Episodes", title_justify="left")
+    columns = _episode_columns(summary, timings)
+    told = len({episode.task for episode in summary.episodes}) > 1
+    # At least a few words of the instruction, if it is told; it wraps.
+    shown = fitting(columns, console.width - 33 * told)
+    for heading, _ in shown:
+        episodes.add_column(heading, justify="left" if heading == "outcome" else "right", no_wrap=True)
+    if told:
+        episodes.add_column("instruction")
+    for row, episode in zip(zip(*(cells for _, cells in shown), strict=True), summary.episodes, strict=True):
+        episodes.add_row(*row, *[escape(episode.task)] * told)
+    console.print(episodes)
+
+
+def _episode_columns(summary: DatasetSummary, timings: Sequence[TimingSummary | None]) -> list[tuple[str, list[str]]]:
+    """Return the table of episodes by columns, the most telling ones first."""
+    measured: tuple[tuple[str, Callable[[TimingSummary], str]], ...] = (
+        ("late frames", lambda t: str(t.late_frames)),
+        ("skipped", lambda t: str(t.skipped)),
+        ("late p99 / ms", lambda t: ms(t.lateness_p99)),
+        ("overruns", lambda t: str(t.overruns)),
+        ("drops", lambda t: str(t.drops)),
+        ("age max / ms", lambda t: ms(t.age_max)),
+    )
+    timing = [(heading, ["" if t is None else cell(t) for t in timings]) for heading, cell in measured]
+    metadata = [episode.metadata for episode in summary.episodes]
+    seed = ("seed", [str(one.get("seed", "")) for one in metadata])
+    simulated = all(t is None or t.clock == "lockstep" for t in timings)
+    return [
+        ("episode", [str(one.index) for one in summary.episodes]),
+        ("frames", [str(one.frames) for one in summary.episodes]),
+        ("seconds", [f"{one.frames / summary.fps:.1f}" for one in summary.episodes]),
+        ("outcome", [str(one.get("outcome", "")) for one in metadata]),
+        ("score", [_score(one.get("score")) for one in metadata]),
+        *([seed, *timing] if simulated else [*timing, seed]),
+    ]
+
+
+def _score(score: object) -> str:
+    return "" if score is None else f"{score:.3f}" if isinstance(score, int | float) else str(score)
+
+
+def _timing(timings: Sequence[TimingSummary]) -> str:
+    measured = [t for t in timings if t.clock != "lockstep"]
+    if not measured:
+        return "simulated time: nothing can be late"
+    late, frames = sum(t.late_frames for t in measured), sum(t.frames for t in measured)
+    skipped, drops = sum(t.skipped for t in measured), sum(t.drops for t in measured)
+    return (
+        f"wall-clock time: {late} of {frames} frames out of tolerance, {skipped} ticks skipped, {drops} frames or "
+        "states lost; `bhd-data timing` says more"
+    )
+
+
+def meaning_of(key: str, feature: dict[str, Any]) -> str:
+    """Return what a column holds, in words; the names of a vector where there is nothing better."""
+    if key in keys.SCALARS:
+        return keys.SCALARS[key][1]
+    if key in _LEROBOT_COLUMNS:
+        return _LEROBOT_COLUMNS[key]
+    names = feature.get("names") or []
+    if isinstance(names, list) and len(names) > 6:
+        return f"{', '.join(map(str, names[:3]))}, … {names[-1]}"
+    return ", ".join(map(str, names)) if isinstance(names, list) else ""
+
+
+_LEROBOT_COLUMNS = {
+    keys.SUBTASK: "what the brain was doing, in words",
+    "timestamp": "frame_index / fps [s]",
+    "frame_index": "number of the frame in its episode",
+    "episode_index": "number of the episode in the dataset",
+    "index": "number of the frame in the dataset",
+    "task_index": "number of the instruction",
+}
+
+
+def _plain(summary: DatasetSummary) -> dict[str, Any]:
+    return {
+        "root": str(summary.root),
+        "robot_type": summary.robot_type,
+        "fps": summary.fps,
+        "frames": summary.frames,
+        "files": summary.files,
+        "bytes": summary.size,
+        "compact": summary.compact,
+        "tasks": list(summary.tasks),
+        "recording": summary.recording,
+        "features": summary.features,
+        "episodes": [
+            {"index": e.index, "frames": e.frames, "task": e.task, "metadata": e.metadata} for e in summary.episodes
+        ],
+    }

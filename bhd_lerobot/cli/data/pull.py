@@ -1,0 +1,188 @@
+"""`bhd-data pull`: a dataset from the Hub, or from below a URL."""
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.remote.listing import check_repo_id, counted, is_url, megabytes
+from bhd_lerobot.datasets.remote.url import check_url, shown
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetWriteError, TransferError
+from bhd_lerobot.cli.data.command import Commands, add_command
+from bhd_lerobot.hub.transfer import (
+    command_line,
+    folder_of,
+    for_urls,
+    prompt_interrupt,
+    quiet_bars,
+    refuse_empty,
+    repeat_line,
+    split_list,
+    storage_options,
+    tell_of_folder,
+)
+from bhd_lerobot.cli.data.episode_list import parse_episodes, short
+
+if TYPE_CHECKING:
+    from bhd_lerobot.datasets.remote.pull import PullReport, Select
+
+
+def add_to(commands: Commands) -> None:
+    """Add `pull`."""
+    help_text = "download a dataset from the Hub or from below a URL, or some episodes of it; repeat it to go on"
+    command = add_command(commands, "pull", help_text, _run, names_dataset=False)
+    command.add_argument("source", nargs="?", help="user/name on the Hub, or a URL")
+    command.add_argument("--repo_id", help="the name on the Hub, as an option")
+    command.add_argument("--root", help="where to; of a name on the Hub, LeRobot's default place if nothing")
+    command.add_argument("--revision", help="branch, tag or commit; the one that stock LeRobot takes if nothing")
+    command.add_argument("--episodes", help="only the files of these episodes, such as 0,3,5-9")
+    command.add_argument("--outcome", help="only the files of episodes that ended so, such as success")
+    command.add_argument("--min_score", type=float, help="only the files of episodes with at least this score, 0 to 1")
+    command.add_argument("--replace", action="store_true", help="give up another or a changed dataset that is there")
+    command.add_argument(
+        "--verify", action="store_true", help="of a URL: read what is there also of files that are here, and compare"
+    )
+    command.add_argument("--storage_options", help="options of the URL's file system, JSON")
+
+
+def _run(options: argparse.Namespace) -> int:
+    source, root = _places(options)
+    again = repeat_line(options, source, root=root)
+    options.stopped = f"{root} is as it was, and what arrived is not fetched again. Go on with:\n  {again}"
+    with prompt_interrupt(options.stopped):
+        report = pull_dataset(
+            source,
+            root,
+            revision=options.revision,
+            select=_selection(options),
+            replace=options.replace,
+            verify=options.verify,
+            storage=options.storage_options,
+            again=again,
+        )
+    print(tell(report, source))
+    return 1 if report.problem else 0
+
+
+def pull_dataset(
+    source: str,
+    root: Path,
+    *,
+    revision: str | None = None,
+    select: "Select | None" = None,
+    replace: bool = False,
+    verify: bool = False,
+    storage: str | None = None,
+    again: str | None = None,
+) -> "PullReport":
+    """Download a dataset, or some episodes of it.
+
+    Args:
+        source: name on the Hub, or a URL.
+        root: where to.
+        revision: branch, tag or commit of the Hub; the one that stock LeRobot takes if None.
+        select: chooses the episodes, given a folder with the metadata; None means all.
+        replace: give up another or a changed dataset that is there.
+        verify: read what lies below a URL also of files that are here, and compare contents.
+        storage: options of the URL's file system, JSON.
+        again: the command to repeat.
+
+    Raises:
+        BhdError: it is not there; the message says why, and how to repeat.
+    """
+    from bhd_lerobot.datasets.remote.hub import HubDataset
+    from bhd_lerobot.datasets.remote.pull import pull
+    from bhd_lerobot.datasets.remote.store import StoreDataset
+
+    quiet_bars()
+    remote = StoreDataset(source, storage_options(storage)) if is_url(source) else HubDataset(source, revision)
+    try:
+        return pull(remote, root, select=select, replace=replace, verify=verify)
+    except (TransferError, DatasetWriteError) as error:
+        again = again or command_line("pull", [source], root=root, revision=revision)
+        raise type(error)(
+            f"{error}\n{root} is as it was, and what arrived is not fetched again. When that is mended, repeat:\n"
+            f"  {again}"
+        ) from error
+
+
+def tell(report: "PullReport", source: str) -> str:
+    """Return a report for a terminal."""
+    lines = [f"{report.root}: {report.total_episodes} episodes"]
+    if report.fetched:
+        lines.append(
+            f"  fetched {counted(report.fetched)}, {megabytes(report.fetched_bytes)}; {report.kept} were there already"
+        )
+    else:
+        lines.append(f"  nothing to fetch: all {report.kept} files are there")
+    if report.by_size:
+        files = "1 file was" if report.by_size == 1 else f"{report.by_size} files were"
+        lines.append(
+            f"  {files} compared by size only, because no checksums are listed at {shown(source)}; --verify compares "
+            "contents"
+        )
+    if report.episodes is not None:
+        count = "1 episode" if len(report.episodes) == 1 else f"{len(report.episodes)} episodes"
+        lines[0] = f"{report.root}: {count} of {report.total_episodes}: {short(report.episodes)}"
+        others = f"all {report.total_episodes}" if report.is_whole else "others, too"
+        label = source if not is_url(source) else report.root.name
+        words = ["bhd-train", f"--dataset.repo_id={label}", f"--dataset.root={report.root}"]
+        lines += [
+            f"  a file holds many episodes: those that are here hold {others}. Name yours where you load them:",
+            f'    {shlex.join(words)} --dataset.episodes="{report.episodes}"',
+        ]
+    if report.problem:
+        lines.append(f"  it came as it is there, and is not sound: {report.problem}")
+    return "\n".join(lines)
+
+
+def _selection(options: argparse.Namespace) -> "Select | None":
+    """Return what chooses the episodes; None if all are wanted.
+
+    Raises:
+        ConfigError: a value that cannot be honoured.
+    """
+    if options.episodes is None and options.outcome is None and options.min_score is None:
+        return None
+    episodes = None if options.episodes is None else sorted(set(parse_episodes(options.episodes)))
+    if options.outcome is None and options.min_score is None:
+        return lambda _: episodes or []
+    from bhd_lerobot.datasets.loader.selection import EpisodeFilter
+
+    wanted = EpisodeFilter(outcome=split_list(options.outcome) or "all", min_score=options.min_score)
+
+    def select(folder: Path) -> Sequence[int]:
+        from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+        try:
+            return wanted.select(LeRobotDatasetMetadata("bhd/pull", root=folder), episodes)
+        except BhdError:
+            raise
+        except Exception as error:  # LeRobot believes what it reads, whoever wrote it
+            raise DatasetError(
+                f"The metadata of the dataset cannot be read, so no episode can be chosen ({error!r}). Pull all of "
+                "it, without --outcome and --min_score, and look at it with bhd-data check."
+            ) from error
+
+    return select
+
+
+def _places(options: argparse.Namespace) -> tuple[str, Path]:
+    refuse_empty(options)
+    source = options.source or options.repo_id
+    if source is None or (options.source and options.repo_id):
+        raise ConfigError("Say where from, once: bhd-data pull user/name, or bhd-data pull s3://bucket/dir --root=DIR.")
+    if is_url(source):
+        check_url(source)
+        if options.root is None:
+            raise ConfigError(f"Say where to: bhd-data pull {source} --root=DIR.")
+        if options.revision is not None:
+            raise ConfigError(f"{source} is a URL: it has no revisions. Leave --revision out.")
+        return source, folder_of(options.root)
+    check_repo_id(source)
+    for_urls(options)
+    root = folder_of(options.root) if options.root else default_root(source)
+    tell_of_folder(source, root)
+    return source, root

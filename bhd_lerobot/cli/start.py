@@ -1,0 +1,123 @@
+"""How a command begins: from its first moment on, Ctrl-C is a line and status 130.
+
+What a command needs takes seconds to import. An interrupt in the middle of that is a traceback, or is swallowed by a
+library that catches everything; so this module imports next to nothing, and ends the process itself meanwhile.
+"""
+
+import importlib
+import os
+import select
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+INTERRUPTED = 128 + signal.SIGINT
+"""The exit status after Ctrl-C."""
+
+
+@contextmanager
+def leaving_on_interrupt() -> Iterator[None]:
+    """End the process at Ctrl-C, with a line and status 130; for imports, when there is nothing to be lost yet.
+
+    Where Ctrl-C is ignored, as of a command in the background of a script, or somebody else minds it, nothing is done.
+    """
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    try:
+        signal.signal(signal.SIGINT, _leave)
+    except ValueError:  # not the main thread, which is the one that is interrupted
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    os.write(2, b"Stopped before it began; nothing was changed.\n")
+    os._exit(INTERRUPTED)
+
+
+def ending_when_unread(main: Callable[[], int]) -> int:
+    """Run a program; return its exit status, that of other programs if nobody reads on, as of ``| head -1``."""
+    try:
+        try:
+            return main()
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()  # a pipe that nobody reads shows now, not when Python ends
+    except BrokenPipeError:
+        if not _is_unread():
+            raise
+        return 128 + signal.SIGPIPE
+
+
+def _is_unread() -> bool:
+    """Tell whether nobody reads any more what is printed; then Python shall not try it again when it ends."""
+    if sys.stdout is None:
+        return False
+    poll = select.poll()
+    poll.register(sys.stdout, 0)
+    if not any(what & select.POLLERR for _, what in poll.poll(0)):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return True
+
+
+def run(module: str) -> int:
+    """Import a module and run its `main`; return the exit status. The process is to end then."""
+    # PyTorch's threads wait for each other after every operation, by default in a loop that keeps a processor busy.
+    # Where other programs run as well, that takes the processor from the thread that is waited for: with two threads
+    # on two processors, beside four busy processes, a training made a fiftieth of its steps. Asleep they compute the
+    # same bits. OpenMP reads this once, when PyTorch is imported.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    try:
+        with leaving_on_interrupt():
+            main = importlib.import_module(module).main
+        status = ending_when_unread(main)
+    except KeyboardInterrupt:  # where the program does not mind it by itself
+        print("Stopped.", file=sys.stderr)
+        return INTERRUPTED
+    finally:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # what libraries do at the very end is no traceback either
+    return status
+
+
+def record() -> int:
+    """Run `bhd-record`."""
+    return run("bhd_lerobot.recording.record")
+
+
+def train() -> int:
+    """Run `bhd-train`."""
+    return run("bhd_lerobot.training.train")
+
+
+def evaluate() -> int:
+    """Run `bhd-eval`."""
+    return run("bhd_lerobot.evaluation.evaluate")
+
+
+def replay() -> int:
+    """Run `bhd-replay`."""
+    return run("bhd_lerobot.rollout.replay")
+
+
+def data() -> int:
+    """Run `bhd-data`."""
+    return run("bhd_lerobot.cli.data.main")
+
+
+def doctor() -> int:
+    """Run `bhd-doctor`."""
+    return run("bhd_lerobot.apps.doctor.doctor")
+
+
+def monitor() -> int:
+    """Run `bhd-monitor`."""
+    return run("bhd_lerobot.apps.monitor.monitor")

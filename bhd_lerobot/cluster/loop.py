@@ -1,0 +1,138 @@
+"""An episode loop whose episodes are run by the workers of a cluster."""
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+from rich.console import Console
+
+from bhd_lerobot.control.tolerance import TimingTolerance
+from bhd_lerobot.datasets.format.video import VideoSettings
+from bhd_lerobot.errors import ClusterError
+from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.cluster.cluster import connected
+from bhd_lerobot.cluster.config import RayConfig
+from bhd_lerobot.cluster.crew import Crew
+from bhd_lerobot.cluster.job import Job, fingerprint, histograms_of, read_checkpoints, unpack
+from bhd_lerobot.cluster.task import Task as ClusterTask
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.tasks.task import Task
+
+
+@contextmanager
+def open_crew(config: RayConfig, console: Console) -> Iterator[Crew]:
+    """Join a cluster, or start one, and give those who will work there.
+
+    Raises:
+        ClusterError: it cannot be reached.
+    """
+    with connected(config), Crew(config, console) as crew:
+        yield crew
+
+
+class ClusterLoop(EpisodeLoop):
+    """Runs episodes on the workers of a cluster and yields the same, in the same order, as an `EpisodeLoop`.
+
+    Args:
+        simulation: robots of this machine; they only say what is recorded.
+        task: what is to be achieved.
+        brain: what drives the robots; made here too, so that what does not fit fails before a dataset exists.
+        tolerance: see `EpisodeLoop`.
+        crew: the workers.
+        config: of the recording or the evaluation.
+        brain_config: of the brain.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        task: Task,
+        brain: Brain,
+        tolerance: TimingTolerance | None = None,
+        *,
+        crew: Crew,
+        config: Any,
+        brain_config: Any,
+    ) -> None:
+        super().__init__(simulation, task, brain, tolerance)
+        self._crew, self._config, self._brain_config = crew, config, brain_config
+
+    def run(
+        self,
+        specs: Sequence[EpisodeSpec],
+        stop: Callable[[], bool] = lambda: False,
+        open_images: Callable[[], Any] | None = None,
+    ) -> Generator[Episode]:
+        """Run episodes and yield them in their order, each as soon as it and all before it are done.
+
+        The arguments are those of `EpisodeLoop.run`.
+
+        Raises:
+            ClusterError: the cluster cannot go on, or the emergency stop was pressed.
+            Exception: what the brain, the task or the simulation raised in a worker.
+        """
+        if not specs:
+            return
+        per_task = self._per_task(len(specs))
+        tasks = [
+            ClusterTask(first, [(spec.index, spec.seed) for spec in specs[first : first + per_task]])
+            for first in range(0, len(specs), per_task)
+        ]
+        video = None
+        if open_images is not None and self.simulation.camera_names:
+            writer = open_images()
+            video = writer.video
+            writer.discard()
+        job = self._job(min(self._config.n_envs, per_task), video)
+        ours = fingerprint(job.robot, job.task, job.fps)
+        for result in self._crew.run(job, ours, tasks, lambda: stop() or self._is_stopped()):
+            if job.is_timed:
+                self.brain.times.extend(result["times"])  # type: ignore[attr-defined]
+            for content in result["episodes"]:
+                episode, videos = unpack(content)
+                if open_images is not None and videos:
+                    writer = open_images()
+                    try:
+                        for key, one in videos.items():
+                            writer.add_video(key, one.content, histograms_of(one))
+                    except BaseException:
+                        writer.discard()
+                        raise
+                    episode = replace(episode, writer=writer)
+                self.frames += episode.frames
+                yield episode
+
+    def _per_task(self, episodes: int) -> int:
+        """Return how many episodes a worker gets at a time."""
+        wanted, n = self._config.ray.episodes_per_task, self._config.n_envs
+        if wanted is not None:
+            return int(wanted)
+        # Twice as many as run side by side: one that is over early makes room for another. Two turns for each worker.
+        fair = -(-episodes // (2 * self._crew.workers_for(episodes)))
+        return 1 if n == 1 else max(1, min(2 * n, fair))
+
+    def _job(self, n: int, video: VideoSettings | None) -> Job:
+        config = self._config
+        return Job(
+            robot=config.robot,
+            task=config.task,
+            brain=self._brain_config,
+            tolerance=self.tolerance,
+            fps=self.simulation.rates.fps,
+            n=n,
+            threads=config.threads or config.ray.cpus_per_worker,
+            video=video,
+            is_timed=hasattr(self.brain, "times"),
+            checkpoints=read_checkpoints(self._brain_config),
+        )
+
+    def _is_stopped(self) -> bool:
+        if self.simulation.bridge.estop_pressed:
+            raise ClusterError(
+                "Emergency stop. Episodes that were running on the cluster were dropped, all others are saved. Go on "
+                "with --resume=true: the dropped ones are run again, the same."
+            )
+        return False

@@ -1,0 +1,237 @@
+"""The controller of arms with position servos: setpoints and goals to servo positions."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
+from bhd_lerobot.control.controller import Controller
+from bhd_lerobot.control.motion.goals import GoalManager
+from bhd_lerobot.control.messages import Limit, Mode
+from bhd_lerobot.control.motion.planning import Planning
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.arm.setpoints import SetpointFilter
+
+# A joint this far from its reference for so long does not follow it; goals end with PATH_TOLERANCE at that distance.
+BLOCKED_RAD, BLOCKED_S = 0.1, 0.05
+_BLOCKED = f"The arm stayed more than {BLOCKED_RAD} rad from its reference: something is in its way."
+_CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)  # numpy compares plain numbers faster
+_REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
+
+
+class ArmController(Controller):
+    """Joint positions and the gripper's opening, from setpoints or from goals.
+
+    A command is the position of each joint [rad] and the gripper's opening [m]. What goes to the servos is the
+    reference plus the lead that makes up for the servos' damping, so that they follow a moving reference without a lag.
+
+    Args:
+        arm: the arm.
+        n: number of arms.
+        control_hz: ticks a second [Hz].
+        frame_ticks: ticks in a frame, over which a setpoint is approached.
+        planning: who plans goals; they are planned in the tick that they start in if None.
+    """
+
+    def __init__(self, arm: Arm, n: int, control_hz: int, frame_ticks: int, planning: Planning | None = None) -> None:
+        limits = arm.limits
+        self.arm = arm
+        self.width = self.joints = width = len(limits.names)
+        self.goals = GoalManager(arm, n, control_hz, planning=planning)
+        self.setpoints = SetpointFilter(limits, n, control_hz, frame_ticks)
+        self.command = np.tile(np.asarray(arm.home), (n, 1))
+        self.velocity: NDArray[np.float64] = np.zeros((n, width))
+        self.acceleration: NDArray[np.float64] = np.zeros((n, width))
+        self.actuators = self.command.copy()
+        self.blocked = np.zeros(n, np.bool_)
+        self._any_blocked = self._any_bad = False
+        self.busy = self.goals.busy  # the same array
+        self._half_tick = 0.5 / control_hz  # [s]
+        # Ticks for which a joint has been too far from its reference.
+        self._off_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
+        self._unwatched: NDArray[np.bool_] = np.zeros(n, np.bool_)  # stopped hard, or on the way back already
+        self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
+        self._most_off_ticks = round(BLOCKED_S * control_hz)
+        self._lead = np.asarray(arm.servo_damping) / np.asarray(arm.servo_stiffness)
+        self._stiffness, self._damping = np.asarray(arm.servo_stiffness), np.asarray(arm.servo_damping)
+        self._effort = np.asarray(limits.effort)
+        self._lowest_effort = -self._effort
+        self._largest_error = self._effort / self._stiffness
+        self._largest_error[-1] = np.inf  # a gripper that grips asks for more than it has, always
+        self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self._work = np.zeros((n, width))
+
+    # --- motion ------------------------------------------------------------------------------------------------------
+
+    def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
+        """Head for new setpoints; goals that are still followed end, because the newer command counts."""
+        # Commands are checked when they are sent; a queue in shared memory is written by another process.
+        if not np.isfinite(values).all() and (bad := mask & ~np.isfinite(values).all(axis=1)).any():
+            self._limited_finite |= bad
+            self._any_bad = True
+            self.stop(bad, Mode.FAULT)
+            mask = mask & ~bad
+        if np.count_nonzero(self.busy & mask):
+            left = mask & self.goals.following & ~self.setpoints.active
+            # A trajectory's command is where a smooth motion is at the end of a tick; a setpoint's goes a tick at one
+            # speed. Going on from the speed at the end would change the command's own by half a tick's acceleration
+            # on top of what is allowed.
+            self.velocity -= np.where(left[:, None], self.acceleration * self._half_tick, 0.0)
+            self.goals.drop_for_setpoint(mask)
+        self.setpoints.head_for(values, mask, self.command)
+
+    def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
+        """Decelerate to rest; all goals of these arms end, with the cause as their result."""
+        if cause not in _STOP_CODES:
+            return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
+        hard = cause in (Mode.ESTOP, Mode.FAULT)
+        if hard:
+            mask = mask & ~self.blocked  # they are on their way back, and goals have ended
+            self._unwatched |= mask
+        self._leave_setpoints(mask)
+        self.goals.stop(mask, _STOP_CODES[cause], hard, self.command, self.velocity, self.acceleration)
+
+    def run(self, reading: PlantReading) -> None:
+        """Advance by one tick."""
+        if np.count_nonzero(self.setpoints.active):
+            # A goal that came after them takes over; both in one tick would move the reference twice.
+            if np.count_nonzero(self.busy):
+                self._leave_setpoints(self.busy)
+            self.setpoints.run(self.command, self.velocity, self.acceleration)
+        self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
+        if np.count_nonzero(self._unwatched):
+            self._unwatched &= ~self.following
+        np.multiply(self.velocity, self._lead, out=self.actuators)
+        self.actuators += self.command
+        # A servo that is asked for more than it can give gives what it can: that is noted, and the command left alone.
+        # Holding the command near the joint, to ask for no more, would be a second loop around the servo, which a few
+        # milliseconds of latency turn into a brake.
+        work = self._work
+        np.multiply(reading.velocity, self._lead, out=work)
+        work += reading.position
+        work -= self.actuators
+        np.abs(work, out=work)
+        beyond = work > self._largest_error
+        if self._any_blocked:
+            self.blocked[:] = self._any_blocked = False
+        if np.count_nonzero(beyond):
+            self._limited_effort |= beyond.any(axis=1)
+            self._watch(reading)
+        elif np.count_nonzero(self._off_ticks):
+            self._off_ticks[:] = 0
+
+    def _watch(self, reading: PlantReading) -> None:
+        """Find arms that do not go where they are commanded to, and stop pressing on with them.
+
+        A servo goes on with its full torque for as long as its command is out of reach. The command is brought back to
+        where the arm is: what it pressed against is let go of.
+        """
+        dof = self.width - 1
+        off = (np.abs(self.command[:, :dof] - reading.position[:, :dof]) > BLOCKED_RAD).any(axis=1)
+        self._off_ticks = (self._off_ticks + 1) * (off & ~self._unwatched)
+        blocked = self._off_ticks >= self._most_off_ticks
+        if not blocked.any():
+            return
+        np.copyto(self.blocked, blocked)
+        self._any_blocked = True
+        self._off_ticks[blocked] = 0
+        self._unwatched |= blocked
+        self._leave_setpoints(blocked)
+        where = np.minimum(np.maximum(reading.position, self._lower), self._upper)
+        where[:, dof] = self.command[:, dof]  # what is gripped is not let go of
+        self.goals.retreat(blocked, _BLOCKED, (self.command, self.velocity, self.acceleration), where)
+
+    def _leave_setpoints(self, mask: NDArray[np.bool_]) -> None:
+        """Follow no setpoints any more; what comes next starts without speeding up.
+
+        Goals and brakes change their acceleration gradually, setpoints do not: one that went on from the acceleration
+        of a setpoint near the limit of speed would exceed it.
+        """
+        left = mask & self.setpoints.active
+        if left.any():
+            np.copyto(self.acceleration, 0.0, where=left[:, None] & (self.acceleration * self.velocity > 0))
+            self.setpoints.drop(left)
+
+    def at_rest(self) -> NDArray[np.bool_]:
+        """Return whether each arm is commanded to be at rest, shape (n,)."""
+        return np.asarray((np.abs(self.velocity) < _REST).all(axis=1)) & ~self.busy
+
+    def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
+        """Start from the posture that the arms are in."""
+        self.command[ids] = np.minimum(np.maximum(reading.position[ids], self._lower), self._upper)
+        self.actuators[ids] = self.command[ids]
+        self.velocity[ids] = self.acceleration[ids] = 0.0
+
+    def restart(self, ids: NDArray[np.intp]) -> None:
+        """Forget everything about arms that were put somewhere else."""
+        self.goals.restart(ids)
+        self.setpoints.restart(ids)
+        self.velocity[ids] = self.acceleration[ids] = 0.0
+        self._off_ticks[ids] = 0
+        self._unwatched[ids] = False
+        for flags in (self._limited_finite, self._limited_effort, self.blocked):
+            flags[ids] = False
+
+    # --- reports -----------------------------------------------------------------------------------------------------
+
+    @property
+    def following(self) -> NDArray[np.bool_]:
+        """Whether each arm follows a goal, shape (n,)."""
+        phase = self.goals.phase
+        return np.asarray((phase == _CONVERTING) | (phase == _EXECUTING))
+
+    def take_limits(self) -> NDArray[np.int64]:
+        """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
+        setpoints = self.setpoints
+        if not np.count_nonzero(self._limited_effort) and not setpoints.limited and not self._any_bad:
+            return np.zeros(len(self.busy), np.int64)
+        limits = np.asarray(
+            self._limited_finite * int(Limit.NON_FINITE)
+            + setpoints.limited_position * int(Limit.POSITION)
+            + setpoints.limited_velocity * int(Limit.VELOCITY)
+            + setpoints.limited_acceleration * int(Limit.ACCELERATION)
+            + self._limited_effort * int(Limit.EFFORT)
+        )
+        for flags in (
+            self._limited_finite,
+            self._limited_effort,
+            setpoints.limited_position,
+            setpoints.limited_velocity,
+            setpoints.limited_acceleration,
+        ):
+            flags[:] = False
+        setpoints.limited = self._any_bad = False
+        return limits
+
+    def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
+        """Return the torques that the servos give beyond gravity [N m], the gripper's force last [N]."""
+        asked = np.subtract(self.actuators, reading.position)
+        asked *= self._stiffness
+        asked -= np.multiply(reading.velocity, self._damping, out=self._work)
+        np.maximum(asked, self._lowest_effort, out=asked)
+        return np.minimum(asked, self._effort, out=asked)
+
+    # --- goals -------------------------------------------------------------------------------------------------------
+
+    def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
+        """Take a goal; None if it was accepted, otherwise the refusal."""
+        return self.goals.submit(sim, command, blocked)
+
+    def cancel(self, sim: int, task_id: str) -> ResultCode:
+        """Cancel a goal: decelerate, then hold."""
+        return self.goals.cancel(sim, task_id)
+
+    def take_results(self, sim: int) -> list[CommandResult]:
+        """Return the results of one arm that nobody has taken yet."""
+        return self.goals.take_results(sim)
+
+    def feedback(self, sim: int) -> Feedback | None:
+        """Return how far the goal is that one arm follows, or None."""
+        return self.goals.feedback(sim)
+
+
+_STOP_CODES = {
+    Mode.STOPPING: ResultCode.CANCELLED,
+    Mode.ESTOP: ResultCode.ESTOP,
+    Mode.FAULT: ResultCode.FAULT,
+}

@@ -1,0 +1,180 @@
+"""Where an impedance's spring is at rest: a tool pose and an opening that move within limits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.geometry.rotations import rotation_vectors, turned
+from bhd_lerobot.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+_GAIN = 50.0  # [1/s] how eagerly a remaining error is closed
+_APPROACH = 0.7  # share of the acceleration that approaching a target may count on: room for discrete time
+_REST = 1e-6  # [m/s, rad/s] slower than this is at rest
+
+
+@dataclass(frozen=True)
+class EquilibriumLimits:
+    """How fast an equilibrium may move; the defaults are those of an arm beside a person (ISO 10218-1: 250 mm/s).
+
+    Attributes:
+        speed: [m/s].
+        acceleration: [m/s^2].
+        turn_speed: [rad/s].
+        turn_acceleration: [rad/s^2].
+    """
+
+    speed: float = 0.25
+    acceleration: float = 1.0
+    turn_speed: float = 1.0
+    turn_acceleration: float = 4.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 < value < float("inf"):
+                raise ConfigError(f"{name} is {value}; it must be positive and finite.")
+
+
+class Equilibrium:
+    """Follows setpoints that come once a frame, for n arms; along straight lines, however far a setpoint is.
+
+    Over the frame that follows a setpoint the target moves evenly from where the last setpoint put it to the new one.
+    The equilibrium follows the target with the target's own speed added, never faster than the limits. Without a
+    setpoint it brakes to rest.
+
+    Attributes:
+        position: of the tool in the base frame [m], shape (n, 3).
+        rotation: of the tool in the base frame, shape (n, 3, 3).
+        opening: of the gripper [m], shape (n, 1).
+        speed: velocity of the tool, linear [m/s] then angular [rad/s], in the base frame, shape (n, 6).
+        active: whether a setpoint is followed, shape (n,).
+
+    Args:
+        n: number of arms.
+        control_hz: ticks a second [Hz].
+        frame_ticks: ticks in a frame, over which a setpoint is approached.
+        limits: how fast the tool's equilibrium may move.
+        opening_limits: largest speed [m/s] and acceleration [m/s^2] of the opening.
+    """
+
+    def __init__(
+        self, n: int, control_hz: int, frame_ticks: int, limits: EquilibriumLimits, opening_limits: tuple[float, float]
+    ) -> None:
+        self.position, self.opening = np.zeros((n, 3)), np.zeros((n, 1))
+        self.rotation = np.tile(np.eye(3), (n, 1, 1))
+        self.speed = np.zeros((n, 6))
+        self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self.limited_velocity: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self.limited_acceleration: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self._opening_speed = np.zeros((n, 1))
+        self._hz, self._frame_ticks, self._left = control_hz, frame_ticks, np.zeros(n, np.int64)
+        self._limits = (
+            (limits.speed, limits.acceleration),
+            (limits.turn_speed, limits.turn_acceleration),
+            opening_limits,
+        )
+        # Target, where it is at the end of the frame, and its speed: of position, rotation and opening.
+        self._target, self._goal = self.position.copy(), self.position.copy()
+        self._target_rotation, self._goal_rotation = self.rotation.copy(), self.rotation.copy()
+        self._target_opening, self._goal_opening = self.opening.copy(), self.opening.copy()
+        self._targets = (
+            (self._target, self.position),
+            (self._target_rotation, self.rotation),
+            (self._target_opening, self.opening),
+        )
+        self._feed, self._feed_opening = np.zeros((n, 6)), np.zeros((n, 1))
+
+    def head_for(self, position: Array, rotation: Array, opening: Array, mask: NDArray[np.bool_]) -> None:
+        """Head for new setpoints.
+
+        Args:
+            position: in the base frame [m], shape (n, 3).
+            rotation: in the base frame, shape (n, 3, 3).
+            opening: [m], shape (n, 1).
+            mask: the arms that they are for, shape (n,).
+        """
+        new = mask & ~self.active
+        for target, present in self._targets:
+            target[new] = present[new]
+        self._goal[mask], self._goal_rotation[mask], self._goal_opening[mask] = (
+            position[mask],
+            rotation[mask],
+            opening[mask],
+        )
+        rate = self._hz / self._frame_ticks
+        turn = rotation_vectors(rotation[mask] @ np.swapaxes(self._target_rotation[mask], 1, 2))
+        self._feed[mask, :3], self._feed[mask, 3:] = (position - self._target)[mask] * rate, turn * rate
+        self._feed_opening[mask] = (opening - self._target_opening)[mask] * rate
+        self._left[mask] = self._frame_ticks
+        self.active |= mask
+
+    def drop(self, mask: NDArray[np.bool_]) -> None:
+        """Follow no setpoint any more: brake to rest."""
+        self.active &= ~mask
+
+    def place(self, ids: NDArray[np.intp], pose: Array) -> None:
+        """Put the tool's equilibrium somewhere, at rest, and follow no setpoint; `pose` has shape (len(ids), 4, 4)."""
+        self.position[ids], self.rotation[ids] = pose[:, :3, 3], pose[:, :3, :3]
+        self.speed[ids] = 0.0
+        self.active[ids] = False
+
+    def place_opening(self, ids: NDArray[np.intp], opening: Array) -> None:
+        """Put the opening's equilibrium somewhere [m], at rest; `opening` has shape (len(ids),)."""
+        self.opening[ids, 0], self._opening_speed[ids] = opening, 0.0
+
+    def run(self) -> None:
+        """Advance by one tick."""
+        if not (self.active.any() or self.speed.any() or self._opening_speed.any()):
+            return
+        self._move_targets()
+        active, moving = self.active[:, None], (self._left > 0)[:, None] & self.active[:, None]
+        self._left -= self._left > 0
+        turn = rotation_vectors(self._target_rotation @ np.swapaxes(self.rotation, 1, 2))
+        speeds = (self.speed[:, :3], self.speed[:, 3:], self._opening_speed)
+        errors = (self._target - self.position, turn, self._target_opening - self.opening)
+        feeds = (self._feed[:, :3], self._feed[:, 3:], self._feed_opening)
+        for speed, error, feed, limits in zip(speeds, errors, feeds, self._limits, strict=True):
+            self._approach(speed, np.where(active, error, 0.0), np.where(moving, feed, 0.0), limits)
+        self.position += self.speed[:, :3] / self._hz
+        self.opening += self._opening_speed / self._hz
+        turning = self.speed[:, 3:].any(axis=1)
+        self.rotation[turning] = turned(self.rotation[turning], self.speed[turning, 3:] / self._hz)
+
+    def at_rest(self) -> NDArray[np.bool_]:
+        """Return whether nothing moves, shape (n,)."""
+        return np.asarray((np.abs(self.speed) < _REST).all(axis=1) & (np.abs(self._opening_speed) < _REST)[:, 0])
+
+    def _move_targets(self) -> None:
+        """Move the targets of the arms that are within the frame after a setpoint."""
+        last = self.active & (self._left == 1)
+        going = self.active & (self._left > 1)
+        self._target[going] += self._feed[going, :3] / self._hz
+        self._target_opening[going] += self._feed_opening[going] / self._hz
+        self._target_rotation[going] = turned(self._target_rotation[going], self._feed[going, 3:] / self._hz)
+        if last.any():  # sums of steps miss it by their rounding
+            self._target[last], self._target_opening[last] = self._goal[last], self._goal_opening[last]
+            self._target_rotation[last] = self._goal_rotation[last]
+
+    def _approach(self, speed: Array, error: Array, feed: Array, limits: tuple[float, float]) -> None:
+        """Change a velocity of shape (n, k), in place, towards the one that leads to the target."""
+        fastest, hardest = limits
+        size = _norm(error)
+        # Faster than this it could not slow down in time to stop at the target.
+        closing = np.minimum(_GAIN * size, np.sqrt(2 * _APPROACH * hardest * size))
+        wanted = feed + error * (closing / np.maximum(size, 1e-12))
+        change = _clip(wanted, fastest) - speed
+        self.limited_velocity |= _norm(wanted)[:, 0] > fastest
+        self.limited_acceleration |= self.active & (_norm(change)[:, 0] * self._hz > hardest)
+        speed += _clip(change, hardest / self._hz)
+
+
+def _norm(vectors: Array) -> Array:
+    """Return the lengths of vectors, shape (n, 1)."""
+    return np.asarray(np.sqrt(np.square(vectors).sum(axis=1, keepdims=True)))
+
+
+def _clip(vectors: Array, longest: float) -> Array:
+    """Return vectors shortened to a length."""
+    return vectors * (longest / np.maximum(_norm(vectors), longest))

@@ -1,0 +1,281 @@
+"""The controller of arms with torque motors: a tool that behaves like a damped spring towards a commanded pose."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
+from bhd_lerobot.control.controller import Controller
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics, DynamicsTerms, product
+from bhd_lerobot.control.arm.equilibrium import Equilibrium, EquilibriumLimits
+from bhd_lerobot.control.messages import Limit, Mode
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.geometry.poses import pose_vectors
+from bhd_lerobot.control.geometry.rotations import rotation_matrices, rotation_vectors
+from bhd_lerobot.control.arm.wrench import OBSERVER_GAIN, ContactObserver
+from bhd_lerobot.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+WIDTH = 8
+_FULL_TORQUE_S = 0.1  # [s] a motor's torque goes from none to its largest in no less: an estimate that spares gears
+_JOINT_DAMPING = 0.01  # [s/rad] share of a joint's largest torque that brakes it at 1 rad/s, in every posture
+_FORCE_RATE, _MOMENT_RATE = 100.0, 20.0  # [N/s, N m/s] of the feed-forward wrench
+_MOBILITY_DAMPING = 1e-3  # [1/kg, 1/(kg m^2)] beside about 0.1 1/kg: no direction weighs more than 1000 kg
+_STILL = 0.05  # [rad/s] the joints' speed below which a hard stop is over
+_NORM_RANGE = (0.5, 2.0)  # a quaternion with a norm beyond this is no orientation with a rounding error
+
+
+class ImpedanceController(Controller):
+    """Tool poses and the gripper's opening, held by a spring and a damper; beside them a feed-forward wrench.
+
+    A command is the equilibrium: the tool's position in the base frame x, y, z [m], its orientation as a quaternion
+    w, x, y, z, and the gripper's opening [m]. The motors are given
+
+        torque = J^T (K error + wrench + D (equilibrium's velocity - tool's velocity)) - joint damping + own dynamics
+
+    with the error in the base frame, the rotation as a vector. The opening goes to the gripper's position servo. The
+    equilibrium moves within limits, so that a far target does not jump; spring and feed-forward together are limited,
+    and so are each motor's torque and its change.
+
+    The feed-forward wrench is part of what is commanded: it acts while setpoints are followed, and every stop ends it.
+    After a hard stop (`ESTOP`, `FAULT`) the equilibrium is where the tool is then: what was pressed is let go.
+
+    Attributes:
+        contact: the estimate of the wrench that the surroundings put on the tool.
+        equilibrium: the equilibrium that moves.
+        wrench: the feed-forward wrench in force, force [N] and moment [N m] in the base frame, shape (n, 6).
+
+    Args:
+        arm: the arm; its actuation is ``"torque"``.
+        n: number of arms.
+        control_hz: ticks a second [Hz].
+        frame_ticks: ticks in a frame, over which a setpoint is approached.
+        compliance: stiffness and damping to start with; the default if None.
+        limits: how fast the equilibrium may move; the default if None.
+        observer_gain: bandwidth of the contact estimate [1/s].
+
+    Raises:
+        ConfigError: the arm does not take torques.
+    """
+
+    width = WIDTH
+
+    def __init__(
+        self,
+        arm: Arm,
+        n: int,
+        control_hz: int,
+        frame_ticks: int,
+        *,
+        compliance: Compliance | None = None,
+        limits: EquilibriumLimits | None = None,
+        observer_gain: float = OBSERVER_GAIN,
+    ) -> None:
+        if arm.actuation != "torque":
+            raise ConfigError(f"The arm {arm.name!r} has actuation={arm.actuation!r}; impedance needs 'torque'.")
+        self.arm, self.n = arm, n
+        self.joints = len(arm.limits.names)
+        self.dynamics = ArmDynamics(arm)
+        dof = self.dynamics.dof
+        self.contact = ContactObserver(n, dof, control_hz, observer_gain)
+        opening_limits = (arm.limits.velocity[-1], arm.limits.acceleration[-1])
+        self.equilibrium = Equilibrium(n, control_hz, frame_ticks, limits or EquilibriumLimits(), opening_limits)
+        self.command, self.actuators = np.zeros((n, WIDTH)), np.zeros((n, self.joints))
+        self.busy, self.blocked = (np.zeros(n, np.bool_) for _ in range(2))
+        self.wrench: Array = np.zeros((n, 6))
+        self._wanted_wrench = np.zeros((n, 6))
+        self._wrench_step = np.repeat([_FORCE_RATE, _MOMENT_RATE], 3) / control_hz
+        self._stiffness, self._fixed_damping = np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
+        self._ratio, self._is_fixed = np.ones(n), np.zeros(n, np.bool_)
+        self._largest = np.zeros((n, 2))
+        self._effort = np.asarray(arm.limits.effort[:dof])
+        self._effort_step = self._effort / (_FULL_TORQUE_S * control_hz)
+        # An opening and positions beyond what the arm can ever reach; nearer ones are for the spring to find out.
+        reach = float(np.abs((*arm.chain.a, *arm.chain.d, *arm.chain.tool)).sum())
+        self._lower = np.array([*(-reach,) * 3, arm.limits.lower[-1]])
+        self._upper = np.array([*(reach,) * 3, arm.limits.upper[-1]])
+        self._capture = np.ones(n, np.bool_)  # the equilibrium is to be put where the tool is
+        self._held = np.zeros(n, np.bool_)  # stopped hard
+        self._still = np.ones(n, np.bool_)
+        self._limits: NDArray[np.int64] = np.zeros(n, np.int64)
+        self.set_compliance(Compliance() if compliance is None else compliance)
+        self.restart(np.arange(n))
+
+    # --- what a brain may set beside commands ------------------------------------------------------------------------
+
+    def set_compliance(self, compliance: Compliance, mask: NDArray[np.bool_] | None = None) -> None:
+        """Change stiffness and damping.
+
+        Args:
+            compliance: the new ones.
+            mask: the arms, shape (n,); all if None.
+        """
+        to = slice(None) if mask is None else mask
+        self._stiffness[to], self._ratio[to] = compliance.stiffness, compliance.damping_ratio
+        self._is_fixed[to] = compliance.damping is not None
+        self._fixed_damping[to] = 0.0 if compliance.damping is None else compliance.damping
+        self._largest[to] = compliance.max_force, compliance.max_moment
+
+    def set_wrench(self, wrench: ArrayLike, mask: NDArray[np.bool_] | None = None) -> None:
+        """Push with a wrench while setpoints are followed, until the next stop; it comes and goes gradually.
+
+        Args:
+            wrench: force [N] and moment [N m] that the tool is to put on its surroundings, base frame, shape (6,).
+            mask: the arms, shape (n,); all if None.
+
+        Raises:
+            ConfigError: it is not 6 finite numbers, or more than the compliance of an arm allows.
+        """
+        values, to = np.asarray(wrench, np.float64), slice(None) if mask is None else mask
+        if values.shape != (6,) or not np.isfinite(values).all():
+            raise ConfigError(f"The wrench is {values.tolist()}; it must be 6 finite numbers.")
+        asked = np.array([np.linalg.norm(values[:3]), np.linalg.norm(values[3:])])
+        least = self._largest[to].min(axis=0, initial=np.inf)
+        if (asked > least).any():
+            raise ConfigError(
+                f"The wrench has {asked[0]:.6g} N and {asked[1]:.6g} N m; max_force and max_moment of the "
+                f"compliance are {least[0]:.6g} N and {least[1]:.6g} N m."
+            )
+        self._wanted_wrench[to] = values
+
+    # --- motion ------------------------------------------------------------------------------------------------------
+
+    def head_for(self, values: Array, mask: NDArray[np.bool_]) -> None:
+        """Head for new equilibria."""
+        norms = np.linalg.norm(np.where(np.isfinite(values), values, 0.0)[:, 3:7].clip(-10, 10), axis=1)
+        bad = mask & ~(np.isfinite(values).all(axis=1) & (norms > _NORM_RANGE[0]) & (norms < _NORM_RANGE[1]))
+        if bad.any():
+            # Commands are checked when they are sent; a queue in shared memory is written by another process.
+            self._limits[bad] |= int(Limit.NON_FINITE)
+            self.stop(bad, Mode.FAULT)
+            mask = mask & ~bad
+        if not mask.any():
+            return
+        asked = np.where(mask[:, None], values, self.command)
+        places = asked[:, [0, 1, 2, 7]]
+        clipped = np.minimum(np.maximum(places, self._lower), self._upper)
+        self._limits[mask & (clipped != places).any(axis=1)] |= int(Limit.POSITION)
+        self.equilibrium.head_for(clipped[:, :3], rotation_matrices(asked[:, 3:7]), clipped[:, 3:], mask)
+        self._held &= ~mask
+
+    def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
+        """Brake the equilibrium to rest and stay there; after a hard stop stay where the tool is, and press nothing."""
+        self.equilibrium.drop(mask)
+        self._wanted_wrench[mask] = 0.0
+        if cause in (Mode.ESTOP, Mode.FAULT):
+            self._capture |= mask & ~self._held
+            self._held |= mask
+
+    def run(self, reading: PlantReading) -> None:
+        """Advance by one tick."""
+        dof = self.dynamics.dof
+        position, velocity = reading.position[:, :dof], reading.velocity[:, :dof]
+        terms = self.dynamics.terms(position, velocity)
+        self.contact.update(terms, velocity, self.actuators[:, :dof])
+        if self._capture.any():
+            self._put(np.flatnonzero(self._capture), terms.tool)
+        self.equilibrium.run()
+        self._advance_wrench()
+        self._publish_command()
+        torque = self._torque(terms, velocity)
+        before = self.actuators[:, :dof]
+        given = np.minimum(np.maximum(torque, before - self._effort_step), before + self._effort_step)
+        given = np.minimum(np.maximum(given, -self._effort), self._effort)
+        self._limits[(given != torque).any(axis=1)] |= int(Limit.EFFORT)
+        self.actuators[:, :dof] = given
+        self.actuators[:, dof:] = self.equilibrium.opening
+        self._still[:] = (np.abs(velocity) < _STILL).all(axis=1)
+
+    def at_rest(self) -> NDArray[np.bool_]:
+        """Return whether the equilibrium is at rest and nothing is pushed, and after a hard stop whether the arm is."""
+        rest = self.equilibrium.at_rest() & ~self.wrench.any(axis=1) & ~(self._capture & self._held)
+        return np.asarray(rest & (self._still | ~self._held))
+
+    def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
+        """Start from where tool and fingers are, with the torque that the posture needs."""
+        dof = self.dynamics.dof
+        terms = self.dynamics.terms(reading.position[:, :dof], reading.velocity[:, :dof])
+        self._put(ids, terms.tool)
+        lower, upper = self._lower[3], self._upper[3]
+        self.equilibrium.place_opening(ids, np.minimum(np.maximum(reading.position[ids, dof], lower), upper))
+        self.actuators[ids, :dof] = np.minimum(np.maximum(terms.gravity, -self._effort), self._effort)[ids]
+        self.actuators[ids, dof:] = self.equilibrium.opening[ids]
+        self._publish_command()
+
+    def restart(self, ids: NDArray[np.intp]) -> None:
+        """Forget everything about arms that were put somewhere else; until they are configured they stay there."""
+        home = np.asarray(self.arm.home)
+        terms = self.dynamics.terms(home[None, :-1], np.zeros((1, self.dynamics.dof)))
+        self._put(ids, np.repeat(terms.tool, self.n, axis=0))
+        self.equilibrium.place_opening(ids, np.full(len(ids), home[-1]))
+        self.actuators[ids] = (*terms.gravity[0], home[-1])
+        self.contact.restart(ids)
+        self.wrench[ids] = self._wanted_wrench[ids] = 0.0
+        self._capture[ids] = True
+        self._held[ids], self._still[ids], self._limits[ids] = False, True, 0
+        self._publish_command()
+
+    # --- reports -----------------------------------------------------------------------------------------------------
+
+    def take_limits(self) -> NDArray[np.int64]:
+        """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
+        limits, equilibrium = self._limits.copy(), self.equilibrium
+        limits |= equilibrium.limited_velocity * int(Limit.VELOCITY)
+        limits |= equilibrium.limited_acceleration * int(Limit.ACCELERATION)
+        self._limits[:] = 0
+        equilibrium.limited_velocity[:] = equilibrium.limited_acceleration[:] = False
+        return limits
+
+    def efforts(self, reading: PlantReading) -> Array:
+        """Return the torques that the motors give, weight included [N m], and what the gripper is asked for [N]."""
+        efforts = self.actuators.copy()
+        stiffness, damping = self.arm.servo_stiffness[-1], self.arm.servo_damping[-1]
+        efforts[:, -1] = (efforts[:, -1] - reading.position[:, -1]) * stiffness - reading.velocity[:, -1] * damping
+        return efforts
+
+    def measured(self, reading: PlantReading) -> Array:
+        """Return the tool's pose and the opening as they are, shape (n, 8)."""
+        dof = self.dynamics.dof
+        tool = self.dynamics.terms(reading.position[:, :dof], reading.velocity[:, :dof]).tool
+        return np.concatenate([pose_vectors(tool), reading.position[:, dof:]], axis=1)
+
+    # --- inside a tick -----------------------------------------------------------------------------------------------
+
+    def _torque(self, terms: DynamicsTerms, velocity: Array) -> Array:
+        """Return the torques that are wanted [N m], shape (n, dof)."""
+        error = np.empty((self.n, 6))
+        error[:, :3] = self.equilibrium.position - terms.tool[:, :3, 3]
+        error[:, 3:] = rotation_vectors(self.equilibrium.rotation @ np.swapaxes(terms.tool[:, :3, :3], 1, 2))
+        push = product(self._stiffness, error) + self.wrench
+        for number, part in enumerate((push[:, :3], push[:, 3:])):
+            size, largest = np.linalg.norm(part, axis=1), self._largest[:, number]
+            self._limits[size > largest] |= int(Limit.EFFORT)
+            np.multiply(part, (largest / np.maximum(size, largest))[:, None], out=part)
+        damping = self._fixed_damping.copy()
+        if not self._is_fixed.all():
+            designed = critical_damping(terms.mobility(_MOBILITY_DAMPING), self._stiffness, self._ratio)
+            np.copyto(damping, designed, where=~self._is_fixed[:, None, None])
+        slip = self.equilibrium.speed - product(terms.jacobian, velocity)
+        push += product(damping, slip)
+        own = product(terms.coriolis, velocity) + terms.gravity
+        return product(np.swapaxes(terms.jacobian, 1, 2), push) + own - _JOINT_DAMPING * self._effort * velocity
+
+    def _advance_wrench(self) -> None:
+        """Move the feed-forward wrench towards what is wanted; none without setpoints, none at once if held."""
+        wanted = np.where(self.equilibrium.active[:, None], self._wanted_wrench, 0.0)
+        step = np.minimum(np.maximum(wanted - self.wrench, -self._wrench_step), self._wrench_step)
+        self.wrench += step
+        self.wrench[self._held] = 0.0
+
+    def _put(self, ids: NDArray[np.intp], tool: Array) -> None:
+        """Put the equilibrium of some arms where the tool is; `tool` has shape (n, 4, 4)."""
+        self.equilibrium.place(ids, tool[ids])
+        self._capture[ids] = False
+
+    def _publish_command(self) -> None:
+        equilibrium = self.equilibrium
+        pose = np.zeros((self.n, 4, 4))
+        pose[:, :3, :3], pose[:, :3, 3] = equilibrium.rotation, equilibrium.position
+        self.command[:, :7] = pose_vectors(pose)
+        self.command[:, 7:] = equilibrium.opening

@@ -1,0 +1,248 @@
+"""Which postures reach a pose, and may be taken: inverse kinematics with limits, collisions and singularities."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import ArmChain, PositionLimits
+from bhd_lerobot.control.geometry import inverse_kinematics
+from bhd_lerobot.control.geometry.collision import CollisionModel
+from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.geometry.forward_kinematics import DOF, ForwardKinematics
+from bhd_lerobot.errors import ConfigError
+
+Array = NDArray[np.float64]
+Codes = NDArray[np.int64]
+
+TURN = 2 * np.pi
+_AT_LIMIT = 1e-9  # a joint this far beyond its limit is at its limit [rad]
+_ROTATION_ERROR = 1e-6  # how far the columns of a rotation may be from orthonormal
+_START_ERROR = 1e-3  # how far a line may start from the posture that it is to start from [rad]
+_LARGEST_STEP = 1.0  # a joint that turns further between two poses of a line has changed its branch [rad]
+_ADMISSIBLE = int(ResultCode.SUCCEEDED)
+_IDENTITY = np.eye(3)
+
+
+@dataclass(frozen=True)
+class IkResult:
+    """Postures that were found, or why there are none.
+
+    Attributes:
+        code: SUCCEEDED, or what was in the way.
+        postures: joint positions [rad], shape (k, 6); empty unless succeeded.
+        message: what was in the way, with numbers and a remedy; empty if succeeded.
+        index: number of the pose of a line that cannot be reached, or None.
+    """
+
+    code: ResultCode
+    postures: Array
+    message: str = ""
+    index: int | None = None
+
+
+class ArmKinematics(ForwardKinematics):
+    """Forward and inverse kinematics of an arm.
+
+    Poses are tool frames in the base frame, shape (..., 4, 4).
+
+    Args:
+        chain: the geometry.
+        limits: limits of its commands; the first six are the joints'.
+
+    Raises:
+        ConfigError: the chain has another structure than the closed form can solve, or too few limits.
+    """
+
+    def __init__(self, chain: ArmChain, limits: PositionLimits) -> None:
+        super().__init__(chain)
+        if len(limits.names) < DOF:
+            raise ConfigError(f"There are limits for {len(limits.names)} commands; the arm has {DOF} joints.")
+        self.collision = CollisionModel(chain)
+        self.lower, self.upper = np.array(limits.lower[:DOF]), np.array(limits.upper[:DOF])
+        self._lowest, self._highest = self.lower - _AT_LIMIT, self.upper + _AT_LIMIT
+
+    def solutions(self, pose: Array, last: Array | float = 0.0) -> Array:
+        """Return every posture that reaches a pose, in closed form, whether it may be taken or not.
+
+        Args:
+            pose: shape (..., 4, 4).
+            last: position of the last joint where the pose leaves it free [rad], shape (...).
+
+        Returns:
+            Joint positions in [-pi, pi] [rad], shape (..., 8, 6), one for each branch of
+            `inverse_kinematics.solutions`; NaN where it does not reach the pose.
+        """
+        return inverse_kinematics.solutions(self.chain, pose, last)
+
+    def check(self, q: Array) -> Codes:
+        """Return for each posture the first check that it fails, or SUCCEEDED.
+
+        Args:
+            q: joint positions [rad], shape (..., 6).
+
+        Returns:
+            JOINT_LIMIT, SELF_COLLISION, TABLE_COLLISION, SINGULAR or SUCCEEDED as numbers, shape (...).
+        """
+        self_distance, table_distance = self.collision.distances(q)
+        failures = (  # the last that is written is the first check
+            (ResultCode.SINGULAR, self.manipulability(q) < self.chain.min_manipulability),
+            (ResultCode.TABLE_COLLISION, table_distance < self.chain.min_distance),
+            (ResultCode.SELF_COLLISION, self_distance < self.chain.min_distance),
+            (ResultCode.JOINT_LIMIT, ((q < self._lowest) | (q > self._highest)).any(axis=-1)),
+        )
+        codes = np.full(np.shape(q)[:-1], _ADMISSIBLE)
+        for code, failed in failures:
+            np.copyto(codes, int(code), where=failed)
+        return codes
+
+    def explain(self, q: Array) -> str:
+        """Return what `check` holds against a posture of shape (6,), with numbers and a remedy; empty if nothing."""
+        code = ResultCode(int(self.check(q[None])[0]))
+        chain = self.chain
+        if code == ResultCode.JOINT_LIMIT:
+            joint = int(np.argmax(np.maximum(self.lower - q, q - self.upper)))
+            return (
+                f"{chain.joints[joint]} would be at {q[joint]:.3f} rad; its limits are {self.lower[joint]:.3f} and "
+                f"{self.upper[joint]:.3f}. Choose another pose, or turn the joint back first."
+            )
+        self_distance, table_distance = (float(distance) for distance in self.collision.distances(q))
+        if code == ResultCode.SELF_COLLISION:
+            first, second = self.collision.closest_pair(q)
+            return (
+                f"{first} and {second} would come within {self_distance:.4f} m; {chain.min_distance} m is the least. "
+                "Move the tool away from the arm, or turn it."
+            )
+        if code == ResultCode.TABLE_COLLISION:
+            return (
+                f"{self.collision.lowest(q)} would come within {table_distance:.4f} m of the table; "
+                f"{chain.min_distance} m is the least. Raise the tool, or tilt it."
+            )
+        if code == ResultCode.SINGULAR:
+            return (
+                f"The posture is singular: its manipulability is {float(self.manipulability(q)):.2e} m^3 and "
+                f"{chain.min_manipulability:.2e} the least. Move the tool, or turn it."
+            )
+        return ""
+
+    def solve(self, pose: Array, posture: Array) -> IkResult:
+        """Return the postures that reach a pose and may be taken.
+
+        Every joint takes the turn that is nearest to `posture` within its limits.
+
+        Args:
+            pose: shape (4, 4).
+            posture: joint positions now [rad], shape (6,).
+
+        Returns:
+            The postures, the one with the smallest largest change of a joint first; or the last check that the
+            remaining ones failed.
+        """
+        refused = _check_poses(pose[None], posture)
+        if refused is not None:
+            return refused
+        found = self.solutions(pose, posture[5])
+        found = found[found[:, 0] == found[:, 0]]
+        if not len(found):
+            return _failed(ResultCode.UNREACHABLE, self._why_unreachable(pose, posture))
+        found = self._nearest_turns(found, posture)
+        change = np.abs(found - posture)
+        found = found[np.lexsort((change.sum(axis=1), change.max(axis=1)))]
+        codes = self.check(found)
+        admissible = found[codes == _ADMISSIBLE]
+        if len(admissible):
+            return IkResult(ResultCode.SUCCEEDED, np.minimum(np.maximum(admissible, self.lower), self.upper))
+        # The checks are numbered in their order, so the largest number is the check that removed the last posture.
+        worst = int(codes.argmax())
+        return _failed(ResultCode(int(codes[worst])), self.explain(found[worst]))
+
+    def line(self, poses: Array, posture: Array) -> IkResult:
+        """Return the postures along a path of the tool, all on the branch of the first.
+
+        Args:
+            poses: the path, close enough together that no joint turns by 1 rad from one to the next, shape (K, 4, 4).
+            posture: the posture in `poses[0]` [rad], shape (6,).
+
+        Returns:
+            Postures of shape (K, 6), continuous from `posture`; or the first pose that cannot be taken and why.
+        """
+        refused = _check_poses(poses, posture)
+        if refused is not None:
+            return refused
+        found = self.solutions(poses, posture[5])
+        away = found[0] - posture
+        away = np.abs(away - TURN * np.rint(away / TURN)).max(axis=1)
+        away[np.isnan(away)] = np.inf
+        branch = int(away.argmin())
+        if not away[branch] < _START_ERROR:
+            message = f"The line starts {away[branch]:.4f} rad from the posture; {_START_ERROR} is the most."
+            if np.isinf(away[branch]):
+                message = self._why_unreachable(poses[0], posture)
+            return _failed(ResultCode.UNREACHABLE, message, 0)
+        path = found[:, branch]
+        before = np.concatenate((posture[None], path[:-1]))
+        path = path - TURN * np.cumsum(np.rint((path - before) / TURN), axis=0)
+        missing = np.isnan(path).any(axis=1)
+        if missing.any():
+            path = path[: int(missing.argmax())]
+        codes = self.check(path)
+        codes[1:][np.abs(np.diff(path, axis=0)).max(axis=1) > _LARGEST_STEP] = ResultCode.SINGULAR
+        bad = codes != _ADMISSIBLE
+        if bad.any():
+            index = int(bad.argmax())
+            message = (
+                self.explain(path[index]) or "A joint would have to jump between two poses, at a singular posture."
+            )
+            return _failed(ResultCode(int(codes[index])), message, index)
+        if missing.any():
+            return _failed(ResultCode.UNREACHABLE, self._why_unreachable(poses[len(path)], path[-1]), len(path))
+        return IkResult(ResultCode.SUCCEEDED, np.minimum(np.maximum(path, self.lower), self.upper))
+
+    def _nearest_turns(self, q: Array, posture: Array) -> Array:
+        """Return postures with each joint in that turn within its limits which is nearest to `posture`."""
+        turns = np.rint((posture - q) / TURN)
+        turns = np.minimum(turns, np.floor((self._highest - q) / TURN))
+        turns = np.maximum(turns, np.ceil((self._lowest - q) / TURN))
+        return q + TURN * turns
+
+    def _why_unreachable(self, pose: Array, posture: Array) -> str:
+        """Return what keeps every branch from a pose of shape (4, 4), with numbers and a remedy."""
+        centre = inverse_kinematics.wrist_centre(self.chain, pose)
+        beside, least = float(np.hypot(centre[0], centre[1])), abs(self.chain.d[3])
+        if beside < least:
+            return (
+                f"The wrist would be {beside:.3f} m from the base's axis; {least:.3f} m is the least. "
+                "Move the tool away from the axis."
+            )
+        nearest = self.tool(inverse_kinematics.nearest(self.chain, pose, float(posture[5])))
+        short = np.sqrt(np.square(nearest[:, :3, 3] - pose[:3, 3]).sum(axis=1)).min()
+        far = np.sqrt(np.square(centre - (0.0, 0.0, self.chain.d[0])).sum())
+        where = "too far away: move it towards" if far > abs(self.chain.a[1]) else "too near: move it away from"
+        return f"The arm ends {short:.3f} m short of the pose, which is {where} the base's axis, or turn it."
+
+
+def _check_poses(poses: Array, posture: Array) -> IkResult | None:
+    """Return why the numbers themselves are refused, or None; `poses` has shape (K, 4, 4)."""
+    if not np.isfinite(posture).all():
+        return _failed(ResultCode.NON_FINITE, f"The posture is {posture.tolist()}; all must be finite.")
+    finite = np.isfinite(poses)
+    if not finite.all():
+        index = int(finite.all(axis=(1, 2)).argmin())
+        return _failed(ResultCode.NON_FINITE, f"The pose is {poses[index].tolist()}; all must be finite.", index)
+    rotations = poses[:, :3, :3]
+    error = np.zeros((len(poses), 5, 3))
+    error[:, :3] = (rotations[:, :, :, None] * rotations[:, :, None, :]).sum(axis=1) - _IDENTITY
+    error[:, 3] = poses[:, 3, :3]
+    error[:, 4, 0] = poses[:, 3, 3] - 1.0
+    error[:, 4, 1] = np.linalg.det(rotations) < 0.0  # mirrored
+    wrong = np.abs(error) > _ROTATION_ERROR
+    if wrong.any():
+        index = int(wrong.any(axis=(1, 2)).argmax())
+        largest = float(np.abs(error[index]).max())
+        message = f"The pose is {largest:.2e} from a rotation and a translation; {_ROTATION_ERROR} is the most."
+        return _failed(ResultCode.NOT_NORMALISED, f"{message} Normalise the orientation.", index)
+    return None
+
+
+def _failed(code: ResultCode, message: str, index: int | None = None) -> IkResult:
+    return IkResult(code, np.empty((0, DOF)), message, index)

@@ -1,0 +1,328 @@
+"""Goals of n arms: the queue, the state machine, and exactly one result for every goal."""
+
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
+from bhd_lerobot.control.motion.goal_book import NO_FAILURE, REASONS, GoalBook
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
+from bhd_lerobot.control.motion.planning import InlinePlanning, Planning, PlanOrders
+from bhd_lerobot.control.motion.player import TrajectoryPlayer
+from bhd_lerobot.control.motion.supervision import Supervisor
+from bhd_lerobot.control.motion.trajectory import PlanFailure, State, to_target
+
+Array = NDArray[np.float64]
+Reference = tuple[Array, Array, Array]
+"""Position, velocity and acceleration, each of shape (n, dof + 1)."""
+
+
+class _Motion(IntEnum):
+    """What the reference of a simulation follows."""
+
+    NONE = 0
+    GOAL = 1
+    BRAKE = 2
+    HARD_BRAKE = 3
+
+
+class GoalManager:
+    """Follows goals, one after the other, for each of n arms.
+
+    The owner keeps the reference and calls `tick`, which writes it where a goal is followed or a brake is played.
+
+    Attributes:
+        phase: a `GoalPhase` for each arm, shape (n,).
+        busy: whether a goal is followed or waits, or a brake is played, shape (n,).
+        following: whether `tick` writes the reference, shape (n,).
+
+    Args:
+        arm: the arm.
+        n: number of arms.
+        control_hz: ticks a second [Hz].
+        kinematics: the arm's; made from its chain if None.
+        queue: how many goals may wait.
+        planning: who plans; planned in the tick that a goal starts in if None.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        n: int,
+        control_hz: int,
+        kinematics: ArmKinematics | None = None,
+        queue: int = 8,
+        *,
+        planning: Planning | None = None,
+    ) -> None:
+        self.planner = GoalPlanner(arm, control_hz, kinematics)
+        self.phase: NDArray[np.int8] = np.full(n, GoalPhase.IDLE, np.int8)
+        self.busy: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self.following: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self._hz, self._dof = control_hz, len(arm.chain.joints)
+        self._player = TrajectoryPlayer(n, self._dof + 1)
+        self._orders = PlanOrders(n, InlinePlanning(self.planner) if planning is None else planning, control_hz)
+        self._supervisor = Supervisor(arm, n, control_hz)
+        self._capacity = queue
+        self._books = [GoalBook(queue) for _ in range(n)]
+        self._opening: list[float | None] = [None] * n  # where the gripper is commanded to [m]; None: where it is
+        self._planned = np.ones(n, np.int64)  # ticks of the trajectory of the goal that is followed
+        self._motion = np.full(n, _Motion.NONE, np.int8)
+        self._waiting: set[int] = set()  # simulations in which something is to be started or to be stopped
+        self._is_judged = np.zeros(n, np.bool_)
+        self._judged = np.flatnonzero(self._is_judged)  # simulations whose goal is followed
+        self._braking = self._judged  # simulations that a brake is played for
+        self._idle = True
+
+    # --- what a brain asks for ---------------------------------------------------------------------------------------
+
+    def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
+        """Take a goal; it starts as soon as it is planned.
+
+        A refusal is also among the results, except for a goal that has the name of one that is followed or waits: that
+        one still gets its own. A name counts as used even if its goal was refused.
+
+        Args:
+            sim: the arm.
+            command: the goal.
+            blocked: why the arm takes no goals now; None if it does.
+
+        Returns:
+            None if it was accepted, otherwise the refusal.
+        """
+        book = self._books[sim]
+        refusal = book.admit(command, blocked, self.planner.check)
+        if refusal is None:
+            if book.followed is None:
+                self.phase[sim] = GoalPhase.CONVERTING
+            self._changed(sim)
+        return refusal
+
+    def cancel(self, sim: int, task_id: str) -> ResultCode:
+        """Cancel a goal: one that waits ends at once, one that is followed when the arm has come to rest.
+
+        Returns:
+            SUCCEEDED, or UNKNOWN_ID if no such goal is followed or waits.
+        """
+        book = self._books[sim]
+        code = book.cancel(task_id)
+        if book.followed is None and not book.waiting and self.phase[sim] == GoalPhase.CONVERTING:
+            self.phase[sim] = GoalPhase.IDLE
+        self._changed(sim)
+        return code
+
+    def take_results(self, sim: int) -> list[CommandResult]:
+        """Return the results that nobody has taken yet, in the order in which the goals ended."""
+        return self._books[sim].take_results()
+
+    def feedback(self, sim: int) -> Feedback | None:
+        """Return how far the goal is that is followed, or that is next; None without a goal."""
+        book, phase = self._books[sim], GoalPhase(int(self.phase[sim]))
+        if book.followed is None:
+            return Feedback(book.waiting[0].task_id, phase, 0.0, 0.0, 0.0) if book.waiting else None
+        left = self._player.remaining(sim)
+        error = self._supervisor.error(sim)
+        progress = 1.0 - min(1.0, left / int(self._planned[sim]))
+        return Feedback(book.followed.task_id, phase, progress, left / self._hz, error)
+
+    # --- what the owner asks for -------------------------------------------------------------------------------------
+
+    def stop(  # noqa: PLR0917  the reference is three arrays
+        self,
+        mask: NDArray[np.bool_],
+        code: ResultCode,
+        hard: bool,
+        position: Array,
+        velocity: Array,
+        acceleration: Array,
+    ) -> None:
+        """End all goals of some arms at once, and brake from the next tick on.
+
+        Args:
+            mask: the arms, shape (n,).
+            code: how their goals end.
+            hard: whether to brake with the limits of a stop; a stop that has begun hard stays so.
+            position: the reference [rad, and m for the gripper], shape (n, dof + 1).
+            velocity: shape (n, dof + 1).
+            acceleration: shape (n, dof + 1).
+        """
+        for sim in np.flatnonzero(mask).tolist():
+            self._end_all(sim, code, REASONS.get(code, "The arm was stopped."))
+            wanted = _Motion.HARD_BRAKE if hard else _Motion.BRAKE
+            if self._motion[sim] < wanted:
+                self._brake(sim, (position, velocity, acceleration), wanted)
+            self._changed(sim)
+
+    def drop_for_setpoint(self, mask: NDArray[np.bool_]) -> None:
+        """End all goals of some arms, and let the owner have the reference. `mask` has shape (n,)."""
+        for sim in np.flatnonzero(mask).tolist():
+            self._end_all(sim, ResultCode.REPLACED_BY_SETPOINT, "A setpoint came, and the newer command counts.")
+            self._rest(sim)
+            self._changed(sim)
+
+    def retreat(self, mask: NDArray[np.bool_], message: str, reference: Reference, target: Array) -> None:
+        """End all goals of arms that something is in the way of, and bring their reference to where they are.
+
+        Args:
+            mask: the arms, shape (n,).
+            message: why their goals end, with PATH_TOLERANCE.
+            reference: position, velocity and acceleration, each of shape (n, dof + 1).
+            target: where they are, within the limits, shape (n, dof + 1).
+        """
+        for sim in np.flatnonzero(mask).tolist():
+            self._end_all(sim, ResultCode.PATH_TOLERANCE, message)
+            state = State.of(*(array[sim] for array in reference))
+            way = to_target(state, target[sim], self.planner.limits, self._hz)
+            if isinstance(way, PlanFailure):
+                self._brake(sim, reference, _Motion.BRAKE)
+            else:
+                self._rest(sim)
+                self._player.start(sim, way)
+                self._motion[sim] = _Motion.BRAKE
+            self._changed(sim)
+
+    def restart(self, ids: NDArray[np.intp]) -> None:
+        """Forget everything about arms that were put somewhere else, results included."""
+        for sim in np.asarray(ids).tolist():
+            self._books[sim] = GoalBook(self._capacity)
+            self._rest(sim)
+            self.phase[sim] = GoalPhase.IDLE
+            self._changed(sim)
+
+    def tick(
+        self, position: Array, velocity: Array, acceleration: Array, measured_position: Array, measured_velocity: Array
+    ) -> None:
+        """Judge what is followed, start what is next, and advance the reference by one tick, in place.
+
+        Args:
+            position: the reference [rad, and m for the gripper], shape (n, dof + 1).
+            velocity: shape (n, dof + 1).
+            acceleration: shape (n, dof + 1).
+            measured_position: what the reference before this tick led to, shape (n, dof + 1).
+            measured_velocity: shape (n, dof + 1).
+        """
+        if self._idle:
+            return
+        self._orders.tick += 1
+        reference = (position, velocity, acceleration)
+        if len(self._judged):
+            measured = (measured_position, measured_velocity)
+            for verdict in self._supervisor.judge(self._judged, self._player.active, reference[:2], measured):
+                self._end(verdict.sim, verdict.code, verdict.message)
+                self._brake(verdict.sim, reference, _Motion.BRAKE)
+                self._changed(verdict.sim)
+        if len(self._braking):
+            for sim in self._braking[~self._player.active[self._braking]].tolist():
+                self._rest(sim)
+                if self._books[sim].followed is not None:
+                    self._end(sim, ResultCode.CANCELLED, "It was cancelled; the arm has come to rest.")
+                self._changed(sim)
+        if self._waiting:
+            for sim in sorted(self._waiting):
+                if self._serve(sim, reference):
+                    self._changed(sim)
+        self._player.tick(position, velocity, acceleration)
+
+    def convert(self, sim: int, command: BrainCommand, reference: Reference) -> Plan | PlanFailure:
+        """Turn a goal into a trajectory that starts in the reference; changes nothing."""
+        position, velocity, acceleration = (array[sim] for array in reference)
+        return self.planner.plan(command, position, velocity, acceleration, opening=self._opening[sim])
+
+    # --- the state machine -------------------------------------------------------------------------------------------
+
+    def _serve(self, sim: int, reference: Reference) -> bool:
+        """Start the next goal of an arm, or the brake of one that was cancelled, as soon as it may.
+
+        Returns:
+            Whether anything was started or ended.
+        """
+        book, motion = self._books[sim], self._motion[sim]
+        if motion == _Motion.HARD_BRAKE:
+            return False
+        if book.followed is not None:
+            self._brake(sim, reference, _Motion.BRAKE)
+            if self._motion[sim] == _Motion.NONE:
+                self._end(sim, ResultCode.CANCELLED, "It was cancelled; the arm was at rest.")
+        elif book.waiting and (motion != _Motion.BRAKE or book.waiting[0].preempt or self._orders.wanted(sim)):
+            return self._prepare(sim, book, reference)
+        elif motion == _Motion.GOAL:
+            # The goal that took the last one's place was cancelled before it began.
+            self._brake(sim, reference, _Motion.BRAKE)
+        return True
+
+    def _prepare(self, sim: int, book: GoalBook, reference: Reference) -> bool:
+        """Have the next goal planned, and start it; return whether it was started or has failed."""
+        self.phase[sim] = GoalPhase.CONVERTING
+        now = State(*(array[sim] for array in reference))
+        if self._orders.deferred and self._motion[sim] == _Motion.NONE and now.moving:
+            # It has followed setpoints. Where it is going to be is known only if it is told.
+            self._brake(sim, reference, _Motion.BRAKE)
+            self._changed(sim)
+
+        def ahead(ticks: int) -> State:
+            return (self._player.ahead(sim, ticks) if ticks else None) or State.of(*(array[sim] for array in reference))
+
+        command = book.waiting[0]
+        plan = self._orders.ask(sim, command, now, ahead, self._opening[sim])
+        if plan is None:
+            return False
+        book.follow()
+        if isinstance(plan, PlanFailure):
+            self._end(sim, plan.code, plan.message)
+            if self._motion[sim] < _Motion.BRAKE:
+                self._brake(sim, reference, _Motion.BRAKE)
+            return True
+        self._planned[sim] = plan.trajectory.ticks
+        self._opening[sim] = float(plan.target[self._dof])
+        if plan.rows is None:
+            self._player.start(sim, plan.trajectory)
+        else:
+            self._player.borrow(plan.rows)
+        self._supervisor.begin(sim, command, plan.target)
+        self._motion[sim] = _Motion.GOAL
+        self.phase[sim] = GoalPhase.EXECUTING
+        return True
+
+    def _brake(self, sim: int, reference: Reference, motion: _Motion) -> None:
+        """Brake an arm; one that is at rest stays there."""
+        self._rest(sim)
+        state = State.of(*(array[sim] for array in reference))
+        if state.moving:
+            self._player.start(sim, self.planner.brake(state, hard=motion == _Motion.HARD_BRAKE))
+            self._motion[sim] = motion
+
+    def _rest(self, sim: int) -> None:
+        self._player.stop(sim)
+        self._motion[sim] = _Motion.NONE
+        self._opening[sim] = None
+
+    def _end(self, sim: int, code: ResultCode, message: str) -> None:
+        """End the goal that is followed."""
+        if self._books[sim].end(code, message):
+            self.phase[sim] = GoalPhase.IDLE if code in NO_FAILURE else GoalPhase.ERROR
+
+    def _end_all(self, sim: int, code: ResultCode, message: str) -> None:
+        """End the goal that is followed and those that wait."""
+        if self._books[sim].end_all(code, message):
+            self.phase[sim] = GoalPhase.IDLE if code in NO_FAILURE else GoalPhase.ERROR
+
+    def _changed(self, sim: int) -> None:
+        """Bring up to date what follows from the state of an arm."""
+        book, motion = self._books[sim], self._motion[sim]
+        followed, cancelled = book.followed is not None, book.cancelled
+        if self._orders.wanted(sim) is not (book.waiting[0] if book.waiting else None):
+            self._orders.drop(sim)
+        on_the_way = motion == _Motion.GOAL
+        self._is_judged[sim] = followed and on_the_way and not cancelled
+        self.following[sim] = motion != _Motion.NONE
+        self.busy[sim] = self.following[sim] or followed or bool(book.waiting)
+        if (not followed and (book.waiting or on_the_way)) or (followed and cancelled and on_the_way):
+            self._waiting.add(sim)
+        else:
+            self._waiting.discard(sim)
+        self._judged = np.flatnonzero(self._is_judged)
+        self._braking = np.flatnonzero(self._motion >= _Motion.BRAKE)
+        self._idle = not self.busy.any()

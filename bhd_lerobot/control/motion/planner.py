@@ -1,0 +1,196 @@
+"""From a goal and the commanded state to a trajectory, or the reason why there is none. Pure: the same each time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_TOOL_SPEED, check
+from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.motion.line import ToolLimits, along_line
+from bhd_lerobot.control.motion.trajectory import (
+    MotionLimits,
+    PlanFailure,
+    State,
+    Trajectory,
+    at_once,
+    to_rest,
+    to_target,
+)
+
+Array = NDArray[np.float64]
+
+_CHECK_STEP = 0.03  # [rad] no joint turns further between two postures that are checked for collisions
+_ATTEMPTS = 8  # postures that reach a pose, of which so many are tried
+_ROUNDING = 1e-9  # [m] a distance that shrinks by less does not shrink
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a goal is going to be reached.
+
+    Attributes:
+        trajectory: of all command dimensions, the gripper's last.
+        target: where it ends [rad], and the opening that the gripper is commanded to [m], shape (dof + 1,).
+        rows: the trajectory's position, velocity and acceleration at each tick in one block, shape (T, 3, dof + 1), if
+            it lies in memory that may be played from without copying it; None if it does not.
+    """
+
+    trajectory: Trajectory
+    target: Array
+    rows: Array | None = None
+
+
+class GoalPlanner:
+    """Plans goals of one arm.
+
+    Args:
+        arm: limits and geometry.
+        control_hz: ticks a second [Hz].
+        kinematics: the arm's; made from its chain if None.
+    """
+
+    def __init__(self, arm: Arm, control_hz: int, kinematics: ArmKinematics | None = None) -> None:
+        self.arm, self.hz = arm, control_hz
+        self.kinematics = ArmKinematics(arm.chain, arm.limits) if kinematics is None else kinematics
+        self.dof = dof = len(arm.chain.joints)
+        self.limits = MotionLimits.of(arm.limits)
+        self.stop_limits = MotionLimits.of(arm.limits, stop=True)
+        self._arm, self._gripper = slice(0, dof), slice(dof, dof + 1)
+
+    def check(self, command: BrainCommand) -> PlanFailure | None:
+        """Return what is wrong with a goal whatever the arm's state, or None."""
+        return check(command, self.arm)
+
+    def plan(
+        self,
+        command: BrainCommand,
+        position: ArrayLike,
+        velocity: ArrayLike,
+        acceleration: ArrayLike,
+        *,
+        opening: float | None = None,
+    ) -> Plan | PlanFailure:
+        """Return how a goal is reached from a commanded state.
+
+        Args:
+            command: the goal.
+            position: the state [rad, and m for the gripper], shape (dof + 1,).
+            velocity: shape (dof + 1,).
+            acceleration: shape (dof + 1,).
+            opening: where the gripper was last commanded to [m], for goals that leave it as it is; where it is if
+                None.
+        """
+        failure = self.check(command)
+        if failure is not None:
+            return failure
+        state = State.of(position, velocity, acceleration)
+        arm = self._plan_arm(command, state[self._arm])
+        if isinstance(arm, PlanFailure):
+            return arm
+        gripper = self._plan_gripper(command.gripper if command.gripper is not None else opening, state[self._gripper])
+        if isinstance(gripper, PlanFailure):
+            return gripper
+        trajectory = arm.beside(gripper)
+        return Plan(trajectory, trajectory.target.copy())
+
+    def brake(self, state: State, *, hard: bool) -> Trajectory:
+        """Return how all dimensions come to rest, with the limits of normal motion or with those of a stop."""
+        trajectory = to_rest(state, self.stop_limits if hard else self.limits, self.hz)
+        # A state that nothing can brake is not a state of a reference; what remains is to stand still.
+        return at_once(state.position) if isinstance(trajectory, PlanFailure) else trajectory
+
+    # --- the arm -----------------------------------------------------------------------------------------------------
+
+    def _plan_arm(self, command: BrainCommand, state: State) -> Trajectory | PlanFailure:
+        if command.target_pose is not None:
+            if command.motion == "line":
+                return self._plan_line(command, command.target_pose, state)
+            return self._plan_pose(command, command.target_pose, state)
+        if command.joint_target is not None:
+            return self._plan_joints(command, np.asarray(command.joint_target, np.float64), state)
+        if state.moving:
+            brake = to_rest(state, self.limits[self._arm], self.hz)
+            return brake if isinstance(brake, PlanFailure) else self._checked(brake, state)
+        return at_once(state.position)
+
+    def _plan_joints(self, command: BrainCommand, target: Array, state: State) -> Trajectory | PlanFailure:
+        limits = self.limits[self._arm]
+        speed, change = command.max_velocity, command.max_acceleration
+        scaled = limits.scaled(
+            1.0 if speed is None else speed / limits.velocity.max(),
+            1.0 if change is None else change / limits.acceleration.max(),
+        )
+        # An arm that is already faster than the goal permits may need more than the goal's deceleration at an end of
+        # the joints' range.
+        trajectory = to_target(state, target, scaled, self.hz, limits)
+        return trajectory if isinstance(trajectory, PlanFailure) else self._checked(trajectory, state)
+
+    def _plan_pose(self, command: BrainCommand, pose: Pose, state: State) -> Trajectory | PlanFailure:
+        found = self.kinematics.solve(pose.matrix(), state.position)
+        if found.code != ResultCode.SUCCEEDED:
+            return PlanFailure(found.code, f"The pose cannot be taken: {found.message}")
+        first: PlanFailure | None = None
+        for posture in found.postures[:_ATTEMPTS]:
+            trajectory = self._plan_joints(command, posture, state)
+            if not isinstance(trajectory, PlanFailure):
+                return trajectory
+            first = first or trajectory
+        return first or PlanFailure(ResultCode.UNREACHABLE, "No posture reaches the pose.")
+
+    def _plan_line(self, command: BrainCommand, pose: Pose, state: State) -> Trajectory | PlanFailure:
+        limits = self.limits[self._arm]
+        tool = ToolLimits(command.max_velocity or MAX_TOOL_SPEED, command.max_acceleration or MAX_TOOL_ACCELERATION)
+        # A line starts where the tool can be on it: at rest.
+        brake = to_rest(state, limits, self.hz) if state.moving else None
+        if isinstance(brake, PlanFailure):
+            return brake
+        start = state.position if brake is None else brake.target
+        line = along_line(start, pose.matrix(), self.kinematics, (limits, tool), self.hz)
+        if isinstance(line, PlanFailure):
+            return line
+        return self._checked(line if brake is None else brake.then(line), state)
+
+    # --- the gripper -------------------------------------------------------------------------------------------------
+
+    def _plan_gripper(self, opening: float | None, state: State) -> Trajectory | PlanFailure:
+        limits = self.limits[self._gripper]
+        if opening is None and state.moving:
+            return to_rest(state, limits, self.hz)
+        target = np.clip(state.position if opening is None else opening, limits.lower, limits.upper)
+        if not state.moving and (target == state.position).all():
+            return at_once(target)
+        return to_target(state, np.broadcast_to(target, (1,)), limits, self.hz)
+
+    # --- collisions --------------------------------------------------------------------------------------------------
+
+    def _checked(self, trajectory: Trajectory, state: State) -> Trajectory | PlanFailure:
+        """Return the trajectory, or why its way is not admissible."""
+        path = np.concatenate((state.position[None], trajectory.position))
+        way = np.concatenate(((0.0,), np.abs(np.diff(path, axis=0)).max(axis=1).cumsum()))
+        if way[-1] == 0.0:
+            return trajectory
+        marks = np.linspace(0.0, way[-1], int(np.ceil(way[-1] / _CHECK_STEP)) + 1)
+        postures = np.stack([np.interp(marks, way, joint) for joint in path.T], axis=1)
+        least = self.arm.chain.min_distance
+        for distances, code, what in zip(
+            self.kinematics.collision.distances(postures),
+            (ResultCode.SELF_COLLISION, ResultCode.TABLE_COLLISION),
+            ("itself", "the table"),
+            strict=True,
+        ):
+            inside = distances < least
+            if not inside.any():
+                continue
+            leaves = int(inside.argmin())  # number of postures, from the start, that are too close
+            escapes = leaves > 0 and not inside[leaves:].any()
+            if escapes and (np.diff(distances[: leaves + 1]) >= -_ROUNDING).all():
+                continue
+            where = "The arm starts" if inside[0] else "On the way the arm comes"
+            advice = "; it may only move straight away" if inside[0] else ""
+            return PlanFailure(
+                code, f"{where} within {distances.min():.4f} m of {what}; {least} m is the least{advice}."
+            )
+        return trajectory

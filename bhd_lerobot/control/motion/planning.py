@@ -1,0 +1,211 @@
+"""Asking for plans: at once, or from a planner that takes its time while the arm goes on moving."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from bhd_lerobot.control.commands import BrainCommand, ResultCode
+from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
+from bhd_lerobot.control.motion.trajectory import PlanFailure, State
+from bhd_lerobot.errors import ConfigError
+
+LEAD_S = 0.025  # [s] after a request its plan is to start
+MIN_LEAD = 5  # ticks; less would be a matter of luck at any rate
+MOST_LEADS = 16  # a planner that needs more than so many first leads is too slow for an arm that moves
+TIMEOUT_S = 2.0  # [s] that an answer may take
+
+
+class Planning(Protocol):
+    """Who plans goals, and how long that may take.
+
+    At most one request for each arm is out. None of the methods ever waits.
+
+    Attributes:
+        lead: ticks from a request to the tick that its plan is to start at; 0 if it is answered at once.
+        timeout: ticks that an answer may take.
+    """
+
+    lead: int
+    timeout: int
+
+    def request(self, sim: int, command: BrainCommand, state: State, opening: float | None, start_tick: int) -> None:
+        """Ask for a plan; what was asked for before is not wanted any more.
+
+        Args:
+            sim: the arm.
+            command: the goal.
+            state: where the plan is to start [rad, and m for the gripper], each of shape (dof + 1,).
+            opening: where the gripper is commanded to [m], for goals that leave it as it is; None: where it is.
+            start_tick: the tick that the plan is to start at.
+        """
+
+    def poll(self, sim: int) -> Plan | PlanFailure | None:
+        """Return the answer to the last request, once; None if there is none yet."""
+
+    def begin(self, sim: int) -> None:
+        """Take note that the plan that was polled last is being played: its rows must stay as they are."""
+
+    def drop(self, sim: int) -> None:
+        """Want no answer any more."""
+
+
+class InlinePlanning:
+    """Plans when it is asked to: the answer is there in the same tick.
+
+    Args:
+        planner: the arms' planner.
+    """
+
+    def __init__(self, planner: GoalPlanner) -> None:
+        self.lead = self.timeout = 0
+        self._planner = planner
+        self._answers: dict[int, Plan | PlanFailure] = {}
+
+    def request(self, sim: int, command: BrainCommand, state: State, opening: float | None, start_tick: int) -> None:
+        """Plan."""
+        position, velocity, acceleration = state.position, state.velocity, state.acceleration
+        self._answers[sim] = self._planner.plan(command, position, velocity, acceleration, opening=opening)
+
+    def poll(self, sim: int) -> Plan | PlanFailure | None:
+        """Return the plan."""
+        return self._answers.pop(sim, None)
+
+    def begin(self, sim: int) -> None:
+        """Nothing is to be done: the plan is nobody else's."""
+
+    def drop(self, sim: int) -> None:
+        """Forget the plan."""
+        self._answers.pop(sim, None)
+
+
+def lead_ticks(control_hz: int, lead_s: float = LEAD_S) -> int:
+    """Return a lead in ticks, at least `MIN_LEAD`.
+
+    Raises:
+        ConfigError: it is not positive and finite.
+    """
+    if not (math.isfinite(lead_s) and lead_s > 0):
+        raise ConfigError(f"The planner's lead is {lead_s!r} s; it must be a positive number, such as {LEAD_S}.")
+    return max(MIN_LEAD, math.ceil(lead_s * control_hz - 1e-6))
+
+
+@dataclass
+class _Order:
+    """A plan that was asked for and is not played yet."""
+
+    command: BrainCommand
+    state: State
+    sent_tick: int
+    lead: int
+    answer: Plan | PlanFailure | None = None
+    arrived_tick: int = 0
+
+
+class PlanOrders:
+    """The plans that n arms wait for, at most one each.
+
+    A plan is used only from the state that it was made for. For an arm that moves that is one tick: the one that lies
+    a lead after the request. If the answer is later, it is asked for again, from further ahead. An arm that is at rest
+    stays where it is, and its plan is never too late.
+
+    Args:
+        n: number of arms.
+        planning: who plans.
+        control_hz: ticks a second [Hz].
+    """
+
+    def __init__(self, n: int, planning: Planning, control_hz: int) -> None:
+        self.tick = 0
+        self._planning, self._hz = planning, control_hz
+        self._orders: list[_Order | None] = [None] * n
+
+    @property
+    def deferred(self) -> bool:
+        """Whether plans come later than they are asked for."""
+        return self._planning.lead > 0
+
+    def wanted(self, sim: int) -> BrainCommand | None:
+        """Return the goal that an arm waits for the plan of, or None."""
+        order = self._orders[sim]
+        return None if order is None else order.command
+
+    def drop(self, sim: int) -> None:
+        """Want no plan any more: an answer that comes later is ignored."""
+        if self._orders[sim] is not None:
+            self._orders[sim] = None
+            self._planning.drop(sim)
+
+    def ask(
+        self, sim: int, command: BrainCommand, now: State, ahead: Callable[[int], State], opening: float | None
+    ) -> Plan | PlanFailure | None:
+        """Return the plan of a goal when it is to start, or why there is none; None as long as it is too early.
+
+        To be called every tick until the answer is there.
+
+        Args:
+            sim: the arm.
+            command: the goal; the same one as long as the arm waits for its plan.
+            now: the reference.
+            ahead: returns what the reference is going to be after so many ticks.
+            opening: where the gripper is commanded to [m]; None: where it is.
+        """
+        order = self._orders[sim]
+        if order is None:
+            order = self._order(sim, command, self._planning.lead, ahead, opening)
+        if order.answer is None:
+            order.answer = self._planning.poll(sim)
+            order.arrived_tick = self.tick
+        answer = order.answer
+        if answer is None:
+            waited = self.tick - order.sent_tick
+            return None if waited <= self._planning.timeout else self._give_up(sim, self._silence(waited))
+        if isinstance(answer, PlanFailure):
+            self._orders[sim] = None
+            return answer
+        if self.tick < order.sent_tick + order.lead:
+            return None
+        if not order.lead or _same(order.state, now):
+            self._orders[sim] = None
+            self._planning.begin(sim)
+            return answer
+        if order.lead >= MOST_LEADS * self._planning.lead:
+            return self._give_up(sim, self._slowness(order))
+        self._order(sim, command, 2 * order.lead, ahead, opening)
+        return None
+
+    def _order(
+        self, sim: int, command: BrainCommand, lead: int, ahead: Callable[[int], State], opening: float | None
+    ) -> _Order:
+        self._orders[sim] = order = _Order(command, ahead(lead), self.tick, lead)
+        self._planning.request(sim, command, order.state, opening, self.tick + lead)
+        return order
+
+    def _give_up(self, sim: int, message: str) -> PlanFailure:
+        self.drop(sim)
+        return PlanFailure(ResultCode.PLANNING_FAILED, message)
+
+    def _silence(self, ticks: int) -> str:
+        return (
+            f"The planner did not answer within {ticks / self._hz:.3g} s: the process that plans is not running, is "
+            "stopped or is overloaded. See to it, then send the goal again."
+        )
+
+    def _slowness(self, order: _Order) -> str:
+        took, lead = order.arrived_tick - order.sent_tick, order.lead
+        return (
+            f"The planner's last answer took {took / self._hz:.3g} s, but the arm moves, and the plan was to start "
+            f"after {lead / self._hz:.3g} s, the most. Relieve the process that plans, or send the goal when the arm "
+            "is at rest."
+        )
+
+
+def _same(one: State, other: State) -> bool:
+    # Counting is several times cheaper than `np.array_equal`.
+    return not (
+        np.count_nonzero(one.position != other.position)
+        or np.count_nonzero(one.velocity != other.velocity)
+        or np.count_nonzero(one.acceleration != other.acceleration)
+    )

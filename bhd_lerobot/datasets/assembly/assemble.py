@@ -1,0 +1,270 @@
+"""A dataset made of episodes of others: what merging, filtering, splitting, deleting and marking have in common.
+
+LeRobot's own tools encode films again when they take episodes out of one, write without the columns of
+``meta/episodes`` that they do not know, and leave a half dataset behind a kill. Here films are cut without encoding,
+every column comes along, and the new dataset appears complete or not at all. Files that stay as they are are linked.
+"""
+
+import copy
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.format import statistics
+from bhd_lerobot.datasets.assembly.files import build_data, build_videos
+from bhd_lerobot.datasets.storage.disk import Disk, to_json
+from bhd_lerobot.datasets.format.episode_table import PREFIX, stored_stats
+from bhd_lerobot.datasets.format.identity import comparable, differences
+from bhd_lerobot.datasets.storage.layout import Slot
+from bhd_lerobot.datasets.format.meta_files import tasks_table, write_meta
+from bhd_lerobot.datasets.assembly.picks import Files, Pick, Plan
+from bhd_lerobot.datasets.storage.atomic import has_unfinished_episodes, link_others
+from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, read_frames, slot_of
+from bhd_lerobot.errors import DatasetError, DatasetMismatchError, quoted
+
+EDITS = "meta/edits.jsonl"
+"""What was done to a dataset after its recording: one JSON object a line."""
+
+WRITTEN = (
+    "info.json",
+    "stats.json",
+    "tasks.parquet",
+    "bhd.json",
+    "edits.jsonl",
+    "bhd_subset.json",  # tells what a pull was asked for, which is not so of an edited dataset
+    "episodes/chunk-*/file-*.parquet",
+)
+"""Files of ``meta`` that are made anew with every change of episodes; all others are taken along."""
+
+
+def assemble(
+    picks: Sequence[Pick],
+    new: Path,
+    disk: Disk,
+    *,
+    types: Mapping[str, pa.DataType] | None = None,
+    in_place: bool = False,
+    edit: Mapping[str, Any],
+    identity: Mapping[str, Any] | None,
+) -> None:
+    """Write a dataset.
+
+    Args:
+        picks: its episodes, in order; at least one.
+        new: an empty or missing folder: becomes the dataset's root, or the folder of a `Workspace`.
+        disk: how to write.
+        types: Arrow types of metadata columns that no source has, by name without prefix.
+        in_place: the new content takes the place of the only source's. Then files that stay are linked; two datasets
+            never share one, because other programs write into files.
+        edit: what is told in ``meta/edits.jsonl`` of this step.
+        identity: content of ``meta/bhd.json``; no such file if None.
+
+    Raises:
+        DatasetMismatchError: the sources have other columns, frame rates or robots.
+        DatasetCorruptError: a file of a source cannot be read.
+        UnsupportedDatasetError: a film cannot be cut without encoding again.
+        OSError: a file cannot be written.
+    """
+    sources = _sources(picks)
+    check_alike(sources)
+    kinds = {**_types(sources, "metadata_types", PREFIX), **(types or {})}
+    extra = _types(sources, "extra_types", "")
+    tasks = _tasks(picks)
+    info = _info(sources, len(picks), sum(pick.row["length"] for pick in picks), len(tasks))
+    rows = _rows(picks, kinds, extra)
+    plan = Plan(picks, rows, tasks, info, Files(picks))
+    take = disk.link if in_place else disk.copy
+    build_data(plan, new, disk, take)
+    build_videos(plan, new, disk, take)
+    disk.make_folder(new / "meta")
+    if len(sources) == 1:
+        link_others(sources[0].root / "meta", new / "meta", disk, *WRITTEN, take=take)
+    if in_place:
+        link_others(sources[0].root / "data", new / "data", disk, "chunk-*/file-*.parquet")
+        if (sources[0].root / "videos").is_dir():
+            link_others(sources[0].root / "videos", new / "videos", disk, "*/chunk-*/file-*.mp4")
+    sink = pa.BufferOutputStream()
+    pq.write_table(tasks_table(list(tasks)), sink)
+    disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
+    write_meta(new, info, rows, kinds, _stats(picks, rows, tasks), disk=disk, extra=extra)
+    if identity is not None:
+        disk.write(new / layout.IDENTITY, to_json(identity))
+    lines = [line for source in sources for line in _edits_of(source)] + [json.dumps(edit, ensure_ascii=False)]
+    disk.write(new / EDITS, "".join(f"{line}\n" for line in lines).encode())
+    disk.write(new / layout.INFO, to_json(info))
+
+
+def check_alike(sources: Sequence[DatasetState]) -> None:
+    """Check that episodes of several datasets can be in one.
+
+    Raises:
+        DatasetMismatchError: they cannot; every difference is told.
+    """
+    first = sources[0]
+    for other in sources[1:]:
+        found = list(differences("", _kind(first), _kind(other)))
+        if found:
+            lines = "\n  ".join(line.replace("recorded", "there").replace("requested", "here") for line in found)
+            raise DatasetMismatchError(
+                f"{other.root} does not fit {first.root}:\n  {lines}\nOnly datasets with the same robot, frame rate "
+                "and features can be one. lerobot-edit-dataset can remove features from one of them."
+            )
+
+
+def _kind(state: DatasetState) -> dict[str, Any]:
+    features = comparable(state.info["features"])
+    return {
+        "fps": state.info["fps"],
+        "robot_type": state.info.get("robot_type"),
+        "features": {
+            key: {
+                **{name: feature.get(name) for name in ("dtype", "shape", "names")},
+                # How numbers became depth pictures; what else is told of a film may differ.
+                **{n: v for n, v in (state.info["features"][key].get("info") or {}).items() if _is_meaning(n)},
+            }
+            for key, feature in features.items()
+        },
+    }
+
+
+def _is_meaning(name: str) -> bool:
+    return "depth" in name or name.removeprefix("video.") in ("shift", "use_log")
+
+
+def _sources(picks: Sequence[Pick]) -> list[DatasetState]:
+    if not picks:
+        raise DatasetError("No episode is left, and a dataset needs one. Nothing was changed.")
+    sources: list[DatasetState] = []
+    for pick in picks:
+        if not any(pick.source is source for source in sources):
+            sources.append(pick.source)
+    for source in sources:
+        if has_unfinished_episodes(source.root) or (source.without_stats and source.identity is not None):
+            raise DatasetError(
+                f"{source.root} is not finalised: its recording was interrupted, or goes on. Run `bhd-data repair "
+                f"{quoted(source.root)}` first."
+            )
+        if source.without_stats:
+            raise DatasetError(
+                f"{source.root} has no statistics of single episodes. Run `bhd-data check --fix "
+                f"{quoted(source.root)}` first."
+            )
+    return sources
+
+
+def _types(sources: Sequence[DatasetState], name: str, prefix: str) -> dict[str, pa.DataType]:
+    types: dict[str, pa.DataType] = {}
+    for source in sources:
+        for column, kind in getattr(source, name).items():
+            if types.setdefault(column, kind) != kind:
+                raise DatasetMismatchError(
+                    f"{source.root}: the metadata {prefix}{column} of its episodes is {kind}; in {sources[0].root} it "
+                    f"is {types[column]}. They cannot be one column."
+                )
+    return types
+
+
+def _tasks(picks: Sequence[Pick]) -> dict[str, int]:
+    """Return the index of each instruction that is used: those of the first dataset in its order, then the next's."""
+    tasks: dict[str, None] = {}
+    for source in _sources(picks):
+        used = {task for pick in picks if pick.source is source for task in pick.row["tasks"]}
+        if unknown := used - set(source.tasks):
+            raise corrupt(source.root / layout.TASKS, f"it does not have the instruction {min(unknown)!r}")
+        tasks |= dict.fromkeys(task for task in source.tasks if task in used)
+    return {task: index for index, task in enumerate(tasks)}
+
+
+def _info(sources: Sequence[DatasetState], episodes: int, frames: int, tasks: int) -> dict[str, Any]:
+    info = copy.deepcopy(sources[0].info)
+    for key, feature in info["features"].items():
+        told = [source.info["features"][key].get("info") or {} for source in sources]
+        if any(told):
+            # What films of several encoders do not share is not known of their mixture.
+            feature["info"] = {
+                name: value if all(one.get(name) == value for one in told) else None for name, value in told[0].items()
+            }
+    return info | {
+        "total_episodes": episodes,
+        "total_frames": frames,
+        "total_tasks": tasks,
+        "splits": {"train": f"0:{episodes}"},
+        "data_path": layout.DATA_PATH,
+        "video_path": layout.VIDEO_PATH if info.get("video_path") else info.get("video_path"),
+    }
+
+
+def _rows(picks: Sequence[Pick], types: Iterable[str], extra: Iterable[str]) -> list[Row]:
+    rows, start = [], 0
+    for index, pick in enumerate(picks):
+        length = pick.row["length"]
+        row = {"episode_index": index, "tasks": list(pick.row["tasks"]), "length": length}
+        row |= {"dataset_from_index": start, "dataset_to_index": start + length}
+        row |= {PREFIX + name: pick.metadata.get(name, pick.row.get(PREFIX + name)) for name in types}
+        row |= {name: pick.row.get(name) for name in extra}
+        rows.append(row)
+        start += length
+    return rows
+
+
+def _stats(picks: Sequence[Pick], rows: Sequence[Row], tasks: Mapping[str, int]) -> dict[str, statistics.Stats]:
+    """Return feature -> statistic -> values of all episodes, shape (E, ...): the old ones where nothing changed."""
+    files: dict[tuple[int, Slot], tuple[dict[int, int], dict[str, statistics.Stats]]] = {}
+    stacked: dict[str, dict[str, list[np.ndarray]]] = {}
+    for place, pick in enumerate(picks):
+        slot = slot_of(pick.row, "meta/episodes")
+        if (id(pick.source), slot) not in files:
+            order, stored = stored_stats(pick.source.root / layout.episodes_file(slot))
+            files[id(pick.source), slot] = {index: place for place, index in enumerate(order)}, stored
+        places, stored = files[id(pick.source), slot]
+        index = places[pick.row["episode_index"]]
+        own = {key: {name: values[index] for name, values in stat.items()} for key, stat in stored.items()}
+        row, length = rows[place], pick.row["length"]
+        task = tasks[pick.row["tasks"][0]]
+        columns: dict[str, np.ndarray] = {
+            "episode_index": np.full(length, place),
+            "index": np.arange(row["dataset_from_index"], row["dataset_to_index"]),
+            "task_index": np.full(length, task) if len(pick.row["tasks"]) == 1 else _task_indexes(pick, tasks),
+            **pick.columns,
+        }
+        fresh = statistics.column_stats({key: values for key, values in columns.items() if key in own})
+        for key, stat in {**own, **fresh}.items():
+            for name in own[key]:
+                stacked.setdefault(key, {}).setdefault(name, []).append(stat.get(name, own[key][name]))
+    for key, stat in stacked.items():
+        for name, values in stat.items():
+            if len({np.shape(value) for value in values}) > 1:
+                raise DatasetMismatchError(
+                    f"The statistic {name} of {key} has {np.size(values[0])} numbers in one episode, and another "
+                    "number of them in others. `lerobot-edit-dataset --operation.type recompute_stats` computes them."
+                )
+            if len(values) != len(picks):
+                # Later files of LeRobot's would have more columns than these, and nothing would load any more.
+                raise DatasetMismatchError(
+                    f"Only some of the datasets have the statistic {name} of {key}; there are others of before it came "
+                    "up. `lerobot-edit-dataset --operation.type recompute_stats` computes all of them."
+                )
+    return {key: {name: np.stack(values) for name, values in stat.items()} for key, stat in stacked.items()}
+
+
+def _task_indexes(pick: Pick, tasks: Mapping[str, int]) -> np.ndarray:
+    """Return the new number of the instruction of every frame of an episode that has several."""
+    path = pick.source.root / layout.data_file(slot_of(pick.row, "data"))
+    table = read_frames(path, ["episode_index", "task_index"])
+    own = table["episode_index"].to_numpy() == pick.row["episode_index"]
+    renumbered = np.array([tasks.get(task, -1) for task in pick.source.tasks])
+    return renumbered[table["task_index"].to_numpy()[own]]
+
+
+def _edits_of(source: DatasetState) -> list[str]:
+    path = source.root / EDITS
+    try:
+        return path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    except (OSError, ValueError) as error:
+        raise corrupt(path, error) from error

@@ -1,0 +1,110 @@
+"""Episodes on their way into another dataset, and the files that they share on the way."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bhd_lerobot.datasets.storage.layout import Slot
+from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, slot_of
+
+
+@dataclass(frozen=True)
+class Pick:
+    """An episode that goes into a new dataset.
+
+    Attributes:
+        source: the dataset that it comes from.
+        row: its row there.
+        metadata: metadata columns that get another value, by name without prefix.
+        columns: columns of its frames that get other values, shape (T,).
+    """
+
+    source: DatasetState
+    row: Row
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    columns: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Successive picks that lie in one file.
+
+    Attributes:
+        source: the dataset of that file.
+        slot: the file.
+        places: the numbers of the picks.
+        whole: whether they are all episodes of that file, in its order.
+        share: the share of the file's frames that they have.
+    """
+
+    source: DatasetState
+    slot: Slot
+    places: tuple[int, ...]
+    whole: bool
+    share: float
+
+
+@dataclass
+class Group:
+    """What goes into one new file."""
+
+    target: Slot
+    runs: list[Run]
+
+
+class Files:
+    """Which episodes lie in which file, asked once for each dataset."""
+
+    def __init__(self, picks: Sequence[Pick]) -> None:
+        """Remember the picks."""
+        self._picks = picks
+        self._rows: dict[tuple[int, str], dict[Slot, list[Row]]] = {}
+
+    def rows(self, source: DatasetState, kind: str) -> dict[Slot, list[Row]]:
+        """Return the rows of every file of a kind (`slot_of`) in a dataset."""
+        key = (id(source), kind)
+        if key not in self._rows:
+            self._rows[key] = ordered_slots(source.rows, kind)
+        return self._rows[key]
+
+    def runs(self, kind: str) -> Iterator[Run]:
+        """Yield the runs of picks, in order."""
+        places: list[int] = []
+        for place, pick in enumerate(self._picks):
+            if places:
+                last = self._picks[places[-1]]
+                if last.source is not pick.source or slot_of(last.row, kind) != slot_of(pick.row, kind):
+                    yield self._run(kind, places)
+                    places = []
+            places.append(place)
+        if places:
+            yield self._run(kind, places)
+
+    def _run(self, kind: str, places: list[int]) -> Run:
+        source = self._picks[places[0]].source
+        slot = slot_of(self._picks[places[0]].row, kind)
+        rows, own = self.rows(source, kind)[slot], [self._picks[place].row for place in places]
+        whole = len(rows) == len(own) and all(a is b for a, b in zip(rows, own, strict=True))
+        share = sum(row["length"] for row in own) / sum(row["length"] for row in rows)
+        return Run(source, slot, tuple(places), whole, share)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A dataset that is being assembled.
+
+    Attributes:
+        picks: its episodes, in order.
+        rows: their new rows, to be completed with the files that they get into.
+        tasks: the index of each instruction, in order.
+        info: content of its ``info.json``.
+        files: where the picks lie.
+    """
+
+    picks: Sequence[Pick]
+    rows: Sequence[Row]
+    tasks: Mapping[str, int]
+    info: Mapping[str, Any]
+    files: Files

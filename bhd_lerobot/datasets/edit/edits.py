@@ -1,0 +1,378 @@
+"""Other datasets out of datasets: merge several, keep some episodes, delete some, split one."""
+
+import contextlib
+import datetime
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.assembly.assemble import EDITS, assemble, check_alike
+from bhd_lerobot.datasets.assembly.creation import build_root
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.datasets.format.identity import FORMAT
+from bhd_lerobot.datasets.assembly.picks import Pick
+from bhd_lerobot.datasets.storage.atomic import (
+    Workspace,
+    clean,
+    complete_interrupted,
+    is_free,
+    making,
+    real,
+    refuse_inside,
+    remove_abandoned,
+    uninterrupted,
+)
+from bhd_lerobot.datasets.format.state import DatasetState, load_state, no_dataset, read_json
+from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, quoted
+
+
+@dataclass(frozen=True)
+class EditReport:
+    """What came out of an edit.
+
+    Attributes:
+        root: the dataset that was made or changed.
+        episodes: episodes it holds now.
+        frames: frames it holds now.
+        is_repeated: whether this edit had been completed before, by a process that was killed before it said so;
+            nothing was changed now.
+    """
+
+    root: Path
+    episodes: int
+    frames: int
+    is_repeated: bool = False
+
+    def __str__(self) -> str:
+        """Return the report for a terminal."""
+        told = "; the same edit was interrupted before, after it had been completed: nothing was changed now"
+        return f"{self.root}: {self.episodes} episodes, {self.frames} frames{told if self.is_repeated else ''}"
+
+
+type Tell = Callable[[EditReport], object]
+"""Told of an edit when it is in force. Until it returns, nobody knows of it: the same edit is then recognised."""
+
+
+def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
+    """Make one dataset of all episodes of several, in their order.
+
+    Args:
+        roots: the datasets; they stay as they are.
+        target: the new one; must not exist.
+
+    Raises:
+        ConfigError: fewer than two datasets, or one of them twice.
+        DatasetMismatchError: they have other robots, frame rates or features.
+        DatasetExistsError: `target` exists.
+        DatasetLockedError: one of them is being recorded.
+        DatasetError: one of them is no sound, finalised dataset, or cannot be written.
+    """
+    paths = [Path(root) for root in roots]
+    if len(paths) < 2:
+        raise ConfigError(f"Merging takes at least two datasets; got {len(paths)}.")
+    resolved = [path.resolve() for path in paths]
+    for path in resolved:
+        if resolved.count(path) > 1:
+            raise ConfigError(f"{path} is given more than once; its episodes would be in the new dataset twice.")
+    with opened(paths) as states:
+        check_alike(states)
+        picks = [Pick(state, row) for state in states for row in state.rows]
+        sizes = [{"root": state.root.name, "episodes": len(state.rows)} for state in states]
+        recordings = [(state.identity or {}).get("recording", {}) for state in states]
+        return _write_new(Path(target), picks, {"edit": "merge", "sources": sizes}, _common(recordings))
+
+
+def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditReport:
+    """Make a dataset of some episodes of another, which stays as it is.
+
+    Args:
+        root: the dataset.
+        episodes: the wanted ones, in the wanted order.
+        target: the new one; must not exist.
+
+    Raises:
+        DatasetExistsError: `target` exists.
+        DatasetLockedError: `root` is being recorded.
+        DatasetError: there is no such episode or no sound, finalised dataset, or it cannot be written.
+    """
+    with opened([Path(root)]) as (state,):
+        check_reported(state.root)
+        edit, recording = _kept(state, episodes, "keep")
+        return _write_new(Path(target), _picks(state, episodes), edit, recording)
+
+
+def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | str) -> list[EditReport]:
+    """Make several datasets of the episodes of one, which stays as it is.
+
+    Args:
+        root: the dataset.
+        parts: the episodes of each new dataset, by its name.
+        folder: where they come to lie, each under its name; none of them may exist.
+
+    Raises:
+        ConfigError: an episode is wanted in two parts.
+        DatasetExistsError: one of the new datasets exists; then none is written.
+        DatasetLockedError: `root` is being recorded.
+        DatasetError: there is no such episode or no sound, finalised dataset, or it cannot be written.
+    """
+    owner: dict[int, str] = {}
+    for name, episodes in parts.items():
+        for episode in episodes:
+            if owner.setdefault(episode, name) != name:
+                raise ConfigError(f"Episode {episode} is wanted in {owner[episode]!r} and in {name!r}.")
+    folder = Path(folder)
+    remove_abandoned(real(folder))
+    with opened([Path(root)]) as (state,):
+        check_reported(state.root)
+        refuse_inside(folder / "part", state.root)
+        for name, episodes in parts.items():
+            check_episodes(state, episodes)
+            if not episodes:
+                raise ConfigError(f"Part {name!r} would have no episode; {root} has {len(state.rows)}.")
+        picks = {name: _picks(state, episodes) for name, episodes in parts.items()}
+        done = [_report(folder / name, picks[name]) for name in parts]
+        if complete_interrupted(folder) and all((folder / name).exists() for name in parts):
+            return [replace(report, is_repeated=True) for report in done]
+
+        def refuse() -> None:
+            for name in parts:
+                if not is_free(folder / name):
+                    raise DatasetExistsError(f"{folder / name} exists already. Remove it, or choose another folder.")
+            if folder.exists() and not folder.is_dir():
+                raise DatasetExistsError(f"{folder} is a file. Choose another folder.")
+
+        disk = Disk()
+        with write_errors("split the dataset", folder, "No part was written."), making(folder, disk, refuse) as space:
+            disk.make_folder(space.folder)
+            for name, episodes in parts.items():
+                _fill(space.folder / name, disk, picks[name], *_kept(state, episodes, "split"))
+        return done
+
+
+def delete(root: Path | str, episodes: Sequence[int], tell: Tell = lambda _: None) -> EditReport:
+    """Remove episodes from a dataset, in place; the others are numbered anew.
+
+    A kill at any moment leaves either the old dataset or the new one. If it comes when the new one is there and `tell`
+    has not returned, the same call does nothing but say so, and another one with numbers of episodes is refused once.
+
+    Args:
+        root: the dataset.
+        episodes: what is removed.
+        tell: told what came out.
+
+    Raises:
+        DatasetLockedError: it is being recorded.
+        DatasetError: there is no such episode or no sound, finalised dataset, no episode would be left, or the disk
+            refuses.
+    """
+    edit = {"edit": "delete", "episodes": sorted(set(episodes))}
+
+    def change(state: DatasetState) -> Change:
+        check_episodes(state, episodes)
+        gone = set(episodes)
+        picks = [Pick(state, row) for row in state.rows if row["episode_index"] not in gone]
+        return Change(picks, edit, _edited(state, edit))
+
+    return rewrite(Path(root), edit, change, tell)
+
+
+@dataclass(frozen=True)
+class Change:
+    """Other content for a dataset.
+
+    Attributes:
+        picks: its new episodes.
+        edit: what is told about it in ``meta/edits.jsonl``; the time is added.
+        identity: new content of ``meta/bhd.json``.
+        types: Arrow types of new metadata columns, by name without prefix.
+    """
+
+    picks: Sequence[Pick]
+    edit: Mapping[str, Any]
+    identity: Mapping[str, Any] | None
+    types: Mapping[str, pa.DataType] = field(default_factory=dict)
+
+
+def rewrite(root: Path, request: Mapping[str, Any], change: Callable[[DatasetState], Change], tell: Tell) -> EditReport:
+    """Put other content into a dataset.
+
+    Args:
+        root: the dataset.
+        request: what was asked for, JSON values: an edit that is repeated is recognised by them.
+        change: makes the new content from the old.
+        tell: told what came out.
+
+    Raises:
+        DatasetWriteError: the disk refuses; the dataset is as it was.
+        DatasetCorruptError: one of its files cannot be read.
+    """
+    with contextlib.ExitStack() as stack:
+        lock = _lock(root)
+        stack.callback(lock.release)
+        if (report := _repeated(root, request)) is None:
+            check_reported(root)
+            state = _state_of(root)
+            new, disk = change(state), Disk()
+            edit = _timed(new.edit)
+            with (
+                write_errors(f"{edit['edit']} episodes", root, "The dataset is as it was."),
+                Workspace(root, disk, lock) as space,
+            ):
+                assemble(
+                    new.picks, space.folder, disk, types=new.types, in_place=True, edit=edit, identity=new.identity
+                )
+                told = {"request": request, "time": edit["time"]}
+                disk.write(space.folder / layout.UNREPORTED, to_json(told))
+                space.publish(f"the edit of {root} had been completed")
+            disk.try_remove_tree(root / layout.STAGING)
+            report = _report(root, new.picks)
+        with uninterrupted():  # or who repeats it is told that it was done twice
+            tell(report)
+            (root / layout.UNREPORTED).unlink(missing_ok=True)
+    return report
+
+
+def _repeated(root: Path, request: Mapping[str, Any]) -> EditReport | None:
+    """Return the report of the edit that made the dataset what it is, if nobody was told and it is the one meant."""
+    if (last := _unreported(root)) is None or last.get("request") != json.loads(json.dumps(request)):
+        return None
+    state = _state_of(root)
+    return EditReport(root, state.num_episodes, state.num_frames, is_repeated=True)
+
+
+def _unreported(root: Path) -> dict[str, Any] | None:
+    """Return the edit that made the dataset what it is, if nobody was told of it."""
+    path = root / layout.UNREPORTED
+    if not path.is_file():
+        return None
+    last, edits = read_json(path), edits_of(root)
+    # What was put into the place of the dataset since is not what the edit made of it.
+    return last if edits and edits[-1].get("time") == last.get("time") else None
+
+
+def check_reported(root: Path) -> None:
+    """Check that the dataset is what whoever names its episodes believes it to be; it is refused only once.
+
+    Raises:
+        DatasetError: an edit changed it, and was killed before it said so.
+    """
+    if (last := _unreported(root)) is None:
+        return
+    asked = ", ".join(f"{name} {value}" for name, value in dict(last.get("request") or {}).items())
+    (root / layout.UNREPORTED).unlink(missing_ok=True)
+    raise DatasetError(
+        f"{root} is not what it was: an edit ({asked}) that was interrupted at {last.get('time')} had been completed, "
+        f"so episodes may have other numbers now. Look at `bhd-data info {quoted(root)}`, then repeat this command. "
+        "Nothing was changed now."
+    )
+
+
+def _picks(state: DatasetState, episodes: Sequence[int]) -> list[Pick]:
+    return [Pick(state, state.rows[episode]) for episode in episodes]
+
+
+def _kept(state: DatasetState, episodes: Sequence[int], name: str) -> tuple[dict[str, Any], Mapping[str, Any]]:
+    """Return what is told of some episodes of a dataset as a new one, and of what recording they are."""
+    check_episodes(state, episodes)
+    edit = {"edit": name, "of": state.root.name, "episodes": list(episodes)}
+    identity = _edited(state, edit)
+    return edit, identity["recording"] if identity else {}
+
+
+def _write_new(
+    target: Path, picks: Sequence[Pick], edit: Mapping[str, Any], recording: Mapping[str, Any]
+) -> EditReport:
+    disk = Disk()
+    for source in {pick.source.root for pick in picks}:
+        refuse_inside(target, source)
+    lock = build_root(target, lambda folder: _fill(folder, disk, picks, edit, recording), disk, "Remove it")
+    lock.release()
+    return _report(target, picks)
+
+
+def _fill(
+    folder: Path, disk: Disk, picks: Sequence[Pick], edit: Mapping[str, Any], recording: Mapping[str, Any]
+) -> None:
+    """Write a new dataset into a folder."""
+    identities = [pick.source.identity for pick in picks]
+    identity = None
+    if identities and all(one is not None for one in identities):
+        # Another program's dataset among them: then the whole was not recorded by this one.
+        video = (identities[0] or {}).get("video", {})
+        identity = {"format": FORMAT, "recording": {**recording, "edited": dict(edit)}, "video": video}
+    assemble(picks, folder, disk, edit=_timed(edit), identity=identity)
+
+
+def _report(root: Path, picks: Sequence[Pick]) -> EditReport:
+    return EditReport(root, len(picks), sum(pick.row["length"] for pick in picks))
+
+
+def _edited(state: DatasetState, edit: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return an identity that cannot be resumed: the next episode would no longer be the one that the seed says."""
+    if state.identity is None:
+        return None
+    recording = {name: value for name, value in state.identity["recording"].items() if name != "edited"}
+    return {**state.identity, "recording": {**recording, "edited": dict(edit)}}
+
+
+def _common(recordings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what all recordings share."""
+    return {
+        name: value for name, value in recordings[0].items() if all(one.get(name) == value for one in recordings[1:])
+    }
+
+
+def _timed(edit: Mapping[str, Any]) -> dict[str, Any]:
+    return {"time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"), **edit}
+
+
+def check_episodes(state: DatasetState, episodes: Sequence[int]) -> None:
+    """Check that there are such episodes, and that none is named twice.
+
+    Raises:
+        DatasetError: there is no such episode.
+        ConfigError: one is named twice.
+    """
+    wrong = sorted({episode for episode in episodes if not 0 <= episode < len(state.rows)})
+    if wrong:
+        raise DatasetError(f"There is no episode {wrong[0]} in {state.root}; valid: 0 to {len(state.rows) - 1}.")
+    if len(set(episodes)) != len(episodes):
+        twice = next(episode for episode in episodes if list(episodes).count(episode) > 1)
+        raise ConfigError(f"Episode {twice} is named twice.")
+
+
+@contextlib.contextmanager
+def opened(roots: Sequence[Path]) -> Iterator[list[DatasetState]]:
+    """Lock datasets and read their state."""
+    with contextlib.ExitStack() as stack:
+        for root in roots:
+            stack.callback(_lock(root).release)
+        yield [_state_of(root) for root in roots]
+
+
+def _lock(root: Path) -> RootLock:
+    if not root.is_dir():
+        raise no_dataset(root)
+    complete_interrupted(root)
+    lock = RootLock(root)
+    clean(root)
+    return lock
+
+
+def _state_of(root: Path) -> DatasetState:
+    """Return what is in a dataset that has episodes."""
+    state = load_state(root)
+    if not state.rows:
+        raise DatasetError(f"{root} is empty: it has no episodes.")
+    return state
+
+
+def edits_of(root: Path | str) -> list[dict[str, Any]]:
+    """Return what was done to a dataset after its recording, oldest first."""
+    path = Path(root) / EDITS
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []

@@ -1,0 +1,118 @@
+"""Who recorded a dataset, and whether somebody else may continue it."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from bhd_lerobot.datasets.format.schema import Schema
+from bhd_lerobot.datasets.format.state import DatasetState
+from bhd_lerobot.errors import ConfigError, DatasetEditedError, DatasetMismatchError
+
+FORMAT = 1
+"""Version of ``meta/bhd.json``."""
+
+
+def as_json(recording: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `recording` as it will read after a trip through JSON.
+
+    Raises:
+        ConfigError: it holds something that JSON cannot.
+    """
+    try:
+        return json.loads(json.dumps(dict(recording)))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"The description of the recording must consist of JSON values: {error}.") from error
+
+
+def check_identity(
+    state: DatasetState,
+    *,
+    schema: Schema,
+    fps: int,
+    robot_type: str,
+    recording: Mapping[str, Any] | None,
+    video: Mapping[str, Any] | None,
+) -> None:
+    """Check that a dataset may be continued.
+
+    Args:
+        state: the dataset on disk.
+        schema: the columns asked for.
+        fps: the frame rate asked for.
+        robot_type: the robot asked for.
+        recording: the description asked for; None accepts the recorded one.
+        video: video settings asked for; None accepts the recorded ones.
+
+    Raises:
+        DatasetMismatchError: with every difference: key, recorded value, requested value.
+        DatasetEditedError: it was edited after its recording.
+    """
+    if state.identity is None:
+        raise DatasetMismatchError(
+            f"{state.root} was not recorded by this program (it has no meta/bhd.json). Record into another root."
+        )
+    if state.identity.get("format") != FORMAT:
+        raise DatasetMismatchError(
+            f"{state.root} was recorded with version {state.identity.get('format')} of this recorder's format; this "
+            f"program continues version {FORMAT}. Record into another root."
+        )
+    if edit := (state.identity.get("recording") or {}).get("edited"):
+        name = edit.get("edit", "edit") if isinstance(edit, Mapping) else "edit"
+        raise DatasetEditedError(
+            f"{state.root} was edited after its recording ({name}), so it cannot be continued: its next episode would "
+            "not be the one that its seed says. Record what is missing into another root, with another seed, and merge "
+            "the two."
+        )
+    recorded: dict[str, Any] = {"robot_type": state.info.get("robot_type"), "fps": state.info["fps"]}
+    requested: dict[str, Any] = {"robot_type": robot_type, "fps": fps}
+    recorded["features"] = comparable(state.info["features"])
+    requested["features"] = comparable(schema.features)
+    if recording is not None:
+        recorded["recording"], requested["recording"] = state.identity["recording"], as_json(recording)
+    if video is not None:
+        recorded["video"], requested["video"] = state.identity["video"], as_json(video)
+    found = list(differences("", recorded, requested))
+    if not found and list(recorded["features"]) != list(requested["features"]):
+        old, new = list(recorded["features"]), list(requested["features"])
+        found = [f"order of features: recorded {old}, requested {new}"]
+    if found:
+        text = "\n  ".join(found)
+        raise DatasetMismatchError(
+            f"{state.root} cannot be resumed, because it was recorded differently:\n  {text}\n"
+            "Use the recorded values, or record into another root."
+        )
+
+
+def comparable(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the features without what the encoder added later."""
+    return {key: {k: v for k, v in as_json(feature).items() if k != "info"} for key, feature in features.items()}
+
+
+def differences(prefix: str, recorded: Any, requested: Any) -> Iterator[str]:
+    """Yield a line for every value below `prefix` that is not the same in both."""
+    if isinstance(recorded, dict) and isinstance(requested, dict):
+        for key in [*recorded, *(key for key in requested if key not in recorded)]:
+            name = f"{prefix}.{key}" if prefix else str(key)
+            if key not in recorded:
+                yield f"{name}: not recorded, requested {_short(requested[key])}"
+            elif key not in requested:
+                yield f"{name}: recorded {_short(recorded[key])}, not requested"
+            else:
+                yield from differences(name, recorded[key], requested[key])
+    elif recorded != requested:
+        yield f"{prefix}: recorded {_short(recorded)}, requested {_short(requested)}"
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 120 else f"{text[:80]} ... ({len(text)} characters)"
+
+
+def default_root(repo_id: str) -> Path:
+    """Return where LeRobot looks for a dataset when no root is given."""
+    import os
+
+    from huggingface_hub.constants import HF_HOME
+
+    return Path(os.environ.get("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser() / repo_id

@@ -1,0 +1,328 @@
+"""What is committed on disk: read from ``info.json`` and the episode metadata, and checked against the files.
+
+An episode exists if and only if ``info.json`` counts it. Files of other episodes are leftovers of an interrupted save.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.format.expected import repeated, wrong_columns, wrong_row, wrong_values
+from bhd_lerobot.datasets.format.info import InfoError, kind_of, parse_object, read_info
+from bhd_lerobot.datasets.storage.layout import Slot
+from bhd_lerobot.datasets.storage.places import check_links
+from bhd_lerobot.datasets.storage.atomic import complete_interrupted
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError, quoted
+
+UNREADABLE = (OSError, pa.ArrowException, ValueError)
+"""What reading a damaged Parquet file raises; texts in it that are no UTF-8 are a `ValueError`."""
+
+REPAIR_MAY_HELP = ", or see what `bhd-data repair` can recover"
+
+Row = dict[str, Any]
+"""One row of ``meta/episodes``, without the statistics."""
+
+
+@dataclass
+class DatasetState:
+    """The committed content of a dataset.
+
+    Attributes:
+        root: the dataset.
+        info: content of ``meta/info.json``.
+        identity: content of ``meta/bhd.json``; None if another program recorded the dataset.
+        tasks: task sentences in the order of their index; may hold more than ``info`` counts after a kill.
+        rows: one per committed episode, in order.
+        without_stats: committed episodes whose statistics are not stored yet.
+        metadata_types: Arrow type of every ``bhd/`` column, empty before the first episode.
+        extra_types: Arrow type of columns that neither LeRobot nor this package writes.
+    """
+
+    root: Path
+    info: dict[str, Any]
+    identity: dict[str, Any] | None
+    tasks: list[str] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
+    without_stats: set[int] = field(default_factory=set)
+    metadata_types: dict[str, pa.DataType] = field(default_factory=dict)
+    extra_types: dict[str, pa.DataType] = field(default_factory=dict)
+
+    @property
+    def num_episodes(self) -> int:
+        """Committed episodes."""
+        return len(self.rows)
+
+    @property
+    def num_frames(self) -> int:
+        """Committed frames."""
+        return self.rows[-1]["dataset_to_index"] if self.rows else 0
+
+    @property
+    def video_keys(self) -> list[str]:
+        """Camera features."""
+        return [key for key, feature in self.info["features"].items() if feature["dtype"] == "video"]
+
+    def files(self) -> set[str]:
+        """Return all files of committed episodes, relative to the root."""
+        names = {layout.data_file(slot_of(row, "data")) for row in self.rows}
+        names |= {layout.episodes_file(slot_of(row, "meta/episodes")) for row in self.rows}
+        for key in self.video_keys:
+            names |= {layout.video_file(key, slot_of(row, f"videos/{key}")) for row in self.rows}
+        return names
+
+
+def slot_of(row: Row, kind: str) -> Slot:
+    """Return the (chunk, file) numbers of a row for ``data``, ``meta/episodes`` or ``videos/<key>``."""
+    return row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]
+
+
+def slot_columns(kind: str, slot: Slot) -> Row:
+    """Return the columns that `slot_of` reads."""
+    return {f"{kind}/chunk_index": slot[0], f"{kind}/file_index": slot[1]}
+
+
+def ordered_slots(rows: Iterable[Row], kind: str) -> dict[Slot, list[Row]]:
+    """Return the files of one kind in the order of their episodes, each with its rows."""
+    slots: dict[Slot, list[Row]] = {}
+    for row in rows:
+        slots.setdefault(slot_of(row, kind), []).append(row)
+    return slots
+
+
+class DamagedFileError(DatasetCorruptError):
+    """A file of a dataset cannot be trusted.
+
+    Attributes:
+        wrong: what is wrong with it, without a remedy.
+        path: the file, or the folder that lacks it; None if the message alone tells.
+    """
+
+    def __init__(self, message: str, path: Path | None = None, wrong: str | None = None) -> None:
+        super().__init__(message)
+        self.path, self.wrong = path, message if wrong is None else wrong
+
+
+def corrupt(path: Path, reason: object) -> DamagedFileError:
+    """Return the error for a file that cannot be trusted."""
+    remedy = f"Restore this file from a copy (or from the Hub){REPAIR_MAY_HELP}; nothing was changed."
+    if path.as_posix().endswith(layout.INFO):
+        remedy = repair_with_info(path.parents[1])
+    wrong = f"{path} is corrupt: {' '.join(str(reason).split()).rstrip('.')}"
+    return DamagedFileError(f"{wrong}. {remedy}", path, wrong)
+
+
+def repair_with_info(root: Path) -> str:
+    """Return what to do if `info.json` cannot be used, in words."""
+    return (
+        "Restore this file from a copy (or from the Hub), or take that of another recording with the same robot and "
+        f"cameras, whose counts do not matter: `bhd-data repair {quoted(root)} --info OTHER`. Nothing was changed."
+    )
+
+
+def no_dataset(root: Path) -> DatasetError:
+    """Return the error for a place without a ``meta/info.json``."""
+    if not root.is_dir():
+        found = "is a file" if root.exists() else "is a broken link" if root.is_symlink() else "does not exist"
+        return DatasetError(f"{root} is not a LeRobot dataset: it {found}.")
+    said = f"{root} is not a LeRobot dataset: it has no meta/info.json."
+    if (root / "data").is_dir() or (root / "meta").is_dir():
+        return DatasetError(f"{said} {repair_with_info(root)}")
+    inside = sorted(path.parents[1].name for path in root.glob(f"*/{layout.INFO}"))
+    told = f" It holds some; name one: {', '.join(inside[:6])}{', …' if len(inside) > 6 else ''}." if inside else ""
+    return DatasetError(said + told)
+
+
+def load_state(root: Path, *, films: bool = True) -> DatasetState:
+    """Read what is committed and check that every file it needs is there and readable.
+
+    Args:
+        root: the dataset.
+        films: whether films must be there, too.
+
+    Reads file footers, not their pages: a damaged value inside a file is found by `bhd_lerobot.datasets.recovery.repair.repair`.
+
+    Raises:
+        DatasetError: `root` is not a dataset, or a link in it leads out of it.
+        DatasetCorruptError: a file is missing, unreadable or contradicts the others; the message names it.
+    """
+    complete_interrupted(root)
+    if not (root / layout.INFO).is_file():
+        raise no_dataset(root)
+    check_links(root)
+    info = load_info(root)
+    if info.get("data_path") not in (None, layout.DATA_PATH) or info.get("video_path") not in (None, layout.VIDEO_PATH):
+        raise UnsupportedDatasetError(
+            f"{root} keeps its files at {info.get('data_path')!r} and {info.get('video_path')!r}; this program reads "
+            f"{layout.DATA_PATH!r} and {layout.VIDEO_PATH!r}. Copy it with lerobot-edit-dataset first."
+        )
+    identity = read_identity(root)
+    state = DatasetState(root, info, identity)
+    if info["total_episodes"]:
+        state.tasks = read_tasks(root / layout.TASKS)
+        if len(state.tasks) < info["total_tasks"]:
+            raise corrupt(root / layout.TASKS, f"it has {len(state.tasks)} of {info['total_tasks']} tasks")
+        _read_rows(state)
+        _check_files(state, films)
+    return state
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return a JSON object.
+
+    Raises:
+        DatasetCorruptError: there is none.
+    """
+    try:
+        return parse_object(path.read_bytes())
+    except (OSError, InfoError) as error:
+        raise corrupt(path, error) from error
+
+
+def read_identity(root: Path) -> dict[str, Any] | None:
+    """Return the content of ``meta/bhd.json``; None if another program recorded the dataset.
+
+    Raises:
+        DatasetCorruptError: it cannot be read, or does not describe a recording.
+    """
+    path = root / layout.IDENTITY
+    if not path.exists():
+        return None
+    identity = {"recording": {}, "video": {}, **read_json(path)}
+    for key in ("recording", "video"):
+        if not isinstance(identity[key], dict):
+            raise corrupt(path, f"{key!r} is {kind_of(identity[key])} and no JSON object")
+    return identity
+
+
+def load_info(root: Path) -> dict[str, Any]:
+    """Return the content of ``meta/info.json``, checked and with defaults; see `info.checked_info`.
+
+    Raises:
+        DatasetCorruptError: it cannot be read, or a value is missing or not valid.
+        DatasetError: it is of another version.
+    """
+    path = root / layout.INFO
+    try:
+        return read_info(path, root)
+    except (OSError, InfoError) as error:
+        raise corrupt(path, error) from error
+
+
+def read_tasks(path: Path) -> list[str]:
+    """Return the instructions in the order of their index.
+
+    Raises:
+        DatasetCorruptError: the file cannot be read.
+    """
+    try:
+        table = pq.ParquetFile(path).read(use_threads=False)
+        # LeRobot keeps the sentence in the index of a pandas table; the column name differs between its versions.
+        name = next(n for n in table.column_names if n != "task_index")
+        told = dict(zip(table["task_index"].to_pylist(), table[name].to_pylist(), strict=True))
+    except (*UNREADABLE, KeyError, StopIteration, TypeError) as error:
+        raise corrupt(path, error) from error
+    if table.num_rows != len(told) or told.keys() != set(range(len(told))):
+        raise corrupt(path, f"its numbers are not 0 to {table.num_rows - 1}, each once")
+    if not all(isinstance(task, str) for task in told.values()):
+        raise corrupt(path, "not all of its instructions are texts")
+    return [told[index] for index in range(len(told))]
+
+
+def _read_rows(state: DatasetState) -> None:
+    total = state.info["total_episodes"]
+    by_index: dict[int, Row] = {}
+    for path in sorted((state.root / "meta/episodes").glob("chunk-*/file-*.parquet")):
+        try:
+            file = pq.ParquetFile(path)
+            names = file.schema_arrow.names
+            light = [name for name in names if not name.startswith("stats/")]
+            rows = file.read(columns=light, use_threads=False).to_pylist()
+            slot = layout.slot_in(path)
+        except UNREADABLE as error:
+            raise corrupt(path, error) from error
+        if wrong := repeated(file.schema_arrow):
+            raise corrupt(path, wrong)
+        has_stats = "stats/index/mean" in names
+        for row in rows:
+            index = row.get("episode_index")
+            if index is None or (isinstance(index, int) and index >= total):
+                continue  # a save that was interrupted before it counted
+            if wrong := wrong_row(row, state.video_keys):
+                raise corrupt(path, f"episode {index!r} {wrong}")
+            if index in by_index:
+                raise corrupt(path, f"episode {index} is in another file as well")
+            by_index[index] = row | slot_columns("meta/episodes", slot)  # the file knows better than its row
+            if not has_stats:
+                state.without_stats.add(index)
+        own, extra = column_types(file.schema_arrow)
+        state.metadata_types = {**own, **state.metadata_types}
+        state.extra_types = {**extra, **state.extra_types}
+    for index in range(total):
+        if index not in by_index:
+            what = f"info.json counts {total} episodes, but episode {index} is not described"
+            raise corrupt(state.root / "meta/episodes", what)
+    state.rows = [by_index[index] for index in range(total)]
+
+
+def read_frames(path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Return a data file, or some of its columns.
+
+    Raises:
+        DatasetCorruptError: it cannot be read, a page is not what was written, or a number is missing.
+    """
+    try:
+        table = pq.ParquetFile(path, page_checksum_verification=True).read(columns, use_threads=False)
+    except UNREADABLE as error:
+        raise corrupt(path, error) from error
+    if wrong := wrong_values(table):
+        raise corrupt(path, wrong)
+    return table
+
+
+def column_types(schema: pa.Schema) -> tuple[dict[str, pa.DataType], dict[str, pa.DataType]]:
+    """Return the types of the columns of ``meta/episodes`` that are ours, without prefix, and of those of others."""
+    own = {name.removeprefix("bhd/"): schema.field(name).type for name in schema.names if name.startswith("bhd/")}
+    known = ("bhd/", "stats/", "data/", "videos/", "meta/episodes/")
+    extra = {
+        name: schema.field(name).type for name in schema.names if not name.startswith(known) and name not in _STRUCTURE
+    }
+    return own, extra
+
+
+_STRUCTURE = ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index")
+
+
+def _check_files(state: DatasetState, films: bool) -> None:
+    start = 0
+    for row in state.rows:
+        if row["dataset_from_index"] != start or row["dataset_to_index"] != start + row["length"]:
+            path = state.root / layout.episodes_file(slot_of(row, "meta/episodes"))
+            raise corrupt(path, f"episode {row['episode_index']} does not start at frame {start}")
+        start += row["length"]
+    if start != state.info["total_frames"]:
+        raise DatasetCorruptError(
+            f"{state.root / layout.INFO} counts {state.info['total_frames']} frames; its episodes have {start}. "
+            f"`bhd-data check {quoted(state.root)} --fix` counts anew. Nothing was changed."
+        )
+    for slot, rows in ordered_slots(state.rows, "data").items():
+        path = state.root / layout.data_file(slot)
+        wanted = sum(row["length"] for row in rows)
+        try:
+            footer = pq.read_metadata(path)
+            found, schema = footer.num_rows, footer.schema.to_arrow_schema()
+        except UNREADABLE as error:
+            raise corrupt(path, error) from error
+        if found != wanted:
+            raise corrupt(path, f"it has {found} frames; its episodes have {wanted}")
+        if wrong := wrong_columns(schema, state.info["features"]):
+            raise corrupt(path, wrong)
+    for key in state.video_keys if films else ():
+        for slot in ordered_slots(state.rows, f"videos/{key}"):
+            path = state.root / layout.video_file(key, slot)
+            if not path.is_file() or path.stat().st_size == 0:
+                raise corrupt(path, "it is missing or empty")

@@ -1,0 +1,302 @@
+"""Video of one camera: encoded in a thread while the episode runs, and joined later without encoding again."""
+
+import contextlib
+import queue
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bhd_lerobot.datasets.format import statistics
+from bhd_lerobot.errors import ConfigError, DatasetCorruptError, FrameError, unknown_name
+
+
+@dataclass(frozen=True)
+class VideoSettings:
+    """How images become video. The first seven fields mean what they mean in LeRobot's `RGBEncoderConfig`.
+
+    Attributes:
+        vcodec: encoder name. H.264 encodes fastest on a CPU and decodes everywhere.
+        pix_fmt: pixel format of the stream.
+        g: distance of key frames [frames]. Small values make random access fast and files larger.
+        crf: quality, lower is better and larger.
+        preset: speed of the encoder; its values depend on the codec.
+        fast_decode: ease decoding at the price of size (0 is off).
+        extra_options: further options of the encoder; they never override a field.
+        encoder_threads: threads per camera and open episode. One is best when many simulations record at once.
+        queue_size: images that may wait for the encoder before `add_image` blocks.
+    """
+
+    vcodec: str = "h264"
+    pix_fmt: str = "yuv420p"
+    g: int | None = 2
+    crf: float | None = 23
+    preset: int | str | None = "veryfast"
+    fast_decode: int = 0
+    extra_options: Mapping[str, Any] = field(default_factory=dict)
+    encoder_threads: int = 1
+    queue_size: int = 16
+
+    def check(self) -> None:
+        """Check that this machine can encode so.
+
+        Raises:
+            ConfigError: the encoder is not available, or a count is not positive.
+        """
+        import av  # here and below: a dataset without cameras does not need ffmpeg at all
+
+        if self.vcodec not in av.codecs_available or not _is_encoder(self.vcodec):
+            usable = [name for name in ("h264", "hevc", "libsvtav1", "libaom-av1") if _is_encoder(name)]
+            raise ConfigError(unknown_name("video encoder", self.vcodec, usable))
+        for name in ("encoder_threads", "queue_size"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"video.{name} must be at least 1; got {getattr(self, name)}.")
+
+    def codec_options(self) -> dict[str, str]:
+        """Return the options for ffmpeg."""
+        options: dict[str, Any] = {"g": self.g, "crf": self.crf, "preset": self.preset}
+        if self.vcodec == "libsvtav1":
+            options["svtav1-params"] = f"fast-decode={self.fast_decode}:lp={self.encoder_threads}"
+        else:
+            options["threads"] = self.encoder_threads
+            if self.fast_decode:
+                options["tune"] = "fastdecode"
+            # Without B-frames every file starts at time 0 in decoding order too, and files join exactly.
+            options["bf"] = 0
+        options = {**self.extra_options, **{key: value for key, value in options.items() if value is not None}}
+        return {key: str(value) for key, value in options.items()}
+
+    def recorded(self) -> dict[str, Any]:
+        """Return the fields that shape the stream; a dataset can only be resumed with the same ones."""
+        fields = asdict(self)
+        del fields["encoder_threads"], fields["queue_size"]
+        return {**fields, "extra_options": dict(self.extra_options)}
+
+
+def _is_encoder(name: str) -> bool:
+    import av
+
+    try:
+        return bool(av.codec.Codec(name, "w").is_encoder)
+    except (av.error.FFmpegError, ValueError):
+        return False
+
+
+class CameraEncoder:
+    """Encodes the images of one camera and one episode into one file.
+
+    `add` blocks while the queue is full; no image is ever dropped.
+    """
+
+    def __init__(self, path: Path, fps: int, size: tuple[int, int], settings: VideoSettings) -> None:
+        """Start the thread.
+
+        Args:
+            path: the file to write.
+            fps: frames per second of the dataset.
+            size: (height, width) in pixels.
+            settings: codec and its options.
+        """
+        self.path = path
+        self.frames = 0
+        self._fps, self._size, self._settings = fps, size, settings
+        self._queue: queue.Queue[np.ndarray | None] = queue.Queue(settings.queue_size)
+        self._cancelled = threading.Event()
+        self._error: Exception | None = None
+        self._histograms: list[np.ndarray] = []
+        self._thread = threading.Thread(target=self._run, name=f"encode {path.name}", daemon=True)
+        self._thread.start()
+
+    def add(self, image: np.ndarray) -> None:
+        """Queue a copy of one image of shape (H, W, 3), uint8.
+
+        Raises:
+            FrameError: wrong shape or type.
+            OSError: the encoder failed earlier.
+        """
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != (*self._size, 3):
+            got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise FrameError(f"An image of camera {self.path.stem!r} must be uint8 {(*self._size, 3)}; got {got}.")
+        self._put(np.array(image, order="C"))
+        self.frames += 1
+
+    def finish(self) -> np.ndarray:
+        """Encode what is queued, close the file and return the histograms, shape (T, 3, 256).
+
+        Raises:
+            OSError: the file could not be written completely.
+        """
+        self._put(None)
+        self._thread.join()
+        self._raise_error()
+        if count_frames(self.path) != self.frames:
+            raise OSError(f"the encoder wrote another number of frames than the {self.frames} it was given")
+        return np.stack(self._histograms)
+
+    def cancel(self) -> None:
+        """Stop without caring for the file; also after an error, also twice."""
+        self._cancelled.set()
+        with contextlib.suppress(queue.Full):
+            self._queue.put_nowait(None)
+        self._thread.join()
+
+    def _put(self, item: np.ndarray | None) -> None:
+        while True:
+            self._raise_error()
+            try:
+                # The time-out only serves to notice an encoder that died while the queue was full.
+                self._queue.put(item, timeout=0.1)
+            except queue.Full:
+                continue
+            return
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise OSError(getattr(self._error, "errno", None), str(self._error), str(self.path)) from self._error
+
+    def _run(self) -> None:
+        try:
+            self._encode()
+        except Exception as error:  # raised again in the thread that records
+            self._error = error
+
+    def _encode(self) -> None:
+        import av
+
+        with av.open(str(self.path), "w", format="mp4") as container:
+            stream: Any = container.add_stream(self._settings.vcodec, self._fps, options=self._settings.codec_options())
+            stream.height, stream.width = self._size
+            stream.pix_fmt = self._settings.pix_fmt
+            step = Fraction(1, self._fps)
+            stream.time_base = step
+            while (image := self._queue.get()) is not None and not self._cancelled.is_set():
+                frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+                frame.pts = len(self._histograms)
+                frame.time_base = step  # not the stream's, which the container changes on the way
+                container.mux(stream.encode(frame))
+                self._histograms.append(statistics.image_histogram(image))
+            container.mux(stream.encode())
+
+
+class EncodedVideo:
+    """Images of one camera and one episode that were encoded elsewhere; in the place of a `CameraEncoder`.
+
+    Args:
+        path: the file.
+        histograms: of its images, shape (T, 3, 256).
+    """
+
+    def __init__(self, path: Path, histograms: np.ndarray) -> None:
+        self.path, self.frames = path, len(histograms)
+        self._histograms = histograms
+
+    def finish(self) -> np.ndarray:
+        """Check the file and return the histograms.
+
+        Raises:
+            OSError: the file holds another number of images.
+        """
+        if count_frames(self.path) != self.frames:
+            raise OSError(f"{self.path.name} holds another number of frames than the {self.frames} that belong to it")
+        return self._histograms
+
+    def cancel(self) -> None:
+        """There is nothing to stop."""
+
+
+def count_frames(path: Path) -> int:
+    """Return how many frames a video file holds, by reading all of it but decoding nothing.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            frames = sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
+    except (av.error.FFmpegError, IndexError) as error:
+        raise OSError(getattr(error, "errno", None), str(error), str(path)) from error
+    return frames
+
+
+def stream_signature(path: Path) -> tuple[Any, ...]:
+    """Return what two files must share to be joined: codec, its header, size and time base."""
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            codec = stream.codec_context
+            signature = (codec.name, bytes(codec.extradata or b""), stream.height, stream.width, stream.time_base)
+    except (av.error.FFmpegError, IndexError, OSError) as error:
+        raise DatasetCorruptError(
+            f"{path} is not a readable video ({error}). Restore this file from a copy; nothing was changed."
+        ) from error
+    return signature
+
+
+def concatenate(parts: Sequence[Path], target: Path, fps: int) -> list[int]:
+    """Join videos of the same signature into one file, without encoding again.
+
+    Args:
+        parts: files in order.
+        target: the new file.
+        fps: frames per second of all of them.
+
+    Returns:
+        The number of frames of every part.
+    """
+    import av
+
+    counts: list[int] = []
+    with av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as output:
+        joined: Any = None
+        for part in parts:
+            with av.open(str(part)) as source:
+                stream: Any = source.streams.video[0]
+                if joined is None:
+                    joined = output.add_stream_from_template(stream, opaque=True)
+                    joined.time_base = stream.time_base
+                # Every part starts where the frames before it end; counted in frames, so no rounding adds up.
+                shift = int(Fraction(sum(counts), fps) / stream.time_base)
+                frames = 0
+                packet: Any
+                for packet in source.demux(stream):
+                    if packet.dts is None:
+                        continue  # the demuxer's end marker
+                    packet.pts, packet.dts = packet.pts + shift, packet.dts + shift
+                    packet.stream = joined
+                    output.mux(packet)
+                    frames += 1
+                counts.append(frames)
+    return counts
+
+
+def video_info(path: Path, settings: VideoSettings) -> dict[str, Any]:
+    """Return the entry that LeRobot keeps about a video feature in ``info.json``."""
+    import av
+
+    with av.open(str(path)) as container:
+        stream: Any = container.streams.video[0]
+        info: dict[str, Any] = {
+            "video.height": stream.height,
+            "video.width": stream.width,
+            "video.codec": stream.codec.canonical_name,
+            "video.pix_fmt": stream.pix_fmt,
+            "video.fps": int(stream.base_rate or 0),
+            "video.channels": len(av.VideoFormat(stream.pix_fmt).components),
+            "has_audio": False,
+        }
+    recorded = settings.recorded()
+    info |= {f"video.{key}": recorded[key] for key in ("g", "crf", "preset", "fast_decode")}
+    return {
+        **info,
+        "video.video_backend": "pyav",
+        "video.extra_options": recorded["extra_options"],
+        "is_depth_map": False,
+    }

@@ -1,0 +1,284 @@
+"""Complete or drop what an interrupted recording left behind, and recover what is whole where files are damaged."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.format import video
+from bhd_lerobot.datasets.assembly.compact import compact
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
+from bhd_lerobot.datasets.recovery.fix import compute_stats
+from bhd_lerobot.datasets.format.parquet_rescue import is_cut_off, is_parquet
+from bhd_lerobot.datasets.storage.atomic import real, remove_abandoned, roll_forward
+from bhd_lerobot.datasets.recovery.info import adopt_info, give_back
+from bhd_lerobot.datasets.recovery.salvage import salvage
+from bhd_lerobot.datasets.recovery.videos import whole_frames
+from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.format.schema import Schema
+from bhd_lerobot.datasets.format.state import (
+    REPAIR_MAY_HELP,
+    DamagedFileError,
+    DatasetState,
+    corrupt,
+    load_state,
+    no_dataset,
+    ordered_slots,
+    read_json,
+    slot_of,
+)
+from bhd_lerobot.errors import DatasetCorruptError
+
+
+@dataclass(frozen=True)
+class RepairReport:
+    """What was mended. It is false if there was nothing to do.
+
+    Attributes:
+        root: the dataset.
+        episodes: episodes it holds now.
+        frames: frames it holds now.
+        completed: steps that had been decided before the interruption and were completed.
+        dropped: files of unfinished episodes that were removed, relative to the root.
+        lost: what of a wreck could not be recovered, and why.
+        hints: what may be so about it.
+        aside: where its damaged files lie now; None if none were damaged.
+    """
+
+    root: Path
+    episodes: int
+    frames: int
+    completed: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
+    hints: tuple[str, ...] = ()
+    aside: Path | None = None
+
+    def __bool__(self) -> bool:
+        """Whether anything was mended."""
+        return bool(self.completed or self.dropped)
+
+    def __str__(self) -> str:
+        """Return the report for a terminal."""
+        empty = "" if self.episodes else ": it is empty"
+        lines = [f"{self.root}: {self.episodes} episodes, {self.frames} frames{empty}"]
+        lines += [f"  completed: {item}" for item in self.completed]
+        lines += [f"  dropped: {item}" for item in self.dropped]
+        lines += [f"  lost: {item}" for item in self.lost]
+        lines += ["  lost: nothing"] if self.aside is not None and not self.lost else []
+        lines += [f"  note: {item}" for item in self.hints]
+        lines += [f"  the damaged files are in {self.aside}"] if self.aside is not None else []
+        return "\n".join(lines if self else [*lines, "  nothing to do"])
+
+
+def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
+    """Mend a dataset, check every file to the last page, and leave it compact and with statistics.
+
+    Args:
+        root: the dataset.
+        info: another recording with the same robot and cameras, or its `meta/info.json`: if the dataset's own is lost.
+
+    Raises:
+        DatasetLockedError: it is being recorded at this moment.
+        DatasetCorruptError: files are damaged and no whole episode can be recovered; nothing was changed then.
+        DatasetError: there is no dataset at `root`, or the disk does not give out one of its files.
+        ConfigError: `info` is not needed, cannot be read or describes other data.
+        DatasetWriteError: the disk refuses the repaired files.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise no_dataset(root)
+    lock = RootLock(root)
+    try:
+        disk = Disk()
+        if info is not None:
+            return _repair_with(root, Path(info), disk, lock)
+        is_ours = (root / layout.IDENTITY).exists()
+        if (root / layout.INFO).is_file() and (not is_ours or went_on(root)):
+            return _repair_foreign(root, disk, lock)
+        return _repair_own(root, disk, lock)
+    except DatasetCorruptError as error:
+        # Whoever is told to try `repair` has done that now.
+        raise DatasetCorruptError(str(error).replace(REPAIR_MAY_HELP, "")) from error
+    finally:
+        lock.release()
+
+
+def _repair_own(root: Path, disk: Disk, lock: RootLock) -> RepairReport:
+    """Finish what our recorder or an edit began; where saved files are damaged, recover the episodes that are whole."""
+    report = RepairReport(root, 0, 0)
+    try:
+        with write_errors("repair the dataset", root, "Its saved episodes are intact."):
+            state, report = settle(root, disk)
+            _check_deeply(state)
+            if state.identity is not None and compact(state, Schema(state.info["features"]), disk, lock):
+                what = f"compaction and statistics of {len(state.without_stats)} episodes"
+                disk.remove_tree(root / layout.STAGING)
+                done = (*report.completed, what)
+                report = RepairReport(root, report.episodes, report.frames, done, report.dropped)
+    except DamagedFileError as error:
+        # These two nothing else can replace: what the columns are, and who recorded it how.
+        if error.path in (root / layout.INFO, root / layout.IDENTITY):
+            raise
+        return _salvaged(root, disk, lock, error, completed=report.completed, dropped=report.dropped, is_ours=True)
+    return report
+
+
+def _salvaged(
+    root: Path,
+    disk: Disk,
+    lock: RootLock,
+    error: DatasetCorruptError,
+    *,
+    completed: tuple[str, ...],
+    dropped: tuple[str, ...] = (),
+    is_ours: bool = False,
+) -> RepairReport:
+    wrong = error.wrong if isinstance(error, DamagedFileError) else str(error).split(". ", 1)[0]
+    rescued = salvage(root, disk, lock, wrong, is_ours=is_ours)
+    what = f"{rescued.episodes} whole episodes were recovered, with new statistics. What was wrong: {wrong}"
+    done = (*completed, what)
+    return RepairReport(
+        root, rescued.episodes, rescued.frames, done, dropped, rescued.lost, rescued.hints, rescued.aside
+    )
+
+
+def _repair_with(root: Path, donor: Path, disk: Disk, lock: RootLock) -> RepairReport:
+    """Mend a dataset whose `info.json` is lost.
+
+    Frames that belong to no episode are recovered then, not dropped: nothing says any more which were saved.
+    """
+    consequence = "Its files are as they were."
+    with write_errors("repair the dataset", root, consequence):
+        roll_forward(root, disk)
+        adopted, kept = adopt_info(root, donor, disk)
+    try:
+        report = _repair_foreign(root, disk, lock, adopted)
+    except BaseException:
+        with write_errors("repair the dataset", root, consequence):
+            give_back(root, kept, disk)
+        raise
+    return report if kept is None or report.aside is not None else replace(report, aside=kept.parents[1])
+
+
+def _repair_foreign(root: Path, disk: Disk, lock: RootLock, *completed: str) -> RepairReport:
+    """Mend what another program wrote: nothing if all of it can be read, and else everything that is whole."""
+    with write_errors("repair the dataset", root, "Its files are as they were."):
+        remove_abandoned(real(root))
+        if roll_forward(root, disk):
+            completed += ("a change that was interrupted while its files were moved in",)
+        disk.remove_tree(root / layout.STAGING)  # of an attempt that was interrupted
+    try:
+        state = load_state(root)
+        if unfinished := unfinished_files(root):
+            raise corrupt(unfinished[0], "its writer was killed")
+        extra = sorted(name for name in layout.recorded_files(root) - state.files() if name.startswith("data/"))
+        if extra := [name for name in extra if is_parquet(root / name)]:
+            raise corrupt(root / extra[0], "no episode of meta/episodes is in it")
+        _check_readable(state)
+    except DatasetCorruptError as error:
+        return _salvaged(root, disk, lock, error, completed=completed)
+    if state.rows and not _has_stats(root):
+        with write_errors("repair the dataset", root, "Its files are as they were."):
+            completed = (*completed, compute_stats(state, disk, lock))
+            disk.remove_tree(root / layout.STAGING)
+    return RepairReport(root, state.num_episodes, state.num_frames, completed)
+
+
+def unfinished_files(root: Path) -> list[Path]:
+    """Return the data and episode files without a footer. Ours never are: they get their names when they are whole."""
+    paths = [root / name for name in sorted(layout.recorded_files(root))]
+    return [path for path in paths if path.suffix == ".parquet" and is_cut_off(path)]
+
+
+def went_on(root: Path) -> list[Path]:
+    """Return what another program left unfinished when it went on with a dataset of ours.
+
+    A file that our own rows need and that is cut off is damage of another kind. LeRobot always leaves a data file.
+    """
+    unfinished = unfinished_files(root)
+    rows = Told(root).rows.values() if any(path.is_relative_to(root / "data") for path in unfinished) else ()
+    needed = {root / layout.data_file(slot_of(row, "data")) for row in rows}
+    return [] if not rows or needed & set(unfinished) else unfinished
+
+
+def _has_stats(root: Path) -> bool:
+    try:
+        return bool(read_json(root / layout.STATS))
+    except DatasetCorruptError:
+        return False
+
+
+def _check_readable(state: DatasetState) -> None:
+    """Check that all frames of all episodes can be read, where their rows say that they are."""
+    for slot in ordered_slots(state.rows, "data"):
+        _check_data(state.root / layout.data_file(slot))
+    for key in state.video_keys:
+        kind = f"videos/{key}"
+        for slot, rows in ordered_slots(state.rows, kind).items():
+            path = state.root / layout.video_file(key, slot)
+            needed = max(round(row[f"{kind}/from_timestamp"] * state.info["fps"]) + row["length"] for row in rows)
+            frames, problem = whole_frames(path)
+            if frames < needed:
+                raise corrupt(path, f"it has {frames} of {needed} frames; {problem or 'it ends'}")
+
+
+def settle(root: Path, disk: Disk, *, keep_staging: bool = False) -> tuple[DatasetState, RepairReport]:
+    """Bring the disk to what ``info.json`` says; the caller holds the lock.
+
+    Args:
+        root: the dataset.
+        disk: how to write.
+        keep_staging: leave files of episodes that are still being recorded.
+
+    Returns:
+        The committed state, and what was done.
+
+    Raises:
+        DatasetCorruptError: a file of a saved episode cannot be read; nothing was dropped then.
+    """
+    remove_abandoned(real(root))
+    completed = ["a change that was interrupted while its files were moved in"] if roll_forward(root, disk) else []
+    state = load_state(root)
+    dropped: list[str] = []
+    if state.identity is not None:
+        if unfinished := went_on(root):
+            raise corrupt(unfinished[0], "another program went on with this dataset and was killed")
+        # Only in our own datasets: another program may know what its files are for.
+        dropped = sorted(layout.recorded_files(root) - state.files())
+        for name in dropped:
+            disk.remove(root / name)
+    if not keep_staging and (root / layout.STAGING).exists():
+        staged = [path for path in (root / layout.STAGING).rglob("*") if path.is_file()]
+        dropped += sorted(path.relative_to(root).as_posix() for path in staged)
+        disk.remove_tree(root / layout.STAGING)
+    # A task of a dropped episode may be in tasks.parquet already. It is not counted, and the next save writes the
+    # file again, so it needs no step of its own.
+    state.tasks = state.tasks[: state.info["total_tasks"]]
+    return state, RepairReport(root, state.num_episodes, state.num_frames, tuple(completed), tuple(dropped))
+
+
+def _check_deeply(state: DatasetState) -> None:
+    for slot in ordered_slots(state.rows, "data"):
+        _check_data(state.root / layout.data_file(slot))
+    for key in state.video_keys:
+        for slot, rows in ordered_slots(state.rows, f"videos/{key}").items():
+            path = state.root / layout.video_file(key, slot)
+            wanted = sum(row["length"] for row in rows)
+            try:
+                found = video.count_frames(path)
+            except OSError as error:
+                raise corrupt(path, error) from error
+            if found != wanted:
+                raise corrupt(path, f"it has {found} frames; its episodes have {wanted}")
+
+
+def _check_data(path: Path) -> None:
+    try:
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        for group in range(file.num_row_groups):
+            file.read_row_group(group, use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise corrupt(path, error) from error

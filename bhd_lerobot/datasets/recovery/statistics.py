@@ -1,0 +1,93 @@
+"""Statistics of what another program recorded: of columns by LeRobot's function, of pictures from the pictures."""
+
+import io
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.format import statistics
+from bhd_lerobot.datasets.format.state import Row, slot_of
+
+
+def stats_of(
+    episodes: Iterable[pa.Table],
+    features: Mapping[str, Mapping[str, Any]],
+    new: Path,
+    rows: Sequence[Row],
+    stored: Sequence[Mapping[str, Mapping[str, np.ndarray]]] | None = None,
+) -> dict[str, statistics.Stats]:
+    """Return feature -> statistic -> values of all episodes, shape (E, ...).
+
+    Args:
+        episodes: frames of each episode.
+        features: LeRobot feature dictionaries.
+        new: root of the dataset, with its films.
+        rows: of the episodes, with the places of their films.
+        stored: statistics of each episode's pictures that are known already. Those of depth are never computed here.
+    """
+    from lerobot.datasets.compute_stats import compute_episode_stats
+
+    plain = {
+        key: {**feature, "shape": tuple(feature["shape"])}
+        for key, feature in features.items()
+        if feature["dtype"] not in ("video", "image", "string", "language")
+    }
+    stacked: dict[str, dict[str, list[np.ndarray]]] = {}
+    for table, row in zip(episodes, rows, strict=True):
+        columns = {key: _array(table, key, feature["shape"]) for key, feature in plain.items()}
+        own = dict(compute_episode_stats(columns, plain))
+        known = {} if stored is None else stored[row["episode_index"]]
+        for key, feature in features.items():
+            if feature["dtype"] not in ("video", "image"):
+                continue
+            if key in known:
+                own[key] = known[key]
+                continue
+            if 3 not in (feature["shape"][0], feature["shape"][-1]):
+                continue  # depth: its statistics are in metres, by the encoder's scale
+            pictures = _film(new, key, row) if feature["dtype"] == "video" else _pictures(table, key)
+            own[key] = statistics.image_stats(np.stack([statistics.image_histogram(one) for one in pictures]))
+        for key, stat in own.items():
+            for name, values in stat.items():
+                stacked.setdefault(key, {}).setdefault(name, []).append(
+                    np.asarray(values, None if name == "count" else np.float64)
+                )
+    return {key: {name: np.stack(values) for name, values in stat.items()} for key, stat in stacked.items()}
+
+
+def _array(table: pa.Table, key: str, shape: tuple[int, ...]) -> np.ndarray:
+    column = table[key].combine_chunks()
+    values = np.array(column.to_pylist()) if pa.types.is_nested(column.type) else column.to_numpy(zero_copy_only=False)
+    return values.reshape(len(column), *shape) if shape != (1,) else values.reshape(len(column))
+
+
+def _pictures(table: pa.Table, key: str) -> Iterator[np.ndarray]:
+    from PIL import Image
+
+    for value in table[key].to_pylist():
+        with Image.open(io.BytesIO(value["bytes"])) as picture:
+            yield np.asarray(picture.convert("RGB"))
+
+
+def _film(new: Path, key: str, row: Row) -> Iterator[np.ndarray]:
+    """Yield the pictures of an episode, shape (H, W, 3)."""
+    import av
+
+    kind = f"videos/{key}"
+    start, end = row[f"{kind}/from_timestamp"], row[f"{kind}/to_timestamp"]
+    step = (end - start) / row["length"]
+    with av.open(str(new / layout.video_file(key, slot_of(row, kind)))) as container:
+        stream: Any = container.streams.video[0]
+        begin = stream.start_time or 0
+        container.seek(begin + int(Fraction(start).limit_denominator(10**6) / stream.time_base), stream=stream)
+        for frame in container.decode(stream):
+            time = float((frame.pts - begin) * stream.time_base)
+            if time > end - step / 2:
+                return
+            if time > start - step / 2:
+                yield frame.to_ndarray(format="rgb24")

@@ -1,0 +1,281 @@
+"""The films of a wreck: which frames of which film show which episode."""
+
+import contextlib
+import os
+import stat
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.format import video
+from bhd_lerobot.datasets.storage.disk import Disk
+from bhd_lerobot.datasets.format.expected import wrong_part
+from bhd_lerobot.datasets.recovery.video_files import cut_out, encode
+from bhd_lerobot.datasets.format.state import Row, slot_columns, slot_of
+
+_FRAMES = "images/{key}/episode-{episode:06d}"  # where LeRobot keeps the frames of a film that is not encoded yet
+
+
+@dataclass(frozen=True)
+class Part:
+    """Frames of a film.
+
+    Attributes:
+        path: the film, or a folder with a picture for each frame.
+        start: number of the first frame in it.
+        length: how many.
+    """
+
+    path: Path
+    start: int
+    length: int
+
+
+@dataclass
+class Found:
+    """An episode whose frames were found.
+
+    Attributes:
+        number: the number that it had.
+        table: its frames.
+        films: for each camera what shows it.
+        is_told: whether a readable row of ``meta/episodes`` is about it.
+    """
+
+    number: int
+    table: pa.Table
+    films: dict[str, Part] = field(default_factory=dict)
+    is_told: bool = False
+
+
+class Films:
+    """Films and loose frames below a root.
+
+    Where a row of ``meta/episodes`` is left, it says where the episode is. Episodes without one come after those with
+    one, in films of their own; these hold whole episodes in the order of their numbers, one after the other, so their
+    lengths say where each is. Where that does not come out even, no episode gets a film that may be another's.
+
+    Args:
+        root: the wreck.
+        info: content of its ``info.json``.
+        rows: readable rows of ``meta/episodes``, by the number of the episode.
+    """
+
+    def __init__(self, root: Path, info: dict[str, Any], rows: Mapping[int, Row]) -> None:
+        self._root, self._fps, self._rows = root, Fraction(info["fps"]), rows
+        self._features, self._chunks = info["features"], info.get("chunks_size") or layout.CHUNKS_SIZE
+        self._keys = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+        self._frames: dict[Path, tuple[int, str]] = {}
+        self._whole_copies: dict[Path, Path] = {}
+
+    def assign(self, found: Sequence[Found], lost: list[str], *, is_torn: bool) -> list[Found]:
+        """Find the film of every episode, and return the episodes that have all of theirs.
+
+        Args:
+            found: episodes whose frames are whole, in order.
+            lost: lines about what is lost are added here.
+            is_torn: whether frames are missing behind them: then a film may show more than they need.
+        """
+        for one in found:
+            one.is_told = self._rows.get(one.number, {}).get("length") == one.table.num_rows
+        found, certain = self._without_repeated(found, lost)
+        told = [one for one in found if one.is_told]
+        untold = [one for one in found if not one.is_told]
+        for key in self._keys:
+            for one in told:
+                row = self._rows[one.number]
+                if wrong_part(row, key):
+                    continue  # a camera that these rows do not have
+                path = self._root / layout.video_file(key, slot_of(row, f"videos/{key}"))
+                start = round(row[f"videos/{key}/from_timestamp"] * self._fps)
+                if start + one.table.num_rows <= self._whole(path, lost)[0]:
+                    one.films[key] = Part(self._whole_copies.get(path, path), start, one.table.num_rows)
+            self._assign(key, untold, lost, certain=certain, is_torn=is_torn)
+        kept = []
+        for one in found:
+            missing = [key for key in self._keys if key not in one.films]
+            if missing:
+                lost.append(f"episode {one.number}: no whole film of {', '.join(missing)}")
+            else:
+                kept.append(one)
+        return kept
+
+    def _without_repeated(self, found: Sequence[Found], lost: list[str]) -> tuple[list[Found], int]:
+        """Return each episode once, and how many of those without a row have films at known places.
+
+        An episode that could not be saved and was recorded again is there twice, under one number. The last one counts.
+        Whether a film shows the first one, too, is told nowhere.
+        """
+        last = {one.number: one for one in found}
+        once = [one for one in found if last[one.number] is one]
+        expected = max(self._rows, default=-1) + 1
+        repeated = {one.number for one in found if last[one.number] is not one}
+        lost += [f"episode {number}: a first attempt, which was recorded again" for number in sorted(repeated)]
+        certain = 0
+        for one in (one for one in once if not one.is_told):
+            if one.number != expected + certain or one.number in repeated:
+                break
+            certain += 1
+        return once, certain
+
+    def _assign(self, key: str, untold: Sequence[Found], lost: list[str], *, certain: int, is_torn: bool) -> None:
+        waiting = list(untold[:certain])
+        for path in self._following(key, lost) if waiting else []:
+            frames, problem = self._whole(path, lost)
+            taken: list[Found] = []
+            start = 0
+            while waiting and start + waiting[0].table.num_rows <= frames:
+                one = waiting.pop(0)
+                one.films[key] = Part(self._whole_copies.get(path, path), start, one.table.num_rows)
+                taken.append(one)
+                start += one.table.num_rows
+            if start < frames and not problem and not (is_torn or len(untold) > certain):
+                name = path.relative_to(self._root).as_posix()
+                lost.append(
+                    f"{name}: its {frames} frames are not those of whole episodes, so whose they are is not known"
+                )
+                for one in taken:
+                    del one.films[key]
+                break
+            if problem and waiting:
+                break  # what films after a torn one show is not certain
+        for one in untold:
+            if key not in one.films:
+                self._look_aside(key, one, is_last=one is untold[-1])
+
+    def _following(self, key: str, lost: list[str]) -> Iterator[Path]:
+        """Yield the films after those of the readable rows, as long as their numbers have no gap."""
+        slots = [slot_of(row, f"videos/{key}") for row in self._rows.values() if not wrong_part(row, key)]
+        slot: layout.Slot | None = max(slots, default=None)
+        seen = {self._root / layout.video_file(key, one) for one in slots}
+        while True:
+            slot = layout.next_slot(slot, self._chunks)
+            path = self._root / layout.video_file(key, slot)
+            if not path.exists():
+                break
+            seen.add(path)
+            yield path
+        others = sorted(set((self._root / "videos" / key).glob("chunk-*/file-*.mp4")) - seen)
+        if others:
+            names = ", ".join(path.relative_to(self._root).as_posix() for path in others[:3])
+            lost.append(f"{names}: a film before is missing, so whose they are is not known")
+
+    def _look_aside(self, key: str, one: Found, *, is_last: bool) -> None:
+        """Look for a film that was made and not joined yet, and for pictures that were not encoded yet."""
+        names = [f"tmp*/{key}_{one.number:03d}.mp4", *([f"tmp*/{key}_streaming.mp4"] if is_last else [])]
+        length = one.table.num_rows
+        for path in (path for name in names for path in sorted(self._root.glob(name))):
+            if whole_frames(path) == (length, ""):
+                self._frames[path] = (length, "")
+                one.films[key] = Part(path, 0, length)
+                return
+        folder = self._root / _FRAMES.format(key=key, episode=one.number)
+        if _are_whole(folder, length):
+            one.films[key] = Part(folder, 0, length)
+
+    def _whole(self, path: Path, lost: list[str]) -> tuple[int, str]:
+        if path not in self._frames:
+            found = whole_frames(path)
+            if found[1] and (copy := _being_moved(path)) is not None:
+                self._whole_copies[path] = copy
+                found = self._frames[copy] = whole_frames(copy)
+            self._frames[path] = found
+            if found[1]:
+                name = path.relative_to(self._root).as_posix()
+                lost.append(f"{name}: everything from frame {found[0]} on: {found[1]}")
+        return self._frames[path]
+
+    def write(self, kept: Sequence[Found], rows: Sequence[Row], info: dict[str, Any], new: Path, disk: Disk) -> None:
+        """Write the films of the recovered dataset, and into `rows` where each episode is in them.
+
+        A film of which all is needed stays as it is; of another the frames of these episodes are kept.
+        """
+        for key in self._keys:
+            slot: layout.Slot | None = None
+            for path in dict.fromkeys(one.films[key].path for one in kept):
+                members = [(one, row) for one, row in zip(kept, rows, strict=True) if one.films[key].path == path]
+                slot = layout.next_slot(slot, info["chunks_size"])
+                target = new / layout.video_file(key, slot)
+                disk.make_folder(target.parent)
+                spans = [(one.films[key].start, one.films[key].length) for one, _ in members]
+                if path.is_dir():
+                    encode(path, target, spans[0][1], self._fps, self._features[key])
+                    starts = [0]
+                elif (cut := cut_out(path, target, spans, self._frames[path], self._fps)) is not None:
+                    starts = cut
+                else:
+                    disk.copy(path, target)
+                    starts = [start for start, _ in spans]
+                for (one, row), start in zip(members, starts, strict=True):
+                    row.update(slot_columns(f"videos/{key}", slot))
+                    row[f"videos/{key}/from_timestamp"] = float(start / self._fps)
+                    row[f"videos/{key}/to_timestamp"] = float((start + one.table.num_rows) / self._fps)
+            if "info" not in info["features"][key] and slot is not None:
+                first = new / layout.video_file(key, (0, 0))
+                info["features"][key]["info"] = video.video_info(first, video.VideoSettings())
+
+
+def _being_moved(path: Path) -> Path | None:
+    """Return the film that `path` is the beginning of.
+
+    LeRobot joins films in the folder for temporary files and moves the result. On another file system that is a copy,
+    and a kill leaves the beginning of it, with the whole beside.
+    """
+    begin = path.read_bytes() if path.is_file() else b""
+    for other in sorted(Path(tempfile.gettempdir()).glob("*.mp4")) if begin else []:
+        if not _is_own(other):  # that folder is everybody's
+            continue
+        with contextlib.suppress(OSError), open(other, "rb") as file:
+            if other.stat().st_size > len(begin) and file.read(len(begin)) == begin and not whole_frames(other)[1]:
+                return other
+    return None
+
+
+def _is_own(path: Path) -> bool:
+    """Tell whether a path is a plain file of this user: neither another's, nor a link, nor a pipe that never ends."""
+    try:
+        about = path.lstat()
+    except OSError:
+        return False
+    return stat.S_ISREG(about.st_mode) and about.st_uid == os.getuid()
+
+
+def whole_frames(path: Path) -> tuple[int, str]:
+    """Return how many frames from the first on can be decoded, and what is wrong with the next one, if anything."""
+    import av
+
+    frames = 0
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            for packet in container.demux(stream):
+                if packet.is_corrupt:
+                    return frames, "the film is cut off"
+                for frame in packet.decode():
+                    if getattr(frame, "is_corrupt", False):
+                        return frames, "the film is damaged"
+                    frames += 1
+            if stream.frames and frames < stream.frames:
+                return frames, f"the film is cut off; it had {stream.frames} frames"
+    except (av.error.FFmpegError, IndexError) as error:
+        return frames, " ".join(str(error).split())
+    return frames, ""
+
+
+def _are_whole(folder: Path, length: int) -> bool:
+    """Tell whether a folder has a readable picture for each of `length` frames."""
+    from PIL import Image
+
+    for frame in range(length):
+        try:
+            with Image.open(folder / f"frame-{frame:06d}.png") as picture:
+                picture.load()
+        except (OSError, SyntaxError):
+            return False
+    return True

@@ -1,0 +1,253 @@
+"""A copy of a dataset somewhere else, on the Hub or below a URL: what both have in common.
+
+A `Remote` lists its files with a checksum each, so that a transfer that is repeated moves only what differs.
+"""
+
+import hashlib
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.errors import ConfigError, TransferError
+
+CARD = "README.md"
+PICTURE = "preview.png"
+SUBSET = "meta/bhd_subset.json"
+"""Says which episodes of a dataset were asked for, and whether the folder holds all files. It is never uploaded."""
+
+MANIFEST = "bhd_files.json"
+"""The list of files with size and checksum beside a dataset below a URL; no part of the dataset."""
+
+LISTED = "xxh128"
+"""How the checksums in that list are made."""
+
+_CHUNK = 1 << 20
+"""Bytes that are read at once: they stay in the processor's cache until their checksum is made, which with larger
+pieces takes twice as long."""
+
+_REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """A file of a remote dataset.
+
+    Attributes:
+        size: its bytes.
+        digest: its checksum in hexadecimal; None if the place knows none.
+        algorithm: how the checksum is made: `sha256`; `git`, the name that git gives to the content; or `xxh128`, which
+            takes a tenth of the time and finds damage, though no malice: of files that a push noted in its own list.
+    """
+
+    size: int
+    digest: str | None
+    algorithm: str = "sha256"
+
+
+@dataclass(frozen=True)
+class Item:
+    """A file that is to lie in a remote dataset.
+
+    Attributes:
+        path: where, relative to the dataset, with slashes.
+        content: the file on this machine, or its bytes.
+        size: its bytes.
+    """
+
+    path: str
+    content: Path | bytes
+    size: int
+
+    def is_like(self, file: RemoteFile | None) -> bool:
+        """Return whether the remote file has this content; false where that cannot be known."""
+        if file is None or file.size != self.size or file.digest is None:
+            return False
+        return digest(self.content, file.algorithm) == file.digest
+
+
+class Remote(Protocol):
+    """A place that a dataset is copied to or from.
+
+    Attributes:
+        name: what the user calls it.
+        folder: where it lies, if that is on this machine.
+    """
+
+    name: str
+    folder: Path | None
+
+    def files(self) -> dict[str, RemoteFile]:
+        """Return all files by path; none if there is nothing yet.
+
+        Raises:
+            TransferError: the place cannot be asked, or does not let this user in.
+        """
+
+    def read(self, path: str) -> bytes | None:
+        """Return the content of a small file; None if there is none."""
+
+    def former_info(self) -> bytes | None:
+        """Return the `meta/info.json` that a push took away which did not end; None if nothing is known of one."""
+
+    def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
+        """Return listed files with the checksum of what lies there now, which is read for it.
+
+        Raises:
+            ConfigError: the place makes the checksums from the contents itself, so there is nothing to verify.
+            TransferError: a file cannot be read.
+        """
+
+    def fetch(self, paths: Sequence[str], folder: Path) -> None:
+        """Copy files into a folder, each of which is then the listed one, to the last byte.
+
+        Raises:
+            TransferError: not all of them came, or one came otherwise; those that came well are kept.
+        """
+
+    def send(self, items: Sequence[Item], deleted: Sequence[str], check: Callable[[], None]) -> None:
+        """Put files there and remove others, so that a reader never takes a part for the whole.
+
+        Args:
+            items: what is to be written.
+            deleted: paths that are to go.
+            check: raises if the dataset on this machine changed meanwhile; called before anything becomes visible.
+
+        Raises:
+            TransferError: not all was sent; what was need not be sent again.
+        """
+
+
+def digest(content: Path | bytes, algorithm: str) -> str:
+    """Return the checksum of some content, as `RemoteFile` names them."""
+    if isinstance(content, bytes):
+        hasher = _hasher(algorithm, len(content))
+        hasher.update(content)
+        return str(hasher.hexdigest())
+    size = content.stat().st_size
+    with open(content, "rb", buffering=0) as file:
+        return stream_digest(file, size, algorithm)
+
+
+class Readable(Protocol):
+    """An open file."""
+
+    def readinto(self, buffer: memoryview, /) -> int | None:
+        """Read what comes next into a buffer; return how many bytes that was."""
+
+
+def stream_digest(file: Readable, size: int, algorithm: str) -> str:
+    """Return the checksum of an open file of so many bytes, which are read in pieces."""
+    hasher = _hasher(algorithm, size)
+    buffer = memoryview(bytearray(max(1, min(_CHUNK, size))))
+    while count := file.readinto(buffer):
+        hasher.update(buffer[:count])
+    return str(hasher.hexdigest())
+
+
+def _hasher(algorithm: str, size: int) -> Any:
+    if algorithm == "git":
+        return hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
+    if algorithm == LISTED:
+        import xxhash
+
+        return xxhash.xxh3_128()
+    return hashlib.sha256()
+
+
+def refuse_overlap(root: Path, remote: Remote) -> None:
+    """Refuse to copy a dataset onto itself, or into itself: its files would be removed to be replaced.
+
+    Raises:
+        ConfigError: the two folders are one, or one lies in the other.
+    """
+    if remote.folder is None:
+        return
+    here, there = root.expanduser().resolve(), remote.folder.expanduser().resolve()
+    is_one = here.exists() and there.exists() and os.path.samefile(here, there)
+    if is_one or here.is_relative_to(there) or there.is_relative_to(here):
+        raise ConfigError(f"{remote.name} and {root} are the same folder, or one lies in the other. Name another one.")
+
+
+def is_whole(path: Path, file: RemoteFile) -> bool:
+    """Return whether a file on this machine is the listed one; where no checksum is listed, its size decides."""
+    if not path.is_file() or path.stat().st_size != file.size:
+        return False
+    return file.digest is None or digest(path, file.algorithm) == file.digest
+
+
+def refuse_damaged(path: Path, file: RemoteFile, place: str, name: str) -> None:
+    """Remove a file that came otherwise than it was listed, and say so.
+
+    Raises:
+        TransferError: it did.
+    """
+    if not is_whole(path, file):
+        path.unlink(missing_ok=True)
+        raise TransferError(
+            f"Could not download {place}: {name} came otherwise than it was listed. It was changed meanwhile, or "
+            "damaged on the way."
+        )
+
+
+def is_url(place: str) -> bool:
+    """Return whether a place is a URL, and not the name of a dataset on the Hub."""
+    return "://" in place
+
+
+def check_repo_id(name: str) -> str:
+    """Return a name on the Hub if it is one.
+
+    Raises:
+        ConfigError: it is not of the form user/name.
+    """
+    if not _REPO_ID.fullmatch(name) or ".." in name or "--" in name or name.endswith((".git", ".", "-")):
+        raise ConfigError(
+            f"{name!r} is neither a name on the Hub, such as user/name, nor a URL, such as s3://bucket/folder or "
+            "file:///folder."
+        )
+    return name
+
+
+def is_recorded(path: str) -> bool:
+    """Return whether a path is that of a data, video or episode-metadata file in LeRobot's layout."""
+    return bool(_RECORDED.fullmatch(path))
+
+
+_CHUNK_FILE = r"chunk-\d+/file-\d+"
+_RECORDED = re.compile(rf"(data|meta/episodes)/{_CHUNK_FILE}\.parquet|videos/[^/]+/{_CHUNK_FILE}\.mp4")
+
+
+def total(items: Iterable[Item | RemoteFile]) -> int:
+    """Return the bytes of some files."""
+    return sum(one.size for one in items)
+
+
+def megabytes(size: int) -> str:
+    """Return a number of bytes in words."""
+    return f"{size / 1e6:.1f} MB" if size < 1e9 else f"{size / 1e9:.2f} GB"
+
+
+def counted(names: Sequence[str] | Mapping[str, Any]) -> str:
+    """Return how many files there are, in words."""
+    return "1 file" if len(names) == 1 else f"{len(names)} files"
+
+
+def listed(names: Iterable[str], at_most: int = 3) -> str:
+    """Return some names in words, and how many more there are."""
+    names = sorted(names)
+    more = f" and {len(names) - at_most} more" if len(names) > at_most else ""
+    return f"{', '.join(names[:at_most])}{more}"
+
+
+def largest_first(paths: Iterable[str], files: Mapping[str, RemoteFile]) -> list[str]:
+    """Return paths so that no large file is left for the end, when the other threads have nothing to do."""
+    return sorted(paths, key=lambda path: (-files[path].size, path))
+
+
+def in_order(paths: Iterable[str]) -> list[str]:
+    """Return paths so that what makes the others count comes last: `meta/info.json`."""
+    return sorted(paths, key=lambda path: (path.startswith("meta/"), path == layout.INFO, path))

@@ -1,0 +1,130 @@
+"""`bhd-data check`: is a dataset sound? Nothing is changed."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.format import video
+from bhd_lerobot.datasets.validate.files import RESTORE, Files, read_files
+from bhd_lerobot.datasets.validate.values import Limits, ValueCheck
+from bhd_lerobot.datasets.format.episode_table import PREFIX
+from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity
+from bhd_lerobot.datasets.storage.atomic import complete_interrupted
+
+__all__ = ["CHECKS", "DatasetCheck", "Finding", "Severity", "check_dataset"]
+
+CHECKS = {
+    "schema": "features, their shapes, names and columns",
+    "files": "every file is there, and can be read to its last page",
+    "counts": "meta/info.json, meta/episodes and the data files agree",
+    "stats": "statistics are there, and are those of the data",
+    "video": "every film has as many frames as its episodes",
+    "finite": "no NaN, no infinity, nothing missing",
+    "frozen": "no number stands still that moves elsewhere",
+    "jumps": "no action jumps",
+    "limits": "positions and commands are within the robot's limits",
+    "timing": "timestamps are where they say they are; frames were not late",
+    "outcome": "how many episodes succeeded",
+}
+"""What is checked, and what for."""
+
+
+@dataclass(frozen=True)
+class DatasetCheck:
+    """What a check found.
+
+    Attributes:
+        root: the dataset.
+        episodes: how many it has.
+        frames: how many were read.
+        findings: all findings, the worst first.
+    """
+
+    root: Path
+    episodes: int
+    frames: int
+    findings: tuple[Finding, ...]
+
+    @property
+    def worst(self) -> Severity:
+        """The worst finding's severity."""
+        return max((one.severity for one in self.findings), default=Severity.NOTE)
+
+    def count(self, severity: Severity) -> int:
+        """Return how many findings are of a severity."""
+        return sum(one.severity == severity for one in self.findings)
+
+
+def check_dataset(
+    root: Path | str, limits_of: Callable[[str | None], Limits] = lambda robot_type: {}, *, videos: bool = True
+) -> DatasetCheck:
+    """Check a dataset, of this package or of another program.
+
+    Args:
+        root: the dataset.
+        limits_of: gives the limits of a robot, by its type; only those numbers are compared.
+        videos: read the films, too, which takes longer than all the rest.
+
+    Raises:
+        DatasetError: there is no dataset, or its `meta/info.json` cannot be read.
+    """
+    findings = Findings()
+    complete_interrupted(Path(root))
+    files = read_files(Path(root), findings)
+    robot = files.info.get("robot_type")
+    if not files.info["total_episodes"]:
+        remedy = "Record some (bhd-record --resume=true), or remove it; nothing can be learned from it as it is."
+        findings.error("counts", layout.INFO, "the dataset is empty: it has no episodes", remedy)
+    values = ValueCheck(files, findings, limits_of(robot if isinstance(robot, str) else None))
+    values.run()
+    if videos:
+        _check_videos(files, findings)
+    _judge_outcomes(files, findings)
+    return DatasetCheck(files.root, len(files.episodes.get("episode_index", ())), values.frames, tuple(findings))
+
+
+def _check_videos(files: Files, findings: Findings) -> None:
+    fps = files.fps
+    for key in files.cameras:
+        for slot, positions in files.slots(f"videos/{key}").items():
+            name = layout.video_file(key, slot)
+            path = files.root / name
+            if not path.is_file():
+                continue  # said already
+            lengths = np.array([files.episodes["length"][i] for i in positions])
+            try:
+                found = video.count_frames(path)
+            except OSError as error:
+                findings.error("video", name, f"it cannot be read: {error}", RESTORE)
+                continue
+            if found != lengths.sum():
+                what = f"it has {found} frames; its episodes have {lengths.sum()}"
+                findings.error("video", name, what, RESTORE)
+            begin = np.array([files.episodes[f"videos/{key}/from_timestamp"][i] for i in positions])
+            end = np.array([files.episodes[f"videos/{key}/to_timestamp"][i] for i in positions])
+            expected = (np.cumsum(lengths) - lengths) / fps
+            off = (np.abs(begin - expected) > 0.5 / fps) | (np.abs(end - begin - lengths / fps) > 0.5 / fps)
+            for position in np.flatnonzero(off)[:3]:
+                what = (
+                    f"episode {files.episodes['episode_index'][positions[position]]} is said to be from "
+                    f"{begin[position]:.3f} to {end[position]:.3f} s, and its {lengths[position]} frames begin at "
+                    f"{expected[position]:.3f} s"
+                )
+                findings.error("video", name, what, "Restore meta/episodes from a copy.")
+
+
+def _judge_outcomes(files: Files, findings: Findings) -> None:
+    outcomes = files.episodes.get(f"{PREFIX}outcome")
+    if not outcomes:
+        return
+    counts = Counter("not said" if outcome is None else str(outcome) for outcome in outcomes)
+    told = ", ".join(f"{name} {count}" for name, count in counts.most_common())
+    if counts.get("success"):
+        findings.note("outcome", f"{len(outcomes)} episodes", told)
+    else:
+        remedy = "Nothing shows how it is done: do not imitate them as they are."
+        findings.warning("outcome", f"{len(outcomes)} episodes", f"none succeeded: {told}", remedy)

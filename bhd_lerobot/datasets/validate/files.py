@@ -1,0 +1,259 @@
+"""Whether the files of a dataset are there, can be read, and agree on what they count.
+
+`state.load_state` asks the same and stops at the first contradiction, because a recorder must not go on from it. Here
+all of them are wanted, also in datasets that another program left behind.
+"""
+
+import contextlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.validate.names import check_names
+from bhd_lerobot.datasets.validate.statistics import UNREAD
+from bhd_lerobot.datasets.format.expected import wrong_types
+from bhd_lerobot.datasets.validate.findings import Findings, few, one_line
+from bhd_lerobot.datasets.format.info import InfoError, parse_object, read_info, wrong_feature
+from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
+from bhd_lerobot.datasets.format.state import UNREADABLE, no_dataset, repair_with_info
+from bhd_lerobot.errors import DatasetError
+
+_COPY = "Restore it from a copy, or try bhd-data repair."
+RESTORE = "Restore it from a copy, or run bhd-data repair, which recovers the episodes that are whole."
+_LIGHT = (
+    *("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index"),
+    "tasks",
+)
+_SLOT = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+_STATISTICS = ("min", "max", "mean", "std", "count")
+
+
+@dataclass
+class Files:
+    """What the small files of a dataset say.
+
+    Attributes:
+        root: the dataset.
+        info: `meta/info.json`.
+        episodes: columns of `meta/episodes` by name, one entry for each episode, in order, without statistics.
+        stats: `meta/stats.json`, by feature and name, flat; what is missing there, or no numbers, is not here.
+        tasks: how many instructions there are.
+        is_ours: whether this package recorded it.
+        has_stats: whether the statistics of every single episode are stored.
+    """
+
+    root: Path
+    info: dict[str, Any]
+    episodes: dict[str, list[Any]] = field(default_factory=dict)
+    stats: dict[str, dict[str, NDArray[np.float64]]] = field(default_factory=dict)
+    tasks: int = 0
+    is_ours: bool = False
+    has_stats: bool = True
+
+    @property
+    def features(self) -> dict[str, dict[str, Any]]:
+        """The features."""
+        return self.info["features"]
+
+    @property
+    def fps(self) -> float:
+        """Frames a second."""
+        return float(self.info["fps"])
+
+    @property
+    def cameras(self) -> list[str]:
+        """Features that are videos."""
+        return [key for key, one in self.features.items() if one.get("dtype") == "video"]
+
+    def slots(self, kind: str) -> dict[layout.Slot, NDArray[np.int64]]:
+        """Return the files of one kind, `data` or `videos/KEY`, each with the positions of its episodes."""
+        places: dict[layout.Slot, list[int]] = {}
+        chunks, files = (self.episodes.get(f"{kind}/{name}_index", []) for name in ("chunk", "file"))
+        for position, slot in enumerate(zip(chunks, files, strict=True)):
+            places.setdefault(slot, []).append(position)
+        return {slot: np.array(found) for slot, found in places.items()}
+
+
+def read_files(root: Path, findings: Findings) -> Files:
+    """Read the small files, and check them.
+
+    Args:
+        root: the dataset.
+        findings: what is found is added to it.
+
+    Raises:
+        DatasetError: there is no dataset that could be checked.
+    """
+    files = Files(root, _read_info(root), is_ours=(root / layout.IDENTITY).is_file())
+    _check_features(files, findings)
+    _read_tasks(files, findings)
+    _read_episodes(files, findings)
+    _check_counts(files, findings)
+    check_names(files, findings)
+    _read_stats(files, findings)
+    return files
+
+
+def _read_info(root: Path) -> dict[str, Any]:
+    path = root / layout.INFO
+    if not path.is_file():
+        raise no_dataset(root)
+    try:
+        return read_info(path, root, features=False)
+    except (OSError, InfoError) as error:
+        raise DatasetError(
+            f"{path} cannot be used, and nothing can be checked without it: {one_line(error)}. {repair_with_info(root)}"
+        ) from error
+
+
+def _check_features(files: Files, findings: Findings) -> None:
+    for key in DEFAULT_FEATURES:
+        if key not in files.features:
+            findings.error("schema", layout.INFO, f"the feature {key!r} is missing, which every dataset has", _COPY)
+    for key, feature in list(files.features.items()):
+        if wrong := wrong_feature(feature):
+            findings.error("schema", f"{layout.INFO}: {key}", f"it {wrong}", _COPY)
+            del files.features[key]  # nothing can be said about it
+            continue
+        names, size = feature.get("names"), feature["shape"][0]
+        if feature["dtype"] not in ("video", "image") and isinstance(names, list) and len(names) != size:
+            findings.error("schema", f"{layout.INFO}: {key}", f"{len(names)} names for {size} numbers", _COPY)
+
+
+def _read_tasks(files: Files, findings: Findings) -> None:
+    path = files.root / layout.TASKS
+    if not path.is_file() and not files.info["total_episodes"]:
+        return
+    try:
+        # All of it, though one column is looked at: what is damaged elsewhere shows in the pages' checksums.
+        table = pq.ParquetFile(path, page_checksum_verification=True).read()
+        indices = table["task_index"].to_pylist()
+        are_numbered = set(indices) == set(range(len(indices)))
+    except (*UNREADABLE, KeyError, TypeError) as error:
+        findings.error("files", layout.TASKS, f"it cannot be read: {one_line(error)}", _COPY)
+        return
+    files.tasks = len(indices)
+    if not are_numbered:
+        findings.error("counts", layout.TASKS, f"its numbers are not 0 to {len(indices) - 1}, each once", _COPY)
+    elif files.tasks < files.info["total_tasks"]:
+        what = f"it holds {files.tasks} instructions; meta/info.json counts {files.info['total_tasks']}"
+        findings.error("counts", layout.TASKS, what, _COPY)
+
+
+def _read_episodes(files: Files, findings: Findings) -> None:
+    parts: list[dict[str, list[Any]]] = []
+    for path in sorted((files.root / "meta/episodes").glob("chunk-*/file-*.parquet")):
+        name = path.relative_to(files.root).as_posix()
+        try:
+            file = pq.ParquetFile(path, page_checksum_verification=True)
+            columns = [column for column in file.schema_arrow.names if not column.startswith("stats/")]
+            files.has_stats &= "stats/index/mean" in file.schema_arrow.names
+            if len(columns) == len(file.schema_arrow.names) and not files.is_ours:
+                what = "it has no statistics of single episodes, without which nothing can be edited"
+                findings.warning("stats", name, what, stats_remedy(files))
+            if wrong := wrong_types(file.schema_arrow, files.cameras):
+                findings.error("schema", name, wrong, _COPY)
+                continue
+            part = file.read().select(columns).to_pydict()
+        except UNREADABLE as error:
+            findings.error("files", name, f"it cannot be read: {one_line(error)}", _COPY)
+            continue
+        wanted = [*_LIGHT, *(f"videos/{key}/{one}" for key in files.cameras for one in _SLOT)]
+        missing = [column for column in wanted if column not in part or None in part[column]]
+        if missing:
+            findings.error("schema", name, f"it lacks {few(missing)}, or some of them", _COPY)
+            continue
+        parts.append(part)
+    if not parts:
+        if files.info["total_episodes"]:
+            what = f"no episode is described; meta/info.json counts {files.info['total_episodes']}"
+            findings.error("counts", "meta/episodes", what, _COPY)
+        return
+    # An episode that info.json does not count yet was being saved when the recording was cut off.
+    keep = set.intersection(*(set(part) for part in parts))
+    rows: dict[int, tuple[dict[str, list[Any]], int]] = {}
+    for part in parts:
+        for position, index in enumerate(part["episode_index"]):
+            if index in rows:
+                findings.error("counts", "meta/episodes", f"episode {index} is described twice", _COPY)
+            elif index < files.info["total_episodes"]:
+                rows[index] = part, position
+    order = sorted(rows)
+    files.episodes = {name: [rows[index][0][name][rows[index][1]] for index in order] for name in sorted(keep)}
+    total = files.info["total_episodes"]
+    if len(rows) < total:
+        first = next(index for index in range(total) if index not in rows)
+        what = f"{total - len(rows)} episodes are not described, {first} first; meta/info.json counts {total}"
+        findings.error("counts", "meta/episodes", what, _COPY)
+
+
+def _check_counts(files: Files, findings: Findings) -> None:
+    episodes = files.episodes
+    if not episodes:
+        return
+    length, first, last = (
+        np.array(episodes[name], np.int64) for name in ("length", "dataset_from_index", "dataset_to_index")
+    )
+    for index in np.flatnonzero((last - first != length) | (length < 1))[:3]:
+        number = episodes["episode_index"][index]
+        what = f"episode {number} has {length[index]} frames, from {first[index]} to {last[index]}"
+        findings.error("counts", "meta/episodes", what, _COPY)
+    gaps = np.flatnonzero(first[1:] != last[:-1]) + 1
+    for index in gaps[:3]:
+        what = f"episode {episodes['episode_index'][index]} starts at frame {first[index]}, not at {last[index - 1]}"
+        findings.error("counts", "meta/episodes", what, _COPY)
+    if length.sum() != files.info["total_frames"]:
+        what = f"it counts {files.info['total_frames']} frames; the episodes have {length.sum()}"
+        findings.error("counts", layout.INFO, what, "bhd-data check --fix counts them.")
+
+
+def stats_remedy(files: Files) -> str:
+    """Return what computes missing or wrong statistics."""
+    unfinished = (files.root / layout.STAGING).exists()
+    return "bhd-data repair computes them." if unfinished else "bhd-data check --fix computes them."
+
+
+def _read_stats(files: Files, findings: Findings) -> None:
+    path, name = files.root / layout.STATS, layout.STATS
+    if not files.episodes:
+        return
+    remedy = stats_remedy(files)
+    if not path.is_file():
+        findings.error("stats", name, "it is missing, so no policy can be normalised", remedy)
+        return
+    try:
+        stats = parse_object(path.read_bytes())
+    except (OSError, InfoError) as error:
+        findings.error("stats", name, f"it cannot be read: {one_line(error)}", remedy)
+        return
+    for key, feature in files.features.items():
+        if feature["dtype"] in ("string", "language"):
+            continue
+        told = stats.get(key)
+        known = files.stats[key] = _vectors(told if isinstance(told, dict) else {})
+        lacking = [one for one in _STATISTICS if one not in known]
+        report = findings.warning if key in UNREAD else findings.error
+        if lacking:
+            report("stats", f"{name}: {key}", f"it has no {few(lacking)}", remedy)
+        elif feature["dtype"] not in ("video", "image"):
+            count = known["count"][0]
+            if count != files.info["total_frames"]:
+                what = f"they are of {count:g} frames; the dataset has {files.info['total_frames']}"
+                report("stats", f"{name}: {key}", what, remedy)
+
+
+def _vectors(told: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+    """Return what there are numbers for, flat."""
+    vectors: dict[str, NDArray[np.float64]] = {}
+    for name, value in told.items():
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            values = np.asarray(value, np.float64).reshape(-1)
+            if values.size:
+                vectors[name] = values
+    return vectors

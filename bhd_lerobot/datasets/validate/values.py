@@ -1,0 +1,275 @@
+"""Whether the numbers of a dataset can be learned from: finite, alive, within limits, and where they say they are.
+
+Data files are read one after the other, so that memory holds two of them.
+"""
+
+import math
+from collections import Counter, deque
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.validate.files import RESTORE, Files, stats_remedy
+from bhd_lerobot.datasets.validate.frozen import FrozenCheck
+from bhd_lerobot.datasets.validate.statistics import UNREAD, Moments, wrong_statistic
+from bhd_lerobot.datasets.validate.steps import StepCheck
+from bhd_lerobot.datasets.format.expected import wrong_columns
+from bhd_lerobot.datasets.validate.findings import Findings, few, name_of, one_line
+
+Limits = Mapping[str, Mapping[str, tuple[float, float]]]
+"""Feature -> name of one of its numbers -> least and largest value."""
+
+_TIMESTAMP_TOLERANCE = 1e-4  # [s] LeRobot's own
+_INDEX = ("index", "episode_index", "frame_index", "timestamp", "task_index")
+_LEAVE = "Leave the episode out (dataset.episodes), or record it again."
+_MOVING = (keys.OBSERVATION_STATE, keys.ACTION)  # what is to change; what a task tells often does not, by design
+_LIMIT_TOLERANCE = 0.01  # of the limits' distance: a joint gives way a little at its end
+_LATE_SHARE = 0.01
+
+
+class ValueCheck:
+    """The check of all numbers.
+
+    Attributes:
+        frames: how many were read.
+
+    Args:
+        files: what the small files say.
+        findings: what is found is added to it.
+        limits: of numbers by feature and name; only these are compared.
+    """
+
+    def __init__(self, files: Files, findings: Findings, limits: Limits | None = None) -> None:
+        self.frames = 0
+        self._files, self._findings, self._limits = files, findings, limits or {}
+        self._columns: dict[str, Moments] = {}
+        self._episodes: list[int] = []
+        self._lengths: list[int] = []
+        # By feature: how many frames are not finite, and where the first is, for each file.
+        self._broken: dict[str, list[tuple[int, str]]] = {}
+        self._frozen, self._steps = FrozenCheck(files.features), StepCheck(files.features)
+        self._counted = Counter[str]()  # late frames, skipped ticks
+
+    def run(self) -> None:
+        """Read everything."""
+        slots = [
+            (layout.data_file(slot), positions)
+            for slot, positions in self._files.slots("data").items()
+            if (self._files.root / layout.data_file(slot)).is_file()
+        ]
+        # The next file is read while one is looked at. Findings are added to a list, which threads may do.
+        with ThreadPoolExecutor(1) as reader:
+            tables = deque(reader.submit(self._read, name) for name, _ in slots[:1])
+            for (name, positions), following in zip(slots, [*slots[1:], None], strict=False):
+                table = tables.popleft().result()
+                if following is not None:
+                    tables.append(reader.submit(self._read, following[0]))
+                if table is not None and self._check_rows(name, table, positions):
+                    self._check_table(table)
+        self._judge_columns()
+        self._frozen.judge(self._findings)
+        self._steps.judge(self._findings)
+        self._judge_stats()
+        if self.frames and self._counted[keys.LATE] > _LATE_SHARE * self.frames:
+            what = f"{self._counted[keys.LATE]} of {self.frames} frames were late"
+            self._findings.warning("timing", keys.LATE, what, "bhd-data timing says which.")
+        if self._counted[keys.SKIPPED]:
+            self._findings.note("timing", keys.SKIPPED, f"{self._counted[keys.SKIPPED]} control ticks were skipped")
+
+    # --- files -------------------------------------------------------------------------------------------------------
+
+    def _read(self, name: str) -> pa.Table | None:
+        stored = [
+            key for key, one in self._files.features.items() if one.get("dtype") not in ("video", "image", "language")
+        ]
+        try:
+            file = pq.ParquetFile(self._files.root / name, page_checksum_verification=True)
+            missing = [key for key in stored if key not in file.schema_arrow.names]
+            if missing:
+                self._findings.error("schema", name, f"it has no column {few(missing)}", _LEAVE)
+                return None
+            if wrong := wrong_columns(file.schema_arrow, self._files.features):
+                self._findings.error("schema", name, wrong, _LEAVE)
+                return None
+            extra = [key for key in file.schema_arrow.names if key not in self._files.features]
+            if extra:
+                self._findings.warning(
+                    "schema", name, f"meta/info.json knows no {few(extra)}", "Programs leave it out."
+                )
+            return file.read(columns=stored)
+        except (OSError, pa.ArrowException, ValueError) as error:
+            self._findings.error("files", name, f"it cannot be read: {one_line(error)}", RESTORE)
+            return None
+
+    def _check_rows(self, name: str, table: pa.Table, positions: NDArray[np.int64]) -> bool:
+        """Check that the rows are those of these episodes, in order; return whether they are."""
+        episodes = self._files.episodes
+        wanted = np.array([episodes["episode_index"][i] for i in positions])
+        lengths = np.array([episodes["length"][i] for i in positions])
+        starts = np.array([episodes["dataset_from_index"][i] for i in positions])
+        if (lengths < 1).any():
+            return False  # said already, of meta/episodes
+        if len(table) != lengths.sum():
+            what = f"it has {len(table)} frames; its episodes have {lengths.sum()}"
+            self._findings.error("counts", name, what, "bhd-data repair, or restore it from a copy.")
+            return False
+        got = {key: table[key].to_numpy() for key in _INDEX if key in table.column_names}
+        frame = np.arange(len(table)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+        expected = {
+            "episode_index": np.repeat(wanted, lengths),
+            "frame_index": frame,
+            "index": np.repeat(starts, lengths) + frame,
+        }
+        for key, values in expected.items():
+            wrong: NDArray[np.intp] = np.flatnonzero(got[key] != values) if key in got else np.zeros(0, np.intp)
+            if len(wrong):
+                row = wrong[0]
+                what = f"{key} is {got[key][row]} in row {row}, where meta/episodes has {values[row]}"
+                self._findings.error("counts", name, what, "Restore the file, or meta/episodes, from a copy.")
+                return False
+        self._check_times(name, got, frame)
+        self._episodes += wanted.tolist()
+        self._lengths += lengths.tolist()
+        return True
+
+    def _check_times(self, name: str, got: Mapping[str, NDArray[Any]], frame: NDArray[np.int64]) -> None:
+        fps = self._files.fps
+        if "timestamp" in got:
+            off = np.abs(got["timestamp"] - frame / fps)
+            # Single precision cannot say it better after a while.
+            wrong = np.flatnonzero(~(off <= np.maximum(_TIMESTAMP_TOLERANCE, 1e-6 * frame / fps)))
+            if len(wrong):
+                row = wrong[0]
+                what = (
+                    f"{len(wrong)} timestamps are not frame_index / fps; the first in episode "
+                    f"{got['episode_index'][row]}, frame {frame[row]}: {got['timestamp'][row]:.6g} s"
+                )
+                self._findings.error("timing", name, what, "LeRobot refuses to load it; record it again.")
+        if "task_index" in got and self._files.tasks:
+            wrong = np.flatnonzero((got["task_index"] < 0) | (got["task_index"] >= self._files.tasks))
+            if len(wrong):
+                what = f"task_index is {got['task_index'][wrong[0]]}; there are {self._files.tasks} instructions"
+                self._findings.error("counts", name, what, "Restore meta/tasks.parquet from a copy.")
+
+    # --- numbers -----------------------------------------------------------------------------------------------------
+
+    def _check_table(self, table: pa.Table) -> None:
+        lengths = np.array(self._lengths[len(self._lengths) - self._count_new(table) :])
+        starts = np.cumsum(lengths) - lengths
+        self.frames += len(table)
+        for key in table.column_names:
+            missing = table[key].null_count
+            if missing:
+                self._findings.error("finite", key, f"{missing} frames hold nothing", _LEAVE)
+                continue
+            values = _numbers(table[key])
+            if values is None:
+                continue
+            size = math.prod(self._files.features[key]["shape"])
+            if values.size != len(table) * size:
+                what = f"it holds {values.size} numbers in {len(table)} frames; its shape is {size}"
+                self._findings.error("schema", key, what, "Mend the shape in meta/info.json, or record again.")
+                continue
+            self._check_column(key, values.reshape(len(table), size), starts, lengths)
+        for key in (keys.LATE, keys.SKIPPED):
+            if key in table.column_names and not table[key].null_count:
+                self._counted[key] += int(table[key].to_numpy().sum())
+
+    def _count_new(self, table: pa.Table) -> int:
+        """Return how many of the episodes known last are in this table."""
+        rows = count = 0
+        while rows < len(table):
+            count += 1
+            rows += self._lengths[-count]
+        return count
+
+    def _check_column(
+        self, key: str, values: NDArray[Any], starts: NDArray[np.int64], lengths: NDArray[np.int64]
+    ) -> None:
+        with np.errstate(invalid="ignore"):  # the sum of both infinities
+            found = Moments.of(values)
+        if not (np.isfinite(found.low).all() and np.isfinite(found.high).all()):  # both of a column with a NaN are NaN
+            self._note_broken(key, values, starts)
+            values = np.where(np.isfinite(values), values, 0)
+            found = Moments.of(values)
+        known = self._columns.setdefault(key, found)
+        if known is not found:
+            known.add(found)
+        if key in _MOVING:
+            episodes = self._episodes[len(self._episodes) - len(starts) :]
+            self._frozen.look(key, values, starts, lengths, episodes)
+            self._steps.look(key, values, starts, episodes)
+
+    def _note_broken(self, key: str, values: NDArray[Any], starts: NDArray[np.int64]) -> None:
+        rows, elements = np.nonzero(~np.isfinite(values))
+        row, element = int(rows[0]), int(elements[0])
+        episode = int(np.searchsorted(starts, row, side="right")) - 1
+        number = self._episodes[len(self._episodes) - len(starts) + episode]
+        frame, name = row - int(starts[episode]), name_of(self._files.features[key], element)
+        where = f"episode {number}, frame {frame}: {name} is {values[row, element]}"
+        self._broken.setdefault(key, []).append((len(np.unique(rows)), where))
+
+    # --- over all files ----------------------------------------------------------------------------------------------
+
+    def _judge_columns(self) -> None:
+        for key, places in self._broken.items():
+            count = sum(one for one, _ in places)
+            what = f"{count} frames hold numbers that are not finite; the first in {places[0][1]}"
+            if key.startswith(("observation", "action")):
+                self._findings.error("finite", key, what, _LEAVE)
+            else:
+                self._findings.note("finite", key, what)
+        for key, column in self._columns.items():
+            for name, (low, high) in self._limits.get(key, {}).items():
+                self._judge_limit(column, key, name, (low, high))
+
+    def _judge_limit(self, column: Moments, key: str, name: str, limits: tuple[float, float]) -> None:
+        names = self._files.features[key].get("names") or []
+        if name not in names:
+            return
+        (low, high), element = limits, names.index(name)
+        found, room = (column.low[element], column.high[element]), _LIMIT_TOLERANCE * (high - low)
+        if found[0] < low - room or found[1] > high + room:
+            what = f"it goes from {found[0]:.4g} to {found[1]:.4g}; the robot's limits are {low:.4g} and {high:.4g}"
+            self._findings.warning("limits", f"{key}: {name}", what, "Look whether units and robot are right.")
+
+    def _judge_stats(self) -> None:
+        """Compare `meta/stats.json` with what was read."""
+        if not self.frames or self.frames != self._files.info["total_frames"]:
+            return
+        remedy = stats_remedy(self._files)
+        for key, column in self._columns.items():
+            known = self._files.stats.get(key, {})
+            if key in self._broken or not {"min", "max", "mean"} <= set(known):
+                continue
+            if len(self._files.features[key]["shape"]) > 1:
+                continue  # LeRobot's are over other axes
+            wrong = wrong_statistic(known, column, self.frames, max(self._lengths))
+            if wrong is not None:
+                where, what = f"{layout.STATS}: {key}", f"{wrong} is not that of the data"
+                if key in UNREAD:
+                    what += ", as after an edit by LeRobot; no policy reads it"
+                    self._findings.warning("stats", where, what, remedy)
+                else:
+                    self._findings.error("stats", where, what, remedy)
+
+
+def _numbers(column: pa.ChunkedArray) -> NDArray[Any] | None:
+    """Return the numbers of a column, flat; None if it holds something else."""
+    arrays = []
+    for chunk in column.chunks:
+        array = chunk
+        while isinstance(array, pa.ExtensionArray) or pa.types.is_nested(array.type):
+            array = array.storage if isinstance(array, pa.ExtensionArray) else array.flatten()
+        kind = array.type
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+            return None
+        arrays.append(array.to_numpy(zero_copy_only=False))
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays) if arrays else None

@@ -1,0 +1,168 @@
+"""Configuration of `bhd-eval`."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.robots.config import RobotConfig
+
+from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.cluster.config import RayConfig, check_engine
+from bhd_lerobot.rollout.registry import SIMULATED_ROBOTS, robot_of_brain, robot_of_task
+from bhd_lerobot.tasks.config_task import TaskConfig
+from bhd_lerobot.tasks.task import SPLITS
+
+YARDSTICKS = ("noop", "random")
+"""Brains that are there to be compared with; `fail_below` asks nothing of them."""
+
+
+@dataclass
+class EvalDatasetConfig:
+    """Where the runs of an evaluation are recorded: a LeRobotDataset for each brain, named after it.
+
+    Attributes:
+        repo_id: name of the datasets on the Hub, `user/name`; `_` and the brain's name are added. Nothing is recorded
+            if nothing.
+        root: folder that gets a folder for each brain; LeRobot's default place if nothing.
+    """
+
+    repo_id: str | None = None
+    root: str | None = None
+
+
+@dataclass
+class EvalConfig:
+    """Compare brains on the same episodes.
+
+    Attributes:
+        robot: the robot, in simulation; with `robot.clock=realtime` on the wall clock.
+        task: what it is to achieve, and where.
+        brains: what is compared, by a name of your choice: `--brains.NAME.type=…`. On a command line,
+            `--brains.NAME=null` takes one out that a file names.
+        brain: short for one more brain, named after its type: `--brain.type=…`; `--brain.path=…` alone is a checkpoint.
+        only: run only these of the brains.
+        n_episodes: number of episodes of each brain.
+        episodes: run only these, by number, for example `[17]`: each is what it is in the whole run.
+        seed: every episode's seed follows from this and its number.
+        split: `held_out` or `train`: which of two sets of seeds, disjoint by construction.
+        baseline: name of the brain that the others are compared with; the first one if nothing.
+        n_envs: simulations that run side by side; changes the speed and nothing else.
+        threads: threads that step the physics; all processors if nothing.
+        engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes the speed, nothing else.
+        ray: which cluster, and how much of it.
+        videos: how many failures of each brain are filmed, the first ones; of a brain without failures its first
+            episode. If nothing, 2 where images can be rendered, and none elsewhere.
+        record: where the runs are recorded, if they are.
+        fail_below: end with exit status 1 if the lower end of a brain's 95 % interval of success is below this. Nothing
+            is asked of `noop` and `random`.
+        output_dir: folder for results and report; a new one in `outputs/eval` if nothing.
+    """
+
+    robot: RobotConfig
+    task: TaskConfig
+    brains: dict[str, BrainConfig] = field(default_factory=dict)
+    brain: BrainConfig | None = None
+    only: list[str] | None = None
+    n_episodes: int = 100
+    episodes: list[int] | None = None
+    seed: int = 0
+    split: str = "held_out"
+    baseline: str | None = None
+    n_envs: int = 16
+    threads: int | None = None
+    engine: str = "local"
+    ray: RayConfig = field(default_factory=RayConfig)
+    videos: int | None = None
+    record: EvalDatasetConfig = field(default_factory=EvalDatasetConfig)
+    fail_below: float | None = None
+    output_dir: str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        self._check_robot_and_task()
+        if self.brain is not None:
+            name = str(self.brain.get_choice_name(type(self.brain)))
+            if name in self.brains:
+                raise ConfigError(f"There are two brains of the name {name!r}: brain, and one of brains. Rename one.")
+            self.brains[name], self.brain = self.brain, None
+        if not self.brains:
+            raise ConfigError(
+                "There is no brain to evaluate; set --brains.NAME.type, or --brain.path for a checkpoint."
+            )
+        for label, brain in self.brains.items():
+            try:
+                driven = robot_of_brain(brain)
+            except ConfigError as error:
+                raise ConfigError(f"brains.{label}: {error}") from error
+            if driven and driven != self.robot.type:
+                kind = brain.get_choice_name(type(brain))
+                raise ConfigError(
+                    f"brains.{label}.type is {kind!r}, which drives a {driven}; robot.type is {self.robot.type!r}."
+                )
+        for key, labels in (("only", self.only or []), ("baseline", [self.baseline] if self.baseline else [])):
+            for label in labels:
+                if label not in self.brains:
+                    raise ConfigError(unknown_name(f"brain in {key}", label, self.brains))
+        if self.only is not None and not self.only:
+            raise ConfigError("only is empty; name at least one brain, or leave it out.")
+        check_engine(self)
+        self._check_numbers()
+
+    @property
+    def chosen(self) -> dict[str, BrainConfig]:
+        """The brains that are run, in order."""
+        return {label: brain for label, brain in self.brains.items() if self.only is None or label in self.only}
+
+    @property
+    def reference(self) -> str:
+        """The brain that the others are compared with: the baseline, or the first that is run."""
+        return self.baseline if self.baseline in self.chosen else next(iter(self.chosen))
+
+    @property
+    def indices(self) -> list[int]:
+        """Numbers of the episodes that are run, in ascending order."""
+        return list(range(self.n_episodes)) if self.episodes is None else sorted(self.episodes)
+
+    def _check_robot_and_task(self) -> None:
+        simulated = sorted(kind.get_choice_name(kind) for kind in SIMULATED_ROBOTS)
+        if self.robot.type not in simulated:
+            raise ConfigError(
+                f"robot.type is {self.robot.type!r}; bhd-eval drives robots whose success can be judged: "
+                f"{', '.join(simulated)}."
+            )
+        wanted = robot_of_task(self.task)
+        if wanted != self.robot.type:
+            task = self.task.get_choice_name(type(self.task))
+            raise ConfigError(
+                f"task.type is {task!r}, which is for robot.type = {wanted!r}; robot.type is {self.robot.type!r}."
+            )
+        robot: Any = self.robot
+        _ = robot.rates  # rates that do not divide each other are refused here
+
+    def _check_numbers(self) -> None:
+        for name, value in (
+            ("n_episodes", self.n_episodes),
+            ("n_envs", self.n_envs),
+            ("threads", 1 if self.threads is None else self.threads),
+        ):
+            if value < 1:
+                raise ConfigError(f"{name} is {value}; it must be at least 1.")
+        for name, number in (
+            ("seed", self.seed),
+            ("videos", self.videos or 0),
+            *(("episodes", i) for i in self.indices),
+        ):
+            if number < 0:
+                raise ConfigError(f"{name} holds {number}; it must be 0 or more.")
+        if self.episodes is not None and (not self.episodes or len(set(self.episodes)) != len(self.episodes)):
+            raise ConfigError(f"episodes is {self.episodes}; it must name at least one episode, and none twice.")
+        if self.split not in SPLITS:
+            raise ConfigError(f"split is {self.split!r}. Valid: {', '.join(SPLITS)}.")
+        if self.fail_below is not None and not 0 <= self.fail_below <= 1:
+            raise ConfigError(f"fail_below is {self.fail_below}; it is a success rate, from 0 to 1.")
+        if self.record.root is not None and self.record.repo_id is None:
+            raise ConfigError("record.root is set and record.repo_id is not; datasets need a name, such as me/eval.")

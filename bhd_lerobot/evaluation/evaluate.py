@@ -1,0 +1,266 @@
+"""`bhd-eval`: brains beside each other on the same held-out episodes, with intervals, a report and films."""
+
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from bhd_lerobot.control.estop import EstopInputs, estop_signal
+from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
+from bhd_lerobot.robots.host.simulation import Simulation, describe
+from bhd_lerobot.cluster.loop import open_crew
+from bhd_lerobot.evaluation.config import YARDSTICKS, EvalConfig
+from bhd_lerobot.rollout.configuration import run
+from bhd_lerobot.evaluation.console import tell_summary
+from bhd_lerobot.evaluation.metrics import JerkMeasure
+from bhd_lerobot.evaluation.report import Film, ReportInput, write_report
+from bhd_lerobot.evaluation.results import EvalResults, summarise, write_json, write_table
+from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
+from bhd_lerobot.rollout.preview import Preview
+from bhd_lerobot.rollout.provenance import versions
+from bhd_lerobot.recording.report import ESTOP_STATUS, tell_refusals
+from bhd_lerobot.rollout.registry import make_robot, make_simulation
+from bhd_lerobot.rollout.run_folder import run_folder
+from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
+
+RESULTS_NAME = "results.json"
+FAILED_STATUS = 1  # exit status of an evaluation in which a brain missed `fail_below`
+
+
+@dataclass
+class EvalResult:
+    """What an evaluation found out, and where it is.
+
+    Attributes:
+        output_dir: the folder.
+        results: everything that does not depend on the wall clock.
+        timing: what was measured on the wall clock, by brain.
+        report: the HTML report.
+        missed: brains whose interval of success begins below `fail_below`.
+        stopped_by: the signal that ended the run early, or None.
+        estop: what pressed the emergency stop that ended the run, in words; None if there was none.
+    """
+
+    output_dir: Path
+    results: EvalResults
+    timing: dict[str, Any]
+    report: Path
+    missed: list[str] = field(default_factory=list)
+    stopped_by: StopRequest | None = None
+    estop: str | None = None
+
+    @property
+    def exit_status(self) -> int:
+        """The program's exit status: 0 if all was run, and nothing that was asked for was missed."""
+        if self.estop is not None:
+            return ESTOP_STATUS
+        if self.stopped_by:
+            return self.stopped_by.exit_status
+        return FAILED_STATUS if self.missed else 0
+
+
+def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
+    """Run every brain on the same episodes, write results and report.
+
+    Args:
+        config: what to compare.
+        console: where progress is shown; standard error if None.
+
+    Raises:
+        BhdError: the configuration cannot be honoured; the message names the brain that does not fit.
+    """
+    console = console or Console(stderr=True)
+    _refuse_results(config)
+    is_live = config.robot.clock == "realtime"
+    n = 1 if is_live else min(config.n_envs, len(config.indices))
+    simulation = make_robot(config.robot, n, config.threads)
+    pressed = EstopInputs(simulation.bridge.estop)
+    with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
+        crew = None if config.engine == "local" else cluster.enter_context(open_crew(config.ray, console))
+        runs = [prepare(config, label, simulation, crew) for label in config.chosen]
+        tell_refusals(simulation, console)
+        if (
+            crew is None
+            and simulation.camera_names
+            and (config.record.repo_id or any(one.timed.uses_images for one in runs))
+        ):
+            simulation.start_rendering()  # a machine without OpenGL fails here, before the first episode
+        if is_live:
+            number = estop_signal("SIGUSR1")
+            pressed.add_signal(number)
+            key = "space or e, or " if pressed.add_key() else ""
+            console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} this process")
+        preview, no_films = _make_preview(config, console)
+        with run_folder(config, "eval") as output_dir:
+            facts = _facts(config, simulation, runs)
+        with _progress(console) as progress:
+            bars = [progress.add_task(escape(one.label), total=len(config.indices), success="") for one in runs]
+            for one, bar in zip(runs, bars, strict=True):
+                if stop or any(other.loop.emergency_stop for other in runs):
+                    break
+                run_episodes(config, one, lambda: bool(stop), _shower(progress, bar, one))
+        estop = None
+        if any(one.loop.emergency_stop for one in runs):
+            estop = ", ".join(pressed.causes) or "from another process"
+    results = summarise(
+        facts, _versions(), {one.label: one.episodes for one in runs}, len(config.indices), config.reference
+    )
+    timing = {
+        "made": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "n_envs": n,
+        "clock": config.robot.clock,
+        "brains": {one.label: one.timing() for one in runs if one.timed.times},
+    }
+    result = EvalResult(output_dir, results, timing, output_dir / "report.html", stopped_by=stop, estop=estop)
+    result.missed = _missed(config, results)
+    try:
+        _write(config, result, runs, preview, no_films)
+    except OSError as error:
+        tell_summary(console, config, result)  # so that the numbers, at least, are not lost
+        raise BhdError(
+            f"The results cannot be written to {output_dir}: {error.strerror or error}. What is printed above is "
+            "complete. Make room, or set another --output_dir, and run it again: the numbers will be the same."
+        ) from error
+    tell_summary(console, config, result)
+    return result
+
+
+def _shower(progress: Progress, bar: Any, one: BrainRun) -> Callable[[], None]:
+    def show() -> None:
+        good = sum(metrics.success for metrics in one.episodes)
+        progress.update(bar, completed=len(one.episodes), success=f"{good}/{len(one.episodes)} succeeded")
+
+    return show
+
+
+def _facts(config: EvalConfig, simulation: Simulation, runs: Sequence[BrainRun]) -> dict[str, Any]:
+    """Return what decides the numbers, as plain values; how many run side by side does not."""
+    robot = describe(simulation.config)
+    return {
+        "robot": {key: str(value) if isinstance(value, Path) else value for key, value in robot.items()},
+        "task": runs[0].loop.task.parameters(),
+        "brains": {one.label: one.timed.parameters() for one in runs},
+        "baseline": config.reference,
+        "seed": config.seed,
+        "split": config.split,
+        "episodes": config.indices,
+        "fps": simulation.rates.fps,
+        "jerk": JerkMeasure.of(simulation.action_names).what,
+        "jerk_unit": JerkMeasure.of(simulation.action_names).unit,
+    }
+
+
+def _versions() -> dict[str, str]:
+    return {**versions(), "torch": metadata.version("torch"), "python": platform.python_version()}
+
+
+def _missed(config: EvalConfig, results: EvalResults) -> list[str]:
+    if config.fail_below is None:
+        return []
+    wanted = {label for label, brain in config.chosen.items() if brain.get_choice_name(type(brain)) not in YARDSTICKS}
+    return [label for label, one in results.brains.items() if label in wanted and one.success.low < config.fail_below]
+
+
+def _write(
+    config: EvalConfig, result: EvalResult, runs: Sequence[BrainRun], preview: Preview | None, no_films: str
+) -> None:
+    folder = result.output_dir
+    write_json(folder / RESULTS_NAME, result.results.plain())
+    write_json(folder / "timing.json", result.timing)
+    write_table(folder / "episodes.parquet", result.results.episodes)
+    states: dict[str, Any] = {f"state_{one.label}": np.array(one.initial_states) for one in runs}
+    states |= {f"episode_{one.label}": np.array([m.episode for m in one.episodes], np.int64) for one in runs}
+    np.savez_compressed(folder / "initial_states.npz", **states)
+    films = _film(config, runs, preview, folder) if preview is not None else []
+    write_report(
+        ReportInput(
+            config=config,
+            results=result.results,
+            timing=result.timing,
+            trajectories={one.label: one.trajectories for one in runs},
+            films=films,
+            no_films=no_films,
+            folder=folder,
+        ),
+        result.report,
+    )
+
+
+def _film(config: EvalConfig, runs: Sequence[BrainRun], preview: Preview, folder: Path) -> list[Film]:
+    films = []
+    robot: Any = config.robot
+    with closing(preview):
+        for one in runs:
+            for metrics, scene, states in one.films:
+                path = folder / "videos" / f"{one.label}_{metrics.episode:04d}.mp4"
+                path.parent.mkdir(exist_ok=True)
+                preview.write(scene, states, robot.fps, path)
+                films.append(Film(one.label, metrics, path))
+    return films
+
+
+def _make_preview(config: EvalConfig, console: Console) -> tuple[Preview | None, str]:
+    """Return what makes films, or None and why not."""
+    if config.videos == 0:
+        return None, "videos was 0."
+    try:
+        return Preview(make_simulation(config.robot)), ""
+    except RenderingError as error:
+        if config.videos:
+            raise
+        console.print(f"No films: {escape(str(error))}")
+        return None, str(error)
+
+
+def _refuse_results(config: EvalConfig) -> None:
+    """Refuse a folder that holds the results of another evaluation.
+
+    Raises:
+        ConfigError: names the folder.
+    """
+    if config.output_dir and os.path.isfile(os.path.join(os.path.expanduser(config.output_dir), RESULTS_NAME)):
+        raise ConfigError(
+            f"The folder {config.output_dir} holds the results of an evaluation ({RESULTS_NAME}). Set another "
+            "--output_dir, or remove it."
+        )
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Progress]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[success]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        yield progress
+
+
+def _main(config: EvalConfig) -> int:
+    return evaluate(config).exit_status
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `bhd-eval`; return the exit status."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    keys = [argument.partition("=")[0] for argument in arguments]
+    if "--brain.path" in keys and "--brain.type" not in keys:
+        arguments.append("--brain.type=learned")  # nothing else is somewhere on the disk
+    return run(_main, EvalConfig, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,331 @@
+"""The report of an evaluation: one HTML file that holds everything it shows, charts and films included."""
+
+import base64
+import hashlib
+import io
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import yaml
+
+from bhd_lerobot.evaluation import plots
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.rollout.configuration import encode
+from bhd_lerobot.evaluation.html import cell, chart, share, significant, table
+from bhd_lerobot.evaluation.metrics import EpisodeMetrics
+from bhd_lerobot.evaluation.results import EvalResults
+from bhd_lerobot.evaluation.text import number, percent, sentences
+from bhd_lerobot.rollout.plots import Trajectory
+from bhd_lerobot.datasets.timing.tables import ms
+
+FILM_BYTES = 12_000_000  # films in the page; those beyond stay files beside it
+LISTED = 100  # failed episodes of a brain that are listed
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film of an episode.
+
+    Attributes:
+        label: the brain's name in the evaluation.
+        metrics: the episode.
+        path: the MP4 file.
+    """
+
+    label: str
+    metrics: EpisodeMetrics
+    path: Path
+
+
+@dataclass(frozen=True)
+class ReportInput:
+    """What a report is made of.
+
+    Attributes:
+        config: what was compared.
+        results: what was found out.
+        timing: what was measured on the wall clock.
+        trajectories: the episodes from above, by brain and number.
+        films: films of episodes.
+        no_films: why there are none.
+        folder: where results and configuration lie.
+    """
+
+    config: EvalConfig
+    results: EvalResults
+    timing: dict[str, Any]
+    trajectories: Mapping[str, Mapping[int, Trajectory]]
+    films: list[Film]
+    no_films: str
+    folder: Path
+
+
+def write_report(given: ReportInput, path: Path) -> None:
+    """Write the report."""
+    cite = ("How to cite and repeat", "cite", _cite(given))
+    shown = [one for one in _sections(given) if one[2]] if given.results.episodes else []
+    shown.append(cite)
+    links = "".join(f'<a href="#{key}">{title}</a>' for title, key, _ in shown)
+    facts = given.results.config
+    title = f"{facts['task']['type'].capitalize()} with {facts['robot']['type']}: {_listed(list(given.results.brains))}"
+    template = Template(resources.files(__package__).joinpath("eval_report.html").read_text(encoding="utf-8"))
+    page = template.substitute(
+        title=escape(title),
+        lead=_lead(given) + f"<nav>{links}</nav>",
+        sections="\n".join(f'<section id="{key}"><h2>{title}</h2>\n{body}</section>' for title, key, body in shown),
+        footer=f"Made {escape(given.timing['made'])} by bhd-eval, bhd_lerobot "
+        f"{escape(given.results.versions['bhd_lerobot'])}. This file needs no network and no other file.",
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+def _sections(given: ReportInput) -> list[tuple[str, str, str]]:
+    """Return title, anchor and content of what is told about episodes; what has nothing to say is empty."""
+    return [
+        ("Summary", "summary", _summary(given)),
+        ("Beside the baseline", "paired", _paired(given)),
+        ("How episodes ended", "outcomes", _outcomes(given)),
+        ("Distributions", "distributions", _distributions(given)),
+        ("Limits and stops", "safety", _safety(given)),
+        ("From above", "trajectories", _trajectories(given)),
+        ("Films", "films", _films(given)),
+        ("Failed episodes", "failures", _failures(given)),
+        ("Time to decide", "latency", _latency(given)),
+    ]
+
+
+def replay_command(config: EvalConfig, folder: Path, one: EpisodeMetrics) -> str:
+    """Return the command that runs a single episode again, and films it where films can be made."""
+    options = [
+        f"--config_path={folder / 'config.yaml'}",
+        f"--only=[{one.brain}]",
+        f"--episodes=[{one.episode}]",
+        f"--output_dir={folder / f'{one.brain}_{one.episode:04d}'}",
+    ]
+    if config.record.repo_id is not None:
+        options += ["--record.repo_id=null", "--record.root=null"]
+    if config.fail_below is not None:
+        options.append("--fail_below=null")  # one episode proves no rate
+    return shlex.join(["bhd-eval", *options])
+
+
+def _lead(given: ReportInput) -> str:
+    results, facts = given.results, given.results.config
+    clock = "on the wall clock" if given.timing["clock"] == "realtime" else "in simulated time"
+    count = len(results.brains)
+    lead = (
+        f"<p>{count} brain{'s' * (count != 1)} on the same {results.asked} {facts['split'].replace('_', '-')} "
+        f"episodes, {clock}: the same scenes, the same sensor noise, the same initial states. "
+        f"Robot {escape(facts['robot']['type'])}, {facts['fps']} decisions a second, run seed {facts['seed']}.</p>"
+    )
+    if results.is_partial:
+        ran = ", ".join(f"{escape(label)} {one.episodes}" for label, one in results.brains.items())
+        lead += f'<p class="warn"><b>Partial:</b> the run was stopped early. Episodes finished: {ran}.</p>'
+    return lead + "<ul class='found'>" + "".join(f"<li>{escape(one)}</li>" for one in sentences(results)) + "</ul>"
+
+
+def _summary(given: ReportInput) -> str:
+    results = given.results
+    rows = []
+    for label, one in results.brains.items():
+        means = one.means
+        cells = [
+            cell(percent(one.success), f"{one.successes} of {one.episodes}"),
+            cell(number(means["score"], 3)),
+            cell(number(means["length_s"], 1)),
+            cell(number(means["path_m"], 2)),
+            cell(significant(means["jerk_mean"])),
+            cell(significant(means["jerk_max"])),
+            cell(number(means["reward"], 3)),
+        ]
+        rows.append((label, cells))
+    unit, what = results.config["jerk_unit"], results.config["jerk"]
+    head = ["success", "score", "length [s]", "path [m]", f"mean jerk [{unit}]", f"largest jerk [{unit}]", "return"]
+    note = (
+        "In brackets 95 % intervals: Wilson's for success rates, percentile bootstrap over episodes for means (10,000 "
+        f"resamples, fixed seed). Jerk is that of the commanded motion ({what}), from frame to frame; “largest” is the "
+        "mean over episodes of each one's largest."
+    )
+    drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and scores with intervals")
+    return drawn + table(head, rows, results.config["baseline"]) + f'<p class="note">{note}</p>'
+
+
+def _paired(given: ReportInput) -> str:
+    results = given.results
+    if not results.paired:
+        return ""
+    baseline = results.config["baseline"]
+    rows = []
+    for label, one in results.paired.items():
+        cells = [
+            cell(percent(one.success, sign=True)),
+            f"{one.differ.better} better, {one.differ.worse} worse",
+            f"{one.differ.p:.2g}",
+            cell(number(one.score, 3, sign=True)),
+            cell(number(one.ratio, 3)),
+            str(one.episodes),
+        ]
+        rows.append((label, cells))
+    head = ["success, difference", "episodes that differ", "McNemar p", "score, difference", "score, ratio", "episodes"]
+    note = (
+        f"Every brain beside {escape(baseline)}, episode by episode. Intervals at 95 %: Newcombe's method 10 for "
+        "paired rates, paired percentile bootstrap for scores. p is that of McNemar's exact test, two-sided. An "
+        "interval that leaves out the dashed line says that the difference is more than chance; with several brains, "
+        "expect a false one in twenty."
+    )
+    drawn = chart(plots.paired_forest(results.paired), f"Differences from {baseline} with intervals")
+    return drawn + table(head, rows) + f'<p class="note">{note}</p>'
+
+
+def _outcomes(given: ReportInput) -> str:
+    return chart(plots.outcome_bars(given.results.brains), "How the episodes of each brain ended")
+
+
+def _distributions(given: ReportInput) -> str:
+    note = "Each mark is an episode: a dot a success, a cross a failure. Box: the middle half, and the median."
+    drawn = plots.distributions(_by_brain(given), given.results.config["jerk_unit"])
+    return chart(drawn, "Distributions of score, length, path and jerk") + f'<p class="note">{note}</p>'
+
+
+def _safety(given: ReportInput) -> str:
+    brains = given.results.brains
+
+    def occurring(kind: str) -> list[str]:
+        return [name for name in getattr(next(iter(brains.values())), kind, {}) if any(
+            getattr(one, kind).get(name) for one in brains.values())]  # fmt: skip
+
+    limits, watchdogs = occurring("limits"), occurring("watchdogs")
+    rows = []
+    for label, one in brains.items():
+        cells = [share(one.limits.get(name, 0), one) for name in limits]
+        cells += [share(one.watchdogs.get(name, 0), one) for name in watchdogs]
+        rows.append((label, [*cells, str(one.estops), str(one.faults), str(one.frames)]))
+    head = [f"{name} limited" for name in limits] + [f"watchdog: {name.replace('_', ' ')}" for name in watchdogs]
+    note = (
+        "Share of the frames in which the safety filter changed the command, by kind of limit, and in which a watchdog "
+        "noticed something; kinds that never occurred are left out. Emergency stops and faults count episodes."
+    )
+    return table([*head, "emergency stops", "faults", "frames"], rows) + f'<p class="note">{note}</p>'
+
+
+def _trajectories(given: ReportInput) -> str:
+    ran = {label: one for label, one in given.trajectories.items() if one}
+    if not ran:
+        return ""
+    note = (
+        "A column is an episode, a row a brain; above each panel the episode, how it ended, and its score. Half of "
+        "them are episodes that ended unlike most of a brain's, if there are any; the others are the first. "
+        "Solid blue: success; dashed orange with a cross: failure."
+    )
+    return f'<p class="note">{note}</p>' + chart(plots.trajectory_grid(ran), "Trajectories from above")
+
+
+def _films(given: ReportInput) -> str:
+    if not given.films:
+        return f'<p class="note">No films: {escape(given.no_films or "no episode was finished.")}</p>'
+    room, figures = FILM_BYTES, []
+    for film in given.films:
+        content = film.path.read_bytes()
+        room -= len(content)
+        data = base64.b64encode(content).decode("ascii") if room >= 0 else ""
+        player = (
+            f'<video controls muted playsinline preload="metadata" poster="{_last_picture(film.path)}" '
+            f'src="data:video/mp4;base64,{data}"></video>'
+        )
+        name = escape(str(film.path.relative_to(given.folder)))
+        ended = film.metrics.outcome.replace("_", " ")
+        figures.append(
+            f"<figure>{player if data else ''}<figcaption><b>{escape(film.label)}</b>, episode {film.metrics.episode}: "
+            f"{ended}, after {film.metrics.length_s:.1f} s. File {name}{'' if data else ', too large for this page'}."
+            "</figcaption></figure>"
+        )
+    note = "The first failures of each brain; of a brain without failures its first episode. The picture is the end."
+    return f'<p class="note">{note}</p><div class="films">{"".join(figures)}</div>'
+
+
+def _last_picture(film: Path) -> str:
+    """Return how a film ends, as a JPEG for a page."""
+    import av
+
+    with av.open(str(film)) as container:
+        *_, last = container.decode(video=0)
+        picture = io.BytesIO()
+        last.to_image().save(picture, format="JPEG", quality=80)
+    return f"data:image/jpeg;base64,{base64.b64encode(picture.getvalue()).decode('ascii')}"
+
+
+def _failures(given: ReportInput) -> str:
+    parts = []
+    for label, episodes in _by_brain(given).items():
+        failed = [one for one in episodes if not one.success]
+        if not failed:
+            parts.append(f"<p><b>{escape(label)}</b>: none.</p>")
+            continue
+        rows = [
+            f"<tr><td>{one.episode}</td><td>{one.outcome.replace('_', ' ')}</td><td>{one.score:.3f}</td>"
+            f"<td>{one.length_s:.1f}</td><td><code>{one.seed}</code></td>"
+            f"<td><code>{escape(replay_command(given.config, given.folder, one))}</code>{_why(one)}</td></tr>"
+            for one in failed[:LISTED]
+        ]
+        head = "<tr>" + "".join(f"<th>{h}</th>" for h in ("episode", "ended by", "score", "s", "seed", "run it again"))
+        more = "" if len(failed) <= LISTED else f'<p class="note">{len(failed) - LISTED} more in episodes.parquet.</p>'
+        parts.append(
+            f"<details{' open' if len(failed) <= 10 else ''}><summary>{escape(label)}: {len(failed)} of {len(episodes)}"
+            f'</summary><div class="scroll"><table>{head}</tr>{"".join(rows)}</table></div>{more}</details>'
+        )
+    return "".join(parts)
+
+
+def _why(one: EpisodeMetrics) -> str:
+    return f"<br>{escape(one.problem)}" if one.problem else ""
+
+
+def _latency(given: ReportInput) -> str:
+    rows = []
+    for label, one in given.timing["brains"].items():
+        act = one["act"]
+        cells = [ms(act[name]) for name in ("p50_s", "p99_s", "max_s")]
+        cells += [f"{act['calls']}", f"{act['robots_per_call']}"]
+        rows.append((label, [*cells, f"{one['episodes_per_s']:.2f}", f"{one['real_time_factor']:.0f} ×"]))
+    head = ["p50 [ms]", "p99 [ms]", "longest [ms]", "calls", "robots a call", "episodes a second", "speed"]
+    note = (
+        "Wall-clock time of one call of the brain, which decides for all simulations that run side by side. For the "
+        "time that one robot waits, evaluate with --n_envs=1."
+    )
+    return table(head, rows) + f'<p class="note">{note}</p>' if rows else ""
+
+
+def _cite(given: ReportInput) -> str:
+    results = given.results
+    facts = results.config
+    digest = hashlib.sha256((given.folder / "results.json").read_bytes()).hexdigest()
+    command = shlex.join(["bhd-eval", f"--config_path={given.folder / 'config.yaml'}"])
+    versions = ", ".join(f"{name} {version}" for name, version in results.versions.items())
+    numbers = facts["episodes"]
+    which = f"{numbers[0]} to {numbers[-1]}" if len(numbers) == numbers[-1] - numbers[0] + 1 else str(numbers)
+    shown = yaml.safe_dump(encode(given.config), sort_keys=False, allow_unicode=True)
+    again = "gives" if given.timing["clock"] == "lockstep" else "measures again, on the wall clock, what is in"
+    return (
+        f"<pre>{escape(command)}</pre>"
+        f"<p>{escape(versions)}.<br>Episodes {which} of run seed {facts['seed']}, split {facts['split']}; episode i "
+        "has the seed <code>episode_seed(seed, i, split)</code> of <code>bhd_lerobot.tasks.task</code>.</p>"
+        f"<p>The same command with the same versions {again} the same <code>results.json</code>, SHA-256 "
+        f"<code>{digest}</code>. Beside this file: <code>results.json</code> (everything), "
+        "<code>episodes.parquet</code> (a row for each episode), <code>initial_states.npz</code>, "
+        "<code>timing.json</code> (wall clock), <code>config.yaml</code>.</p>"
+        f"<details><summary>config.yaml</summary><pre>{escape(shown)}</pre></details>"
+    )
+
+
+def _by_brain(given: ReportInput) -> dict[str, list[EpisodeMetrics]]:
+    return {label: [one for one in given.results.episodes if one.brain == label] for label in given.results.brains}
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]

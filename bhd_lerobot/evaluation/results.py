@@ -1,0 +1,216 @@
+"""From the numbers of episodes to what can be said about brains, and to the files that hold it."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bhd_lerobot.evaluation import statistics
+from bhd_lerobot.evaluation.metrics import EpisodeMetrics
+from bhd_lerobot.evaluation.statistics import Discordance, Estimate
+
+MEANS = ("score", "reward", "length_s", "path_m", "jerk_mean", "jerk_max")
+"""Numbers of an episode of which an evaluation tells the mean with its interval."""
+
+
+@dataclass(frozen=True)
+class BrainSummary:
+    """What a brain achieved.
+
+    Attributes:
+        brain: its name in the evaluation.
+        episodes: how many it ran.
+        successes: how many of them were a success.
+        success: its success rate with its Wilson interval.
+        outcomes: how many ended how, the most frequent first.
+        means: means with their bootstrap intervals, by name, see `MEANS`; of the episodes in which they are defined.
+        limits: frames in which the safety filter changed the command, by kind of limit, of all episodes.
+        watchdogs: frames in which a watchdog noticed something, by kind.
+        estops: episodes with an emergency stop.
+        faults: episodes with a latched fault.
+        frames: frames of all episodes.
+    """
+
+    brain: str
+    episodes: int
+    successes: int
+    success: Estimate
+    outcomes: dict[str, int]
+    means: dict[str, Estimate]
+    limits: dict[str, int]
+    watchdogs: dict[str, int]
+    estops: int
+    faults: int
+    frames: int
+
+
+@dataclass(frozen=True)
+class PairedSummary:
+    """A brain beside the baseline, on the episodes that both ran.
+
+    Attributes:
+        brain: the brain.
+        baseline: what it is compared with.
+        episodes: how many episodes both ran.
+        success: difference of the success rates, with Newcombe's paired interval.
+        differ: on how many episodes they differed in success, with McNemar's exact test.
+        score: difference of the mean scores, with its paired bootstrap interval.
+        ratio: ratio of the mean scores, with its paired bootstrap interval.
+    """
+
+    brain: str
+    baseline: str
+    episodes: int
+    success: Estimate
+    differ: Discordance
+    score: Estimate
+    ratio: Estimate
+
+
+@dataclass
+class EvalResults:
+    """Everything an evaluation found out that does not depend on how fast the machine was.
+
+    Attributes:
+        config: what decides the numbers: robot, task, brains, episodes and seeds.
+        versions: of the programs that made them.
+        asked: how many episodes of each brain were asked for.
+        episodes: all episodes, brain by brain, in their order.
+        brains: what each brain achieved.
+        paired: the brains beside the baseline.
+    """
+
+    config: dict[str, Any]
+    versions: dict[str, str]
+    asked: int
+    episodes: list[EpisodeMetrics] = field(default_factory=list)
+    brains: dict[str, BrainSummary] = field(default_factory=dict)
+    paired: dict[str, PairedSummary] = field(default_factory=dict)
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether a brain ran fewer episodes than were asked for."""
+        return any(one.episodes < self.asked for one in self.brains.values())
+
+    def plain(self) -> dict[str, Any]:
+        """Return everything as plain values; what is not a number is nothing."""
+        return {
+            "format": "bhd-eval/1",
+            "partial": self.is_partial,
+            "episodes_asked": self.asked,
+            "config": self.config,
+            "versions": self.versions,
+            "confidence": statistics.CONFIDENCE,
+            "brains": {label: asdict(one) for label, one in self.brains.items()},
+            "paired": {label: asdict(one) for label, one in self.paired.items()},
+            "episodes": [one.plain() for one in self.episodes],
+        }
+
+
+def summarise(
+    config: dict[str, Any],
+    versions: dict[str, str],
+    episodes: Mapping[str, Sequence[EpisodeMetrics]],
+    asked: int,
+    baseline: str,
+) -> EvalResults:
+    """Return what can be said after some episodes.
+
+    Args:
+        config: what decides the numbers.
+        versions: of the programs.
+        episodes: of each brain, by its name.
+        asked: how many episodes of each brain were asked for.
+        baseline: the brain that the others are compared with.
+    """
+    results = EvalResults(config, versions, asked)
+    for label, ran in episodes.items():
+        results.episodes += ran
+        results.brains[label] = _brain(label, ran)
+        if label != baseline:
+            results.paired[label] = _pair(ran, episodes[baseline], label, baseline)
+    return results
+
+
+def _brain(label: str, episodes: Sequence[EpisodeMetrics]) -> BrainSummary:
+    successes = sum(one.success for one in episodes)
+    means = {}
+    for name in MEANS:
+        values = np.array([getattr(one, name) for one in episodes], np.float64)
+        means[name] = statistics.mean(values[np.isfinite(values)])
+    return BrainSummary(
+        brain=label,
+        episodes=len(episodes),
+        successes=successes,
+        success=statistics.wilson(successes, len(episodes)),
+        outcomes=dict(Counter(one.outcome for one in episodes).most_common()),
+        means=means,
+        limits=_sum(one.limits for one in episodes),
+        watchdogs=_sum(one.watchdogs for one in episodes),
+        estops=sum(one.estops for one in episodes),
+        faults=sum(one.faults for one in episodes),
+        frames=sum(one.frames for one in episodes),
+    )
+
+
+def _pair(
+    episodes: Sequence[EpisodeMetrics], others: Sequence[EpisodeMetrics], label: str, baseline: str
+) -> PairedSummary:
+    by_number = {one.episode: one for one in others}
+    pairs = [(one, by_number[one.episode]) for one in episodes if one.episode in by_number]
+    success = [one.success for one, _ in pairs], [other.success for _, other in pairs]
+    score = [one.score for one, _ in pairs], [other.score for _, other in pairs]
+    return PairedSummary(
+        brain=label,
+        baseline=baseline,
+        episodes=len(pairs),
+        success=statistics.rate_difference(*success),
+        differ=statistics.discordance(*success),
+        score=statistics.mean_difference(*score),
+        ratio=statistics.ratio_of_means(*score),
+    )
+
+
+def _sum(counts: Any) -> dict[str, int]:
+    total: Counter[str] = Counter()
+    for one in counts:
+        total.update(one)  # keeps kinds that never occurred
+    return dict(total)
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Write plain values as JSON; numbers that JSON does not have become null."""
+    path.write_text(json.dumps(_finite(values), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_table(path: Path, episodes: Sequence[EpisodeMetrics]) -> None:
+    """Write a Parquet file with a row for each episode; counts by kind and details have columns of their own."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = []
+    for one in episodes:
+        row: dict[str, Any] = {}
+        for name, value in one.plain().items():
+            if isinstance(value, dict):
+                row |= {f"{name}.{kind}": number for kind, number in value.items()}
+            else:
+                row[name] = value
+        rows.append(row)
+    names = dict.fromkeys(name for row in rows for name in row)
+    pq.write_table(pa.table({name: [row.get(name) for row in rows] for name in names}), path)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

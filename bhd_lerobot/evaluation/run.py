@@ -1,0 +1,148 @@
+"""One brain's part of an evaluation: its episodes, and what is kept of them."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.datasets.format.features import PHYSICS_STATE
+from bhd_lerobot.errors import BhdError
+from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.cluster.crew import Crew
+from bhd_lerobot.cluster.loop import ClusterLoop
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
+from bhd_lerobot.evaluation.record import BrainRecorder
+from bhd_lerobot.rollout.plots import Trajectory
+from bhd_lerobot.rollout.registry import make_brain, make_task
+from bhd_lerobot.tasks.task import episode_seed
+
+FILMS = 2  # failures of each brain that are filmed, unless said otherwise
+
+
+class TimedBrain:
+    """A brain whose calls are timed; everything else is the brain's own.
+
+    Attributes:
+        times: duration of each call of `act` [s].
+    """
+
+    def __init__(self, brain: Brain) -> None:
+        self._brain = brain
+        self.times: list[float] = []
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the brain has."""
+        return getattr(self._brain, name)
+
+    def act(self, observation: Observation) -> Any:
+        """Return what the brain wants, and remember how long it took."""
+        started = time.perf_counter()
+        try:
+            return self._brain.act(observation)
+        finally:
+            self.times.append(time.perf_counter() - started)
+
+
+@dataclass
+class BrainRun:
+    """What a brain's run leaves for results and report.
+
+    Attributes:
+        label: the brain's name in the evaluation.
+        loop: what runs it.
+        timed: its clock.
+        episodes: the numbers of its episodes.
+        trajectories: its episodes from above, by number.
+        films: what is to be filmed: episode, scene and recorded physics states.
+        initial_states: the simulator's complete states at the episodes' starts.
+        wall_s: duration of the run [s].
+    """
+
+    label: str
+    loop: EpisodeLoop
+    timed: TimedBrain
+    episodes: list[EpisodeMetrics] = field(default_factory=list)
+    trajectories: dict[int, Trajectory] = field(default_factory=dict)
+    films: list[tuple[EpisodeMetrics, Any, NDArray[np.float64]]] = field(default_factory=list)
+    initial_states: list[NDArray[np.float64]] = field(default_factory=list)
+    wall_s: float = 0.0
+
+    def timing(self) -> dict[str, Any]:
+        """Return what was measured on the wall clock, as plain values."""
+        calls = np.array(self.timed.times)
+        simulated = sum(one.length_s for one in self.episodes)
+        quantiles = dict(zip(("p50_s", "p99_s", "max_s"), np.quantile(calls, (0.5, 0.99, 1.0)).tolist(), strict=True))
+        per = self.wall_s if self.wall_s > 0 else np.inf
+        return {
+            "wall_s": self.wall_s,
+            "episodes_per_s": len(self.episodes) / per,
+            "real_time_factor": simulated / per,
+            "act": {"calls": len(calls), "robots_per_call": self.loop.simulation.n, **quantiles},
+            "episodes": {str(one.episode): one.wall for one in self.episodes if one.wall},
+        }
+
+
+def prepare(config: EvalConfig, label: str, simulation: Simulation, crew: Crew | None = None) -> BrainRun:
+    """Make a brain and what runs it: one that does not fit fails here, before any episode.
+
+    Args:
+        config: the evaluation.
+        label: the brain's name in it.
+        simulation: the robots.
+        crew: who runs the episodes, if not this process.
+
+    Raises:
+        BhdError: the message names the brain.
+    """
+    robot: Any = config.robot
+    try:
+        timed = TimedBrain(make_brain(config.brains[label]))
+        task = make_task(config.task, simulation.n, robot.fps)
+        brain = cast(Brain, timed)
+        if crew is None:
+            return BrainRun(label, EpisodeLoop(simulation, task, brain), timed)
+        loop = ClusterLoop(simulation, task, brain, crew=crew, config=config, brain_config=config.brains[label])
+        return BrainRun(label, loop, timed)
+    except BhdError as error:
+        raise type(error)(f"brains.{label}: {error}") from error
+
+
+def run_episodes(config: EvalConfig, one: BrainRun, stop: Callable[[], bool], show: Callable[[], None]) -> None:
+    """Run a brain's episodes and keep what is needed of them."""
+    simulation, loop = one.loop.simulation, one.loop
+    jerk, fps = JerkMeasure.of(simulation.action_names), simulation.rates.fps
+    split: Any = config.split
+    specs = [EpisodeSpec(index, episode_seed(config.seed, index, split)) for index in config.indices]
+    with BrainRecorder.open(config, one.label, loop) as recorder:
+        started = time.perf_counter()
+        for episode in loop.run(specs, stop, recorder.begin):
+            track = simulation.track(episode.columns[PHYSICS_STATE])
+            metrics = measure(one.label, episode, track, jerk, fps)
+            recorder.save(episode)
+            one.episodes.append(metrics)
+            one.initial_states.append(episode.initial_state)
+            _keep(config, one, metrics, episode, track)
+            one.wall_s = time.perf_counter() - started
+            show()
+
+
+def _keep(
+    config: EvalConfig, one: BrainRun, metrics: EpisodeMetrics, episode: Episode, track: NDArray[np.float64]
+) -> None:
+    title = f"{metrics.episode}: {metrics.outcome}, {metrics.score:.2f}"
+    one.trajectories[metrics.episode] = Trajectory(
+        title, episode.scene, track[:, :2].astype(np.float32), metrics.success
+    )
+    failures = sum(not other.success for other in one.episodes)
+    wanted = FILMS if config.videos is None else config.videos
+    if not metrics.success and failures == 1:
+        one.films.clear()  # the first episode, kept in case that no one fails
+    if (not metrics.success and failures <= wanted) or (len(one.episodes) == 1 and wanted):
+        one.films.append((metrics, episode.scene, episode.columns[PHYSICS_STATE]))

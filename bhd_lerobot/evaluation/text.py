@@ -1,0 +1,61 @@
+"""An evaluation's numbers in words, for the terminal and for the report."""
+
+import math
+
+from bhd_lerobot.evaluation.results import EvalResults, PairedSummary
+from bhd_lerobot.evaluation.statistics import Estimate
+
+
+def percent(estimate: Estimate, *, sign: bool = False) -> str:
+    """Return a rate, or with `sign` a difference of rates, with its interval."""
+    if math.isnan(estimate.value):
+        return "–"
+    form = "+.1f" if sign else ".1f"
+    unit = " points" if sign else " %"
+    value, low, high = (format(100 * one + 0.0, form) for one in (estimate.value, estimate.low, estimate.high))
+    return f"{value}{unit} ({low} to {high})".replace("-", "−")
+
+
+def number(estimate: Estimate, digits: int, *, sign: bool = False) -> str:
+    """Return a number with its interval, if it has one."""
+    if math.isnan(estimate.value):
+        return "–"
+    form = f"{'+' if sign else ''}.{digits}f"
+    if math.isnan(estimate.low):
+        return format(estimate.value, form).replace("-", "−")
+    return f"{estimate.value:{form}} ({estimate.low:{form}} to {estimate.high:{form}})".replace("-", "−")
+
+
+def sentences(results: EvalResults) -> list[str]:
+    """Return what was found out, a sentence for each brain."""
+    found = []
+    for label, one in results.brains.items():
+        if not one.episodes:
+            found.append(f"{label} ran no episode.")
+            continue
+        text = f"{label} succeeded in {one.successes} of {one.episodes} episodes, {percent(one.success)}"
+        pair = results.paired.get(label)
+        if pair is not None and pair.episodes:
+            text += f"; beside {pair.baseline} {verdict(pair)}"
+        found.append(text + ".")
+    return found
+
+
+def verdict(pair: PairedSummary) -> str:
+    """Return whether a brain is better than the baseline, in words, by the intervals of success and of score."""
+    rate = _direction(pair.success, "more often", "less often", "")
+    score = _direction(pair.score, "a higher score", "a lower score", "")
+    times = "" if math.isnan(pair.ratio.value) else f", {pair.ratio.value:.2f} times the mean"
+    said = [
+        f"it succeeds {rate} ({percent(pair.success, sign=True).split(' (')[0]})"
+        if rate
+        else "no difference in success is certain",
+        f"it has {score}{times}" if score else "none in score" if not rate else "no difference in score is certain",
+    ]
+    return " and ".join(said)
+
+
+def _direction(estimate: Estimate, above: str, below: str, neither: str) -> str:
+    if estimate.low > 0:
+        return above
+    return below if estimate.high < 0 else neither

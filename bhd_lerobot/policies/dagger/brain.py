@@ -1,0 +1,251 @@
+"""The brain `corrected`: a learner drives, and an expert takes over where the learner needs help.
+
+What the expert does is recorded as an intervention, and a policy that learns from it has seen what to do in the states
+that it gets itself into: DAgger (S. Ross, G. Gordon and D. Bagnell, AISTATS 2011) in the form of HG-DAgger (M. Kelly,
+C. Sidrane, K. Driggs-Campbell and M. Kochenderfer, ICRA 2019), with a rule in the place of the human.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.errors import ActionError, ConfigError
+from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, Mixed, Observation
+from bhd_lerobot.policies.config_brain import BrainConfig, DriverConfig
+from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
+from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
+from bhd_lerobot.policies.dagger.takeover import DisagreementWatch, PatienceWatch, StallWatch, Watch, collision_watch
+
+Array = NDArray[np.float64]
+LEARNER_DRIVES = "the learner drives"
+_EXPERT_STREAM = 3  # the expert's random numbers are not the learner's
+
+
+@BrainConfig.register_subclass("corrected")
+@dataclass
+class CorrectedConfig(BrainConfig):
+    """A learner, an expert, and when the expert takes over: one reason is enough, what is left out is not watched.
+
+    Attributes:
+        learner: what drives; it gives setpoints. Normally `learned`.
+        expert: what takes over: a rule.
+        collision_s: the learner is about to collide: a base within this time [s], with what its lidar sees; an arm, if
+            it could not come to rest any more, with the table or with itself.
+        stall_s: the robot has got nowhere for so long [s].
+        disagreement: the learner's action is farther from the expert's than this share of its range; not for experts
+            that give goals.
+        disagreement_s: it has been so for so long [s].
+        patience_s: the learner has driven for so long [s].
+        hold_s: how long the expert drives before the learner has another turn [s]; to the episode's end if nothing.
+    """
+
+    is_composed: ClassVar[bool] = True
+
+    learner: DriverConfig
+    expert: DriverConfig
+    collision_s: float | None = 0.5
+    stall_s: float | None = 3.0
+    disagreement: float | None = None
+    disagreement_s: float = 0.5
+    patience_s: float | None = None
+    hold_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("collision_s", "stall_s", "disagreement", "disagreement_s", "patience_s", "hold_s"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ConfigError(f"brain.{name} is {value}; it must be positive and finite, or left out (null).")
+        for name in ("learner", "expert"):
+            if isinstance(getattr(self, name), CorrectedConfig):
+                raise ConfigError(f"brain.{name}.type is 'corrected' itself; choose a brain that drives.")
+        if getattr(self.learner, "stream", False):
+            raise ConfigError(
+                "brain.learner.stream is true, but who drives is decided anew in every frame. Set it to false."
+            )
+
+
+class CorrectedBrain:
+    """Drives with a learner, and with an expert where the learner needs help.
+
+    The learner is asked in every frame of its turns, and between them if it gets another; a rule that gives setpoints
+    sees every frame, so that it knows where the robot has been. An expert that gives goals starts afresh whenever it
+    takes over.
+
+    Args:
+        config: the parameters.
+        learner: what `config.learner` describes.
+        expert: what `config.expert` describes.
+
+    Raises:
+        ConfigError: the two do not fit together.
+    """
+
+    name = "corrected"
+    robot_type = ANY_ROBOT
+
+    def __init__(self, config: CorrectedConfig, learner: Brain, expert: Brain) -> None:
+        self.config, self.learner, self.expert = config, learner, expert
+        if isinstance(learner, GoalBrain):
+            raise ConfigError(f"brain.learner.type is {learner.name!r}, which gives goals; a learner gives setpoints.")
+        self._goals = GoalExpert(expert) if isinstance(expert, GoalBrain) else None
+        if self._goals is not None and config.disagreement is not None:
+            raise ConfigError(
+                f"brain.disagreement compares setpoints, and the expert {expert.name!r} gives goals. Leave it out; "
+                "brain.collision_s, brain.stall_s and brain.patience_s say when it takes over."
+            )
+        self.robot_type = robot_of_both(learner.robot_type, expert.robot_type)
+        self.uses_images = learner.uses_images or expert.uses_images
+        self.has_plan = expert.has_plan
+        self._watches: list[Watch] = []
+        self._collision: Watch | None = None
+        self._hold: int | None = None
+        self._width = 0
+        self._driving: NDArray[np.bool_] = np.zeros(0, np.bool_)
+        self._driven = np.zeros(0, np.int64)
+        self._causes: list[str] = []
+        self._shown: NDArray[np.bool_] = np.zeros(0, np.bool_)
+
+    def bind(
+        self,
+        observation_names: Sequence[str],
+        action_names: Sequence[str],
+        fps: int,
+        environment_names: Sequence[str] = (),
+    ) -> None:
+        """Bind learner and expert, and find what is to be watched."""
+        config = self.config
+        self.learner.bind(observation_names, action_names, fps, environment_names)
+        (self._goals or self.expert).bind(observation_names, action_names, fps, environment_names)
+        self._width = len(action_names)
+
+        def frames(time_s: float) -> int:
+            return max(1, round(time_s * fps))
+
+        self._hold = None if config.hold_s is None else frames(config.hold_s)
+        self._watches, self._collision = [], None
+        if config.collision_s is not None:
+            self._collision = collision_watch(config.collision_s, observation_names, action_names, fps)
+            self._watches.append(self._collision)
+        if config.disagreement is not None:
+            watch = DisagreementWatch(config.disagreement, frames(config.disagreement_s), action_names)
+            self._watches.append(watch)
+        if config.stall_s is not None:
+            self._watches.append(StallWatch(frames(config.stall_s), observation_names, fps))
+        if config.patience_s is not None:
+            self._watches.append(PatienceWatch(frames(config.patience_s)))
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
+        """Start episodes: the learner has the first turn."""
+        if len(self._driving) != n:
+            self._driving, self._shown = np.zeros((2, n), np.bool_)
+            self._driven, self._causes = np.zeros(n, np.int64), [""] * n
+        self._driving[ids] = self._shown[ids] = False
+        self._driven[ids] = 0
+        for sim in ids.tolist():
+            self._causes[sim] = ""
+        for watch in self._watches:
+            watch.restart(ids, n)
+        # The learner's numbers are those that it would have alone.
+        self.learner.reset(ids, seeds, n, instructions)
+        own = [int(np.random.SeedSequence([_EXPERT_STREAM, seed]).generate_state(1)[0]) for seed in seeds]
+        (self._goals or self.expert).reset(ids, own, n, instructions)
+
+    def act(self, observation: Observation) -> "Array | Mixed":
+        """Return what the robots are to do; `Mixed` if the expert gives goals.
+
+        Raises:
+            ActionError: the learner or the expert gives something else than setpoints.
+        """
+        running = np.ones(len(self._driving), np.bool_) if observation.running is None else observation.running
+        wanted = self._ask_learner(observation, running)
+        advised = None if self._goals else _setpoints(self.expert.act(observation), self.expert.name, "expert")
+        self._decide(observation, wanted, advised, running)
+        self._shown = self._driving & running
+        if self._goals is not None:
+            return Mixed(wanted, self._shown.copy(), self._goals.act(observation, self._shown))
+        if advised is None:
+            raise AssertionError("An expert that gives no goals gives setpoints.")
+        return np.where(self._driving[:, None], advised, wanted)
+
+    def interventions(self) -> NDArray[np.bool_]:
+        """Return which robots the expert drives, shape (n,)."""
+        return self._shown.copy()
+
+    def causes(self) -> Sequence[str]:
+        """Return why the expert took over last, of each simulation."""
+        return tuple(self._causes)
+
+    def subtasks(self) -> Sequence[str]:
+        """Return what the expert is doing, in words, where it drives."""
+        said = self._goals.subtasks() if self._goals else self.expert.subtasks()
+        return [text if taken else LEARNER_DRIVES for text, taken in zip(said, self._shown, strict=True)]
+
+    def plan(self, sim: int) -> dict[str, Any]:
+        """Return the expert's plan for one simulation."""
+        return self.expert.plan(sim)
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters, with those of learner and expert: which weights, for example."""
+        own = {one.name: getattr(self.config, one.name) for one in fields(self.config)}
+        return {
+            "type": self.name,
+            **own,
+            "learner": self.learner.parameters(),
+            "expert": self.expert.parameters(),
+        }
+
+    # --- turns -------------------------------------------------------------------------------------------------------
+
+    def _ask_learner(self, observation: Observation, running: NDArray[np.bool_]) -> Array:
+        """Return what the learner wants, shape (n, actions); zeros where nobody needs to know any more."""
+        asked = running if self._hold is not None else running & ~self._driving
+        if not asked.any():
+            return np.zeros((len(running), self._width))
+        wanted = _setpoints(self.learner.act(replace(observation, running=asked)), self.learner.name, "learner")
+        return np.where(asked[:, None], wanted, 0.0)
+
+    def _decide(
+        self, observation: Observation, wanted: Array, advised: Array | None, running: NDArray[np.bool_]
+    ) -> None:
+        """Settle who drives in this frame."""
+        n = len(running)
+        self._driven += self._driving
+        danger: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        if self._collision is not None:
+            danger = self._collision.look(observation, wanted, advised)
+        if self._hold is not None:
+            # One who is about to collide would be taken over from again at once.
+            over = self._driving & running & (self._driven >= self._hold) & ~danger
+            if over.any():
+                self._driving &= ~over
+                for watch in self._watches:
+                    watch.restart(np.flatnonzero(over), n)
+        for watch in self._watches:
+            mask = danger if watch is self._collision else watch.look(observation, wanted, advised)
+            for sim in np.flatnonzero(mask & running & ~self._driving).tolist():
+                self._driving[sim], self._driven[sim], self._causes[sim] = True, 0, watch.cause
+                if self._goals is not None:
+                    self._goals.take_over(sim)
+
+
+def robot_of_both(learner: str, expert: str) -> str:
+    """Return the robot that learner and expert drive.
+
+    Raises:
+        ConfigError: they drive different ones.
+    """
+    if ANY_ROBOT not in (learner, expert) and learner != expert:
+        raise ConfigError(f"brain.learner drives a {learner}, but brain.expert drives a {expert}.")
+    return expert if learner == ANY_ROBOT else learner
+
+
+def _setpoints(decision: Any, name: str, who: str) -> Array:
+    if not isinstance(decision, np.ndarray):
+        raise ActionError(
+            f"brain.{who} is {name!r}, which gave {type(decision).__name__} instead of setpoints for this frame."
+        )
+    return decision

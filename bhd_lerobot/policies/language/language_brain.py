@@ -1,0 +1,49 @@
+"""The brain that does what an instruction says: language to a plan of skills, skills to goals."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.manipulation.grasp import SeenObject
+from bhd_lerobot.policies.language.instruction import RulePlanner
+from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig, _Work
+from bhd_lerobot.policies.manipulation.skills import Plan, Planner
+from bhd_lerobot.policies.manipulation.scene_objects import scene_object
+
+
+@BrainConfig.register_subclass("language")
+@dataclass
+class LanguageBrainConfig(PickBrainConfig):
+    """Parameters of the language brain.
+
+    Attributes:
+        instruction: what it is asked for, in English or Chinese; what the task asks for if empty.
+    """
+
+    instruction: str = ""
+
+
+class LanguageBrain(PickBrain):
+    """Finds the object that an instruction means by what it is called and where it stands, and does what is asked.
+
+    It does not look at which object the task marks. An instruction that it does not understand, or that fits no object
+    or several, is not carried out: its subtask says why.
+
+    Args:
+        config: the parameters.
+        planner: what turns instructions into plans; the rules if None. A language model goes here.
+    """
+
+    name = "language"
+
+    def __init__(self, config: LanguageBrainConfig | None = None, planner: Planner | None = None) -> None:
+        super().__init__(config or LanguageBrainConfig())
+        self._planner = planner or RulePlanner()
+
+    def _begin(self, sim: int, seed: int, instruction: str) -> None:
+        config = self.config
+        own = config.instruction if isinstance(config, LanguageBrainConfig) else ""
+        super()._begin(sim, seed, own or instruction)
+
+    def _make_plan(self, work: _Work, objects: Sequence[SeenObject]) -> Plan:
+        return self._planner.plan(work.instruction, [scene_object(one) for one in objects])

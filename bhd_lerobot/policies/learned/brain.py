@@ -1,0 +1,289 @@
+"""The brain `learned`: any trained LeRobot policy, with the processors that were saved with it."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import file_digest
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.errors import ActionError, ConfigError
+from bhd_lerobot.policies.brain import ANY_ROBOT, Chunk, Observation
+from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.learned.contract import WEIGHT_FILES, PolicyContract, find_checkpoint
+
+if TYPE_CHECKING:
+    from bhd_lerobot.policies.learned.inference import Rows
+
+_STATE, _ENVIRONMENT, _ACTION = "observation.state", "observation.environment_state", "action"
+_log = logging.getLogger(__name__)
+
+
+@BrainConfig.register_subclass("learned")
+@dataclass
+class LearnedBrainConfig(BrainConfig):
+    """Parameters of the learned brain.
+
+    Attributes:
+        path: the checkpoint: its folder, a training run's folder (then its last checkpoint), or a name on the Hub.
+        device: where it runs: `cpu`, `cuda`, …
+        n_action_steps: how many actions of a chunk are carried out before it looks again; as it was trained if nothing.
+        sample: draw actions from a Gaussian policy instead of taking its mean.
+        stream: give whole chunks, which go on while the policy thinks: for `clock = realtime`, where it is slow.
+        exact: infer for every simulation by itself: the bits are those of LeRobot's own evaluation however many run
+            side by side; slower.
+        threads: threads for torch on the CPU; if nothing, one for small networks and torch's own choice for others.
+        name: what reports call it.
+    """
+
+    path: str
+    device: str = "cpu"
+    n_action_steps: int | None = None
+    sample: bool = False
+    stream: bool = False
+    exact: bool = False
+    threads: int | None = None
+    name: str = "learned"
+
+    def __post_init__(self) -> None:
+        if not self.path:
+            raise ConfigError("brain.path is empty; name a checkpoint or a training run's folder.")
+        for name in ("n_action_steps", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(f"brain.{name} is {value}; it must be at least 1.")
+
+
+class LearnedBrain:
+    """Drives n simulations, whose episodes need not be in step, with one policy.
+
+    Every simulation has its own chunk, history and random numbers, which follow from its episode's seed; those that
+    need a new chunk in the same frame share a forward pass.
+
+    Args:
+        config: the parameters.
+
+    Raises:
+        ConfigError: the checkpoint cannot be used; the message says why.
+    """
+
+    name = "learned"
+    robot_type = ANY_ROBOT
+    has_plan = False
+
+    def __init__(self, config: LearnedBrainConfig) -> None:
+        from bhd_lerobot.policies.learned.inference import expected_frames, make_inference
+        from bhd_lerobot.policies.learned.policy import load_policy
+
+        self.config, self.name = config, config.name
+        folder = find_checkpoint(config.path)
+        self.contract = PolicyContract.load(folder)
+        self.loaded = load_policy(folder, config.device, config.n_action_steps)
+        self.robot_type = self.contract.robot_type or ANY_ROBOT
+        self.uses_images = bool(self.loaded.cameras)
+        self.inference = make_inference(self.loaded, sample=config.sample, exact=config.exact, threads=config.threads)
+        if config.stream and self.inference.steps == 1:
+            raise ConfigError(
+                f"brain.stream is true, but this {self.loaded.kind!r} carries out one action at a time. Leave it out, "
+                "or set brain.n_action_steps to more than 1 if the policy predicts chunks."
+            )
+        self._history_length = expected_frames(self.inference.frames)
+        self._history: Rows = {}
+        self._chunks: NDArray[np.float32] = np.zeros((0, 0, 0), np.float32)
+        self._next = self._frame = np.zeros(0, np.int64)
+        self._fresh = np.zeros(0, np.bool_)
+        self._actions = np.zeros((0, 0))
+        self._action_names: tuple[str, ...] = ()
+
+    @staticmethod
+    def robot_of(config: LearnedBrainConfig) -> str:
+        """Return the robot that a configuration's policy was trained on, without loading the policy.
+
+        Where there is no such folder, it says `ANY_ROBOT`: a configuration may be read before its policy is trained,
+        and reading it asks nobody on the network. Making the brain then fails, or fetches the policy.
+
+        Raises:
+            ConfigError: there is a folder, and no checkpoint that can be used.
+        """
+        if not Path(config.path).expanduser().is_dir():
+            return ANY_ROBOT
+        return PolicyContract.load(config.path).robot_type or ANY_ROBOT
+
+    def bind(
+        self,
+        observation_names: Sequence[str],
+        action_names: Sequence[str],
+        fps: int,
+        environment_names: Sequence[str] = (),
+    ) -> None:
+        """Check that these are the features and the rate that the policy was trained on.
+
+        Raises:
+            ConfigError: they are not; the message names both sides.
+        """
+        who = f"The policy {self.config.path!r}"
+        inputs = self.loaded.inputs
+        has_environment = _ENVIRONMENT in inputs
+        self.contract.check(
+            observation_names if _STATE in inputs else None,
+            action_names,
+            fps,
+            environment_names if has_environment else None,
+            who=who,
+        )
+        if not self.contract.is_known:
+            _log.warning(
+                "%s does not say what it was trained on, and its dataset is not here: only the number of its inputs is "
+                "checked, not which they are, nor the robot, nor the frame rate.",
+                who,
+            )
+        for key, names in ((_STATE, observation_names), (_ENVIRONMENT, environment_names), (_ACTION, action_names)):
+            width = self.loaded.width(key)
+            if (key in inputs or key == _ACTION) and width not in (None, len(names)):
+                raise ConfigError(
+                    f"{who} was trained with {width} numbers in {key!r}; this robot and task have {len(names)}: "
+                    f"{', '.join(names[:6]) or 'none'}{', …' if len(names) > 6 else ''}. Use the robot options and the "
+                    "task of its dataset."
+                )
+        self._action_names = tuple(action_names)
+        self._next = np.zeros(0, np.int64)
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
+        """Start episodes in some of n simulations: forget their chunks and histories, and seed their random numbers."""
+        if len(self._next) != n:
+            width = len(self._action_names)
+            self._chunks, self._history = np.zeros((n, 0, width), np.float32), {}
+            self._next, self._frame = np.zeros(n, np.int64), np.zeros(n, np.int64)
+            self._fresh, self._actions = np.ones(n, np.bool_), np.zeros((n, width))
+        self._next[ids] = self.inference.steps
+        self._frame[ids] = 0
+        self._fresh[ids] = True
+        self._actions[ids] = 0
+        self.inference.reset(ids, seeds, n, instructions)
+
+    def act(self, observation: Observation) -> "NDArray[np.float64] | Chunk | None":
+        """Return the actions, shape (n, actions); with `stream`, chunks, and None between two of them.
+
+        Raises:
+            ConfigError: an image that the policy looks at is missing or has another shape.
+            ActionError: the policy gave a value that is not finite.
+        """
+        n = len(self._next)
+        running = np.arange(n) if observation.running is None else np.flatnonzero(observation.running)
+        rows = self._remember(self._rows(observation), running)
+        ids = running[self._next[running] >= self.inference.steps]
+        if len(ids):
+            self._store(ids, self.inference.infer(ids, {key: values[ids] for key, values in rows.items()}), rows)
+        if self.config.stream:
+            chunk = self._stream(running) if len(ids) else None
+            self._next[running] += 1
+            self._frame[running] += 1
+            return chunk
+        self._actions[running] = self._chunks[running, self._next[running]]
+        self._next[running] += 1
+        self._frame[running] += 1
+        return self._actions.copy()
+
+    def subtasks(self) -> Sequence[str]:
+        """It has no plan."""
+        return ()
+
+    def plan(self, sim: int) -> dict[str, Any]:
+        """It has no plan."""
+        return {}
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters, and which weights they are."""
+        return {
+            "type": "learned",
+            "path": self.config.path,
+            "policy": self.loaded.kind,
+            "weights": self._digest,
+            "n_action_steps": getattr(self.loaded.config, "n_action_steps", 1),
+            "sample": self.config.sample,
+            "stream": self.config.stream,
+            "exact": self.config.exact,
+            "device": self.config.device,
+            "dataset": dict(self.contract.dataset or {}),
+            "trainer": self.contract.trainer,
+        }
+
+    @cached_property
+    def _digest(self) -> str:
+        with (self.loaded.folder / WEIGHT_FILES[0]).open("rb") as file:
+            return f"sha256:{file_digest(file, 'sha256').hexdigest()}"
+
+    def _rows(self, observation: Observation) -> "Rows":
+        """Return the policy's inputs of all simulations, shape (n, …)."""
+        rows: Rows = {}
+        for key in self.loaded.inputs:
+            if key == _STATE:
+                rows[key] = observation.state.astype(np.float32)
+            elif key == _ENVIRONMENT:
+                if observation.environment_state is None:
+                    raise AssertionError("The brain was bound to a task that tells something.")
+                rows[key] = observation.environment_state.astype(np.float32)
+            else:
+                rows[key] = self._image(observation, self.loaded.cameras[key], key)
+        return rows
+
+    def _image(self, observation: Observation, camera: str, key: str) -> NDArray[np.uint8]:
+        images = observation.images.get(camera)
+        shape = tuple((self.contract.cameras or {}).get(camera, ()))
+        if images is None:
+            size = f" --robot.camera_width={shape[1]} --robot.camera_height={shape[0]}" if shape else ""
+            raise ConfigError(
+                f"The policy {self.config.path!r} looks at the camera {camera!r} ({key}), which this robot does not "
+                f"have. There is: {', '.join(observation.images) or 'none'}. Set --robot.camera=true{size}."
+            )
+        if shape and images.shape[1:] != shape:
+            self.contract.check(cameras={camera: images.shape[1:]}, who=f"The policy {self.config.path!r}")
+        return images
+
+    def _remember(self, rows: "Rows", running: NDArray[np.intp]) -> "Rows":
+        """Return the frames that the policy looks at, shape (n, frames, …), oldest first."""
+        length = self._history_length
+        if length == 1:
+            return {key: values[:, None] for key, values in rows.items()}
+        fresh = running[self._fresh[running]]
+        self._fresh[running] = False
+        for key, values in rows.items():
+            if key not in self._history:
+                self._history[key] = np.zeros((len(values), length, *values.shape[1:]), values.dtype)
+            history = self._history[key]
+            history[running, :-1] = history[running, 1:]
+            history[running, -1] = values[running]
+            # As in the dataset, nothing was before an episode's first frame but that frame.
+            history[fresh] = values[fresh, None]
+        columns = [length - 1 + frame for frame in self.inference.frames]
+        return {key: history[:, columns] for key, history in self._history.items()}
+
+    def _store(self, ids: NDArray[np.intp], chunks: NDArray[np.float32], rows: "Rows") -> None:
+        finite = np.isfinite(chunks)
+        if not finite.all():
+            row, step, column = np.argwhere(~finite)[0]
+            sim = int(ids[row])
+            blind = [key for key, values in rows.items() if not np.isfinite(values[sim]).all()]
+            cause = f"its input {blind[0]!r} is not finite either" if blind else "all its inputs are finite"
+            raise ActionError(
+                f"The policy {self.config.path!r} gave {chunks[row, step, column]} for "
+                f"{self._action_names[column]!r}, {step} frames ahead, in frame {self._frame[sim]} of the episode in "
+                f"simulation {sim}; {cause}. The training perhaps diverged: look at its loss, and use an earlier "
+                "checkpoint."
+            )
+        if self._chunks.shape[1] != chunks.shape[1]:
+            self._chunks = np.zeros((len(self._next), *chunks.shape[1:]), np.float32)
+        self._chunks[ids] = chunks
+        self._next[ids] = 0
+
+    def _stream(self, running: NDArray[np.intp]) -> Chunk:
+        """Return what is left of every simulation's chunk; the shorter ones go on with their last action."""
+        length = self._chunks.shape[1]
+        columns = np.minimum(self._next[:, None] + np.arange(length), length - 1)
+        left = np.take_along_axis(self._chunks, columns[..., None], axis=1)
+        longest = length - int(self._next[running].min())
+        return Chunk(left.transpose(1, 0, 2)[:longest].astype(np.float64))

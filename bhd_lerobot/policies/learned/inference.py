@@ -1,0 +1,283 @@
+"""From observations to chunks of actions: batched where a policy lets us, one copy a simulation where it does not."""
+
+import copy
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from lerobot.policies.act.modeling_act import ACTTemporalEnsembler
+from lerobot.processor import (
+    AddBatchDimensionProcessorStep,
+    DeviceProcessorStep,
+    NormalizerProcessorStep,
+    RenameObservationsProcessorStep,
+    UnnormalizerProcessorStep,
+)
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.learned.policy import LoadedPolicy, torch_device
+from bhd_lerobot.policies.mlp.scan_mlp import ScanProcessorStep
+from bhd_lerobot.policies.mlp.yaw_mlp import YawProcessorStep
+
+type Rows = dict[str, NDArray]
+"""Observations of some simulations: by key, shape (simulations, frames, …), oldest first; images uint8 (…, h, w, 3)."""
+
+# Steps that treat every number by itself, so that a batch, a history or a chunk may go through them in one piece.
+_ELEMENTWISE = (
+    RenameObservationsProcessorStep,
+    AddBatchDimensionProcessorStep,
+    DeviceProcessorStep,
+    NormalizerProcessorStep,
+    UnnormalizerProcessorStep,
+    ScanProcessorStep,
+    YawProcessorStep,
+)
+_SMALL = 2_000_000  # parameters; below, a second thread costs more than it does
+_BLOCK, _BLOCK_LARGE = 64, 8
+
+
+class Inference(Protocol):
+    """What turns observations into actions."""
+
+    frames: tuple[int, ...]
+    """Which frames `infer` needs, oldest first, the present one being 0."""
+    steps: int
+    """How many actions of a chunk are carried out."""
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str]) -> None:
+        """Start episodes in some of n simulations; a seed and an instruction for each of them."""
+
+    def infer(self, ids: NDArray[np.intp], rows: Rows) -> NDArray[np.float32]:
+        """Return chunks, in the robot's units, shape (len(ids), at least `steps`, actions)."""
+
+
+def make_inference(loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: int | None) -> Inference:
+    """Return what drives simulations with a policy.
+
+    Args:
+        loaded: the policy.
+        sample: draw actions from a Gaussian policy instead of taking its mean.
+        exact: infer for every simulation by itself, so that its actions are the same bits beside any others.
+        threads: threads for torch on the CPU; if None, one for small networks and torch's own choice for others.
+
+    Raises:
+        ConfigError: `sample` for a policy that is not Gaussian.
+    """
+    if sample and not getattr(loaded.config, "gaussian", False):
+        raise ConfigError("brain.sample is true, but this policy has no distribution (bhd_mlp with gaussian=true has).")
+    if threads is None and sum(p.numel() for p in loaded.policy.parameters()) < _SMALL:
+        threads = 1
+    is_plain = all(isinstance(step, _ELEMENTWISE) for step in (*loaded.before.steps, *loaded.after.steps))
+    if is_plain and loaded.kind in ("bhd_mlp", "act", "diffusion"):
+        return BatchedInference(loaded, sample=sample, exact=exact, threads=threads)
+    return StockInference(loaded, threads=threads)
+
+
+class BatchedInference:
+    """One forward pass for all simulations that need one: `bhd_mlp`, ACT and Diffusion.
+
+    The policy keeps nothing between two calls: histories and chunks belong to the caller, the averages of ACT's
+    temporal ensembling and the random numbers to each simulation.
+
+    Simulations go through the network in blocks of a fixed size, because the last bits of a matrix product depend on
+    how many rows it has. So an episode's actions do not depend on what is beside it; alone (n = 1), or with `exact`,
+    they are the bits of LeRobot's own `select_action`.
+
+    Args:
+        loaded: the policy.
+        sample: draw from a Gaussian policy.
+        exact: blocks of one.
+        threads: for torch on the CPU; its own choice if None.
+    """
+
+    def __init__(self, loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: int | None) -> None:
+        self.loaded, self._exact, self._threads = loaded, exact, threads
+        config, self._kind = loaded.config, loaded.kind
+        self._sample = self._kind == "bhd_mlp" and (sample or config.sample)
+        self.steps = int(config.n_action_steps)
+        self.frames = tuple(config.observation_delta_indices or (0,))
+        self._device = torch_device(loaded)
+        self._block = 1
+        coefficient = getattr(config, "temporal_ensemble_coeff", None)
+        self._coefficient: float | None = None if self._kind != "act" else coefficient
+        self._ensemblers: dict[int, ACTTemporalEnsembler] = {}
+        self._generators: dict[int, torch.Generator] = {}
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str]) -> None:
+        """Start episodes: new random numbers, and no average yet."""
+        large = self._kind != "bhd_mlp"
+        self._block = 1 if n == 1 or self._exact else _BLOCK_LARGE if large else _BLOCK
+        for sim, seed in zip(ids.tolist(), seeds, strict=True):
+            self._generators[sim] = torch.Generator(self._device).manual_seed(seed)
+            if self._coefficient is not None:
+                self._ensemblers[sim] = ACTTemporalEnsembler(self._coefficient, self.loaded.config.chunk_size)
+
+    def infer(self, ids: NDArray[np.intp], rows: Rows) -> NDArray[np.float32]:
+        """Return chunks, shape (len(ids), predicted actions, actions)."""
+        chunks = []
+        with torch.inference_mode(), _threads(self._threads), _precision(self.loaded):
+            for start in range(0, len(ids), self._block):
+                sims = ids[start : start + self._block].tolist()
+                block = {key: _filled(values[start : start + self._block], self._block) for key, values in rows.items()}
+                chunk = self.loaded.after(self._predict(sims, self.loaded.before(self._batch(block))))
+                chunks.append(chunk[: len(sims)].to("cpu", torch.float32).numpy())
+        return np.concatenate(chunks)
+
+    def _batch(self, block: Rows) -> dict[str, Any]:
+        """Return tensors as LeRobot's evaluation gives them: float, images channels first and in [0, 1]."""
+        has_history = self._kind == "diffusion" or len(self.frames) > 1
+        batch: dict[str, Any] = {}
+        for key, values in block.items():
+            tensor = torch.from_numpy(np.ascontiguousarray(values if has_history else values[:, -1]))
+            batch[key] = image_tensor(tensor) if tensor.dtype == torch.uint8 else tensor
+        return batch
+
+    def _predict(self, sims: list[int], batch: dict[str, Any]) -> Tensor:
+        policy = self.loaded.policy
+        if self._kind == "diffusion":
+            return self._diffuse(sims, batch)
+        if self._kind == "bhd_mlp":
+            if not self._sample:
+                return policy.predict_action_chunk(batch)
+            return policy.predict_action_chunk(batch, noise=self._noise(sims, self.loaded.config.chunk_size))
+        chunk = policy.predict_action_chunk(batch)
+        if self._coefficient is None:
+            return chunk
+        rows = [self._ensemblers[sim].update(chunk[i : i + 1]) for i, sim in enumerate(sims)]
+        return torch.stack(rows, dim=1).transpose(0, 1).reshape(len(sims), 1, -1)
+
+    def _diffuse(self, sims: list[int], batch: dict[str, Any]) -> Tensor:
+        """Return Diffusion's chunks; every step of its sampling draws from the simulation's own generator."""
+        config, model = self.loaded.config, self.loaded.policy.diffusion
+        if config.image_features:
+            batch = {**batch, OBS_IMAGES: torch.stack([batch[key] for key in config.image_features], dim=-4)}
+        noise = self._noise(sims, config.horizon)
+        spare = [torch.Generator(self._device)] * (self._block - len(sims))
+        generators = [self._generators[sim] for sim in sims] + spare
+        # `predict_action_chunk` would be nearer, but takes no generator.
+        condition = model._prepare_global_conditioning(batch)
+        actions = model.conditional_sample(
+            batch[OBS_STATE].shape[0],
+            global_cond=condition,
+            noise=noise,
+            generator=generators if len(generators) > 1 else generators[0],
+        )
+        first = config.n_obs_steps - 1
+        return actions[:, first : first + config.n_action_steps]
+
+    def _noise(self, sims: list[int], length: int) -> Tensor:
+        """Return normal random numbers, shape (block, length, actions), every row from its own generator."""
+        shape = (1, length, self.loaded.width(ACTION) or 0)
+        drawn = [torch.randn(shape, generator=self._generators[sim], device=self._device) for sim in sims]
+        return torch.cat(drawn + [torch.zeros(shape, device=self._device)] * (self._block - len(sims)))
+
+
+class StockInference:
+    """LeRobot's own `select_action`, with a copy of the policy for every simulation: any policy there is.
+
+    The copies share the weights; only what a policy remembers is theirs. One simulation after the other, so n of them
+    take n times as long as one.
+
+    Args:
+        loaded: the policy.
+        threads: for torch on the CPU; its own choice if None.
+    """
+
+    frames: tuple[int, ...] = (0,)
+    steps: int = 1
+
+    def __init__(self, loaded: LoadedPolicy, *, threads: int | None) -> None:
+        self.loaded, self._threads = loaded, threads
+        self._policies: dict[int, Any] = {}
+        self._random: dict[int, list[Tensor]] = {}
+        self._instructions: dict[int, str] = {}
+        device = torch_device(loaded)
+        self._cuda = [device.index or 0] if device.type == "cuda" else []
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str]) -> None:
+        """Start episodes: everything that the policy remembers is forgotten."""
+        for i, (sim, seed) in enumerate(zip(ids.tolist(), seeds, strict=True)):
+            if sim not in self._policies:
+                self._policies[sim] = _twin(self.loaded.policy)
+            self._policies[sim].reset()
+            self._instructions[sim] = instructions[i] if i < len(instructions) else ""
+            with torch.random.fork_rng(self._cuda):
+                torch.manual_seed(seed)
+                self._random[sim] = self._random_state()
+
+    def infer(self, ids: NDArray[np.intp], rows: Rows) -> NDArray[np.float32]:
+        """Return the next action of every simulation, shape (len(ids), 1, actions)."""
+        actions = []
+        with torch.inference_mode(), _threads(self._threads), _precision(self.loaded):
+            for row, sim in enumerate(ids.tolist()):
+                batch: dict[str, Any] = {"task": [self._instructions[sim]]}
+                for key, values in rows.items():
+                    tensor = torch.from_numpy(np.ascontiguousarray(values[row : row + 1, -1]))
+                    batch[key] = image_tensor(tensor) if tensor.dtype == torch.uint8 else tensor
+                with torch.random.fork_rng(self._cuda):
+                    torch.set_rng_state(self._random[sim][0])
+                    if self._cuda:
+                        torch.cuda.set_rng_state(self._random[sim][1], self._cuda[0])
+                    action = self.loaded.after(self._policies[sim].select_action(self.loaded.before(batch)))
+                    self._random[sim] = self._random_state()
+                actions.append(action.to("cpu", torch.float32).numpy())
+        return np.stack(actions)
+
+    def _random_state(self) -> list[Tensor]:
+        return [torch.get_rng_state(), *(torch.cuda.get_rng_state(index) for index in self._cuda)]
+
+
+def image_tensor(pixels: Tensor) -> Tensor:
+    """Return images as LeRobot's evaluation makes them.
+
+    Args:
+        pixels: uint8, shape (…, height, width, channels).
+
+    Returns:
+        float32 in [0, 1], shape (…, channels, height, width)
+    """
+    last = pixels.ndim - 1
+    order = (*range(last - 2), last, last - 2, last - 1)
+    return pixels.permute(order).contiguous().type(torch.float32) / 255
+
+
+def _filled(values: NDArray, size: int) -> NDArray:
+    """Return a block of exactly `size` rows; the first row stands in for those that are missing."""
+    missing = size - len(values)
+    return values if missing <= 0 else np.concatenate([values, np.repeat(values[:1], missing, axis=0)])
+
+
+def _twin(policy: Any) -> Any:
+    """Return a copy that shares the weights."""
+    shared = {id(tensor): tensor for tensor in (*policy.parameters(), *policy.buffers())}
+    return copy.deepcopy(policy, shared)
+
+
+@contextmanager
+def _threads(count: int | None) -> Iterator[None]:
+    """Give torch some threads for a while."""
+    before = torch.get_num_threads()
+    if count is None or count == before:
+        yield
+        return
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _precision(loaded: LoadedPolicy) -> Any:
+    """Return the context of LeRobot's evaluation: lower precision where the policy was configured so."""
+    return torch.autocast(loaded.config.device.partition(":")[0]) if loaded.config.use_amp else nullcontext()
+
+
+def expected_frames(frames: Sequence[int]) -> int:
+    """Return how many frames have to be remembered, the present one included."""
+    return math.ceil(1 - min(frames))

@@ -1,0 +1,186 @@
+"""A trained policy and its processors, loaded as they were saved, whatever LeRobot policy it is."""
+
+import contextlib
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lerobot.policies  # noqa: F401 - registers LeRobot's own policies
+import torch
+from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.processor import RenameObservationsProcessorStep
+from lerobot.utils.constants import (
+    ACTION,
+    OBS_ENV_STATE,
+    OBS_STATE,
+    POLICY_POSTPROCESSOR_DEFAULT_NAME,
+    POLICY_PREPROCESSOR_DEFAULT_NAME,
+)
+from lerobot.utils.device_utils import is_torch_device_available
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
+from bhd_lerobot.policies.learned.contract import CONFIG_FILE, camera_name
+from bhd_lerobot.policies.mlp import configuration_mlp  # noqa: F401 - registers bhd_mlp
+
+
+@dataclass(frozen=True)
+class LoadedPolicy:
+    """A policy, ready to act.
+
+    Attributes:
+        folder: where it was loaded from.
+        policy: the network, in evaluation mode.
+        before: what turns a batch of observations into its input.
+        after: what gives its actions their units back.
+        inputs: keys of the observations that it takes, under the names that they have before `before`.
+        cameras: camera names of those inputs that are images, by key.
+    """
+
+    folder: Path
+    policy: Any
+    before: Any
+    after: Any
+    inputs: tuple[str, ...]
+    cameras: dict[str, str]
+
+    @property
+    def config(self) -> Any:
+        """The policy's configuration."""
+        return self.policy.config
+
+    @property
+    def kind(self) -> str:
+        """LeRobot's name of the type of policy."""
+        return str(self.config.type)
+
+    def width(self, key: str) -> int | None:
+        """Return how many numbers a vector input, or the action, has; None if the policy does not say."""
+        features = {**(self.config.input_features or {}), **(self.config.output_features or {})}
+        return int(features[key].shape[0]) if key in features else None
+
+
+def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = None) -> LoadedPolicy:
+    """Return the policy of a checkpoint.
+
+    Args:
+        folder: a checkpoint's folder `pretrained_model`.
+        device: where it runs: `cpu`, `cuda`, `cuda:1`, …
+        n_action_steps: how many actions of a chunk are carried out; the checkpoint's own number if None.
+
+    Raises:
+        ConfigError: the checkpoint cannot be loaded or does not fit, with the cause and the remedy.
+    """
+    try:
+        is_there = is_torch_device_available(device)
+    except (ValueError, RuntimeError):
+        is_there = False
+    if not is_there:
+        raise ConfigError(f"brain.device is {device!r}, which this machine does not have. Set --brain.device=cpu.")
+    config = _config(folder, device)
+    if n_action_steps is not None:
+        _set_action_steps(config, n_action_steps)
+    for name in (POLICY_PREPROCESSOR_DEFAULT_NAME, POLICY_POSTPROCESSOR_DEFAULT_NAME):
+        if not (folder / f"{name}.json").is_file():
+            raise ConfigError(
+                f"The checkpoint {folder} has no {name}.json, so nothing says how its inputs were normalised. Copy it "
+                "again; if a LeRobot before 0.4 wrote it, convert it with LeRobot's migrate_policy_normalization.py."
+            )
+    check_checkpoint(folder)
+    try:
+        # LeRobot prints where it loads from, and without `strict` it would go on with weights that are not there.
+        with contextlib.redirect_stdout(io.StringIO()):
+            policy = get_policy_class(config.type).from_pretrained(str(folder), config=config, strict=True)
+        before, after = make_pre_post_processors(
+            config,
+            pretrained_path=str(folder),
+            preprocessor_overrides={"device_processor": {"device": device}},
+        )
+    except ImportError as error:
+        raise ConfigError(f"The policy type {config.type!r} needs a package that is not installed: {error}") from error
+    except ConfigError:
+        raise
+    except Exception as error:  # whatever a policy's constructor, safetensors or torch find wrong with the files
+        reason = " ".join(str(error).split())
+        raise ConfigError(
+            f"The checkpoint {folder} cannot be loaded ({type(error).__name__}: {reason[:300]}). It was perhaps "
+            "interrupted while it was written or copied; use an earlier checkpoint of the run, or copy it again."
+        ) from error
+    policy.eval()
+    return LoadedPolicy(folder, policy, before, after, *_inputs(config, before))
+
+
+def _config(folder: Path, device: str) -> Any:
+    file = folder / CONFIG_FILE
+    try:
+        values = json.loads(file.read_text(encoding="utf-8"))
+        kind = values["type"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{file} cannot be read ({error!r}). Copy the checkpoint again.") from error
+    if kind not in PreTrainedConfig.get_known_choices():
+        register_third_party_plugins()
+    if kind not in PreTrainedConfig.get_known_choices():
+        known = ", ".join(sorted(PreTrainedConfig.get_known_choices()))
+        raise ConfigError(
+            f"The checkpoint {folder} is of the policy type {kind!r}, which is not installed. There is: {known}."
+        )
+    try:
+        config: Any = PreTrainedConfig.from_pretrained(folder, cli_overrides=[f"--device={device}"])
+    except Exception as error:  # draccus raises what it likes
+        raise ConfigError(f"{file} cannot be used: {error}. It was perhaps written by another version.") from error
+    if config.use_peft:
+        raise ConfigError(
+            f"The checkpoint {folder} holds a PEFT adapter only. Merge it into its base model and save that "
+            "(PeftModel.merge_and_unload, then save_pretrained)."
+        )
+    config.pretrained_path = folder
+    return config
+
+
+def _set_action_steps(config: Any, steps: int) -> None:
+    if not hasattr(config, "n_action_steps"):
+        raise ConfigError(f"brain.n_action_steps was given, but a {config.type!r} gives no chunks. Leave it out.")
+    predicted = getattr(config, "chunk_size", None)
+    if predicted is None and hasattr(config, "horizon"):
+        predicted = config.horizon - config.n_obs_steps + 1
+    if steps < 1 or (predicted is not None and steps > predicted):
+        raise ConfigError(f"brain.n_action_steps is {steps}; this {config.type!r} predicts chunks of {predicted}.")
+    if steps > 1 and getattr(config, "temporal_ensemble_coeff", None) is not None:
+        raise ConfigError(
+            f"brain.n_action_steps is {steps}, but this policy averages over its chunks (temporal_ensemble_coeff), for "
+            "which it looks at every frame. Leave brain.n_action_steps out."
+        )
+    config.n_action_steps = steps
+
+
+def _inputs(config: Any, before: Any) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the inputs under the robot's names, and which are cameras."""
+    renamed: dict[str, str] = {}
+    for step in before.steps:
+        if isinstance(step, RenameObservationsProcessorStep):
+            renamed |= {new: old for old, new in step.rename_map.items()}
+    inputs, cameras = [], {}
+    for key, feature in (config.input_features or {}).items():
+        own = renamed.get(key, key)
+        inputs.append(own)
+        if feature.type == FeatureType.VISUAL:
+            cameras[own] = camera_name(own)
+        elif own not in (OBS_STATE, OBS_ENV_STATE):
+            raise ConfigError(
+                f"The policy reads {own!r}, which no robot here gives. There is {OBS_STATE}, {OBS_ENV_STATE} and "
+                "images."
+            )
+    if ACTION not in (config.output_features or {}):
+        raise ConfigError(
+            f"The policy gives no {ACTION!r}; it gives {', '.join(config.output_features or {}) or 'nothing'}."
+        )
+    return tuple(inputs), cameras
+
+
+def torch_device(loaded: LoadedPolicy) -> torch.device:
+    """Return where the policy runs."""
+    return next(iter(loaded.policy.parameters())).device

@@ -1,0 +1,290 @@
+"""The scripted brain of the pick task: approach, grasp, lift; once more if the gripper missed."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, check_camera_error
+from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED, MAX_OPENING
+from bhd_lerobot.control.commands import BrainCommand, CommandResult
+from bhd_lerobot.errors import ConfigError, InstructionError
+from bhd_lerobot.policies.brain import Observation, find_columns
+from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
+from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject, neutral_yaw, plan_grasp, pointing_down, read_objects
+from bhd_lerobot.policies.manipulation.skills import Plan, Skill, make_plan
+from bhd_lerobot.policies.manipulation.scene_objects import scene_object
+
+_SQUEEZE = 0.03  # [m] how far inside the object the fingers are sent: the gripper's force limit does the rest
+_MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers
+_TRAVEL = 0.22  # [m] height of the tool above the table on free motions: the finger tips stay above every object
+_LIFTED = 0.05  # [m] an object that was lifted by less slipped out
+_POSITION = [OBJECT_FIELDS.index(axis) for axis in "xyz"]
+
+
+@BrainConfig.register_subclass("pick")
+@dataclass
+class PickBrainConfig(BrainConfig):
+    """Parameters of the scripted pick brain.
+
+    Attributes:
+        max_velocity: speed of the fastest joint on free motions [rad/s].
+        max_acceleration: acceleration of the fastest joint on free motions [rad/s^2].
+        line_velocity: speed of the tool on the way down and up [m/s].
+        line_acceleration: acceleration of the tool on the way down and up [m/s^2].
+        lift_m: height that it lifts to [m].
+        attempts: how often it tries to grasp.
+        camera_error_m: what positions that it is told are known to be off by, x, y, z in the base frame [m]; it is
+            subtracted.
+    """
+
+    max_velocity: float = 2.0
+    max_acceleration: float = 6.0
+    line_velocity: float = 0.25
+    line_acceleration: float = 1.0
+    lift_m: float = 0.15
+    attempts: int = 2
+    camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+    def __post_init__(self) -> None:
+        for name in ("max_velocity", "max_acceleration", "line_velocity", "line_acceleration", "lift_m"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"brain.{name} is {getattr(self, name)}; it must be positive and finite.")
+        if self.max_velocity > MAX_JOINT_SPEED:
+            raise ConfigError(
+                f"brain.max_velocity is {self.max_velocity}; the joints turn at {MAX_JOINT_SPEED:.4g} rad/s at most."
+            )
+        if self.attempts < 1:
+            raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")
+        check_camera_error("brain.camera_error_m", self.camera_error_m)
+
+
+@dataclass
+class _Work:
+    """What is known and under way in one simulation."""
+
+    instruction: str = ""
+    plan: Plan | None = None
+    step: int = 0
+    stage: str = ""
+    attempts: int = 0
+    grasp: Grasp | None = None
+    problem: str = ""
+
+
+class PickBrain(GoalBrain):
+    """Carries out a plan of skills with goals; its plan is to pick up the object that the task marks.
+
+    Args:
+        config: the parameters.
+    """
+
+    name = "pick"
+
+    def __init__(self, config: PickBrainConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or PickBrainConfig()
+        self._work: dict[int, _Work] = {}
+        self._columns: NDArray[np.intp] = np.zeros(0, np.intp)
+        self._opening = 0
+
+    def bind(
+        self,
+        observation_names: Sequence[str],
+        action_names: Sequence[str],
+        fps: int,
+        environment_names: Sequence[str] = (),
+    ) -> None:
+        """Find the objects and the gripper."""
+        wanted = [f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS]
+        self._columns = find_columns(environment_names, wanted, self.name, "environment")
+        self._opening = int(find_columns(observation_names, ["gripper.pos"], self.name, "observation")[0])
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters."""
+        return {"type": self.name, **asdict(self.config)}
+
+    def plan(self, sim: int) -> dict[str, Any]:
+        """Return the plan of one simulation, how far it got, and what was in the way."""
+        work = self._work[sim]
+        plan = work.plan
+        return {
+            "instruction": work.instruction,
+            "target": None if plan is None else plan.target,
+            "steps": [] if plan is None else [[step.skill.value, step.text] for step in plan.steps],
+            "done": work.step,
+            "attempts": work.attempts,
+            "problem": work.problem,
+        }
+
+    def _make_plan(self, work: _Work, objects: Sequence[SeenObject]) -> Plan:
+        """Return the plan for what is on the table.
+
+        Raises:
+            InstructionError: there is none.
+        """
+        for one in objects:
+            if one.target:
+                skills = (Skill.LOCATE, Skill.APPROACH, Skill.GRASP, Skill.LIFT, Skill.HOLD)
+                return make_plan(work.instruction, scene_object(one), skills)
+        raise InstructionError("No object on the table is the one that the task is about.")
+
+    # --- from one goal to the next -----------------------------------------------------------------------------------
+
+    def _begin(self, sim: int, seed: int, instruction: str) -> None:
+        self._work[sim] = _Work(instruction)
+
+    def _decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
+        work = self._work[sim]
+        objects = self._objects(sim, seen)
+        if work.plan is None:
+            try:
+                work.plan = self._make_plan(work, objects)
+            except InstructionError as error:
+                return self._give_up(sim, str(error))
+            work.step = 1  # what it needs to know about the object, it has just been told
+            work.stage = ""
+        target = next((one for one in objects if one.index == work.plan.target), None)
+        if target is None:
+            return self._give_up(sim, "the object is gone")
+        if result is not None:
+            if not result.success:
+                return self._retry(sim, target, objects, result.message)
+            missed = self._missed(sim, seen, target)
+            if missed:
+                return self._retry(sim, target, objects, missed)
+        return self._next(sim, target, objects)
+
+    def _next(self, sim: int, target: SeenObject, objects: Sequence[SeenObject]) -> BrainCommand | None:
+        """Return the goal that follows the one that succeeded."""
+        work = self._work[sim]
+        if work.plan is None:
+            raise AssertionError("There is a plan by now.")
+        steps = work.plan.steps
+        if work.stage in _LAST_STAGE.get(steps[work.step].skill, ()):
+            work.step += 1
+            if work.step == len(steps):
+                self._doing[sim] = "done"
+                return None
+        if steps[work.step].skill == Skill.HOLD and work.step + 1 < len(steps):
+            work.step += 1  # between two goals nothing moves: it was held
+        step = steps[work.step]
+        self._doing[sim] = step.text
+        if step.skill == Skill.APPROACH and work.stage != "above":
+            return self._approach(sim, target, objects)
+        if work.grasp is None:
+            raise AssertionError("A plan approaches before it grasps.")
+        return self._carry_out(sim, step.skill, work.grasp)
+
+    def _approach(self, sim: int, target: SeenObject, objects: Sequence[SeenObject]) -> BrainCommand | None:
+        """Return the goal that brings the open gripper above the object."""
+        work = self._work[sim]
+        others = [one for one in objects if one.index != target.index]
+        work.grasp = plan_grasp(target, others, MAX_OPENING)
+        if work.grasp is None:
+            return self._give_up(sim, f"the {scene_object(target).name} does not fit between the fingers")
+        work.attempts += 1
+        return self._free(sim, "above", work.grasp, opening=work.grasp.opening)
+
+    def _carry_out(self, sim: int, skill: Skill, grasp: Grasp) -> BrainCommand | None:
+        """Return the next goal of a skill that needs the grasp."""
+        work, config = self._work[sim], self.config
+        command: BrainCommand | None = None  # hold: nothing moves any more
+        if skill == Skill.APPROACH:
+            command = self._line(sim, "down", grasp, grasp.z)
+        elif skill == Skill.GRASP:
+            work.stage = "close"
+            command = BrainCommand(self._name(sim, "close"), gripper=max(0.0, grasp.width - _SQUEEZE))
+        elif skill == Skill.LIFT:
+            command = self._line(sim, "lift", grasp, grasp.z + config.lift_m)
+        elif skill == Skill.HAND_OVER:
+            work.stage = "hand_over"
+            command = BrainCommand(
+                self._name(sim, "hand_over"),
+                target_pose=pointing_down(*_HAND_OVER, yaw=neutral_yaw(*_HAND_OVER[:2])),
+                max_velocity=config.max_velocity / 2,
+                max_acceleration=config.max_acceleration / 2,
+            )
+        elif skill == Skill.PLACE and work.stage != "put":
+            command = self._line(sim, "put", grasp, grasp.z)
+        elif skill == Skill.PLACE:
+            work.stage = "release"
+            command = BrainCommand(self._name(sim, "release"), gripper=grasp.opening)
+        return command
+
+    def _retry(self, sim: int, target: SeenObject, objects: Sequence[SeenObject], problem: str) -> BrainCommand | None:
+        """Go back to before the grasp, or give up."""
+        work = self._work[sim]
+        if work.stage == "back":
+            work.attempts += 1  # the way back failed: without an end it would be tried for ever
+        if work.plan is None or work.attempts >= self.config.attempts:
+            return self._give_up(sim, problem)
+        work.problem = problem
+        work.step, work.stage = 1, ""
+        if work.grasp is None:
+            return self._next(sim, target, objects)
+        work.stage = "back"
+        self._doing[sim] = "let go and try again"
+        # Up first, with the fingers open, from wherever the tool is.
+        return self._free(sim, "back", work.grasp, opening=MAX_OPENING)
+
+    def _missed(self, sim: int, seen: Observation, target: SeenObject) -> str:
+        """Return what is wrong with the grasp, if anything."""
+        work = self._work[sim]
+        if work.grasp is None:
+            return ""
+        opening = float(seen.state[sim, self._opening])
+        if work.stage == "close" and opening < work.grasp.width - _MISSED:
+            return f"the gripper closed to {opening * 1000:.0f} mm and holds nothing"
+        if work.stage == "lift" and target.position[2] < target.size[2] / 2 + _LIFTED:
+            return "the object was not lifted"
+        return ""
+
+    def _give_up(self, sim: int, problem: str) -> BrainCommand | None:
+        self._work[sim].problem = problem
+        self._doing[sim] = f"cannot: {problem}"
+        return None
+
+    def _free(self, sim: int, stage: str, grasp: Grasp, opening: float) -> BrainCommand:
+        work, config = self._work[sim], self.config
+        work.stage = stage
+        return BrainCommand(
+            self._name(sim, stage),
+            target_pose=grasp.pose(_TRAVEL),
+            gripper=opening,
+            max_velocity=config.max_velocity,
+            max_acceleration=config.max_acceleration,
+        )
+
+    def _line(self, sim: int, stage: str, grasp: Grasp, height: float) -> BrainCommand:
+        config = self.config
+        self._work[sim].stage = stage
+        return BrainCommand(
+            self._name(sim, stage),
+            target_pose=grasp.pose(height),
+            motion="line",
+            max_velocity=config.line_velocity,
+            max_acceleration=config.line_acceleration,
+        )
+
+    def _objects(self, sim: int, seen: Observation) -> list[SeenObject]:
+        if seen.environment_state is None:
+            raise AssertionError("The brain was bound to the objects.")
+        table = seen.environment_state[sim, self._columns].reshape(MAX_OBJECTS, len(OBJECT_FIELDS))
+        table[:, _POSITION] -= self.config.camera_error_m
+        return read_objects(table)
+
+
+# The stage that completes each skill.
+_LAST_STAGE: dict[Skill, tuple[str, ...]] = {
+    Skill.APPROACH: ("down",),
+    Skill.GRASP: ("close",),
+    Skill.LIFT: ("lift",),
+    Skill.HAND_OVER: ("hand_over",),
+    Skill.PLACE: ("release",),
+}
+_HAND_OVER = (0.40, -0.40, 0.35)  # [m] beside the table's middle, where a person can take it

@@ -1,0 +1,113 @@
+"""The scripted brain of the reach task."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.tabletop import check_camera_error
+from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED, ur5
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import Observation, find_columns
+from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
+
+_TARGET = tuple(f"target_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+
+
+@BrainConfig.register_subclass("reach")
+@dataclass
+class ReachBrainConfig(BrainConfig):
+    """Parameters of the scripted reach brain.
+
+    Attributes:
+        max_velocity: speed of the fastest joint [rad/s].
+        max_acceleration: acceleration of the fastest joint [rad/s^2].
+        attempts: how often it tries in all; between two tries the arm goes home, as another start opens other ways.
+        camera_error_m: what positions that it is told are known to be off by, x, y, z in the base frame [m]; it is
+            subtracted.
+    """
+
+    max_velocity: float = 2.0
+    max_acceleration: float = 8.0
+    attempts: int = 3
+    camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+    def __post_init__(self) -> None:
+        for name in ("max_velocity", "max_acceleration"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"brain.{name} is {getattr(self, name)}; it must be positive and finite.")
+        if self.max_velocity > MAX_JOINT_SPEED:
+            raise ConfigError(
+                f"brain.max_velocity is {self.max_velocity}; the joints turn at {MAX_JOINT_SPEED:.4g} rad/s at most."
+            )
+        if self.attempts < 1:
+            raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")
+        check_camera_error("brain.camera_error_m", self.camera_error_m)
+
+
+class ReachBrain(GoalBrain):
+    """Gives the target pose as a goal; where no way leads there from the present posture, by way of home.
+
+    Args:
+        config: the parameters.
+    """
+
+    name = "reach"
+
+    def __init__(self, config: ReachBrainConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or ReachBrainConfig()
+        self._columns: NDArray[np.intp] = np.zeros(0, np.intp)
+        self._tries: dict[int, int] = {}
+        self._home = ur5().home
+
+    def bind(
+        self,
+        observation_names: Sequence[str],
+        action_names: Sequence[str],
+        fps: int,
+        environment_names: Sequence[str] = (),
+    ) -> None:
+        """Find the target."""
+        self._columns = find_columns(environment_names, _TARGET, self.name, "environment")
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters."""
+        return {"type": self.name, **asdict(self.config)}
+
+    def _begin(self, sim: int, seed: int, instruction: str) -> None:
+        self._tries[sim] = 0
+
+    def _decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
+        if result is not None and result.success and self._doing[sim] != "go home":
+            self._doing[sim] = "hold"
+            return None
+        if result is not None and not result.success:
+            if self._tries[sim] >= self.config.attempts:
+                self._doing[sim] = f"give up: {result.message}"
+                return None
+            if self._doing[sim] != "go home":
+                self._doing[sim] = "go home"
+                return self._goal(sim, "home", joint_target=self._home[:-1])
+        if seen.environment_state is None:
+            raise AssertionError("The brain was bound to a target.")
+        x, y, z, *quaternion = seen.environment_state[sim, self._columns].tolist()
+        # Observations are rounded to single precision, and so is the quaternion's length.
+        length = math.sqrt(sum(value * value for value in quaternion))
+        if not (0.5 < length < 2 and math.isfinite(x + y + z)):
+            self._doing[sim] = "give up: there is no target pose"
+            return None
+        self._tries[sim] += 1
+        self._doing[sim] = "move the tool to the target"
+        dx, dy, dz = self.config.camera_error_m
+        w, i, j, k = (value / length for value in quaternion)
+        return self._goal(sim, "reach", target_pose=Pose((x - dx, y - dy, z - dz), (w, i, j, k)))
+
+    def _goal(self, sim: int, step: str, **target: Any) -> BrainCommand:
+        speed, acceleration = self.config.max_velocity, self.config.max_acceleration
+        return BrainCommand(self._name(sim, step), max_velocity=speed, max_acceleration=acceleration, **target)

@@ -1,0 +1,183 @@
+"""What brain, cerebellum, recorder and monitor of one running robot share: words, queues, states.
+
+The words are 64-bit integers, each written by one process (those that any may write are marked), and read by all.
+"""
+
+import time
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Self
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.fifo import CommandFifo, StateRing
+from bhd_lerobot.realtime.shared_memory import SharedBlock
+
+WORDS = 64
+
+
+class Word(IntEnum):
+    """Where each word is."""
+
+    START = 0
+    """Monotonic time of tick 0 of the present stretch [ns]; the cerebellum's time counts from there."""
+    STRETCH = 1
+    """How often the loop has been started."""
+    PHASE = 2
+    """A `Phase`."""
+    PAUSE = 3
+    """Not 0: the loop is to stand still. Written by the brain's process."""
+    END = 4
+    """Not 0: the process is to end. Written by the brain's process."""
+    ESTOP = 5
+    """Not 0: emergency stop. Any process may set it; the cerebellum clears it on a reset."""
+    BRAIN_ALIVE = 8
+    """When the brain's process last showed that it lives, monotonic [ns]; 0: it is not watched."""
+    CEREBELLUM_ALIVE = 9
+    """The same of the cerebellum's process."""
+    RECORDER_ALIVE = 10
+    """The same of the recorder's process."""
+    PLANT_ALIVE = 11
+    """The same of the plant's process."""
+    EXECUTED = 16
+    """Ticks executed in the present stretch."""
+    SKIPPED = 17
+    """Ticks skipped in it."""
+    OVERRUNS = 18
+    """Ticks of it that ended after their successor was due."""
+    CATCH_UP_LOST = 19
+    """Ticks of it by which the simulation fell behind, beyond what it may catch up at once."""
+    RECORDER_DROPS = 24
+    """States that the recorder did not get before they were overwritten, in the present stretch."""
+
+
+class Phase(IntEnum):
+    """What the loop's process is doing."""
+
+    STARTING = 0
+    """Importing, building the model, asking for privileges, warming up."""
+    STANDING = 1
+    """Ready; no tick runs, and the plant stands still."""
+    RUNNING = 2
+    """Ticks run."""
+    ENDED = 3
+    """The process has ended in order."""
+
+
+@dataclass(frozen=True)
+class LiveLayout:
+    """Sizes of everything in a block.
+
+    Attributes:
+        width: values in a command.
+        state: dtype of the states.
+        fifo_capacity: commands that may wait.
+        ring_capacity: states that a reader may lag behind.
+        extra: further sections, sizes in bytes by name.
+    """
+
+    width: int
+    state: np.dtype
+    fifo_capacity: int
+    ring_capacity: int
+    extra: dict[str, int]
+
+    def create(self, name: str, about: dict[str, Any]) -> "LiveBlock":
+        """Make the block.
+
+        Raises:
+            RealtimeError: a robot of this name is running, or there is no room.
+        """
+        sections = {
+            "words": 8 * WORDS,
+            "fifo": CommandFifo.nbytes(1, self.width, self.fifo_capacity),
+            "ring": StateRing.nbytes(self.state, self.ring_capacity),
+            **self.extra,
+        }
+        described = {
+            "width": self.width,
+            "fifo_capacity": self.fifo_capacity,
+            "ring_capacity": self.ring_capacity,
+            "state": npy.dtype_to_descr(self.state),
+        }
+        about = {**about, "made_ns": time.monotonic_ns(), "layout": described}
+        return LiveBlock(SharedBlock.create(name, sections, about))
+
+
+class LiveBlock:
+    """A block in use.
+
+    Attributes:
+        words: the words, shape (64,).
+        fifo: the commands.
+        ring: the states.
+
+    Args:
+        block: the memory.
+    """
+
+    def __init__(self, block: SharedBlock) -> None:
+        self._block = block
+        layout = block.about["layout"]
+        self.name, self.about = block.name, block.about
+        self.words: NDArray[np.int64] = np.frombuffer(block.section("words"), np.int64)
+        self.state_dtype = npy.descr_to_dtype(_tuples(layout["state"]))
+        self.fifo = CommandFifo(1, layout["width"], layout["fifo_capacity"], block.section("fifo"))
+        self.ring = StateRing(self.state_dtype, layout["ring_capacity"], block.section("ring"))
+
+    @classmethod
+    def attach(cls, name: str) -> Self:
+        """Open the block of a running robot.
+
+        Raises:
+            RealtimeError: there is none.
+        """
+        return cls(SharedBlock.attach(name))
+
+    @classmethod
+    def watch(cls, name: str) -> Self:
+        """Open the block of a running robot to look at it; nothing in it can be written but by `set_estop`.
+
+        Raises:
+            RealtimeError: there is none.
+        """
+        return cls(SharedBlock.watch(name))
+
+    @property
+    def is_held(self) -> bool:
+        """Whether a process of the robot still holds the block that this one watches; for the result of `watch`."""
+        return self._block.is_held
+
+    def set_estop(self) -> None:
+        """Set the word of the emergency stop of a robot that is watched."""
+        self._block.write("words", 8 * Word.ESTOP, np.int64(1).tobytes())
+
+    def section(self, name: str) -> memoryview:
+        """Return the memory of a further section."""
+        return self._block.section(name)
+
+    def has(self, name: str) -> bool:
+        """Return whether there is a section of this name."""
+        return self._block.has(name)
+
+    @property
+    def estop_word(self) -> NDArray[np.int64]:
+        """The word of the emergency stop, shape (1,): any process may set it."""
+        return self.words[Word.ESTOP : Word.ESTOP + 1]
+
+    def show_life(self, word: Word) -> None:
+        """Note that this process lives."""
+        self.words[word] = time.monotonic_ns()
+
+    def close(self) -> None:
+        """Leave the block; the last process that does so removes it."""
+        self._block.close()
+
+
+def _tuples(value: Any) -> Any:
+    """Return what JSON made lists of as numpy wants it: a list of fields, each a tuple, with shapes as tuples."""
+    if not isinstance(value, list):
+        return value
+    return [tuple(tuple(part) if index == 2 else _tuples(part) for index, part in enumerate(one)) for one in value]

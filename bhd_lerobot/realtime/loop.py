@@ -1,0 +1,145 @@
+"""The loop of the cerebellum in real time: ticks on an absolute grid, and watchdogs on the other processes.
+
+The clock and the sleep are given, so that everything in here runs on a virtual clock in tests.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.realtime.block import Phase, Word
+from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
+
+
+@dataclass(frozen=True)
+class LoopLimits:
+    """When the loop stops the robot by itself.
+
+    Attributes:
+        brain_timeout_s: after so long without a sign of life of the brain's process a robot that moves decelerates and
+            holds [s].
+        recorder_timeout_s: the same for the recorder's process, if there is one [s].
+        plant_timeout_s: after so long without a sign of life of the plant's process, if there is one, FAULT [s].
+        most_misses: after so many starts in a row that came a period or more too late, FAULT.
+        most_catch_up: so many periods at the most are caught up by one tick; what is beyond is lost to the simulation,
+            which then is behind, and counted.
+    """
+
+    brain_timeout_s: float = 0.5
+    recorder_timeout_s: float = 1.0
+    plant_timeout_s: float = 0.02
+    most_misses: int = 10
+    most_catch_up: int = 10
+
+
+Advance = Callable[[int], None]
+"""Lets the plant go on by a number of ticks."""
+Serve = Callable[[int], None]
+"""Answers what the bridge asks for, at a time of the cerebellum [ns]."""
+Publish = Callable[[Slot, int, int, TickGrid], None]
+"""Publishes the state: the tick, when it started and when its predecessor ended (both monotonic) [ns], the grid."""
+Count = Callable[[int, int, int, int], None]
+"""Takes the timing of a tick: due, start, end (monotonic) [ns], ticks skipped before it."""
+
+
+class RealtimeLoop:
+    """Runs ticks until a word says pause or end.
+
+    Args:
+        cerebellum: what is run, of one robot.
+        words: the block's words.
+        limits: when to stop the robot.
+        serve: answers requests, before each tick.
+        advance: moves the plant on, after each tick.
+        publish: publishes the state, at the end of each tick.
+        count: takes the timing of each tick.
+        clock: monotonic time [ns].
+        sleep: waits for a time [s].
+    """
+
+    def __init__(
+        self,
+        cerebellum: Cerebellum,
+        words: NDArray[np.int64],
+        limits: LoopLimits,
+        *,
+        serve: Serve,
+        advance: Advance,
+        publish: Publish,
+        count: Count,
+        clock: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.cerebellum, self.words, self.limits = cerebellum, words, limits
+        self.period_ns = NANOSECONDS // cerebellum.control_hz
+        self._serve, self._advance, self._publish, self._count = serve, advance, publish, count
+        self._clock, self._sleep = clock, sleep
+        self._watched = [
+            (int(Word.BRAIN_ALIVE), round(limits.brain_timeout_s * NANOSECONDS), Watchdog.BRAIN, Mode.STOPPING),
+            (
+                int(Word.RECORDER_ALIVE),
+                round(limits.recorder_timeout_s * NANOSECONDS),
+                Watchdog.RECORDER,
+                Mode.STOPPING,
+            ),
+            (int(Word.PLANT_ALIVE), round(limits.plant_timeout_s * NANOSECONDS), Watchdog.PLANT, Mode.FAULT),
+        ]
+
+    def run(self, start_ns: int | None = None) -> TickGrid:
+        """Run a stretch of ticks, until `Word.PAUSE` or `Word.END` is set; return its grid.
+
+        Args:
+            start_ns: when tick 0 is due [ns]; one period from now if None.
+        """
+        words, clock, sleep, period = self.words, self._clock, self._sleep, self.period_ns
+        start = clock() + period if start_ns is None else start_ns
+        grid = TickGrid(start, period, self.limits.most_misses)
+        words[Word.EXECUTED : Word.CATCH_UP_LOST + 1] = 0
+        words[Word.START] = start
+        words[Word.STRETCH] += 1
+        words[Word.PHASE] = Phase.RUNNING
+        ended = start
+        # Plain numbers: an index of an enumeration costs a call.
+        pause, end, alive = int(Word.PAUSE), int(Word.END), int(Word.CEREBELLUM_ALIVE)
+        executed, skipped, overruns = int(Word.EXECUTED), int(Word.SKIPPED), int(Word.OVERRUNS)
+        while not (words[pause] or words[end]):
+            now = clock()
+            left = grid.next_due_ns - now
+            if left > 0:
+                # On Linux this is clock_nanosleep to an absolute time of this clock.
+                sleep(left / NANOSECONDS)
+                now = clock()
+            slot = grid.begin(now)
+            self._tick(slot, now, ended, grid)
+            ended = clock()
+            grid.end(ended)
+            self._count(slot.due_ns, now, ended, slot.skipped)
+            words[alive] = ended
+            words[executed], words[skipped], words[overruns] = grid.executed, grid.skipped, grid.overruns
+        words[Word.PHASE] = Phase.STANDING
+        return grid
+
+    def _tick(self, slot: Slot, started_ns: int, ended_ns: int, grid: TickGrid) -> None:
+        self._watch(started_ns, grid)
+        now = slot.due_ns - grid.start_ns
+        self._serve(now)
+        ticks = 1
+        if slot.skipped:
+            ticks += min(slot.skipped, self.limits.most_catch_up)
+            self.words[Word.CATCH_UP_LOST] += slot.skipped + 1 - ticks
+        self.cerebellum.tick(now, ticks)
+        self._advance(ticks)
+        self._publish(slot, started_ns, ended_ns, grid)
+
+    def _watch(self, now_ns: int, grid: TickGrid) -> None:
+        for word, timeout, watchdog, mode in self._watched:
+            seen = int(self.words[word])
+            if seen and now_ns - seen > timeout:
+                self.cerebellum.interrupt(watchdog, mode)
+        if grid.too_many_misses:
+            self.cerebellum.interrupt(Watchdog.MISSES, Mode.FAULT)

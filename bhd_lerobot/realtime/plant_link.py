@@ -1,0 +1,250 @@
+"""A cerebellum and a plant in two processes: what passes between them, and when the plant stops by itself.
+
+Actuator commands go one way and readings the other, each through a small `StateRing` in shared memory: both sides take
+the newest entry and neither ever waits. Every command carries the time at which it was written; a plant that sees it
+become too old stops the robot without asking anybody, as a motor controller does whose bus has gone quiet.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.fifo import StateRing
+from bhd_lerobot.realtime.block import LiveBlock
+from bhd_lerobot.control.plant import PlantReading
+
+_COMMANDS = 8  # that are kept; only the newest counts
+
+
+class PlantPhase(IntEnum):
+    """Who commands the actuators."""
+
+    WAITING = 0
+    """Nobody yet: no command has come since the robot was placed or its loop started; the world stands still."""
+    DRIVEN = 1
+    """The cerebellum."""
+    STOPPED = 2
+    """The plant itself: it stopped the robot and holds it, until a fresh command acknowledges the stop."""
+
+
+@dataclass(frozen=True)
+class PlantShape:
+    """Sizes of what a plant publishes.
+
+    Attributes:
+        joints: joints and actuators.
+        positions: generalised positions of the physics.
+        velocities: generalised velocities of the physics.
+        features: floats in an observation.
+        touches: kinds of touches.
+        kept: states that can still be read.
+    """
+
+    joints: int
+    positions: int
+    velocities: int
+    features: int
+    touches: int
+    kept: int
+
+    @property
+    def command_dtype(self) -> np.dtype:
+        """Return the dtype of commands.
+
+        - ``number``: counts from 1; ``stamp_ns``: when it was written, monotonic.
+        - ``acknowledged``: up to which of its own stops the plant may be driven again.
+        - ``actuators``: wheel speeds [rad/s], or joint positions [rad] or torques [N m] and the opening [m].
+        """
+        numbers = [(name, np.int64) for name in ("number", "stamp_ns", "acknowledged")]
+        return np.dtype([*numbers, ("actuators", np.float64, (1, self.joints))])
+
+    @property
+    def state_dtype(self) -> np.dtype:
+        """Return the dtype of states. Times are monotonic [ns].
+
+        - ``index``, ``due_ns``, ``start_ns``: the tick on the plant's grid; ``executed``, ``skipped``, ``overruns``: of
+          them so far.
+        - ``phase``: a `PlantPhase`; ``stops``: how often the plant has stopped by itself; ``stopped_ns``: the tick at
+          which it last did.
+        - ``command``, ``command_ns``: number and stamp of the newest command; ``actuators``: what the actuators got in
+          this tick.
+        - ``stamp_ns``: when what follows was read; ``tick``, ``oldest``: the simulation's tick, and that of the oldest
+          reading in the observation.
+        - ``touches``: in how many ticks there was each kind of touch; ``observation``; ``position``, ``velocity``: of
+          the joints; ``qpos``, ``qvel``: of the physics.
+        """
+        names = ("index", "due_ns", "start_ns", "executed", "skipped", "overruns", "phase", "stops", "stopped_ns")
+        numbers = [(name, np.int64) for name in (*names, "command", "command_ns", "stamp_ns", "tick", "oldest")]
+        sizes = {"actuators": self.joints, "position": self.joints, "velocity": self.joints}
+        sizes |= {"observation": self.features, "qpos": self.positions, "qvel": self.velocities}
+        floats = [(name, np.float64, (1, size)) for name, size in sizes.items()]
+        return np.dtype([*numbers, ("touches", np.int64, (self.touches,)), *floats])
+
+    def sections(self) -> dict[str, int]:
+        """Return what sections a block needs, and their sizes [bytes]."""
+        return {
+            "plant_commands": StateRing.nbytes(self.command_dtype, _COMMANDS),
+            "plant_states": StateRing.nbytes(self.state_dtype, self.kept),
+        }
+
+    def as_dict(self) -> dict[str, int]:
+        """Return the sizes by name, for the description of a block under the key ``plant``."""
+        return asdict(self)
+
+
+class PlantLink:
+    """The two rings between a cerebellum and a plant.
+
+    Attributes:
+        shape: the sizes.
+        commands: what the cerebellum writes, of `PlantShape.command_dtype`.
+        states: what the plant writes, of `PlantShape.state_dtype`.
+
+    Args:
+        shape: the sizes.
+        commands: memory of the size that `PlantShape.sections` says; new memory if None.
+        states: the same for the states.
+    """
+
+    def __init__(self, shape: PlantShape, commands: Any = None, states: Any = None) -> None:
+        self.shape = shape
+        self.commands = StateRing(shape.command_dtype, _COMMANDS, commands)
+        self.states = StateRing(shape.state_dtype, shape.kept, states)
+
+    @classmethod
+    def of(cls, block: LiveBlock) -> Self | None:
+        """Return the link in a block, or None if its robot has no plant in a process of its own."""
+        if "plant" not in block.about:
+            return None
+        shape = PlantShape(**block.about["plant"])
+        return cls(shape, block.section("plant_commands"), block.section("plant_states"))
+
+
+class RemotePlant:
+    """The plant as the cerebellum's process sees it.
+
+    Attributes:
+        state: the newest state, of `PlantShape.state_dtype`; None before there is one.
+
+    Args:
+        link: the rings.
+        clock: monotonic time [ns].
+    """
+
+    n = 1
+
+    def __init__(self, link: PlantLink, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._states, self._commands, self._clock = link.states, link.commands, clock
+        self._record = np.zeros((), link.shape.command_dtype)
+        self._record["number"] = len(link.commands)
+        self._seen = 0
+        self.state: Any = None
+
+    def refresh(self) -> Any:
+        """Take the newest state, and return it."""
+        published = len(self._states)
+        if published != self._seen:
+            self._seen, self.state = published, self._states.latest()
+        return self.state
+
+    @property
+    def has_stopped(self) -> bool:
+        """Whether the plant has stopped by itself, by the state taken last, and that was not acknowledged yet."""
+        return self.state is None or bool(self.state["stops"] > self._record["acknowledged"])
+
+    def acknowledge(self) -> None:
+        """Let the plant be driven again, after the stops that the state taken last tells of."""
+        if self.state is not None:
+            self._record["acknowledged"] = self.state["stops"]
+
+    def read(self, out: PlantReading) -> None:
+        """Write the newest joint readings into `out`; a stop that nobody acknowledged is a fault."""
+        state = self.refresh()
+        if state is not None:
+            out.position[:], out.velocity[:] = state["position"], state["velocity"]
+        out.fault[:] = self.has_stopped
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        """Send actuator commands, shape (1, joints)."""
+        record = self._record
+        record["number"] += 1
+        record["actuators"] = ctrl
+        record["stamp_ns"] = self._clock()
+        self._commands.publish(record)
+
+
+class CommandGuard:
+    """The plant's judgement of the commands that it gets: who commands the actuators in this tick.
+
+    A stop is latched. It ends with a fresh command that acknowledges it, never with commands alone: a cerebellum that
+    was away for a while has not seen where the robot went meanwhile.
+
+    Attributes:
+        phase: who commands.
+        stops: how often the plant has stopped by itself.
+        stopped_ns: when it last did [ns].
+        number: number of the newest command.
+        stamp_ns: when that was written [ns].
+        actuators: the commands in force, shape (1, joints).
+
+    Args:
+        link: the rings.
+        timeout_ns: age at which a command is too old, and so long may the plant itself be away [ns].
+    """
+
+    def __init__(self, link: PlantLink, timeout_ns: int) -> None:
+        self._commands, self._timeout_ns = link.commands, timeout_ns
+        self.phase = PlantPhase.WAITING
+        self.stops = self.stopped_ns = self.number = self.stamp_ns = 0
+        self.actuators = np.zeros((1, link.shape.joints))
+        self._begun = self._acknowledged = self._seen = 0
+        self._checked_ns: int | None = None
+        self._finite = True
+
+    def place(self) -> None:
+        """Forget a stop: the robot was put somewhere else, at rest."""
+        self.phase = PlantPhase.WAITING
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a stretch: commands from before it do not count. A stop stays latched."""
+        self._begun = len(self._commands)
+        self._checked_ns = None
+        if self.phase == PlantPhase.DRIVEN:
+            self.phase = PlantPhase.WAITING
+
+    def check(self, now_ns: int) -> PlantPhase:
+        """Return who commands the actuators now.
+
+        Args:
+            now_ns: the time [ns].
+        """
+        self._take()
+        before, self._checked_ns = self._checked_ns, now_ns
+        away = before is not None and now_ns - before > self._timeout_ns
+        good = self.number > self._begun and self._finite and now_ns - self.stamp_ns <= self._timeout_ns
+        if self.phase == PlantPhase.DRIVEN:
+            if away or not good:
+                self.phase = PlantPhase.STOPPED
+                self.stops += 1
+                self.stopped_ns = now_ns
+        elif good and (self.phase == PlantPhase.WAITING or self._acknowledged >= self.stops):
+            self.phase = PlantPhase.DRIVEN
+        return self.phase
+
+    def _take(self) -> None:
+        written = len(self._commands)
+        if written == self._seen:
+            return
+        self._seen = written
+        command: Any = self._commands.latest()
+        self.number, self.stamp_ns = int(command["number"]), int(command["stamp_ns"])
+        self._acknowledged = int(command["acknowledged"])
+        self._finite = bool(np.isfinite(command["actuators"]).all())
+        if self._finite:
+            self.actuators[:] = command["actuators"]

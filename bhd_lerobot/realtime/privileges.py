@@ -1,0 +1,289 @@
+"""What a process asks of the kernel and of Python, so that it wakes up on time: asked for, reported, given back.
+
+Nothing here is needed for a simulation in lockstep. Each request may be refused; a refusal is reported with its remedy.
+"""
+
+import gc
+import os
+import resource
+import sys
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, suppress
+from dataclasses import asdict, dataclass
+from types import TracebackType
+from typing import Any, Self
+
+from bhd_lerobot.realtime.system_calls import CAP_IPC_LOCK, CAP_SYS_NICE, MCL_CURRENT, MCL_FUTURE, SystemCalls
+from bhd_lerobot.errors import ConfigError, RealtimeError
+
+SLACK_NS = 1  # 0 would mean "the default"
+
+# Remedies, in which {python} is the interpreter and {rtprio} the priority that the limit has to allow.
+GRANT_RIGHTS = (
+    "one of: (1) `sudo setcap cap_sys_nice,cap_ipc_lock+ep {python}`; (2) the lines `@realtime - rtprio {rtprio}` and "
+    "`@realtime - memlock unlimited` in `/etc/security/limits.d/99-realtime.conf`, yourself in the group `realtime`, "
+    "and a new login; (3) in a container, start it with `--cap-add=SYS_NICE --cap-add=IPC_LOCK --ulimit "
+    "rtprio={rtprio} --ulimit memlock=-1`"
+)
+GRANT_BANDWIDTH = (
+    "give the control group real-time time (cgroup v1: `cpu.rt_runtime_us`) or leave it; see that `sysctl "
+    "kernel.sched_rt_runtime_us` is not 0; in a rootless container or a user namespace the capability does not count: "
+    "raise `rtprio` outside of it"
+)
+GRANT_LATENCY_FILE = (
+    'a udev rule: `KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"`; in a container, start it with '
+    "`--device=/dev/cpu_dma_latency`; or `cpupower idle-set -D 10`"
+)
+
+
+def real_interpreter() -> str:
+    """Return the file that runs this program.
+
+    Capabilities belong to a file, and the `python` of a virtual environment is a symbolic link: what is granted to the
+    file behind it is granted to every environment made from the same interpreter. (`python -m venv --copies` makes an
+    environment with a file of its own.)
+    """
+    return os.path.realpath(sys.executable)
+
+
+@dataclass(frozen=True)
+class RealtimeSettings:
+    """What a real-time process asks for.
+
+    Attributes:
+        priority: priority under SCHED_FIFO, 1 to 99, larger is more urgent. The kernel's own interrupt threads have 50.
+        lock_memory: keep all pages in memory, so that none has to be fetched within a tick.
+        hold_cpu_latency: keep processors out of sleep states that take time to leave. Costs power.
+        freeze_collector: keep the garbage collector from running; reference counting goes on.
+        affinity: processors to run on; those of the parent if empty.
+        require: raise an error where SCHED_FIFO is refused, instead of going on without it.
+
+    Raises:
+        ConfigError: the priority or a processor is not one that there is.
+    """
+
+    priority: int = 80
+    lock_memory: bool = True
+    hold_cpu_latency: bool = True
+    freeze_collector: bool = True
+    affinity: tuple[int, ...] = ()
+    require: bool = False
+
+    def __post_init__(self) -> None:
+        if isinstance(self.priority, bool) or not isinstance(self.priority, int) or not 1 <= self.priority <= 99:
+            raise ConfigError(f"The real-time priority is {self.priority!r}; it must be a whole number from 1 to 99.")
+        there = os.sched_getaffinity(0) if self.affinity else set()
+        wrong = [cpu for cpu in self.affinity if isinstance(cpu, bool) or cpu not in there]
+        if wrong:
+            raise ConfigError(
+                f"The affinity names processor(s) {', '.join(map(repr, wrong))}; this process may run on "
+                f"{', '.join(map(str, sorted(there)))}. Leave the affinity empty, or take some of these."
+            )
+
+
+@dataclass(frozen=True)
+class Grant:
+    """What became of one request.
+
+    Attributes:
+        name: "affinity", "collector", "memory lock", "cpu latency", "timer slack" or "scheduler".
+        wanted: what was asked for.
+        granted: whether it is in force.
+        detail: what is in force now.
+        remedy: how to have it granted; empty where it was.
+    """
+
+    name: str
+    wanted: str
+    granted: bool
+    detail: str
+    remedy: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields, as JSON can hold them."""
+        return asdict(self)
+
+
+def describe_refusals(grants: Iterable[Grant]) -> str:
+    """Return a text that says what was refused and how to have it granted, one line each; empty if nothing was."""
+    return "\n".join(
+        f"real time: {grant.name} refused ({grant.wanted}). {grant.detail} Remedy: {grant.remedy}."
+        for grant in grants
+        if not grant.granted
+    )
+
+
+class Privileges:
+    """Acquires what `RealtimeSettings` asks for, and gives it back.
+
+    Everything concerns the thread that calls `acquire` or its whole process, and `release` must be called from the
+    same thread. Threads and processes started later run under SCHED_OTHER (reset on fork).
+
+    Args:
+        calls: how to reach the kernel; the real one if None.
+    """
+
+    def __init__(self, calls: SystemCalls | None = None) -> None:
+        self._calls = calls or SystemCalls()
+        self._undo = ExitStack()
+        self.grants: list[Grant] = []
+        """What became of each request of `acquire`."""
+
+    def acquire(self, settings: RealtimeSettings) -> list[Grant]:
+        """Ask for everything, each independently of the others.
+
+        What takes long comes before the priority is raised, so that it holds up nobody else.
+
+        Args:
+            settings: what to ask for.
+
+        Returns:
+            One grant for each request, the scheduler's last.
+
+        Raises:
+            RealtimeError: SCHED_FIFO was refused and the settings require it, in which case nothing is kept; or
+                this was called before without `release`.
+        """
+        if self.grants:
+            raise RealtimeError("The privileges are held already; call release() first.")
+        wanted: list[Callable[[RealtimeSettings], Grant]] = [self._timer_slack, self._scheduler]
+        if settings.hold_cpu_latency:
+            wanted.insert(0, self._cpu_latency)
+        if settings.lock_memory:
+            wanted.insert(0, self._memory_lock)
+        if settings.freeze_collector:
+            wanted.insert(0, self._collector)
+        if settings.affinity:
+            wanted.insert(0, self._affinity)
+        try:
+            self.grants = [ask(settings) for ask in wanted]
+        except BaseException:
+            self.release()
+            raise
+        scheduler = self.grants[-1]
+        if settings.require and not scheduler.granted:
+            self.release()
+            raise RealtimeError(
+                f"{scheduler.wanted} is required and was refused. {scheduler.detail} Remedy: {scheduler.remedy}; or go "
+                "on without it: require_realtime = false."
+            )
+        return list(self.grants)
+
+    def release(self) -> None:
+        """Give everything back, in reverse order. May be called twice, or without `acquire`."""
+        self.grants = []
+        self._undo.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.release()
+
+    # --- one request each --------------------------------------------------------------------------------------------
+
+    def _affinity(self, settings: RealtimeSettings) -> Grant:
+        wanted = f"processors {', '.join(map(str, sorted(settings.affinity)))}"
+        before = self._calls.affinity()
+        try:
+            self._calls.set_affinity(set(settings.affinity))
+        except OSError as error:
+            now = f"{_why(error)} It runs on processors {', '.join(map(str, sorted(before)))}."
+            return Grant("affinity", wanted, False, now, "take processors that this process may run on, or none")
+        self._undo.callback(self._calls.set_affinity, before)
+        return Grant("affinity", wanted, True, f"{wanted}.")
+
+    def _collector(self, settings: RealtimeSettings) -> Grant:
+        enabled = gc.isenabled()
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        self._undo.callback(gc.unfreeze)
+        if enabled:
+            self._undo.callback(gc.enable)
+        count = gc.get_freeze_count()
+        return Grant("collector", "no garbage collection", True, f"Frozen with {count} objects, and off.")
+
+    def _memory_lock(self, settings: RealtimeSettings) -> Grant:
+        wanted = "all memory locked"
+        limit = self._calls.limit(resource.RLIMIT_MEMLOCK)
+        # With a limit, an allocation beyond it would fail in the middle of a tick: worse than waiting for a page.
+        bounded = limit != resource.RLIM_INFINITY and not self._capable(CAP_IPC_LOCK)
+        try:
+            self._calls.lock_memory(MCL_CURRENT if bounded else MCL_CURRENT | MCL_FUTURE)
+        except OSError as error:
+            limited = f" The limit is {limit // 1024} KiB." if bounded else ""
+            return Grant("memory lock", wanted, False, f"{_why(error)}{limited} Nothing is locked.", _rights(settings))
+        self._undo.callback(self._calls.unlock_memory)
+        if bounded:
+            now = f"What there was is locked; what comes is not, because the limit is {limit // 1024} KiB."
+            return Grant("memory lock", wanted, False, now, _rights(settings))
+        return Grant("memory lock", wanted, True, "All memory is locked, present and future.")
+
+    def _cpu_latency(self, settings: RealtimeSettings) -> Grant:
+        wanted = "0 µs to wake a processor"
+        try:
+            handle = self._calls.hold_cpu_latency(0)
+        except OSError as error:
+            now = f"{_why(error)} Idle processors may sleep deeply."
+            return Grant("cpu latency", wanted, False, now, GRANT_LATENCY_FILE)
+        self._undo.callback(self._calls.close, handle)
+        return Grant("cpu latency", wanted, True, "Held at 0 µs.")
+
+    def _timer_slack(self, settings: RealtimeSettings) -> Grant:
+        # Under SCHED_FIFO there is none; set it in any case, for the fall-back.
+        wanted = f"timer slack {SLACK_NS} ns"
+        before = self._calls.timer_slack()
+        try:
+            self._calls.set_timer_slack(SLACK_NS)
+        except OSError as error:
+            now = f"{_why(error)} The timer slack is {before} ns."
+            return Grant("timer slack", wanted, False, now, "allow prctl(PR_SET_TIMERSLACK) in the sandbox's filter")
+        self._undo.callback(self._restore_slack, before)
+        return Grant("timer slack", wanted, True, f"{self._calls.timer_slack()} ns.")
+
+    def _restore_slack(self, before: int) -> None:
+        with suppress(OSError):
+            self._calls.set_timer_slack(before)
+
+    def _scheduler(self, settings: RealtimeSettings) -> Grant:
+        wanted = f"SCHED_FIFO priority {settings.priority}, reset on fork"
+        policy, priority = self._calls.scheduler()
+        try:
+            self._calls.set_scheduler(os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, settings.priority)
+        except OSError as error:
+            now = (
+                f"{_why(error)} It runs under {_policy(policy)} with a timer slack of {self._calls.timer_slack()} ns: "
+                "wake-ups come later, and any other process can delay them."
+            )
+            limit = self._calls.limit(resource.RLIMIT_RTPRIO)
+            may = self._capable(CAP_SYS_NICE) or limit == resource.RLIM_INFINITY or limit >= settings.priority
+            return Grant("scheduler", wanted, False, now, GRANT_BANDWIDTH if may else _rights(settings))
+        self._undo.callback(self._restore_scheduler, policy, priority)
+        return Grant("scheduler", wanted, True, f"{wanted}.")
+
+    def _restore_scheduler(self, policy: int, priority: int) -> None:
+        try:
+            self._calls.set_scheduler(policy, priority)
+        except PermissionError:
+            # Who has the priority by limit and not by capability may leave SCHED_FIFO, but not clear the flag.
+            self._calls.set_scheduler(policy | os.SCHED_RESET_ON_FORK, priority)
+
+    def _capable(self, capability: int) -> bool:
+        return bool(self._calls.capabilities() >> capability & 1)
+
+
+def _rights(settings: RealtimeSettings) -> str:
+    return GRANT_RIGHTS.format(python=real_interpreter(), rtprio=max(95, settings.priority))
+
+
+def _why(error: OSError) -> str:
+    return f"The kernel said: {error.strerror or error}."
+
+
+def _policy(policy: int) -> str:
+    names = {os.SCHED_OTHER: "SCHED_OTHER", os.SCHED_BATCH: "SCHED_BATCH", os.SCHED_IDLE: "SCHED_IDLE"}
+    names |= {os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
+    return names.get(policy & ~os.SCHED_RESET_ON_FORK, f"policy {policy}")

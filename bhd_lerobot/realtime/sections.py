@@ -1,0 +1,72 @@
+"""The two ends of what goes through a block beyond setpoints and states: requests, results, goals and their plans."""
+
+import time
+from collections.abc import Callable
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.arm.controller import ArmController
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.realtime.block import LiveBlock
+from bhd_lerobot.realtime.mailbox import Mailbox
+from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
+from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestServer, request_dtype
+
+_REQUESTS, _EVENTS = 16, 64
+_REST_S = 0.002  # between two looks of the planner for a request
+
+
+def _dof(cerebellum: Cerebellum) -> int:
+    return len(cerebellum.body.chain.joints) if isinstance(cerebellum.body, Arm) else 0
+
+
+def section_sizes(cerebellum: Cerebellum) -> dict[str, int]:
+    """Return what sections a block needs for one robot, and their sizes [bytes]."""
+    sizes = {
+        "requests": Mailbox.nbytes(request_dtype(_dof(cerebellum)), _REQUESTS),
+        "events": Mailbox.nbytes(EVENT_DTYPE, _EVENTS),
+    }
+    if isinstance(cerebellum.controller, ArmController):
+        sizes["plan"] = PlanLink.nbytes(_dof(cerebellum), cerebellum.control_hz)
+    return sizes
+
+
+def plan_link(block: LiveBlock, dof: int, control_hz: int) -> PlanLink | None:
+    """Return the planning of an arm whose goals the brain's process plans; None for a robot that takes none."""
+    return PlanLink(block.section("plan"), dof, control_hz) if block.has("plan") else None
+
+
+def cerebellum_side(block: LiveBlock, cerebellum: Cerebellum) -> Callable[[int], None]:
+    """Return what answers requests, to be called once a tick with the cerebellum's time."""
+    requests = Mailbox(request_dtype(_dof(cerebellum)), _REQUESTS, block.section("requests"))
+    server = RequestServer(cerebellum, requests, Mailbox(EVENT_DTYPE, _EVENTS, block.section("events")))
+
+    def serve(now_ns: int) -> None:
+        server.serve(time.monotonic_ns())  # requests expire on the clock that both processes share
+
+    return serve
+
+
+class BrainSide:
+    """The brain's process.
+
+    Attributes:
+        client: asks for modes and goals.
+        serve: plans goals until it is told to stop, for a thread; None for a robot that takes no goals.
+
+    Args:
+        block: the block.
+        cerebellum: one like that of the other side; its planner is used.
+        wait: waits for about a tick, and raises if there is nothing to wait for any more.
+    """
+
+    def __init__(self, block: LiveBlock, cerebellum: Cerebellum, wait: Callable[[], None]) -> None:
+        requests = Mailbox(request_dtype(_dof(cerebellum)), _REQUESTS, block.section("requests"))
+        self.client = RequestClient(requests, Mailbox(EVENT_DTYPE, _EVENTS, block.section("events")), wait)
+        self.serve: Callable[[Callable[[], bool]], None] | None = None
+        if isinstance(cerebellum.controller, ArmController):
+            server = PlanServer(block.section("plan"), cerebellum.controller.goals.planner)
+
+            def serve(stop: Callable[[], bool]) -> None:
+                server.serve(stop, lambda: time.sleep(_REST_S))
+
+            self.serve = serve

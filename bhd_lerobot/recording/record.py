@@ -1,0 +1,328 @@
+"""`bhd-record`: episodes of a simulated robot, driven by a brain, into a LeRobotDataset."""
+
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from bhd_lerobot.control.estop import EstopInputs, estop_signal
+from bhd_lerobot.control.tolerance import verdict
+from bhd_lerobot.datasets.format.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
+from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.storage.atomic import is_free
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import ConfigError, DatasetEditedError, RealtimeError, RenderingError
+from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.robots.host.simulation import Simulation, describe
+from bhd_lerobot.cluster.loop import ClusterLoop, open_crew
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import run
+from bhd_lerobot.cli.data.push import check_pushable, left_by_interrupt, push_command, push_dataset, tell
+from bhd_lerobot.hub.transfer import prompt_interrupt
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.recording.language_rows import language_column
+from bhd_lerobot.recording.live_view import live_view
+from bhd_lerobot.rollout.marks import KEYS, Marks
+from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
+from bhd_lerobot.rollout.preview import Preview
+from bhd_lerobot.rollout.provenance import episode_metadata
+from bhd_lerobot.recording.report import RecordResult, tell_refusals, tell_summary
+from bhd_lerobot.rollout.registry import make_brain, make_robot, make_simulation, make_task
+from bhd_lerobot.recording.resume_advice import instead_of_resuming
+from bhd_lerobot.rollout.run_folder import run_folder
+from bhd_lerobot.rollout.signals import stop_on_signals
+from bhd_lerobot.tasks.task import Task, episode_seed, outcomes_of
+
+_ATTEMPTS = 3  # that an episode gets to be punctual
+
+
+def record(config: RecordConfig, console: Console | None = None) -> RecordResult:
+    """Record what a configuration asks for.
+
+    Args:
+        config: what to record.
+        console: where progress is shown; standard error if None.
+
+    Raises:
+        BhdError: the configuration cannot be honoured, or the dataset cannot be written. Episodes that were saved
+            before are intact.
+    """
+    if config.dataset.push_to_hub:
+        check_pushable(config.dataset.repo_id)  # before hours of recording, not after
+    console = console or Console(stderr=True)
+    root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
+    is_here = config.engine == "local"  # otherwise one simulation, which only says what is recorded
+    n = 1 if config.robot.clock == "realtime" or not is_here else min(config.n_envs, config.dataset.num_episodes)
+    simulation = make_robot(config.robot, n, config.threads)
+    # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
+    marks = Marks(n, outcomes_of(config.task.get_choice_name(type(config.task)), config.robot.type))
+    pressed = EstopInputs(simulation.bridge.estop, marks.hear)
+    with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
+        _add_estop_inputs(config, pressed, console)
+        task = make_task(config.task, simulation.n, config.dataset.fps)
+        brain = make_brain(config.brain)
+        # A brain that does not fit the robot fails here, before a dataset exists.
+        if is_here:
+            loop = EpisodeLoop(simulation, task, brain, config.timing)
+        else:
+            crew = cluster.enter_context(open_crew(config.ray, console))
+            loop = ClusterLoop(
+                simulation, task, brain, config.timing, crew=crew, config=config, brain_config=config.brain
+            )
+        loop.marks = marks
+        tell_refusals(simulation, console)
+        preview = _make_preview(config, simulation, console)
+        if simulation.camera_names and is_here:
+            simulation.start_rendering()  # a machine without OpenGL fails here, before a dataset exists
+        with ExitStack() as opened:
+            with run_folder(config, "record") as output_dir:
+                # A view that cannot be started fails before a dataset exists.
+                loop.observer = opened.enter_context(live_view(config, simulation, console))
+                recorder = opened.enter_context(open_recorder(config, root, simulation, task, brain))
+            result = RecordResult(root, output_dir, stopped_by=stop)
+            if recorder.repair_report:
+                console.print(f"Repaired before resuming: {recorder.repair_report}")
+            album, first = _run(config, recorder, loop, result, console)
+        if loop.emergency_stop:
+            result.estop = ", ".join(pressed.causes) or "from another process"
+    if album.added:
+        heading = f"{task.name}, {brain.name}: {result.successes} of {result.recorded} episodes succeeded"
+        album.draw(output_dir / "trajectories.png", heading)
+    if first is not None and preview is not None:
+        states = first.columns[PHYSICS_STATE]
+        preview.write(first.scene, states, config.dataset.fps, output_dir / "episode.mp4")
+        preview.write_strip(first.scene, states, output_dir / "episode.png")
+        preview.close()
+    tell_summary(console, config, result, preview is not None and first is not None)
+    if config.dataset.push_to_hub:
+        _push(config, result, console)
+    return result
+
+
+def _run(
+    config: RecordConfig, recorder: DatasetRecorder, loop: EpisodeLoop, result: RecordResult, console: Console
+) -> tuple[TrajectoryAlbum, Episode | None]:
+    """Run and save the episodes that the dataset lacks; return their trajectories, and the first of them."""
+    task, brain = loop.task, loop.brain
+    album = TrajectoryAlbum()
+    first: Episode | None = None
+    specs = [
+        EpisodeSpec(index, episode_seed(config.seed, index, config.split))  # type: ignore[arg-type]
+        for index in range(recorder.num_episodes, config.dataset.num_episodes)
+    ]
+    if not specs:
+        console.print(
+            f"The dataset has {recorder.num_episodes} episodes already, and {config.dataset.num_episodes} are to be in "
+            "it: nothing is recorded. For more, raise --dataset.num_episodes.",
+            soft_wrap=True,
+        )
+    with _progress(console) as progress:
+        bar = progress.add_task("recording", total=len(specs), success="", speed="")
+        started = time.perf_counter()
+        for episode in _episodes(loop, specs, result, recorder, console):
+            metadata = episode_metadata(episode, split=config.split, task=task.parameters(), brain=brain.parameters())
+            if config.dataset.language and brain.has_plan:
+                said = language_column(episode.plan, episode.columns[SUBTASK], config.dataset.fps)
+                episode.columns[LANGUAGE] = said
+            save_episode(recorder, episode, metadata)
+            result.count(episode, config.dataset.fps)
+            result.wall_s = time.perf_counter() - started
+            album.add(_trajectory(episode, loop.simulation))
+            first = first or episode
+            progress.update(
+                bar,
+                advance=1,
+                success=f"{result.successes}/{result.recorded} succeeded",
+                speed=f"{result.real_time_factor:.0f}x real time",
+            )
+    result.episodes = recorder.num_episodes
+    recorder.finalize()
+    result.wall_s = time.perf_counter() - started if result.recorded else 0.0
+    return album, first
+
+
+def _episodes(
+    loop: EpisodeLoop, specs: list[EpisodeSpec], result: RecordResult, recorder: DatasetRecorder, console: Console
+) -> Iterator[Episode]:
+    """Run episodes; those that were too unpunctual are run again, if that was asked for.
+
+    Raises:
+        RealtimeError: an episode was too unpunctual every time.
+    """
+
+    def stop() -> bool:
+        return bool(result.stopped_by)
+
+    if not (loop.simulation.is_live and loop.tolerance.reject):
+        yield from loop.run(specs, stop, recorder.begin_episode)
+        return
+    for spec in specs:
+        for attempt in range(1, _ATTEMPTS + 1):
+            with closing(loop.run([spec], stop, recorder.begin_episode)) as run_once:
+                episode = next(run_once, None)
+            if episode is None:
+                return
+            if loop.emergency_stop:  # it is not run again, however punctual it was
+                yield episode
+                return
+            why = verdict(episode.timing, loop.tolerance)
+            if why is None:
+                yield episode
+                break
+            if episode.writer is not None:
+                episode.writer.discard()
+            console.print(f"Episode {spec.index}, attempt {attempt} of {_ATTEMPTS}, was not saved: {escape(why)}")
+        else:
+            raise RealtimeError(
+                f"Episode {spec.index} was too unpunctual {_ATTEMPTS} times. Those before it are saved. Mend the cause "
+                "and go on with --resume=true, or save such episodes too, flagged, with --timing.reject=false."
+            )
+
+
+def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Console) -> None:
+    """Let a signal and, in a terminal, a key press the emergency stop.
+
+    Raises:
+        ConfigError: a key was asked for where there is no terminal.
+    """
+    is_live = config.robot.clock == "realtime"
+    number = estop_signal(config.estop_signal)
+    pressed.add_signal(number)
+    has_key = (is_live if config.estop_key is None else config.estop_key) and pressed.add_key()
+    if config.estop_key and not has_key:
+        raise ConfigError("estop_key is true, but standard input is no terminal that this program has to itself.")
+    if is_live:
+        key = "space or e, or " if has_key else ""
+        console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} {os.getpid()}")
+    if has_key:
+        console.print(f"Keys: {KEYS}")
+
+
+def open_recorder(
+    config: RecordConfig, root: Path, simulation: Simulation, task: Task, brain: Brain
+) -> DatasetRecorder:
+    """Open the dataset that a configuration asks for, or go on with it.
+
+    Raises:
+        BhdError: it exists and is not to be resumed, or holds something else.
+    """
+    images = dict.fromkeys(
+        simulation.camera_names, (simulation.config.camera_height, simulation.config.camera_width, 3)
+    )
+    nq, nv = simulation.world.qpos.shape[1], simulation.world.qvel.shape[1]
+    physics = [f"qpos_{i}" for i in range(nq)] + [f"qvel_{i}" for i in range(nv)]
+    features = dataset_features(
+        simulation.observation_names,
+        simulation.action_names,
+        images,
+        physics,
+        task.environment_names,
+        subtask=brain.has_plan,
+        language=brain.has_plan and config.dataset.language,
+    )
+    # What decides the episodes. How many there are, and how many run side by side, does not.
+    recording = {
+        "robot": {
+            key: str(value) if isinstance(value, Path) else value for key, value in describe(simulation.config).items()
+        },
+        "task": task.parameters(),
+        "brain": brain.parameters(),
+        "seed": config.seed,
+        "split": config.split,
+    }
+    goes_on = config.resume and not is_free(root)
+    make = DatasetRecorder.resume if goes_on else DatasetRecorder.create
+    return make(
+        config.dataset.repo_id,
+        config.dataset.fps,
+        features,
+        robot_type=config.robot.type,
+        root=root,
+        recording=recording,
+    )
+
+
+def save_episode(recorder: DatasetRecorder, episode: Episode, metadata: dict[str, Any]) -> None:
+    """Save an episode; when this returns, it survives a kill."""
+    writer = episode.writer or recorder.begin_episode()
+    try:
+        writer.set_columns(episode.columns)
+        recorder.save(writer, task=episode.instruction, metadata=metadata)
+    except BaseException:
+        writer.discard()
+        raise
+
+
+def _trajectory(episode: Episode, simulation: Simulation) -> Trajectory:
+    outcome = episode.outcome
+    title = f"{episode.spec.index}: {outcome.event.cause}, score {outcome.score:.2f}"
+    track = simulation.track(episode.columns[PHYSICS_STATE])
+    return Trajectory(title, episode.scene, track[:, :2], outcome.success)
+
+
+def _make_preview(config: RecordConfig, simulation: Simulation, console: Console) -> Preview | None:
+    if config.preview_video is False:
+        return None
+    try:
+        return Preview(make_simulation(config.robot))
+    except RenderingError as error:
+        if config.preview_video:
+            raise
+        console.print(f"No film of an episode: {error}")
+        return None
+
+
+def _progress(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[success]}"),
+        TextColumn("{task.fields[speed]}"),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def _push(config: RecordConfig, result: RecordResult, console: Console) -> None:
+    dataset = config.dataset
+    again = push_command(result.root, dataset.repo_id, private=dataset.private, tags=dataset.tags)
+    if result.exit_status:
+        said = f"The dataset is not complete, so it was not uploaded. To upload it as it is:\n  {again}"
+    else:
+        private = True if dataset.private else None  # of a repository that exists, whatever it is
+        left = left_by_interrupt(result.root, again)
+        try:
+            with prompt_interrupt(left):
+                said = tell(push_dataset(result.root, dataset.repo_id, private=private, tags=dataset.tags))
+        except KeyboardInterrupt:
+            console.print(escape(f"Stopped; {left}"), soft_wrap=True, highlight=False)
+            raise
+    console.print(escape(said), soft_wrap=True, highlight=False)
+
+
+def _main(config: RecordConfig, arguments: Sequence[str]) -> int:
+    try:
+        return record(config).exit_status
+    except DatasetEditedError as error:
+        for line in instead_of_resuming(config, arguments):
+            error.add_note(line)
+        raise
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `bhd-record`; return the exit status."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    return run(lambda config: _main(config, arguments), RecordConfig, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

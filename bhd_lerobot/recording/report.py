@@ -1,0 +1,124 @@
+"""What a recording run did, counted and told."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.types import Episode
+from bhd_lerobot.rollout.signals import StopRequest
+
+ESTOP_STATUS = 3  # exit status of a run that an emergency stop ended
+
+
+@dataclass
+class RecordResult:
+    """What a run recorded.
+
+    Attributes:
+        root: the dataset.
+        output_dir: the run folder.
+        episodes: episodes that the dataset holds.
+        recorded: episodes that this run added.
+        successes: how many of them were a success.
+        outcomes: how many ended how.
+        scores: their scores.
+        problems: why brains gave up, in words, of the episodes that were no success.
+        frames: frames that this run added.
+        simulated_s: simulated time of the episodes that this run added [s].
+        wall_s: time that this took [s], from the first observation to the last save.
+        stopped_by: the signal that ended the run early, or None.
+        estop: what pressed the emergency stop that ended the run, in words; None if there was none.
+    """
+
+    root: Path
+    output_dir: Path
+    episodes: int = 0
+    recorded: int = 0
+    successes: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    scores: list[float] = field(default_factory=list)
+    problems: Counter[str] = field(default_factory=Counter)
+    frames: int = 0
+    simulated_s: float = 0.0
+    wall_s: float = 0.0
+    stopped_by: StopRequest | None = None
+    estop: str | None = None
+
+    @property
+    def exit_status(self) -> int:
+        """The program's exit status: 0 if the dataset is complete."""
+        if self.estop is not None:
+            return ESTOP_STATUS
+        return self.stopped_by.exit_status if self.stopped_by else 0
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated seconds in a second."""
+        return self.simulated_s / self.wall_s if self.wall_s > 0 else 0.0
+
+    def count(self, episode: Episode, fps: int) -> None:
+        """Count an episode that was saved."""
+        self.recorded += 1
+        self.successes += episode.outcome.success
+        self.outcomes[episode.outcome.event.cause] += 1
+        self.scores.append(episode.outcome.score)
+        if episode.plan.get("problem") and not episode.outcome.success:
+            self.problems[episode.plan["problem"]] += 1
+        self.frames += episode.frames
+        self.simulated_s += episode.frames / fps
+
+
+def tell_refusals(simulation: Simulation, console: Console) -> None:
+    """Say loudly what the system refused the real-time process, and the remedy."""
+    refused = [grant for grant in simulation.grants or () if not grant["granted"]]
+    for grant in refused:
+        console.print(
+            f"[bold]Real time: {grant['name']} was refused.[/bold] {escape(grant['detail'])} {escape(grant['remedy'])}"
+        )
+
+
+def tell_summary(console: Console, config: RecordConfig, result: RecordResult, film: bool) -> None:
+    """Print what the run did; `film` says whether it left a film."""
+    table = Table(title="Recorded", show_header=False, title_justify="left")
+    table.add_row("dataset", f"{result.root} ({result.episodes} episodes)")
+    table.add_row(
+        "this run", f"{result.recorded} episodes, {result.frames} frames, {result.simulated_s:.0f} s simulated"
+    )
+    if result.recorded:
+        table.add_row("success", f"{result.successes} of {result.recorded}")
+        table.add_row("outcomes", ", ".join(f"{name} {count}" for name, count in result.outcomes.most_common()))
+        for problem, count in result.problems.most_common(3):
+            table.add_row("gave up" if count == 1 else f"gave up {count} times", escape(problem))
+        table.add_row("mean score", f"{np.mean(result.scores):.3f}")
+        table.add_row(
+            "speed",
+            f"{result.real_time_factor:.{0 if result.real_time_factor > 9 else 2}f} x real time, {_clock(config)}",
+        )
+    files = [
+        "config.yaml",
+        *(["trajectories.png"] if result.recorded else []),
+        *(["episode.mp4", "episode.png"] if film else []),
+    ]
+    table.add_row("run folder", f"{result.output_dir}: {', '.join(files)}")
+    console.print(table)
+    if result.estop is not None:
+        console.print(
+            f"[bold]Emergency stop ({escape(result.estop)}).[/bold] The episode that was running is saved with the "
+            "outcome 'estop', and no other was begun. Clear the cause and go on with --resume=true."
+        )
+    if result.stopped_by:
+        console.print(
+            f"Stopped by {result.stopped_by.name}. Episodes that were running were dropped, all others are saved. "
+            "Go on with --resume=true: the dropped ones are run again, the same."
+        )
+
+
+def _clock(config: RecordConfig) -> str:
+    return "on the wall clock" if config.robot.clock == "realtime" else f"n_envs = {config.n_envs}"

@@ -1,0 +1,83 @@
+"""Options of a robot on the wall clock."""
+
+from dataclasses import dataclass, field
+
+from bhd_lerobot.realtime.privileges import RealtimeSettings
+from bhd_lerobot.realtime.loop import LoopLimits
+from bhd_lerobot.errors import ConfigError
+
+CLOCKS = ("lockstep", "realtime")
+
+
+@dataclass(kw_only=True)
+class RealtimeConfig:
+    """How a robot runs with ``clock = "realtime"``; without effect on the lockstep clock.
+
+    Attributes:
+        priority: priority of the real-time process under SCHED_FIFO, 1 to 99.
+        lock_memory: keep all of its memory in RAM.
+        hold_cpu_latency: keep the processors from sleeping deeply meanwhile.
+        freeze_collector: run it without Python's garbage collector.
+        affinity: the processors that it may run on; all if empty.
+        brain_timeout_s: after so long without a sign of life of the brain's process the robot decelerates and holds
+            [s].
+        recorder_timeout_s: the same for the recorder's process [s].
+        most_misses: after so many ticks in a row that came a period or more too late the robot stops, with FAULT.
+        most_catch_up: so many missed ticks at the most are caught up at once by the simulation.
+        plant_process: run the simulated world in a process of its own, which stops the robot by itself when it hears
+            nothing from the cerebellum, as a motor controller would.
+        plant_timeout_s: it does that after so long without a command, and the cerebellum goes to FAULT after so long
+            without a sign of life of it [s]; at least two control ticks.
+        buffer_s: so long may the recorder fall behind before a state is lost, and counted [s].
+    """
+
+    priority: int = 80
+    lock_memory: bool = True
+    hold_cpu_latency: bool = True
+    freeze_collector: bool = True
+    affinity: list[int] = field(default_factory=list)
+    brain_timeout_s: float = 0.5
+    recorder_timeout_s: float = 1.0
+    most_misses: int = 10
+    most_catch_up: int = 10
+    plant_process: bool = False
+    plant_timeout_s: float = 0.02
+    buffer_s: float = 8.0
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        for name in ("brain_timeout_s", "recorder_timeout_s", "plant_timeout_s", "buffer_s"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ConfigError(
+                    f"robot.realtime.{name} is {getattr(self, name)}; it must be positive and finite. "
+                    "A time-out of 0 does not mean 'off': the watchdog cannot be turned off."
+                )
+        for name in ("most_misses", "most_catch_up"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"robot.realtime.{name} is {getattr(self, name)}; it must be at least 1.")
+        self.privileges(False)
+
+    def privileges(self, require: bool) -> RealtimeSettings:
+        """Return what to ask the system for, and whether the robot is to stop if that is refused."""
+        return RealtimeSettings(
+            priority=self.priority,
+            lock_memory=self.lock_memory,
+            hold_cpu_latency=self.hold_cpu_latency,
+            freeze_collector=self.freeze_collector,
+            affinity=tuple(self.affinity),
+            require=require,
+        )
+
+    def limits(self) -> LoopLimits:
+        """Return when the loop stops the robot by itself."""
+        return LoopLimits(
+            brain_timeout_s=self.brain_timeout_s,
+            recorder_timeout_s=self.recorder_timeout_s,
+            plant_timeout_s=self.plant_timeout_s,
+            most_misses=self.most_misses,
+            most_catch_up=self.most_catch_up,
+        )

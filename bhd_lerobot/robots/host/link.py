@@ -1,0 +1,300 @@
+"""Starts, feeds and ends the processes of one robot on the wall clock, from the brain's process."""
+
+import contextlib
+import os
+import pickle
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from typing import Any, NoReturn
+
+import numpy as np
+
+from bhd_lerobot.realtime.frame_log import FrameLog
+from bhd_lerobot.realtime.block import LiveLayout, Word
+from bhd_lerobot.realtime.sections import BrainSide, section_sizes
+from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.control.timing import TimingStatistics
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.robots.host.config import RealtimeConfig
+from bhd_lerobot.robots.host.process import LiveSpec
+from bhd_lerobot.robots.host.state import state_dtype
+from bhd_lerobot.robots.host.remote_plant import plant_shape
+from bhd_lerobot.robots.host.simulation import Simulation
+
+_LIFE_S = 0.02  # between two signs of life of this process
+_START_S = 120.0  # that a process may take to import, build its model and warm up
+_ANSWER_S = 30.0  # that it may take to place a scene
+_HEAD_START_S = 0.02  # from the order to run to the first tick
+_SILENCE_S = 2.0  # so long without a sign of life a plant is stopped, or gets no processor time
+_FIFO = 256
+
+
+class LiveLink:
+    """The processes of one robot.
+
+    Attributes:
+        block: what they share.
+        bridge_side: this process's ends of the queues for requests and goals.
+        grants: what the real-time process was granted or refused, as plain values.
+
+    Args:
+        mirror: a simulation like the one that is to run; this process's picture of the robot.
+        config: the robot's configuration.
+        name: name of the running robot, for `bhd-monitor`.
+
+    Raises:
+        ConfigError: the plant's time-out is shorter than two control ticks.
+        RealtimeError: a process could not be started, or real time is required and was refused.
+    """
+
+    def __init__(self, mirror: Simulation, config: Any, name: str) -> None:
+        realtime: RealtimeConfig = config.realtime
+        rates = mirror.rates
+        dtype = state_dtype(mirror)
+        frames = max(64, round(realtime.buffer_s * rates.fps * 4))
+        shape = plant_shape(mirror) if realtime.plant_process else None
+        if shape is not None and realtime.plant_timeout_s * rates.control_hz < 2:
+            raise ConfigError(
+                f"robot.realtime.plant_timeout_s is {realtime.plant_timeout_s:g}; at control_hz = {rates.control_hz} "
+                f"it must be at least {2 / rates.control_hz:g} s, two ticks."
+            )
+        layout = LiveLayout(
+            mirror.cerebellum.width,
+            dtype,
+            _FIFO,
+            max(64, round(realtime.buffer_s * rates.control_hz)),
+            {
+                **section_sizes(mirror.cerebellum),
+                "statistics": TimingStatistics.nbytes,
+                "frames": FrameLog.nbytes(dtype, frames),
+                **({} if shape is None else shape.sections()),
+            },
+        )
+        about = {
+            "robot": config.type,
+            "fps": rates.fps,
+            "control_hz": rates.control_hz,
+            "frames": frames,
+            "actions": list(mirror.action_names),
+            "commands": list(mirror.body.limits.names),
+            "observations": list(mirror.observation_names),
+            "brain_pid": os.getpid(),
+            **({} if shape is None else {"plant": shape.as_dict()}),
+        }
+        self.grants: list[dict[str, Any]] = []
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._pipes: dict[str, Connection] = {}
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
+        self.block = layout.create(name, about)
+        self.log = FrameLog(dtype, frames, self.block.section("frames"))
+        self.bridge_side = BrainSide(self.block, mirror.cerebellum, self.wait)
+        try:
+            self._start(mirror, config, realtime)
+        except BaseException:
+            self.close()
+            raise
+
+    def _start(self, mirror: Simulation, config: Any, realtime: RealtimeConfig) -> None:
+        spec = LiveSpec(
+            simulation=f"{type(mirror).__module__}:{type(mirror).__qualname__}",
+            values=_plain(config),
+            rates=mirror.rates,
+            body=mirror.body,
+            block=self.block.name,
+            privileges=realtime.privileges(config.require_realtime),
+            limits=realtime.limits(),
+        )
+        pickle.dumps(spec)  # what cannot be sent is found out before a process waits for it
+        self._spawn_piped("cerebellum", "bhd_lerobot.robots.host.process")
+        if realtime.plant_process:
+            self._spawn_piped("plant", "bhd_lerobot.robots.host.plant_process")
+        self._spawn("recorder", ["-m", "bhd_lerobot.realtime.recorder_process", self.block.name])
+        self._pipes["cerebellum"].send(spec)
+        if realtime.plant_process:
+            # One above the cerebellum: no command that fails to come, for whatever reason, keeps it from noticing.
+            privileges = replace(spec.privileges, priority=min(spec.privileges.priority + 1, 99))
+            self._pipes["plant"].send(replace(spec, privileges=privileges))
+        self.block.show_life(Word.BRAIN_ALIVE)
+        self._threads.append(threading.Thread(target=self._live, name="bhd-brain-life", daemon=True))
+        serve = self.bridge_side.serve
+        if serve is not None:
+            self._threads.append(threading.Thread(target=serve, args=(self._stop.is_set,), daemon=True))
+        for thread in self._threads:
+            thread.start()
+        self.about = self._answer("ready", _START_S)
+        self.grants = self.about["grants"]
+        if realtime.plant_process:
+            grants = self._answer("ready", _START_S, "plant")["grants"]
+            self.grants = self.grants + [{**grant, "name": f"plant: {grant['name']}"} for grant in grants]
+        self._until(lambda: self.block.words[Word.RECORDER_ALIVE] != 0, _START_S, "The recorder did not start")
+
+    def _spawn(self, name: str, arguments: list[str], descriptors: tuple[int, ...] = ()) -> None:
+        # A session of its own: Ctrl-C in the terminal is for the brain's process, which ends the others in order.
+        self._processes[name] = subprocess.Popen(
+            [sys.executable, *arguments], pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True
+        )
+
+    def _spawn_piped(self, name: str, module: str) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._spawn(name, ["-m", module, str(theirs.fileno())], (theirs.fileno(),))
+        self._pipes[name] = Connection(ours.detach())
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process numbers by name."""
+        return {name: process.pid for name, process in self._processes.items()}
+
+    def place(self, scene: Any, seed: int) -> None:
+        """Put the robot into a scene, at rest; its loop stands."""
+        self.pause()
+        if "plant" in self._pipes:  # first: the cerebellum starts from where the robot is
+            self._ask("place", scene, seed, to="plant")
+            self._answer("place", _ANSWER_S, "plant")
+        self._ask("place", scene, seed)
+        self._answer("place", _ANSWER_S)
+
+    def run(self) -> int:
+        """Start the loop; return when its tick 0 is due, monotonic [ns]."""
+        words = self.block.words
+        words[Word.PAUSE] = 0
+        stretch = int(words[Word.STRETCH])
+        has_plant = "plant" in self._pipes
+        start = time.monotonic_ns() + round(_HEAD_START_S * (1 + has_plant) * NANOSECONDS)
+        if has_plant:
+            self._ask("run", start, to="plant")
+            self._answer("run", _ANSWER_S, "plant")
+            answered = time.monotonic_ns()
+            # The first frame's observation is to be of now.
+            self._until(lambda: words[Word.PLANT_ALIVE] > answered, _ANSWER_S, "The plant did not start")
+        self._ask("run", start)
+        self._running = True
+        self._until(lambda: words[Word.STRETCH] > stretch, _ANSWER_S, "The loop did not start")
+        return start
+
+    _running = False
+
+    def pause(self) -> None:
+        """Let the loop stand; the simulated world stands still with it."""
+        if self._running:
+            self.block.words[Word.PAUSE] = 1
+            self._answer("run", _ANSWER_S)
+            if "plant" in self._pipes:
+                self._answer("stood", _ANSWER_S, "plant")
+            self._running = False
+
+    def check(self) -> None:
+        """Raise if a process has ended, or the plant's is stopped.
+
+        Raises:
+            RealtimeError: names it, and what became of the robot.
+        """
+        for name, process in self._processes.items():
+            status = process.poll()
+            if status is not None:
+                how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+                self._complain(name, how)
+        if self._running and "plant" in self._pipes:
+            silence = time.monotonic_ns() - int(self.block.words[Word.PLANT_ALIVE])
+            if silence > _SILENCE_S * NANOSECONDS:
+                self._complain(
+                    "plant", f"({self.pids['plant']}) has shown no sign of life for {silence / NANOSECONDS:.1f} s"
+                )
+
+    def _complain(self, name: str, how: str) -> NoReturn:
+        alone = "plant" not in self._pipes
+        what = {
+            "cerebellum": "The simulated robot ended with it." if alone else "The plant stops the robot by itself.",
+            "recorder": "The robot decelerates and holds.",
+            "plant": "The cerebellum is in FAULT; the simulated robot stands still.",
+        }[name]
+        raise RealtimeError(f"The {name}'s process {how}. {what} Episodes that were saved are intact.")
+
+    def close(self) -> None:
+        """End all processes. May be called twice."""
+        if self._stop.is_set():
+            return
+        words = self.block.words
+        words[Word.PAUSE] = words[Word.END] = 1
+        for pipe in self._pipes.values():
+            with contextlib.suppress(OSError):
+                pipe.send(("end",))
+        for process in self._processes.values():
+            try:
+                process.wait(5.0)
+            except subprocess.TimeoutExpired:
+                process.kill()  # stopped, or stuck: nothing it holds survives it
+                process.wait()
+        self._stop.set()
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join(5.0)
+        for pipe in self._pipes.values():
+            pipe.close()
+        self.block.close()
+
+    # --- waiting -----------------------------------------------------------------------------------------------------
+
+    def _live(self) -> None:
+        while not self._stop.wait(_LIFE_S):
+            self.block.show_life(Word.BRAIN_ALIVE)
+
+    def wait(self) -> None:
+        """Wait for about a tick.
+
+        Raises:
+            RealtimeError: a process has ended.
+        """
+        self.check()
+        time.sleep(0.0005)
+
+    def _until(self, condition: Callable[[], Any], seconds: float, message: str) -> None:
+        end = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > end:
+                raise RealtimeError(f"{message} within {seconds:g} s.")
+            self.wait()
+
+    def _ask(self, kind: str, *arguments: Any, to: str = "cerebellum") -> None:
+        try:
+            self._pipe(to).send((kind, *arguments))
+        except OSError:
+            self.check()
+            raise
+
+    def _pipe(self, name: str) -> Connection:
+        if self._stop.is_set():
+            raise RealtimeError("The robot's processes have ended.")
+        return self._pipes[name]
+
+    def _answer(self, wanted: str, seconds: float, name: str = "cerebellum") -> Any:
+        connection = self._pipe(name)
+        end = time.monotonic() + seconds
+        while not connection.poll(0.01):
+            self.check()
+            if time.monotonic() > end:
+                raise RealtimeError(f"The {name}'s process did not answer ({wanted}) within {seconds:g} s.")
+        try:
+            kind, value = connection.recv()
+        except (EOFError, OSError):
+            self._processes[name].wait(5.0)
+            self.check()
+            raise RealtimeError(f"The {name}'s process closed its pipe.") from None
+        if kind in ("failed", "refused"):
+            raise RealtimeError(f"The {name}'s process could not do what was asked: {value}")
+        if kind != wanted:
+            raise RealtimeError(f"The {name}'s process answered {kind!r} where {wanted!r} was expected.")
+        return value
+
+
+def _plain(config: Any) -> dict[str, Any]:
+    """Return the values of a configuration that a simulation reads: those that need no class of LeRobot or ours."""
+    kinds = (bool, int, float, str, tuple, type(None), np.integer, np.floating)
+    return {key: value for key, value in vars(config).items() if isinstance(value, kinds)}

@@ -1,0 +1,120 @@
+"""How a plant that hears no commands any more brings its robot to rest, by itself and with its own sensors only."""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm, Body
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics, product
+from bhd_lerobot.control.plant import PlantReading
+
+Array = NDArray[np.float64]
+
+_SLOW = 0.2  # [rad/s] a joint slower than this is held where it is
+_HOLD_RATE = 20.0  # [rad/s] of the critically damped spring that holds an arm with torque motors
+
+
+class PlantStop(Protocol):
+    """What the actuators get from a plant that stops by itself."""
+
+    def begin(self, actuators: Array) -> None:
+        """Start a stop.
+
+        Args:
+            actuators: the last commands, shape (1, joints).
+        """
+
+    def command(self, reading: PlantReading) -> Array:
+        """Return the commands of one tick, shape (1, joints); the array is the stop's own."""
+
+
+class WheelStop:
+    """Wheels that are commanded to stand.
+
+    Args:
+        joints: number of wheels.
+    """
+
+    def __init__(self, joints: int) -> None:
+        self._actuators = np.zeros((1, joints))
+
+    def begin(self, actuators: Array) -> None:
+        """Start a stop."""
+
+    def command(self, reading: PlantReading) -> Array:
+        """Return a speed of 0 for each wheel."""
+        return self._actuators
+
+
+class ServoStop:
+    """Position servos that hold each joint where it is.
+
+    While a joint is fast its servo is commanded to wherever the joint is: it brakes with what its damping gives, up to
+    its largest torque, and does not pull the joint back to where the stop began. Once slow, it holds the joint there.
+    The gripper keeps its last command: what it grips is not let go of.
+
+    Attributes:
+        hold: where the joints are held [rad], the opening last [m], shape (1, joints).
+
+    Args:
+        arm: the arm.
+    """
+
+    def __init__(self, arm: Arm) -> None:
+        self.hold = np.asarray(arm.home)[None].copy()
+        self._held = np.zeros(self.hold.shape, np.bool_)
+
+    def begin(self, actuators: Array) -> None:
+        """Start a stop."""
+        self._held[:] = False
+        self._held[:, -1] = True
+        self.hold[:, -1] = actuators[:, -1]
+
+    def command(self, reading: PlantReading) -> Array:
+        """Return where the joints are to be."""
+        np.copyto(self.hold, reading.position, where=~self._held)
+        self._held |= np.abs(reading.velocity) < _SLOW
+        return self.hold
+
+
+class TorqueStop:
+    """Torque motors that carry the arm's weight, brake it, and then hold it where it is.
+
+    Args:
+        arm: the arm.
+    """
+
+    def __init__(self, arm: Arm) -> None:
+        self._where = ServoStop(arm)
+        self._dynamics = ArmDynamics(arm)
+        self._effort = np.asarray(arm.limits.effort[:-1])
+        self._actuators = self._where.hold.copy()
+
+    def begin(self, actuators: Array) -> None:
+        """Start a stop."""
+        self._where.begin(actuators)
+
+    def command(self, reading: PlantReading) -> Array:
+        """Return torques, and the opening."""
+        hold, dof = self._where.command(reading), self._dynamics.dof
+        position, velocity = reading.position[:, :dof], reading.velocity[:, :dof]
+        terms = self._dynamics.terms(position, velocity)
+        # Every joint brakes alike, whatever hangs on it: the damping is the inertia's, and stable at any rate of ours.
+        wanted = _HOLD_RATE**2 * (hold[:, :dof] - position) - 2 * _HOLD_RATE * velocity
+        torque = product(terms.mass, wanted) + product(terms.coriolis, velocity) + terms.gravity
+        np.minimum(np.maximum(torque, -self._effort), self._effort, out=self._actuators[:, :dof])
+        self._actuators[:, dof:] = hold[:, dof:]
+        return self._actuators
+
+
+def make_stop(body: Body, joints: int) -> PlantStop:
+    """Return how a robot is stopped.
+
+    Args:
+        body: the robot.
+        joints: number of its actuators.
+    """
+    if not isinstance(body, Arm):
+        return WheelStop(joints)
+    return TorqueStop(body) if body.actuation == "torque" else ServoStop(body)

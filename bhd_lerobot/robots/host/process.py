@@ -1,0 +1,245 @@
+"""The real-time process: cerebellum and simulated plant of one robot, ticking on the wall clock.
+
+With a plant in a process of its own (`plant_process`) the cerebellum runs here alone, against what that one publishes.
+
+Started by `LiveLink` as a program of its own, ``python -m bhd_lerobot.robots.host.process``, never forked and not by
+`multiprocessing`, whose children import the main module of their parent: it imports neither torch nor LeRobot. While
+its loop stands it takes messages from a pipe; while the loop runs it reads shared memory only.
+"""
+
+import contextlib
+import gc
+import importlib
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from types import SimpleNamespace
+from typing import Any, Protocol
+
+import numpy as np
+
+from bhd_lerobot.bodies.body import Arm, Body, Rates
+from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
+from bhd_lerobot.realtime.sections import cerebellum_side, plan_link
+from bhd_lerobot.control.messages import NANOSECONDS, Mode
+from bhd_lerobot.control.motion.planning import Planning
+from bhd_lerobot.realtime.plant_link import PlantLink
+from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
+from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
+from bhd_lerobot.control.timing import TimingStatistics
+from bhd_lerobot.errors import BhdError
+from bhd_lerobot.robots.host.state import StatePublisher
+from bhd_lerobot.robots.host.remote_plant import RemoteSimulation
+from bhd_lerobot.robots.host.simulation import Simulation
+
+_WARM_UP_S = 0.2  # ticks before the first real one: caches, pages and branches are as they will be
+_POLL_S = 0.02
+_ORPHAN_S = 5.0  # so long at the most a robot whose brain is gone may take to come to rest before the process ends
+
+
+@dataclass(frozen=True)
+class LiveSpec:
+    """What the process is to run; everything in it can be pickled without LeRobot.
+
+    Attributes:
+        simulation: module and class of the simulation, ``"package.module:Class"``.
+        values: the robot's configuration as plain values.
+        rates: the rates.
+        body: the hardware.
+        block: name of the shared block.
+        privileges: what to ask the system for.
+        limits: when the loop stops the robot.
+    """
+
+    simulation: str
+    values: dict[str, Any]
+    rates: Rates
+    body: Body
+    block: str
+    privileges: RealtimeSettings
+    limits: LoopLimits
+
+    def make_simulation(self, planning: Planning | None = None) -> Simulation:
+        """Return a simulation of one robot.
+
+        Args:
+            planning: who plans its goals, for an arm that takes goals.
+        """
+        module, _, name = self.simulation.partition(":")
+        body = self.body
+        config = SimpleNamespace(**self.values, rates=self.rates, body=lambda: body)
+        kind = getattr(importlib.import_module(module), name)
+        made: Simulation = kind(config, 1, 1) if planning is None else kind(config, 1, 1, planning)
+        return made
+
+
+class LiveProcess:
+    """The process's side of the pipe.
+
+    Args:
+        spec: what to run.
+        connection: the pipe to the brain's process.
+    """
+
+    def __init__(self, spec: LiveSpec, connection: Connection) -> None:
+        self._connection = connection
+        self._block = LiveBlock.attach(spec.block)
+        self._words = self._block.words
+        dof = len(spec.body.chain.joints) if isinstance(spec.body, Arm) else 0
+        planning = plan_link(self._block, dof, spec.rates.control_hz)
+        simulation = spec.make_simulation(planning)
+        link = PlantLink.of(self._block)
+        remote = None if link is None else RemoteSimulation(simulation, link)
+        self._simulation = simulation = simulation if remote is None else remote
+        cerebellum = simulation.cerebellum
+        cerebellum.fifo, cerebellum.estop_word = self._block.fifo, self._block.estop_word
+        self._serve_bridge = cerebellum_side(self._block, cerebellum)
+        self._publisher = StatePublisher(simulation, self._block.ring)
+        if remote is not None:
+            self._publisher = StatePublisher(simulation, self._block.ring, remote.sensed_ns)
+            self._serve_bridge = remote.resuming(self._serve_bridge)
+        period = NANOSECONDS // spec.rates.control_hz
+        self._statistics = TimingStatistics(period, self._block.section("statistics"))
+        self._warm_up_ticks = round(_WARM_UP_S * spec.rates.control_hz)
+        self._parent = os.getppid()
+        self._orphan_ticks = 0
+        self._most_orphan_ticks = round(_ORPHAN_S * spec.rates.control_hz)
+        self._warm = False
+        self._loop = RealtimeLoop(
+            cerebellum,
+            self._words,
+            spec.limits,
+            serve=self._serve,
+            advance=self._advance,
+            publish=self._publisher.publish,
+            count=self._statistics.add,
+        )
+
+    def work(self) -> None:
+        """Take messages until the brain's process says end, or is gone."""
+        answers: dict[str, Callable[..., Any]] = {"place": self._place, "run": self._run}
+        while not self._words[Word.END]:
+            self._words[Word.PHASE] = Phase.STANDING
+            self._block.show_life(Word.CEREBELLUM_ALIVE)
+            if not self._connection.poll(_POLL_S):
+                continue
+            try:
+                kind, *arguments = self._connection.recv()
+            except EOFError:
+                return
+            if kind == "end":
+                return
+            try:
+                self._connection.send((kind, answers[kind](*arguments)))
+            except BhdError as error:
+                self._connection.send(("refused", f"{type(error).__name__}: {error}"))
+            except BrokenPipeError:
+                return
+
+    def _place(self, scene: Any, seed: int) -> None:
+        if not self._warm:
+            self._warm_up(scene, seed)
+        self._reset(scene, seed)
+
+    def _reset(self, scene: Any, seed: int) -> None:
+        self._block.fifo.drop(np.zeros(1, np.intp))
+        self._simulation.reset(np.zeros(1, np.intp), [scene], [seed])
+        gc.collect()  # the loop runs without a collector
+
+    def _warm_up(self, scene: Any, seed: int) -> None:
+        """Run ticks that nobody sees: what happens for the first time takes longest."""
+        self._reset(scene, seed)
+        grid = TickGrid(0, self._loop.period_ns)
+        for tick in range(self._warm_up_ticks):
+            self._simulation.cerebellum.tick(tick * self._loop.period_ns)
+            self._serve_bridge(0)
+            self._advance(1)
+            self._publisher.publish(Slot(tick, 0, 0, 0), 0, 0, grid)
+            self._statistics.add(0, 0, 0, 0)
+        self._warm = True
+
+    def _run(self, start_ns: int) -> tuple[int, int]:
+        """Run a stretch that begins at a monotonic time [ns]; return how many ticks were executed and skipped."""
+        self._statistics.reset()
+        self._publisher.restart(int(self._words[Word.STRETCH]) + 1)
+        # What is so before the first tick: the first frame's observation.
+        before = Slot(-1, start_ns - self._loop.period_ns, 0, 0)
+        self._publisher.publish(before, before.due_ns, before.due_ns, TickGrid(start_ns, self._loop.period_ns))
+        grid = self._loop.run(start_ns)
+        return grid.executed, grid.skipped
+
+    def _serve(self, now_ns: int) -> None:
+        self._serve_bridge(now_ns)
+        if os.getppid() == self._parent:
+            return
+        # Nobody is left to work for: come to rest (the watchdog on the brain sees to that), then end.
+        self._orphan_ticks += 1
+        moving = self._simulation.cerebellum.mode[0] in (Mode.TRACKING, Mode.STOPPING)
+        if not moving or self._orphan_ticks > self._most_orphan_ticks:
+            self._words[Word.END] = 1
+
+    def _advance(self, ticks: int) -> None:
+        for _ in range(ticks):
+            self._simulation.advance()
+
+    def close(self) -> None:
+        """Free everything."""
+        self._words[Word.PHASE] = Phase.ENDED
+        self._simulation.close()
+        self._block.close()
+
+
+class Worker(Protocol):
+    """What one of the robot's real-time processes does."""
+
+    def work(self) -> None:
+        """Take messages until the brain's process says end, or is gone."""
+
+    def close(self) -> None:
+        """Free everything."""
+
+
+def run_worker(make: Callable[[LiveSpec, Connection], Worker]) -> int:
+    """Run a real-time process; the program's one argument is the descriptor of its pipe.
+
+    Args:
+        make: makes what it runs, from what the brain's process sends and the pipe.
+
+    Returns:
+        The process's exit status.
+    """
+    connection = Connection(int(sys.argv[1]))
+    # Keys of the terminal are for the brain's process, which decides what becomes of the robot.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    spec: LiveSpec = connection.recv()
+    try:
+        with Privileges() as privileges:
+            process = make(spec, connection)
+            try:
+                grants = [grant.as_dict() for grant in privileges.acquire(spec.privileges)]
+                heavy = sorted({"torch", "lerobot"} & set(sys.modules))
+                connection.send(("ready", {"grants": grants, "pid": os.getpid(), "heavy": heavy}))
+                process.work()
+            finally:
+                process.close()
+    except BhdError as error:
+        _say(connection, f"{type(error).__name__}: {error}")
+        return 2
+    except Exception:
+        _say(connection, traceback.format_exc())
+        return 1
+    return 0
+
+
+def _say(connection: Connection, what: str) -> None:
+    with contextlib.suppress(OSError):  # the brain's process is gone: nobody wants to know
+        connection.send(("failed", what))
+
+
+if __name__ == "__main__":
+    sys.exit(run_worker(LiveProcess))

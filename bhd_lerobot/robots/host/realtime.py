@@ -1,0 +1,375 @@
+"""A robot on the wall clock, with the interface of a `Simulation` of one.
+
+Cerebellum, physics and recorder run in processes of their own. Here is a mirror: a simulation of the same kind that is
+put into published states, to tell what is true and to render images.
+"""
+
+import itertools
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.commands import BrainCommand, CommandResult
+from bhd_lerobot.control.fifo import RingReader
+from bhd_lerobot.realtime.block import Word
+from bhd_lerobot.realtime.bridge import LiveBridge
+from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
+from bhd_lerobot.control.timing import TimingStatistics
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.robots.host.link import LiveLink
+from bhd_lerobot.robots.host.state import raised
+from bhd_lerobot.robots.host.simulation import Frame, FrameReport, Simulation
+from bhd_lerobot.sim.world import Snapshot
+
+_SILENCE_S = 2.0  # so long after it was due a frame that does not come means that the loop or the recorder is stuck
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """A frame that went by on the wall clock.
+
+    Attributes:
+        number: its number in the episode.
+        seen: the observation that it began with.
+        physics: the simulator's generalised positions and velocities at its start, shape (1, nq + nv).
+        requested: what the brain last asked for by its end, in the space of the actions, shape (1, actions).
+        end: the state at its end.
+        touches: what was touched during it, by kind.
+        lateness_ns: the latest start of one of its ticks [ns].
+        overruns: its ticks that ended after the next was due.
+        skipped: its ticks that were skipped.
+    """
+
+    number: int
+    seen: Frame
+    physics: NDArray[np.float64]
+    requested: NDArray[np.float64]
+    end: Any
+    touches: NDArray[np.bool_]
+    lateness_ns: int
+    overruns: int
+    skipped: int
+
+
+class LiveSimulation(Simulation):
+    """One robot on the wall clock.
+
+    Attributes:
+        mirror: this process's picture of the robot.
+        link: its processes.
+
+    Args:
+        mirror: a simulation of one robot.
+        name: name of the running robot, for `bhd-monitor`.
+
+    Raises:
+        ConfigError: the mirror is of more than one robot.
+        RealtimeError: the processes could not be started, or real time is required and was refused.
+    """
+
+    def __init__(self, mirror: Simulation, name: str) -> None:
+        if mirror.n != 1:
+            raise ConfigError(
+                f"n_envs is {mirror.n}; with robot.clock = 'realtime' one robot runs at a time: use --n_envs=1."
+            )
+        self.mirror, self.config, self.n, self.rates, self.body = mirror, mirror.config, 1, mirror.rates, mirror.body
+        self.world, self.cerebellum, self.camera_names = mirror.world, mirror.cerebellum, mirror.camera_names
+        self.action_names, self.observation_names = mirror.action_names, mirror.observation_names
+        self.view, self.film_speed = mirror.view, mirror.film_speed
+        self.is_live, self.sensor_period_s = True, mirror.sensor_period_s
+        self._begin()
+        self.link = LiveLink(mirror, mirror.config, name)
+        self.live_bridge = LiveBridge(self.link.block, self.rates, self.link.bridge_side.client, self.link.wait)
+        self.bridge = self.live_bridge  # type: ignore[assignment]
+        self.grants = self.link.grants
+        self._frame_ns = NANOSECONDS // self.rates.fps
+        self._reader: RingReader | None = None
+        self._boundary: Any = None  # the newest boundary of a frame that was taken
+        self._shown: Any = None  # the state that the mirror shows
+        self._origin = 0  # when the episode's first observation was taken, monotonic [ns]
+
+    # --- the mirror --------------------------------------------------------------------------------------------------
+
+    def _show(self, state: Any, touches: NDArray[np.bool_] | None = None) -> None:
+        """Put the mirror into a published state."""
+        if self._shown is not state:
+            self._shown = state
+            mirror = self.mirror
+            mirror.restore_physics(0, state["physics"][0])
+            mirror.cerebellum.command[:] = state["command"]
+            mirror.cerebellum.mode[:] = state["mode"]
+        if touches is not None:
+            for flag, touched in zip(self.mirror.touches, touches, strict=True):
+                flag[:] = touched
+
+    def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
+        """Put the mirror into a scene; `reset` does that for the robot, too."""
+        self.mirror.place(ids, scenes)
+
+    def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the robot was in recorded states, shape (frames, 7)."""
+        return self.mirror.track(states)
+
+    def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the newest observation's floats, shape (1, features), and the tick that it belongs to, shape (1,)."""
+        state = self.live_bridge.latest
+        return state["observation"].copy(), np.array([int(state["tick"])])
+
+    def truth(self, report: FrameReport | None = None) -> Any:
+        """Return what is true at the end of a frame; at the start of the present one if None."""
+        if report is not None and report.live is not None:
+            self._show(report.live.end, report.live.touches)
+        elif self._shown is None and self._boundary is not None:
+            self._show(self._boundary["state"])
+        return self.mirror.truth()
+
+    @property
+    def touches(self) -> tuple[NDArray[np.bool_], ...]:
+        """What the mirror was last told about touches."""
+        return self.mirror.touches
+
+    @property
+    def physics_state(self) -> NDArray[np.float64]:
+        """Generalised positions and velocities at the start of the present frame, shape (1, nq + nv)."""
+        if self._boundary is None:  # the episode's time has not begun
+            return self.mirror.physics_state
+        physics: NDArray[np.float64] = self._boundary["state"]["physics"].copy()
+        return physics
+
+    def to_action(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return commands of the cerebellum in the space of the actions."""
+        return self.mirror.to_action(command)
+
+    def snapshot(self, ids: NDArray[np.intp] | None = None) -> Snapshot:
+        """Return the mirror's physics: after a `reset` those that the episode begins with."""
+        return self.mirror.snapshot(ids)
+
+    # --- episodes ----------------------------------------------------------------------------------------------------
+
+    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
+        """Start an episode: put the robot into its scene. Its time begins with the first observation, or with `begin`.
+
+        Raises:
+            RealtimeError: a process has ended or does not answer.
+        """
+        link = self.link
+        link.place(scenes[0], int(seeds[0]))
+        self.mirror.reset(ids, scenes, seeds)
+        self.live_bridge.begin()
+        self._reader = None
+        self._boundary, self._shown = None, None
+        self.running[:] = True
+
+    def begin(self) -> None:
+        """Let the loop run, if it does not yet.
+
+        Raises:
+            RealtimeError: a process has ended or does not answer.
+        """
+        if self._reader is None:
+            self._reader = self.link.log.reader()
+            self._origin = self.link.run() - NANOSECONDS // self.rates.control_hz
+            self._take(0)
+
+    def stop(self, ids: NDArray[np.intp]) -> None:
+        """End the episode: the loop stands."""
+        if len(ids):
+            self.running[:] = False
+            self.link.pause()
+
+    def observe(self) -> Frame:
+        """Return the observation that the present frame began with; its age is what it is now."""
+        self.begin()
+        self._show(self._boundary["state"])
+        return self._frame_of(self._boundary["state"], time.monotonic_ns())
+
+    def latest(self) -> Frame:
+        """Return the newest observation, whatever frame it is in.
+
+        Raises:
+            RealtimeError: a process has ended, or is stopped.
+        """
+        state = self._newest()
+        self._show(state)
+        return self._frame_of(state, time.monotonic_ns())
+
+    def _newest(self) -> Any:
+        """Return the newest state; what a process said that has ended, or is stopped, is none."""
+        self.link.check()
+        state = self.live_bridge.latest
+        silence = (time.monotonic_ns() - int(state["sensed_ns"])) / NANOSECONDS
+        if self._reader is not None and self.running[0] and silence > _SILENCE_S:
+            raise RealtimeError(
+                f"The cerebellum's process ({self.link.pids['cerebellum']}) has published nothing for {silence:.1f} s: "
+                "it is stopped, or gets no processor time. Disconnect and connect again."
+            )
+        return state
+
+    def _frame_of(self, state: Any, seen_ns: int) -> Frame:
+        sensed = int(state["sensed_ns"])
+        age = max(0, seen_ns - sensed) + int(state["oldest_ns"])
+        return Frame(state["observation"].copy(), np.array([sensed - self._origin]), np.array([age]))
+
+    # --- frames ------------------------------------------------------------------------------------------------------
+
+    def send(self, action: NDArray[np.float64], mask: NDArray[np.bool_]) -> tuple[SendResult, dict[int, str]]:
+        """Send a setpoint and return at once: what became of it, and in words why it was refused.
+
+        Raises:
+            RealtimeError: a process has ended, or is stopped.
+        """
+        self._show(self._newest())  # what a tool pose is solved from is where the arm is commanded to be
+        setpoints, refused = self.mirror.to_setpoints(action, mask)
+        if refused:
+            reason, message = refused[0]
+            return SendResult(np.array([reason], np.int8)), {0: message}
+        return self.live_bridge.send(setpoints, mask), {}
+
+    def act(self, action: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> FrameReport:
+        """Send a setpoint, and wait for the end of the present frame."""
+        sent, refusals = self.send(action, self.running if mask is None else mask & self.running)
+        return self.wait(sent, refusals=refusals)
+
+    def follow(self, actions: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> FrameReport:
+        """Send an action chunk that begins with the present frame, and wait for the end of the frame that it is now."""
+        mask = self.running if mask is None else mask & self.running
+        self._show(self.live_bridge.latest)
+        rows: list[NDArray[np.float64]] = []
+        refusals: dict[int, str] = {}
+        reason = int(Reason.ACCEPTED)
+        for action in actions:
+            setpoints, refused = self.mirror.to_setpoints(action, mask)
+            if refused:
+                reason, refusals[0] = int(refused[0][0]), refused[0][1]
+                break
+            rows.append(setpoints)
+        if rows and mask[0]:
+            start = int(self._boundary["frame"]) * self._frame_ns
+            results = self.live_bridge.send_chunk(np.array(rows), start)
+            reason = next((int(one.reasons[0]) for one in results if one.reasons[0]), reason)
+        return self.wait(SendResult(np.array([reason], np.int8)), refusals=refusals)
+
+    def pursue(self, commands: Mapping[int, Sequence[BrainCommand]]) -> FrameReport:
+        """Send goals, and wait for the end of the present frame."""
+        refused = [one for goal in commands.get(0, ()) if (one := self.live_bridge.submit(goal)) is not None]
+        return self.wait(SendResult(np.zeros(1, np.int8)), refused={0: refused} if refused else None)
+
+    def wait(
+        self,
+        sent: SendResult,
+        refused: Mapping[int, Sequence[CommandResult]] | None = None,
+        refusals: Mapping[int, str] | None = None,
+    ) -> FrameReport:
+        """Wait for the end of the frame that it is now; frames that went by before are in `missed` of the report.
+
+        Raises:
+            RealtimeError: a process has ended or is stuck.
+        """
+        # Boundary k is the end of tick k F - 1, one period before k frames.
+        now = time.monotonic_ns() - self._origin
+        last = max(int(self._boundary["frame"]) + 1, now // self._frame_ns + 1)
+        frames: list[tuple[LiveFrame, Any]] = []
+        before = self._boundary
+        while int(before["frame"]) < last:
+            after = self._take(int(before["frame"]) + 1)
+            frames.append((self._between(before, after), before))
+            before = after
+        results = self.live_bridge.take_results()
+        if refused:
+            results = [one for one in refused.get(0, ()) if one not in results] + results
+        reports = []
+        for frame, begun in frames:
+            is_last = frame is frames[-1][0]
+            limits, watchdog = raised(begun["state"], frame.end)
+            reports.append(
+                FrameReport(
+                    applied=self.mirror.to_action(frame.end["command"]),
+                    sent=sent if is_last else SendResult(np.zeros(1, np.int8)),
+                    limits=np.array([limits]),
+                    watchdog=np.array([watchdog]),
+                    command_age_ns=np.array([int(frame.end["command_age_ns"])]),
+                    mode=frame.end["mode"].copy(),
+                    results={0: results} if results and is_last else {},
+                    refusals=(refusals or {}) if is_last else {},
+                    live=frame,
+                )
+            )
+        *missed, report = reports
+        report.missed.extend(missed)
+        return report
+
+    def _between(self, before: Any, after: Any) -> LiveFrame:
+        begun, end = before["state"], after["state"]
+        return LiveFrame(
+            number=int(before["frame"]),
+            seen=self._frame_of(begun, int(begun["sensed_ns"])),  # if the brain did not look at it, nobody waited
+            physics=begun["physics"].copy(),
+            requested=self.mirror.to_action(end["requested"]),
+            end=end,
+            touches=end["touches"] > begun["touches"],
+            lateness_ns=int(after["lateness_ns"]),
+            overruns=int(end["overruns"] - begun["overruns"]),
+            skipped=int(end["skipped"] - begun["skipped"]),
+        )
+
+    def _take(self, number: int) -> Any:
+        """Wait for a boundary of this number or, if that one was lost, a later one."""
+        link, reader = self.link, self._reader
+        if reader is None:
+            raise RealtimeError("The robot is in no episode. Call reset() first.")
+        due = self._origin + number * self._frame_ns
+        while True:
+            entry = reader.read()
+            if entry is not None and int(entry["state"]["stretch"]) == int(link.block.words[Word.STRETCH]):
+                if int(entry["frame"]) >= number:
+                    self._boundary = entry
+                    return entry
+                continue
+            left = due - time.monotonic_ns()
+            if left < -_SILENCE_S * NANOSECONDS:
+                link.check()
+                raise RealtimeError(
+                    f"Frame {number} was due {_SILENCE_S:g} s ago and has not come: the real-time process or the "
+                    "recorder is stopped, or gets no processor time. The robot holds by itself when it hears nothing."
+                )
+            if left > 0:
+                time.sleep(left / NANOSECONDS)
+            else:
+                link.wait()
+
+    def statistics(self) -> TimingStatistics:
+        """Return how punctual the ticks of the present episode are; live."""
+        return TimingStatistics.view(self.link.block.section("statistics"))
+
+    @property
+    def modes(self) -> NDArray[np.int8]:
+        """The newest `Mode`, shape (1,)."""
+        mode: NDArray[np.int8] = self.live_bridge.latest["mode"].copy()
+        return mode
+
+    # --- images ------------------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """End the robot's processes and free the renderers. May be called twice."""
+        super().close()
+        self.mirror.close()
+        self.link.close()
+
+
+def make_live(mirror: Simulation, name: str | None) -> LiveSimulation:
+    """Return a robot on the wall clock.
+
+    Args:
+        mirror: a simulation of one robot.
+        name: the robot's id; its type and this process's number if None.
+    """
+    number = next(_nameless) if name is None else 0
+    return LiveSimulation(mirror, name or f"{mirror.config.type}-{os.getpid()}{f'-{number}' if number else ''}")
+
+
+_nameless = itertools.count()  # several robots of one process that have no id

@@ -1,0 +1,144 @@
+"""A simulation whose world runs in the plant's process, as the cerebellum's process sees it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.arm.controller import ArmController
+from bhd_lerobot.control.base.controller import BaseController
+from bhd_lerobot.control.messages import Mode
+from bhd_lerobot.realtime.plant_link import PlantLink, PlantShape, RemotePlant
+from bhd_lerobot.realtime.loop import Serve
+from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
+
+_LATCHED = (Mode.ESTOP, Mode.FAULT)
+_ODOMETRY = ("x.pos", "y.pos", "theta.pos")
+
+
+def plant_shape(simulation: Simulation) -> PlantShape:
+    """Return the sizes of what the plant of a robot publishes; a second of it is kept."""
+    return PlantShape(
+        joints=simulation.cerebellum.controller.joints,
+        positions=simulation.world.qpos.shape[1],
+        velocities=simulation.world.qvel.shape[1],
+        features=len(simulation.observation_names),
+        touches=len(simulation.touches),
+        kept=simulation.rates.control_hz,
+    )
+
+
+class RemoteSimulation(Simulation):
+    """One robot with its cerebellum here and its world in another process.
+
+    The own world is never stepped: it is put into what the plant publishes.
+
+    Attributes:
+        remote: the plant.
+
+    Args:
+        own: a simulation of one robot, of the same kind as that in the plant's process.
+        link: what both processes share.
+    """
+
+    def __init__(self, own: Simulation, link: PlantLink) -> None:
+        self._own = own
+        self.config, self.n, self.rates, self.body = own.config, 1, own.rates, own.body
+        self.world, self.cerebellum, self.bridge = own.world, own.cerebellum, own.bridge
+        self.action_names, self.observation_names = own.action_names, own.observation_names
+        self.camera_names, self.sensor_period_s = own.camera_names, own.sensor_period_s
+        self._begin()
+        self.remote = self.cerebellum.plant = RemotePlant(link)
+        self._taken: Any = None
+        self._touches: NDArray[np.int64] = np.zeros(len(own.touches), np.int64)  # that it told of
+        has_odometry = set(_ODOMETRY) <= set(own.observation_names)
+        first = own.observation_names.index(_ODOMETRY[0]) if has_odometry else 0
+        self._odometry = slice(first, first + len(_ODOMETRY)) if has_odometry else None
+
+    def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
+        """Put the own world into a scene; the plant's process does that with its own."""
+        self._own.place(ids, scenes)
+
+    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
+        """Start an episode; the plant's process has put its world into the scene already."""
+        state = self.remote.refresh()
+        self.remote.acknowledge()  # stops of another episode
+        self._own.reset(ids, scenes, seeds)
+        self._touches[:] = state["touches"]
+        for flag in self.touches:
+            flag[:] = False
+
+    def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the robot was in recorded states, shape (frames, 7)."""
+        return self._own.track(states)
+
+    def truth(self, report: FrameReport | None = None) -> Any:
+        """Return what is true in the newest state; object poses are those that the world was last put into."""
+        self.advance()
+        return self._own.truth(report)
+
+    @property
+    def touches(self) -> tuple[NDArray[np.bool_], ...]:
+        """What was touched since the flags were cleared last, by kind, live, each of shape (1,)."""
+        return self._own.touches
+
+    def advance(self) -> None:
+        """Take the newest state of the plant, which goes on by itself."""
+        state = self.remote.refresh()
+        if state is None or state is self._taken:
+            return
+        self._taken = state
+        self.tick = int(state["tick"])
+        self.world.qpos[:], self.world.qvel[:] = state["qpos"], state["qvel"]
+        touched = state["touches"] > self._touches
+        if touched.any():
+            self._touches[:] = state["touches"]
+            for flag, one in zip(self.touches, touched, strict=True):
+                flag[:] |= one
+
+    def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the plant's observation, shape (1, features), and the tick of the oldest reading, shape (1,)."""
+        self.advance()
+        state = self.remote.state
+        observation: NDArray[np.float64] = state["observation"].copy()
+        controller = self.cerebellum.controller
+        if self._odometry is not None and isinstance(controller, BaseController):
+            # Odometry is the cerebellum's memory: where it began is known here only.
+            observation[:, self._odometry] = controller.drive.odometry_at(state["position"])
+        return observation, np.array([int(state["oldest"])])
+
+    def sensed_ns(self) -> int:
+        """Return when the plant read what `sense` returned last, monotonic [ns]."""
+        return int(self.remote.state["stamp_ns"])
+
+    def resuming(self, serve: Serve) -> Serve:
+        """Return what answers requests, and lets a plant that stopped by itself be driven again after a reset.
+
+        Args:
+            serve: answers requests.
+        """
+        mode = self.cerebellum.mode
+
+        def serve_and_resume(now_ns: int) -> None:
+            was_latched = mode[0] in _LATCHED
+            serve(now_ns)
+            if was_latched and mode[0] not in _LATCHED and self.remote.has_stopped:
+                self._resume()
+
+        return serve_and_resume
+
+    def _resume(self) -> None:
+        """Let the plant be driven again, from where the robot is."""
+        self.remote.acknowledge()
+        controller = self.cerebellum.controller
+        if isinstance(controller, ArmController):
+            # The plant stopped the arm elsewhere than the reference came to rest: to go there would be a jump.
+            opening = controller.command[0, -1]  # what is gripped is not let go of
+            controller.configure(np.zeros(1, np.intp), self.cerebellum.reading)
+            controller.command[0, -1] = controller.actuators[0, -1] = opening
+
+    def close(self) -> None:
+        """Free everything. May be called twice."""
+        super().close()
+        self._own.close()

@@ -1,0 +1,169 @@
+"""What the real-time process publishes at every tick."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.cerebellum import MOVING, Cerebellum
+from bhd_lerobot.control.fifo import StateRing
+from bhd_lerobot.control.motion.goal_codec import FEEDBACK_DTYPE, encode_feedback
+from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.control.messages import Limit, Reason, Watchdog
+from bhd_lerobot.robots.host.simulation import Simulation
+
+LIMITS, WATCHDOGS = tuple(limit for limit in Limit if limit), tuple(watchdog for watchdog in Watchdog if watchdog)
+
+
+# The numbers that a state begins with, in the order in which they are written.
+_NUMBERS = (
+    *("tick", "stretch", "due_ns", "start_ns", "ended_ns", "executed", "skipped", "overruns"),
+    *("setpoints", "waiting", "command_age_ns", "sensed_ns", "oldest_ns"),
+)
+
+
+def state_dtype(simulation: Simulation) -> np.dtype:
+    """Return the dtype of the published states of one robot.
+
+    Beside the fields of `CerebellumState`:
+
+    - ``tick``: number on the grid of its stretch; ``stretch``: number of the stretch.
+    - ``due_ns``, ``start_ns``: when the tick was due and when it started, monotonic; ``ended_ns``: when the tick before
+      it ended.
+    - ``executed``, ``skipped``, ``overruns``: ticks so far in the stretch.
+    - ``requested``, ``setpoints``: the setpoint taken last, and how many were taken; ``command_age_ns``: its age if it
+      is followed; ``waiting``: entries in the queue.
+    - ``limits``, ``watchdogs``, ``refusals``, ``touches``: how often each was raised so far, of `LIMITS`, `WATCHDOGS`,
+      `Reason`, and of what the simulation tells about touches. Limits are counted once a frame.
+    - ``feedback``: how far the goal is that is followed, once a frame.
+    - ``observation``: the observation's floats; ``sensed_ns``: when they were read, monotonic; ``oldest_ns``: how much
+      older the oldest reading in them was.
+    - ``physics``: the simulator's generalised positions and velocities.
+    """
+    cerebellum = simulation.cerebellum
+    odometry = cerebellum.controller.odometry().shape[1]
+    own = Cerebellum.state_dtype(1, cerebellum.controller.joints, cerebellum.width, odometry)
+    physics = simulation.world.qpos.shape[1] + simulation.world.qvel.shape[1]
+    return np.dtype(
+        [
+            *((name, np.int64) for name in _NUMBERS),
+            *((name, own[name].base, own[name].shape) for name in own.names or () if name != "stamp_ns"),
+            ("requested", np.float64, (1, cerebellum.width)),
+            ("limits", np.int64, (len(LIMITS),)),
+            ("watchdogs", np.int64, (len(WATCHDOGS),)),
+            ("refusals", np.int64, (len(Reason),)),
+            ("touches", np.int64, (len(simulation.touches),)),
+            ("observation", np.float64, (1, len(simulation.observation_names))),
+            ("physics", np.float64, (1, physics)),
+            ("feedback", FEEDBACK_DTYPE),
+        ]
+    )
+
+
+class StatePublisher:
+    """Publishes the states of one robot, into a ring.
+
+    Args:
+        simulation: the robot.
+        ring: where they go, of dtype `state_dtype(simulation)`.
+        clock: monotonic time [ns].
+    """
+
+    def __init__(self, simulation: Simulation, ring: StateRing, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._clock = clock
+        self._simulation, self._cerebellum, self._ring = simulation, simulation.cerebellum, ring
+        self._record = np.zeros(1, state_dtype(simulation))
+        # The one robot's values, as views: an index costs as much as a write.
+        self._field = {name: self._record[name][0] for name in self._record.dtype.names or ()}
+        self._state = self._record[0]
+        self._speed = np.zeros_like(simulation.cerebellum.reading.velocity)
+        self._numbers = np.frombuffer(self._record.data, np.int64, len(_NUMBERS))  # one write instead of thirteen
+        self._feedback = self._state["feedback"]
+        self._touches = np.zeros(len(simulation.touches), np.int64)
+        self._limits, self._watchdogs = np.zeros(len(LIMITS), np.int64), np.zeros(len(WATCHDOGS), np.int64)
+        nq = simulation.world.qpos.shape[1]
+        self._physics = self._field["physics"][:, :nq], self._field["physics"][:, nq:]
+        self._frame = simulation.rates.ticks_per_frame
+        self._next_frame = 0
+        self.stretch = 0
+
+    def restart(self, stretch: int) -> None:
+        """Begin a new stretch."""
+        self.stretch = stretch
+        self._next_frame = 0
+        self._limits[:] = self._watchdogs[:] = self._touches[:] = 0
+
+    def publish(self, slot: Slot, start_ns: int, ended_ns: int, grid: TickGrid) -> None:
+        """Publish what is so at the end of a tick.
+
+        Args:
+            slot: the tick.
+            start_ns: when it started [ns].
+            ended_ns: when its predecessor ended [ns].
+            grid: what the loop has done so far.
+        """
+        simulation, cerebellum, field = self._simulation, self._cerebellum, self._field
+        self._count(slot)
+        controller, reading = cerebellum.controller, cerebellum.reading
+        field["joint_positions"][:], field["joint_velocities"][:] = reading.position, reading.velocity
+        field["joint_efforts"][:] = controller.efforts(reading)
+        field["command"][:], field["measured"][:] = cerebellum.command, controller.measured(reading)
+        field["odometry"][:] = controller.odometry()
+        field["mode"][:], field["requested"][:] = cerebellum.mode, cerebellum.requested
+        np.abs(reading.velocity, out=self._speed)
+        field["is_moving"][:] = np.count_nonzero(self._speed > MOVING) > 0
+        field["emergency_stop"][:] = cerebellum.estop_latched
+        field["refusals"][:] = cerebellum.refusals[:, 0]
+        field["observation"][:], oldest = simulation.sense()
+        self._numbers[:] = (
+            slot.index,
+            self.stretch,
+            slot.due_ns,
+            start_ns,
+            ended_ns,
+            grid.executed,
+            grid.skipped,
+            grid.overruns,
+            cerebellum.setpoints_taken,
+            len(cerebellum.fifo),
+            cerebellum.command_age_of(0, slot.due_ns - grid.start_ns),
+            # Before the first tick everything stands still: what is read then is so until that tick.
+            self._clock() if slot.index >= 0 else slot.due_ns,
+            (simulation.tick - int(oldest[0])) * grid.period_ns,
+        )
+        self._physics[0][:], self._physics[1][:] = simulation.world.qpos, simulation.world.qvel
+        self._ring.publish(self._state)
+
+    def _count(self, slot: Slot) -> None:
+        """Count what was raised since the last tick; limits and watchdogs at the last tick of every frame."""
+        field = self._field
+        flags = [flag[0] for flag in self._simulation.touches]
+        if any(flags):
+            self._touches += flags
+            field["touches"][:] = self._touches
+            for flag in self._simulation.touches:
+                flag[0] = False
+        # The state that a frame ends with holds all that was raised in it, also if its last tick was skipped.
+        frame = (slot.index + 1) // self._frame
+        if frame < self._next_frame:
+            return
+        self._next_frame = frame + 1
+        encode_feedback(self._cerebellum.controller.feedback(0), self._feedback)
+        limits, watchdog = self._cerebellum.take_flags()
+        raised = int(limits[0])
+        if raised:
+            self._limits += [bool(raised & limit) for limit in LIMITS]
+            field["limits"][:] = self._limits
+        raised = int(watchdog[0])
+        if raised:
+            self._watchdogs += [bool(raised & one) for one in WATCHDOGS]
+            field["watchdogs"][:] = self._watchdogs
+
+
+def raised(before: Any, after: Any) -> tuple[int, int]:
+    """Return the `Limit` and `Watchdog` flags that were raised between two published states."""
+    limits = sum(int(limit) for limit, more in zip(LIMITS, after["limits"] > before["limits"], strict=True) if more)
+    seen: NDArray[np.bool_] = after["watchdogs"] > before["watchdogs"]
+    return limits, sum(int(one) for one, more in zip(WATCHDOGS, seen, strict=True) if more)

@@ -1,0 +1,342 @@
+"""The only observe-think-act-record loop: n episodes side by side, each as if it were alone."""
+
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.commands import BrainCommand, CommandResult
+from bhd_lerobot.control.messages import NANOSECONDS, SendResult
+from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
+from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Mixed, Observation
+from bhd_lerobot.robots.faults import add_faults
+from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
+from bhd_lerobot.rollout.drivers import DriverLog, flagged
+from bhd_lerobot.rollout.images import EpisodeImages, Observer
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.tasks.task import Event, Task, outcomes_of
+
+# The brain's random numbers must not be the sensors': two streams of one episode's seed.
+_BRAIN_STREAM = 2
+
+
+class EpisodeLoop:
+    """Runs episodes on n simulations. A simulation that is done with one takes the next.
+
+    What the brain sees and what it asks for are rounded to single precision first, because that is what is recorded: a
+    recorded action, applied again, is exactly the action that was applied.
+
+    Attributes:
+        observer: is shown every frame of every simulation, and every image; None if nobody looks.
+
+    Args:
+        simulation: the robots.
+        task: what is to be achieved.
+        brain: what drives them.
+        tolerance: how unpunctual a frame may be on the wall clock; the defaults if None.
+
+    Attributes:
+        emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
+        marks: takes what a person says about the running episodes.
+    """
+
+    observer: Observer | None = None
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        task: Task,
+        brain: Brain,
+        tolerance: TimingTolerance | None = None,
+    ) -> None:
+        self.simulation, self.task, self.brain = simulation, task, brain
+        self.tolerance = tolerance or TimingTolerance()
+        self.emergency_stop = False
+        self.marks = Marks(simulation.n, outcomes_of(task.name, task.robot_type))
+        self._last_frame = -1  # number of the last frame on the wall clock
+        self._open_images: Callable[[], Any] | None = None
+        self._frames = max(1, round(task.duration_s * simulation.rates.fps))
+        self._columns: dict[str, NDArray] = {}
+        self._length = np.zeros(simulation.n, np.int64)
+        self.frames = 0
+        self._drivers = DriverLog(brain, simulation.n, self._frames)
+        self._truth: Any = None
+        self._results: Mapping[int, Sequence[CommandResult]] = {}
+        environment = task.environment_names
+        brain.bind(simulation.observation_names, simulation.action_names, simulation.rates.fps, environment)
+
+    def run(
+        self,
+        specs: Sequence[EpisodeSpec],
+        stop: Callable[[], bool] = lambda: False,
+        open_images: Callable[[], Any] | None = None,
+    ) -> Generator[Episode]:
+        """Run episodes and yield them in their order, each as soon as it and all before it are done.
+
+        Args:
+            specs: the episodes.
+            stop: asked between frames; when it says yes, the episodes that run are dropped and the loop ends.
+            open_images: called at the start of every episode of a robot with cameras; returns where its images go.
+        """
+        self._open_images = open_images
+        waiting = list(reversed(specs))
+        done: dict[int, Episode] = {}
+        order = [spec.index for spec in specs]
+        n = self.simulation.n
+        self._specs: list[EpisodeSpec | None] = [None] * n
+        self._scenes: list[Any] = [None] * n
+        self._commands: list[list[tuple[int, BrainCommand]]] = [[] for _ in range(n)]
+        self._ends: list[list[tuple[int, CommandResult]]] = [[] for _ in range(n)]
+        self._initial: list[NDArray[np.float64] | None] = [None] * n
+        self._images = EpisodeImages(self.simulation)
+        self.simulation.stop(np.arange(n))
+        self._start(np.arange(n), waiting)
+        try:
+            while self.simulation.running.any():
+                if stop():
+                    return
+                finished = self._frame()
+                for sim, event in finished:
+                    episode = self._finish(sim, event)
+                    done[episode.spec.index] = episode
+                    self.emergency_stop |= event == Event.ESTOP
+                if not finished:
+                    continue
+                ids = np.array([sim for sim, _ in finished])
+                self.simulation.stop(ids)
+                # Before others start: on the wall clock they would begin while these are still being saved.
+                while order and order[0] in done:
+                    yield done.pop(order.pop(0))
+                self._start(ids, waiting)
+        finally:
+            self._images.discard()
+            for episode in done.values():
+                if episode.writer is not None:
+                    episode.writer.discard()
+
+    def _start(self, ids: NDArray[np.intp], waiting: list[EpisodeSpec]) -> None:
+        """Start the next episodes in idle simulations."""
+        ids = ids[: len(waiting)]
+        if not len(ids):
+            return
+        # A person decides when the robot moves again; the stop may also have come between two episodes.
+        self.emergency_stop |= self.simulation.bridge.estop_pressed
+        if self.emergency_stop:
+            waiting.clear()
+            return
+        specs = [waiting.pop() for _ in ids]
+        scenes = [self.task.sample(spec.seed) for spec in specs]
+        self.simulation.reset(ids, scenes, [spec.seed for spec in specs])
+        self.task.begin(ids, scenes)
+        brain_seeds = [int(np.random.SeedSequence([_BRAIN_STREAM, spec.seed]).generate_state(1)[0]) for spec in specs]
+        instructions = [self.task.instruction(scene) for scene in scenes]
+        self.brain.reset(ids, brain_seeds, self.simulation.n, instructions)
+        states = self.simulation.snapshot(ids).state
+        self._results = {sim: results for sim, results in self._results.items() if sim not in ids}
+        for sim, spec, scene, state in zip(ids, specs, scenes, states, strict=True):
+            self._specs[sim], self._scenes[sim], self._initial[sim] = spec, scene, state
+            self._commands[sim], self._ends[sim] = [], []
+            self._images.sinks[sim] = (
+                self._open_images() if self._open_images and self.simulation.camera_names else None
+            )
+        self._length[ids] = 0
+        self._drivers.start(ids)
+        self.marks.begin(ids)
+        self._truth = None
+
+    def _frame(self) -> list[tuple[int, Event]]:
+        """Run one frame of all running simulations; return those that ended, and why."""
+        simulation, task, brain = self.simulation, self.task, self.brain
+        frame = simulation.observe()
+        state = frame.state.astype(np.float32)
+        images = self._images.order_all(self.observer, wanted=brain.uses_images)
+        values: dict[str, NDArray] = {}
+        environment = None
+        if task.environment_names:
+            # What is true at the end of a frame is so at the beginning of the next, unless an episode began in between.
+            truth = simulation.truth() if self._truth is None else self._truth
+            told = task.environment_state(truth).astype(np.float32)
+            environment, values[keys.ENVIRONMENT_STATE] = told.astype(np.float64), told
+        seen = Observation(
+            simulation.observation_names,
+            state.astype(np.float64),
+            images,
+            environment,
+            self._results,
+            simulation.running,
+        )
+        started = time.perf_counter()
+        decision = brain.act(seen)
+        # On the lockstep clock time stands still while the brain thinks.
+        thought = np.full(simulation.n, time.perf_counter() - started if simulation.is_live else 0.0)
+        physics = simulation.physics_state
+        if isinstance(decision, Goals):
+            report = simulation.pursue(decision.commands)
+            action = report.applied.astype(np.float32)
+        elif isinstance(decision, Mixed):
+            action = np.asarray(decision.actions).astype(np.float32)
+            report = simulation.divide(action.astype(np.float64), decision.by_goals, decision.commands)
+        elif decision is None or isinstance(decision, Chunk):
+            if decision is None:
+                report = simulation.wait(SendResult(np.zeros(simulation.n, np.int8)))
+            else:
+                report = simulation.follow(np.asarray(decision.actions).astype(np.float32).astype(np.float64))
+            # What the chunk asks for over this frame; when it is used up, its last.
+            action = simulation.to_action(simulation.cerebellum.requested).astype(np.float32)
+        else:
+            action = np.asarray(decision).astype(np.float32)
+            report = simulation.act(action.astype(np.float64))
+        self._log(decision, report)
+        if brain.has_plan:
+            values[keys.SUBTASK] = np.array(brain.subtasks(), object)
+        values |= {
+            keys.OBSERVATION_STATE: state,
+            keys.ACTION: action,
+            keys.TIME: frame.time_ns / NANOSECONDS,
+            keys.AGE: frame.age_ns / NANOSECONDS,
+            keys.INFERENCE_TIME: thought,
+            keys.PHYSICS_STATE: physics,
+        }
+        finished: list[tuple[int, Event]] = []
+        for one in (*report.missed, report):
+            if one.live is not None:
+                values |= self._live_values(one, is_first=one is (report.missed or [report])[0])
+            finished = self._end_frame(one, values, is_missed=one is not report)
+            if finished:
+                break  # what a robot did after its episode's end is not part of it
+        return finished
+
+    def _end_frame(
+        self, report: FrameReport, values: dict[str, NDArray], *, is_missed: bool
+    ) -> list[tuple[int, Event]]:
+        """Judge and store a frame; return the episodes that ended with it."""
+        simulation = self.simulation
+        running = np.flatnonzero(simulation.running)
+        self._truth = simulation.truth(report)
+        reward, event = self.task.judge(self._truth, simulation.running)
+        event = add_faults(event, report.mode, simulation.running)
+        event, driven = self.marks.frame(event, simulation.running)
+        taken, by_goals = self._drivers.frame(running, self._length, is_missed=is_missed)
+        values |= {
+            # While a goal is followed, what a policy learns from is where the reference was.
+            keys.ACTION: np.where(by_goals[:, None], report.applied.astype(np.float32), values[keys.ACTION]),
+            keys.APPLIED_ACTION: report.applied,
+            keys.COMMAND_AGE: report.command_age_ns / NANOSECONDS,
+            keys.LIMITS: report.limits,
+            keys.WATCHDOG: report.watchdog,
+            keys.MODE: report.mode,
+            keys.REWARD: reward,
+            keys.EVENT: flagged(event, taken | driven),
+        }
+        self._store(running, values)
+        if self.observer is not None:
+            for sim in running.tolist():
+                self.observer(sim, {key: value[sim] for key, value in values.items()})
+        self._length[running] += 1
+        self.frames += len(running)
+        return [(int(sim), Event(int(event[sim]))) for sim in running if event[sim] != Event.NOTHING]
+
+    def _live_values(self, report: FrameReport, *, is_first: bool) -> dict[str, NDArray]:
+        """Return what was measured of a frame on the wall clock.
+
+        The first is the one that the brain saw the beginning of; later ones went by while it was still thinking.
+        """
+        live = report.live
+        self._last_frame = live.number
+        values: dict[str, NDArray] = {
+            keys.ACTION: live.requested.astype(np.float32),
+            keys.LATENESS: np.array([live.lateness_ns / NANOSECONDS]),
+            keys.OVERRUNS: np.array([live.overruns]),
+            keys.SKIPPED: np.array([live.skipped]),
+        }
+        if is_first:
+            return values
+        values |= {
+            keys.OBSERVATION_STATE: live.seen.state.astype(np.float32),
+            keys.TIME: live.seen.time_ns / NANOSECONDS,
+            keys.AGE: live.seen.age_ns / NANOSECONDS,
+            keys.PHYSICS_STATE: live.physics,
+        }
+        if self.task.environment_names:
+            values[keys.ENVIRONMENT_STATE] = self.task.environment_state(self._truth).astype(np.float32)
+        for sim in np.flatnonzero(self.simulation.running).tolist():
+            self._images.order(sim, self.observer)  # what is shown is the end of the frame before: its beginning
+        return values
+
+    def _log(self, decision: Any, report: FrameReport) -> None:
+        """Remember goals and how they ended, for the episode's metadata and for the brain."""
+        self._drivers.decided(decision)
+        if isinstance(decision, Goals | Mixed):
+            for sim, commands in decision.commands.items():
+                self._commands[sim] += [(int(self._length[sim]), command) for command in commands]
+        for sim, results in report.results.items():
+            last = int(self._length[sim]) + len(report.missed)
+            self._ends[sim] += [(last, result) for result in results]
+        self._results = report.results
+
+    def _store(self, running: NDArray[np.intp], values: Mapping[str, NDArray]) -> None:
+        """Write one frame of the running simulations into their columns."""
+        if not self._columns:
+            for key, value in values.items():
+                dtype = keys.SCALARS[key][0] if key in keys.SCALARS else "float32"
+                dtype = {keys.PHYSICS_STATE: "float64", keys.SUBTASK: "object"}.get(key, dtype)
+                self._columns[key] = np.zeros((self.simulation.n, self._frames, *value.shape[1:]), dtype)
+        rows = self._length[running]
+        for key, value in values.items():
+            self._columns[key][running, rows] = value[running]
+
+    def _timing(self, sim: int, columns: dict[str, NDArray]) -> TimingSummary:
+        """Return how punctual an episode was, and add the columns that follow from that."""
+        simulation, length = self.simulation, len(columns[keys.ACTION])
+        rates = simulation.rates
+        if not simulation.is_live:
+            columns |= {key: np.zeros(length, keys.SCALARS[key][0]) for key in keys.PUNCTUALITY}
+            timing = TimingStatistics(NANOSECONDS // rates.control_hz)
+            timing.add_punctual(length * rates.ticks_per_frame)
+            return timing.summary(age=columns[keys.AGE], late=columns[keys.LATE])
+        simulation.stop(np.array([sim]))
+        measured = FrameTiming(*(columns[key] for key in (keys.TIME, keys.AGE, keys.LATENESS, keys.SKIPPED)))
+        columns[keys.LATE] = late_frames(measured, self.tolerance, rates, simulation.sensor_period_s)
+        return simulation.statistics().summary(
+            clock="realtime",
+            age=columns[keys.AGE],
+            inference_time=columns[keys.INFERENCE_TIME],
+            late=columns[keys.LATE],
+            drops=self._last_frame + 1 - length,
+            tolerated=self.tolerance.limits(rates, simulation.sensor_period_s),
+        )
+
+    def _finish(self, sim: int, event: Event) -> Episode:
+        spec, scene, initial = self._specs[sim], self._scenes[sim], self._initial[sim]
+        if spec is None or initial is None:
+            raise AssertionError(f"Simulation {sim} ended an episode that it never started.")
+        writer = self._images.finish(sim)
+        length = int(self._length[sim])
+        columns = {key: column[sim, :length].copy() for key, column in self._columns.items()}
+        outcome = self.task.outcome(sim, event)
+        plan = self.brain.plan(sim) if self.brain.has_plan else {}
+        last = np.arange(length) == length - 1
+        columns[keys.DONE] = last
+        columns[keys.SUCCESS] = last & outcome.success
+        timing = self._timing(sim, columns)
+        return Episode(
+            spec=spec,
+            scene=scene,
+            instruction=plan.get("instruction") or self.task.instruction(scene),
+            initial_state=initial,
+            columns=columns,
+            outcome=outcome,
+            timing=timing,
+            writer=writer,
+            commands=self._commands[sim] if self._drivers.gives_goals else None,
+            results=self._ends[sim],
+            plan=plan,
+            realtime=self.simulation.grants,
+            interventions=self._drivers.interventions(sim, length),
+            goal_frames=self._drivers.goal_frames(sim, length),
+        )

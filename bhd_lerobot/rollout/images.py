@@ -1,0 +1,92 @@
+"""The images of running episodes: ordered when a frame begins, delivered while it goes on."""
+
+from collections.abc import Callable, Mapping
+from concurrent import futures
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.robots.host.simulation import Simulation
+
+Image = NDArray[np.uint8]
+Observer = Callable[[int, Mapping[str, Any]], None]
+"""Is shown a frame: the simulation, and its columns so far by key; or an image, under its camera's key. Must not wait,
+and copy what it keeps; images come on another thread."""
+
+
+class EpisodeImages:
+    """Orders images of n simulations, each for its episode.
+
+    Attributes:
+        sinks: where the images of each simulation go: something with `add_image` and `discard`, or None.
+
+    Args:
+        simulation: the robots.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self.sinks: list[Any] = [None] * simulation.n
+        self._pending: list[list[futures.Future[Image]]] = [[] for _ in range(simulation.n)]
+
+    def order_all(self, observer: Observer | None, *, wanted: bool) -> dict[str, Image]:
+        """Order the images of the running simulations; return them if they are wanted.
+
+        A brain that does not look at images does not wait for them: they are made while the frame goes on.
+
+        Args:
+            observer: is shown them, too.
+            wanted: whether to wait for them.
+        """
+        simulation, cameras = self._simulation, self._simulation.camera_names
+        images: dict[str, Image] = {}
+        running = np.flatnonzero(simulation.running).tolist() if cameras else []
+        for sim in running:
+            self.order(sim, observer)
+        if wanted:
+            height, width = simulation.config.camera_height, simulation.config.camera_width
+            images = {camera: np.zeros((simulation.n, height, width, 3), np.uint8) for camera in cameras}
+            for sim in running:
+                for camera, image in zip(cameras, self._pending[sim][-len(cameras) :], strict=True):
+                    images[camera][sim] = image.result()
+        # What went wrong in the making of an image ends the run now, not at the end of the episode.
+        for waiting in self._pending:
+            while waiting and waiting[0].done():
+                waiting.pop(0).result()
+        return images
+
+    def order(self, sim: int, observer: Observer | None) -> None:
+        """Order the images of what one simulation shows now."""
+        sink = self.sinks[sim]
+        for camera in self._simulation.camera_names:
+            key = f"{keys.OBSERVATION_IMAGES}.{camera}"
+            deliver = None if sink is None else partial(sink.add_image, key)
+            image = self._simulation.render_later(sim, camera, deliver)
+            self._pending[sim].append(image)
+            if observer is not None:
+                image.add_done_callback(partial(_show, observer, sim, key))
+
+    def finish(self, sim: int) -> Any:
+        """Wait for the images of an episode; return where they went."""
+        while self._pending[sim]:
+            self._pending[sim].pop(0).result()
+        sink, self.sinks[sim] = self.sinks[sim], None
+        return sink
+
+    def discard(self) -> None:
+        """Drop the images of all episodes that are running."""
+        for pending in self._pending:
+            futures.wait(pending)
+            pending.clear()
+        for sim, sink in enumerate(self.sinks):
+            self.sinks[sim] = None
+            if sink is not None:
+                sink.discard()
+
+
+def _show(observer: Observer, sim: int, key: str, image: futures.Future[Image]) -> None:
+    if not image.cancelled() and image.exception() is None:
+        observer(sim, {key: image.result()})

@@ -1,0 +1,86 @@
+"""A film and a picture of a recorded episode, rendered from its recorded physics states."""
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.sim.camera import Camera
+
+WIDTH, HEIGHT = 640, 480
+FPS = 20
+STRIP = 2, 3  # rows and columns of the picture
+
+
+class Preview:
+    """Renders episodes from outside. Making one fails early where no image can be rendered.
+
+    Args:
+        simulation: one robot, for this alone.
+
+    Raises:
+        RenderingError: no image can be rendered here.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._camera = Camera(simulation.world, WIDTH, HEIGHT)
+
+    def image(self, scene: Any, state: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Return the scene in one recorded state, shape (HEIGHT, WIDTH, 3)."""
+        self._simulation.place(np.zeros(1, np.intp), [scene])
+        self._show(state)
+        return self._camera.render(0, self._simulation.view)
+
+    def write(self, scene: Any, states: NDArray[np.float64], fps: int, path: Path) -> None:
+        """Write the film of an episode.
+
+        Args:
+            scene: where it was.
+            states: recorded physics states, shape (frames, nq + nv).
+            fps: recorded frames a second [Hz].
+            path: the MP4 file.
+        """
+        import av  # a run without a film does not need FFmpeg
+
+        self._simulation.place(np.zeros(1, np.intp), [scene])
+        # Every film frame shows the recorded frame nearest to its time.
+        frames = np.arange(0, len(states), fps * self._simulation.film_speed / FPS).round().astype(int)
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("h264", rate=Fraction(FPS), options={"crf": "24", "preset": "veryfast"})
+            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+            for index in frames[frames < len(states)]:
+                self._show(states[index])
+                image = self._camera.render(0, self._simulation.view)
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            container.mux(stream.encode())
+
+    def write_strip(self, scene: Any, states: NDArray[np.float64], path: Path) -> None:
+        """Write a picture of an episode: some of its frames, evenly spaced, in rows.
+
+        Args:
+            scene: where it was.
+            states: recorded physics states, shape (frames, nq + nv).
+            path: the PNG file.
+        """
+        from matplotlib.image import imsave
+
+        self._simulation.place(np.zeros(1, np.intp), [scene])
+        images = []
+        for index in np.linspace(0, len(states) - 1, STRIP[0] * STRIP[1]).round().astype(int):
+            self._show(states[index])
+            images.append(self._camera.render(0, self._simulation.view))
+        rows = [np.concatenate(images[row : row + STRIP[1]], axis=1) for row in range(0, len(images), STRIP[1])]
+        imsave(path, np.concatenate(rows))
+
+    def _show(self, state: NDArray[np.float64]) -> None:
+        world = self._simulation.world
+        nq = world.qpos.shape[1]
+        world.qpos[0], world.qvel[0] = state[:nq], state[nq:]
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self._camera.close()

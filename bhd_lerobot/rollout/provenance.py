@@ -1,0 +1,124 @@
+"""What is stored with every episode, so that it can be understood and run again."""
+
+import json
+from dataclasses import asdict
+from functools import cache
+from importlib import metadata
+from typing import Any
+
+from bhd_lerobot import __version__
+from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.bodies.tabletop import TableObject, TableScene, Variation
+from bhd_lerobot.control.commands import BrainCommand, Pose
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rollout.types import Episode
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what decides an episode."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
+    # Read once: looking them up reads the distributions' metadata, which takes longer than saving an episode.
+    return {"bhd_lerobot": __version__, **{name: metadata.version(name) for name in ("lerobot", "mujoco", "numpy")}}
+
+
+def episode_metadata(episode: Episode, *, split: str, task: dict[str, Any], brain: dict[str, Any]) -> dict[str, Any]:
+    """Return the metadata columns of an episode: plain values, structures as JSON."""
+    outcome = episode.outcome
+    return {
+        "episode": episode.spec.index,
+        # As text: a 63-bit number does not survive a reader that takes numbers for floats.
+        "seed": str(episode.spec.seed),
+        "split": split,
+        "success": outcome.success,
+        "outcome": outcome.event.cause,
+        "score": outcome.score,
+        **outcome.details,
+        "task": _json(task),
+        "brain": _json(brain),
+        "scene": scene_to_json(episode.scene),
+        "initial_state": episode.initial_state.tolist(),
+        "timing": _json(asdict(episode.timing)),
+        "versions": _json(versions()),
+        **({} if episode.realtime is None else {"realtime": _json(episode.realtime)}),
+        **_goals(episode),
+        **_interventions(episode),
+    }
+
+
+def _goals(episode: Episode) -> dict[str, Any]:
+    """Return the plan, the goals and how they ended, of an episode that was driven by goals."""
+    columns: dict[str, Any] = {}
+    if episode.plan:
+        columns["plan"] = _json(episode.plan)
+    if episode.commands is not None:
+        columns["goals"] = _json([[frame, asdict(command)] for frame, command in episode.commands])
+        columns["results"] = _json(
+            [[frame, one.task_id, one.success, one.code.name.lower(), one.message] for frame, one in episode.results]
+        )
+    if episode.goal_frames is not None:
+        columns["goal_frames"] = _json(episode.goal_frames)
+    return columns
+
+
+def _interventions(episode: Episode) -> dict[str, Any]:
+    """Return when somebody else than the brain drove, if there was anybody to do so."""
+    if episode.interventions is None:
+        return {}
+    return {
+        "intervened_frames": sum(one.end - one.first for one in episode.interventions),
+        "interventions": _json([[one.first, one.end, one.cause] for one in episode.interventions]),
+    }
+
+
+def scene_to_json(scene: Any) -> str:
+    """Return a scene as JSON: a replay needs no generator that may have changed since."""
+    if isinstance(scene, Arena):
+        return _json(
+            {
+                "name": scene.name,
+                "extent": scene.extent,
+                "start": scene.start,
+                "shapes": [[s.kind, s.x, s.y, s.yaw, s.size_x, s.size_y, s.height] for s in scene.shapes],
+                **({} if scene.goal is None else {"goal": scene.goal}),
+            }
+        )
+    return _json(asdict(scene))
+
+
+def scene_from_json(text: str) -> Any:
+    """Return the scene that `scene_to_json` wrote: an `Arena` or a `TableScene`.
+
+    Raises:
+        DatasetError: the text is no scene.
+    """
+    try:
+        scene = json.loads(text)
+        if "shapes" in scene:
+            shapes = tuple(Shape(*row) for row in scene["shapes"])
+            goal = tuple(scene["goal"]) if "goal" in scene else None
+            return Arena(scene["name"], shapes, tuple(scene["extent"]), tuple(scene["start"]), goal)
+        objects = tuple(TableObject(**_tuples(one)) for one in scene.pop("objects"))
+        variation = Variation(**_tuples(scene.pop("variation")))
+        return TableScene(objects=objects, variation=variation, **_tuples(scene))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"The recorded scene cannot be read: {error!r}.") from error
+
+
+def command_from_json(fields: dict[str, Any]) -> BrainCommand:
+    """Return the goal whose fields were recorded."""
+    pose = fields["target_pose"]
+    return BrainCommand(**{**_tuples(fields), "target_pose": None if pose is None else Pose(**_tuples(pose))})
+
+
+def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
+    """JSON knows lists only."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()}
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"))

@@ -1,0 +1,316 @@
+"""`bhd-replay`: run a recorded episode again, and say how far it came out differently.
+
+Open loop: the recorded actions, from the recorded initial state, through a new cerebellum and new physics. State-exact:
+the robot is put into each recorded physics state, and its sensors are read again.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.robots.config import RobotConfig
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from bhd_lerobot.control.commands import BrainCommand
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.rollout.configuration import run
+from bhd_lerobot.rollout.plots import draw_divergence
+from bhd_lerobot.rollout.provenance import command_from_json, scene_from_json, versions
+from bhd_lerobot.rollout.registry import make_simulation
+
+MODES = ("open_loop", "state", "both")
+
+
+@dataclass
+class ReplayDatasetConfig:
+    """Which episode is replayed. The names are those of `lerobot-replay`.
+
+    Attributes:
+        repo_id: name of the dataset.
+        root: folder of the dataset; LeRobot's default place if nothing.
+        episode: its number in the dataset.
+    """
+
+    repo_id: str = "bhd/replay"
+    root: str | None = None
+    episode: int = 0
+
+
+@dataclass
+class ReplayConfig:
+    """Replay a recorded episode in simulation, and report how far it diverges from the recording.
+
+    Attributes:
+        dataset: which episode.
+        mode: `open_loop`, `state`, or `both`.
+        output_dir: where the plots go; `outputs/replay` if nothing.
+        tolerance_m: largest position difference that counts as the same [m]; beyond it the exit status is 1.
+    """
+
+    dataset: ReplayDatasetConfig = field(default_factory=ReplayDatasetConfig)
+    mode: str = "both"
+    output_dir: str | None = None
+    tolerance_m: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        if self.mode not in MODES:
+            raise ConfigError(unknown_name("mode", self.mode, MODES))
+        if self.tolerance_m is not None and not self.tolerance_m >= 0:
+            raise ConfigError(f"tolerance_m is {self.tolerance_m}; it must be 0 or positive.")
+
+
+@dataclass(frozen=True)
+class Divergence:
+    """How far a replay is from its recording, per frame.
+
+    Attributes:
+        mode: how it was replayed.
+        position_m: distance of the base positions [m], shape (frames,).
+        angle_rad: difference of the base's yaw [rad], shape (frames,).
+        state: largest difference of any recorded physics value, in its own unit, shape (frames,).
+        observation: largest difference of any compared observation, in its own unit, shape (frames,).
+        recorded_xy: recorded positions of base or tool [m], shape (frames, 2).
+        replayed_xy: replayed positions of base or tool [m], shape (frames, 2).
+        not_compared: observations that this mode cannot reproduce.
+    """
+
+    mode: str
+    position_m: NDArray[np.float64]
+    angle_rad: NDArray[np.float64]
+    state: NDArray[np.float64]
+    observation: NDArray[np.float64]
+    recorded_xy: NDArray[np.float64]
+    replayed_xy: NDArray[np.float64]
+    not_compared: tuple[str, ...] = ()
+
+    @property
+    def identical(self) -> bool:
+        """Whether states and observations are the recorded ones, bit for bit."""
+        return not self.state.any() and not self.observation.any()
+
+
+class Replay:
+    """One recorded episode and a simulation of its robot.
+
+    Args:
+        root: the dataset.
+        episode: the episode's number in it.
+
+    Raises:
+        DatasetError: the dataset, or what a replay needs of it, is missing.
+    """
+
+    def __init__(self, root: Path, episode: int) -> None:
+        summary = dataset_info(root)
+        self.columns = read_episode(root, episode)
+        metadata = summary.episodes[episode].metadata
+        missing = [key for key in (keys.PHYSICS_STATE, keys.ACTION, keys.AGE) if key not in self.columns]
+        missing += [key for key in ("scene", "initial_state", "seed") if key not in metadata]
+        if missing or "robot" not in summary.recording:
+            raise DatasetError(
+                f"{root} was not recorded by bhd-record: it lacks {', '.join(missing) or 'the robot parameters'}. "
+                "Replay its actions on a robot with lerobot-replay."
+            )
+        self.metadata = metadata
+        self.scene = scene_from_json(metadata["scene"])
+        self.seed = int(metadata["seed"])
+        self.fps = summary.fps
+        self.simulation = make_simulation(_robot_config(summary.recording["robot"]))
+        self.goals: dict[int, list[BrainCommand]] | None = None
+        if metadata.get("goals"):
+            self.goals = {}
+            for frame, fields_ in json.loads(metadata["goals"]):
+                self.goals.setdefault(frame, []).append(command_from_json(fields_))
+        # Frames in which goals were followed; in the others, the recorded actions were the setpoints.
+        self._by_goals = np.full(len(self.columns[keys.ACTION]), self.goals is not None)
+        if metadata.get("goal_frames"):
+            self._by_goals[:] = False
+            for first, end in json.loads(metadata["goal_frames"]):
+                self._by_goals[first:end] = True
+        self._initial = np.asarray(metadata["initial_state"], np.float64)
+        self.is_live = summary.recording["robot"].get("clock") == "realtime"
+
+    def changed_versions(self) -> dict[str, tuple[str, str]]:
+        """Return what has another version than at the recording: name to recorded and present version."""
+        recorded = json.loads(self.metadata["versions"])
+        return {
+            name: (recorded.get(name, "none"), now) for name, now in versions().items() if recorded.get(name) != now
+        }
+
+    def open_loop(self) -> Divergence:
+        """Replay the recorded commands from the recorded initial state.
+
+        They are the recorded actions, or, where the robot was driven by goals, the goals.
+        """
+        simulation = self._start()
+        actions = self.columns[keys.ACTION].astype(np.float64)
+        states, observations = [], []
+        for frame, action in enumerate(actions):
+            states.append(simulation.physics_state[0])
+            observations.append(simulation.observe().state[0])
+            if self.goals is not None and self._by_goals[frame]:
+                simulation.pursue({0: self.goals.get(frame, [])})
+            else:
+                simulation.act(action[None])
+        return self._compare("open_loop", np.array(states), np.array(observations), ())
+
+    def state_exact(self) -> Divergence:
+        """Put the robot into every recorded state and read its sensors again."""
+        simulation = self._start()
+        states, observations = [], []
+        ages = self.columns[keys.AGE]
+        for frame, state in enumerate(self.columns[keys.PHYSICS_STATE]):
+            simulation.restore_physics(0, state)
+            simulation.resense(0, float(self.columns[keys.TIME][frame]), float(ages[frame]))
+            states.append(simulation.physics_state[0])
+            observations.append(simulation.observe().state[0])
+        return self._compare("state", np.array(states), np.array(observations), simulation.not_in_state)
+
+    def _start(self) -> Simulation:
+        simulation = self.simulation
+        first = np.zeros(1, np.intp)
+        simulation.reset(first, [self.scene], [self.seed])
+        world = simulation.world
+        if self._initial.shape != world.snapshot().state.shape[1:]:
+            raise DatasetError(
+                f"The recorded initial state has {len(self._initial)} numbers; this version's simulation has "
+                f"{world.snapshot().state.shape[1]}. Replay it with the versions that recorded it: "
+                f"{self.metadata['versions']}."
+            )
+        world.restore(replace(world.snapshot(), state=self._initial[None]))
+        return simulation
+
+    def _compare(
+        self, mode: str, states: NDArray[np.float64], observations: NDArray[np.float64], skipped: tuple[str, ...]
+    ) -> Divergence:
+        recorded = self.columns[keys.PHYSICS_STATE]
+        names = self.simulation.observation_names
+        kept = np.array([name not in skipped for name in names])
+        # A scan that fell between two frames is not in any recorded state.
+        fresh = self.columns[keys.AGE] == 0 if mode == "state" else np.ones(len(recorded), bool)
+        scan = np.array([name.startswith("scan_") for name in names])
+        difference = np.abs(observations.astype(np.float32) - self.columns[keys.OBSERVATION_STATE])
+        difference[np.ix_(~fresh, scan)] = 0.0
+        now, then = self.simulation.track(states), self.simulation.track(recorded)
+        return Divergence(
+            mode=mode,
+            position_m=np.sqrt(((now[:, :3] - then[:, :3]) ** 2).sum(axis=1)),
+            angle_rad=_angle(now[:, 3:], then[:, 3:]),
+            state=np.abs(states - recorded).max(axis=1),
+            observation=difference[:, kept].max(axis=1),
+            recorded_xy=then[:, :2],
+            replayed_xy=now[:, :2],
+            not_compared=skipped,
+        )
+
+
+def replay(config: ReplayConfig, console: Console | None = None) -> list[Divergence]:
+    """Replay an episode, print how far it diverges, and draw it.
+
+    Raises:
+        DatasetError: the dataset cannot be replayed.
+    """
+    console = console or Console(stderr=True)
+    root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
+    episode = Replay(root, config.dataset.episode)
+    folder = Path(config.output_dir or "outputs/replay").expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
+    for name, (then, now) in episode.changed_versions().items():
+        console.print(f"Recorded with {name} {then}, replayed with {now}: differences may come from that.")
+    if episode.is_live:
+        console.print(
+            "Recorded on the wall clock: commands took effect when they came, not at the start of a frame. open_loop "
+            "gives them at the start and so differs; state shows whether the record is true to itself."
+        )
+    results = []
+    table = Table(title=f"Replay of episode {config.dataset.episode} of {root}", title_justify="left")
+    for heading in ("largest difference", "frames", "position", "angle", "state", "observed", ""):
+        table.add_column(heading, justify="left" if heading in ("largest difference", "") else "right")
+    for mode in ("open_loop", "state") if config.mode == "both" else (config.mode,):
+        result = episode.open_loop() if mode == "open_loop" else episode.state_exact()
+        results.append(result)
+        table.add_row(
+            mode,
+            str(len(result.state)),
+            *(
+                f"{values.max():.3g}"
+                for values in (result.position_m, result.angle_rad, result.state, result.observation)
+            ),
+            "identical" if result.identical else "",
+        )
+        if result.not_compared:
+            table.caption = f"Not compared in mode state: {', '.join(result.not_compared)}."
+        curves: dict[str, Any] = {
+            "position [m]": result.position_m,
+            "angle [rad]": result.angle_rad,
+            "observation, largest": result.observation,
+        }
+        time = np.arange(len(result.state)) / episode.fps
+        heading = f"Episode {config.dataset.episode}, replay mode {mode}"
+        path = folder / f"episode_{config.dataset.episode:06d}_{mode}.png"
+        draw_divergence(
+            scene=episode.scene,
+            recorded=result.recorded_xy,
+            replayed=result.replayed_xy,
+            time=time,
+            curves=curves,
+            heading=heading,
+            path=path,
+        )
+    console.print(table)
+    console.print(f"Plots: {folder}")
+    return results
+
+
+def _angle(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angles between orientations, exactly 0 for equal ones."""
+    # A quaternion and its negative are the same orientation.
+    apart, across = first - second, first + second
+    chord = np.sqrt(np.minimum((apart * apart).sum(axis=1), (across * across).sum(axis=1)))
+    return np.asarray(4 * np.arcsin(np.minimum(chord / 2, 1.0)))
+
+
+def _robot_config(recorded: dict[str, Any]) -> Any:
+    """Return the configuration of the robot that recorded an episode, without cameras."""
+    try:
+        kind = RobotConfig.get_choice_class(recorded["type"])
+    except KeyError:
+        raise DatasetError(f"The dataset was recorded by an unknown robot, {recorded.get('type')!r}.") from None
+    known = {one.name for one in fields(kind)}
+    # Replayed in simulated time, whatever clock it was recorded on.
+    parameters = {key: value for key, value in recorded.items() if key in known and key != "realtime"}
+    return kind(**{**parameters, "camera": False, "clock": "lockstep"})
+
+
+def _main(config: ReplayConfig) -> int:
+    results = replay(config)
+    worst = max(float(result.position_m.max()) for result in results)
+    return int(config.tolerance_m is not None and worst > config.tolerance_m)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `bhd-replay`; return the exit status: 1 if the replay differs by more than `tolerance_m`."""
+    return run(_main, ReplayConfig, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,53 @@
+"""The folder of a run: its configuration, results and pictures."""
+
+import contextlib
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.rollout.configuration import encode
+
+CONFIG = "config.yaml"
+
+
+@contextlib.contextmanager
+def run_folder(config: Any, kind: str) -> Iterator[Path]:
+    """Make the folder of a run, with its resolved configuration; if the block fails, the run was refused.
+
+    A run that was refused leaves no folder; what was there before stays.
+
+    Args:
+        config: of the run, with `output_dir`, `robot` and `task`.
+        kind: of the run, for the default place: ``record`` or ``eval``.
+
+    Raises:
+        ConfigError: the folder cannot be written.
+    """
+    if config.output_dir:
+        folder = Path(config.output_dir).expanduser()
+    else:
+        now = datetime.now()
+        name = f"{now:%H-%M-%S}_{config.robot.type}_{config.task.get_choice_name(type(config.task))}"
+        folder = Path("outputs") / kind / f"{now:%Y-%m-%d}" / name
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        before = (folder / CONFIG).read_bytes() if (folder / CONFIG).is_file() else None
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
+    try:
+        yield folder
+    except BaseException:
+        with contextlib.suppress(OSError):
+            if before is None:
+                (folder / CONFIG).unlink()
+            else:
+                (folder / CONFIG).write_bytes(before)
+            for path in missing:
+                path.rmdir()
+        raise

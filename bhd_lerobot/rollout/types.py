@@ -1,0 +1,68 @@
+"""An episode: what is asked for, and what came of it."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.commands import BrainCommand, CommandResult
+from bhd_lerobot.control.timing import TimingSummary
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.rollout.drivers import Intervention
+from bhd_lerobot.tasks.task import Outcome
+
+
+@dataclass(frozen=True)
+class EpisodeSpec:
+    """An episode to be run.
+
+    Attributes:
+        index: its number in the run; results come back in this order.
+        seed: decides everything that is random in it.
+    """
+
+    index: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Episode:
+    """An episode that was run.
+
+    Attributes:
+        spec: what was asked for.
+        scene: where it was: an `Arena` or a `TableScene`.
+        instruction: what was asked for: what the brain was told to do, or what the task asks for.
+        initial_state: the simulator's complete state at its start, shape (nstate,).
+        columns: the dataset's columns by key, each of shape (frames, ...), images left out.
+        outcome: how it ended.
+        timing: how punctual its control ticks were.
+        writer: what was given for the episode's images at its start, or None.
+        commands: the goals that the brain gave, each with the frame in which it gave it; None if it gave setpoints.
+        results: how goals ended, each with the frame in which it did.
+        plan: the brain's plan, as plain values, if it has one.
+        realtime: what the real-time process was granted and refused; None on the lockstep clock.
+        interventions: when somebody else than the brain drove, in order; None if there was nobody to take over.
+        goal_frames: in which frames goals were followed, as first frames and those after the last; None if always, or
+            never.
+    """
+
+    spec: EpisodeSpec
+    scene: Any
+    instruction: str
+    initial_state: NDArray
+    columns: dict[str, NDArray]
+    outcome: Outcome
+    timing: TimingSummary
+    writer: Any
+    commands: list[tuple[int, BrainCommand]] | None = None
+    results: list[tuple[int, CommandResult]] = field(default_factory=list)
+    plan: dict[str, Any] = field(default_factory=dict)
+    realtime: list[dict[str, Any]] | None = None
+    interventions: list[Intervention] | None = None
+    goal_frames: list[tuple[int, int]] | None = None
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.columns[keys.ACTION])

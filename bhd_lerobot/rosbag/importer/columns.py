@@ -1,0 +1,115 @@
+"""What is in the frames of an episode that is made of a robot's bag: every column but the pictures."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.rosbag.importer.dataset import RobotImport
+from bhd_lerobot.rosbag.importer.tracks import Array, Track
+from bhd_lerobot.rosbag.importer.resample import NANO, Times, newest
+from bhd_lerobot.rosbag.messages.base import GYRO, ODOMETRY, TWIST
+from bhd_lerobot.tasks.task import Event
+
+_MOVES = 0.01
+"""[m/s, rad/s] A robot that is slower stands."""
+
+
+def frame_columns(
+    wanted: RobotImport, tracks: Mapping[str, Track], times: Times, ages: Times
+) -> dict[str, NDArray[Any]]:
+    """Return the columns of an episode.
+
+    Args:
+        wanted: what becomes of the bag.
+        tracks: by role, each sorted by time.
+        times: of the frames [ns], shape (n,).
+        ages: of the oldest of each frame's newest readings [ns], shape (n,).
+    """
+    n = len(times)
+    asked, command_age = _commands(wanted, tracks["cmd"], times)
+    heard = command_age >= 0
+    applied = np.clip(asked, -np.array(wanted.max_speed), wanted.max_speed)
+    over = (applied != asked).any(axis=1)
+    done = np.arange(n) == n - 1
+    ended = Event.NOTHING if wanted.outcome is None else Event[wanted.outcome.upper()]
+    return {
+        keys.OBSERVATION_STATE: _state(wanted, tracks, times),
+        keys.ACTION: asked.astype(np.float32),
+        keys.APPLIED_ACTION: applied.astype(np.float32),
+        keys.TIME: (times - times[0]) / NANO,
+        keys.AGE: (ages / NANO).astype(np.float32),
+        keys.COMMAND_AGE: (np.where(heard, command_age, 0) / NANO).astype(np.float32),
+        keys.LATENESS: np.zeros(n, np.float32),
+        keys.OVERRUNS: np.zeros(n, np.int64),
+        keys.SKIPPED: np.zeros(n, np.int64),
+        keys.INFERENCE_TIME: np.zeros(n, np.float32),
+        keys.LATE: ages > round(wanted.max_age_s * NANO),
+        keys.LIMITS: np.where(over, int(Limit.VELOCITY), 0),
+        keys.WATCHDOG: np.where(heard, 0, int(Watchdog.COMMAND_AGE)),
+        keys.MODE: np.where(heard, int(Mode.TRACKING), int(Mode.HOLD)),
+        keys.REWARD: np.zeros(n, np.float32),
+        keys.SUCCESS: done & (ended == Event.SUCCESS),
+        keys.DONE: done,
+        keys.EVENT: np.where(done, int(ended), 0),
+    }
+
+
+def told_silence(wanted: RobotImport, columns: Mapping[str, NDArray[Any]]) -> str | None:
+    """Return how many frames have no command, and whether the robot drove in them; None if all have one."""
+    silent = columns[keys.MODE] == int(Mode.HOLD)
+    if not silent.any():
+        return None
+    names = list(wanted.observation_names)
+    speeds = columns[keys.OBSERVATION_STATE][:, [names.index(name) for name in TWIST]]
+    moving = int((silent & (np.abs(speeds) > _MOVES).any(axis=1)).sum())
+    for_ever = np.isinf(wanted.command_timeout_s)
+    lacking = "come before the first command" if for_ever else (
+        f"have no command that is younger than {wanted.command_timeout_s:g} s"
+    )  # fmt: skip
+    drove = f", though the robot moved in {moving} of them" if moving else ""
+    if moving and not for_ever:
+        drove += ": --command_timeout=inf is for robots that go on with the last command"
+    return f"{int(silent.sum())} of {len(silent)} frames of the episode {lacking}; their action is 0{drove}"
+
+
+def _commands(wanted: RobotImport, track: Track, times: Times) -> tuple[Array, Times]:
+    """Return the command in force at the end of each frame, shape (n, 2), and its age then [ns]; 0 and -1 if none.
+
+    An action is what was asked for over the frame that an observation begins. What answers the observation comes after
+    it: the command in force when the observation was taken is the answer to the one before.
+    """
+    ends = times + round(NANO / wanted.fps)
+    place = np.searchsorted(track.times, ends, side="left") - 1
+    known = np.maximum(place, 0)
+    if not len(track.times):
+        return np.zeros((len(times), len(TWIST))), np.full(len(times), -1, np.int64)
+    age = np.where(place < 0, -1, ends - track.times[known])
+    if np.isfinite(wanted.command_timeout_s):
+        age = np.where(age > round(wanted.command_timeout_s * NANO), -1, age)
+    order = [TWIST.index(name) for name in wanted.action_names]
+    return np.where(age[:, None] >= 0, track.values[known], 0.0)[:, order], age
+
+
+def _state(wanted: RobotImport, tracks: Mapping[str, Track], times: Times) -> NDArray[np.float32]:
+    def at(role: str) -> Array:
+        return tracks[role].values[newest(tracks[role].times, times)]
+
+    scan, odom = at("scan"), at("odom")
+    columns = dict(zip(TWIST, odom[:, :2].T, strict=True))
+    if wanted.tracks.pose:
+        columns |= dict(zip(ODOMETRY, _since_start(odom[:, 2:]).T, strict=True))
+    columns |= {f"scan_{beam:03d}.pos": scan[:, beam] for beam in range(scan.shape[1])}
+    if "imu" in tracks:
+        columns |= dict(zip(GYRO, at("imu").T, strict=True))
+    return np.stack([columns[name] for name in wanted.observation_names], axis=1).astype(np.float32)
+
+
+def _since_start(pose: Array) -> Array:
+    """Return poses x, y, yaw in the frame of the first one, shape (n, 3)."""
+    x, y, yaw = (pose - pose[0]).T
+    cos, sin = np.cos(pose[0, 2]), np.sin(pose[0, 2])
+    return np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1)

@@ -1,0 +1,126 @@
+"""Which frames of reference a bag's messages are in, and how the scanner is turned in the robot."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.rosbag.messages.base import FOOTPRINT_FRAME, SCAN_FRAME
+from bhd_lerobot.rosbag.messages.types import type_store
+from bhd_lerobot.errors import DatasetError
+
+Array = NDArray[np.float64]
+Static = Mapping[str, tuple[str, Array]]
+"""Frame -> its parent, and its rotation in it, shape (3, 3)."""
+
+BASE_FRAMES = (FOOTPRINT_FRAME, "base_link")
+_DEEPEST = 32  # frames between a sensor and the base
+
+
+def static_frames(messages: Sequence[bytes]) -> tuple[Static, int]:
+    """Return what ``/tf_static`` says, and how many of its messages cannot be read."""
+    frames: dict[str, tuple[str, Array]] = {}
+    lost = 0
+    for message, times in Counter(messages).items():  # a latched message may be there many times
+        try:
+            transforms = type_store().deserialize_cdr(message, "tf2_msgs/msg/TFMessage").transforms
+        except Exception:  # whatever a parser of damaged bytes raises
+            transforms = None
+        if transforms is None or not np.isfinite([_quaternion(one) for one in transforms]).all():
+            lost += times
+            continue
+        for one in transforms:
+            frames[one.child_frame_id.lstrip("/")] = (one.header.frame_id.lstrip("/"), _matrix(_quaternion(one)))
+    return frames, lost
+
+
+def the_frame(topic: str, frames: Sequence[str]) -> str:
+    """Return the one frame that all messages of a topic are in.
+
+    Raises:
+        DatasetError: there are several.
+    """
+    names, counts = np.unique(np.array(frames, dtype=str), return_counts=True)
+    if len(names) > 1:
+        found = ", ".join(f"{str(name)!r} in {count} messages" for name, count in zip(names, counts, strict=True))
+        raise DatasetError(
+            f"{topic} has messages in several frames: {found}. They come from several sensors or robots; make a bag "
+            "of one of them."
+        )
+    return str(names[0]).lstrip("/")
+
+
+def scanner_rotation(topic: str, frame: str, static: Static, given: str | None, yaw: float | None) -> tuple[Array, str]:
+    """Return how the scanner is turned in the robot, shape (3, 3), and where that is known from.
+
+    Args:
+        topic: of the scans.
+        frame: that they are in.
+        static: the bag's static transforms.
+        given: a frame that the user says is the scanner's, or None.
+        yaw: the scanner's angle in the robot [rad], if the user says it.
+
+    Raises:
+        DatasetError: the frame is not known.
+    """
+    rotation = _from_base(frame, static)
+    known = rotation is not None or frame == given or _last(frame) == SCAN_FRAME
+    if not known:
+        raise DatasetError(
+            f"The scans of {topic} are in the frame {frame!r}, and nothing says how that is turned in the robot: it is "
+            f"not {SCAN_FRAME!r}, and /tf_static has no way from {' or '.join(BASE_FRAMES)} to it. Say that it is the "
+            f"scanner with --scan_frame={frame}, and where its zero points with --scan_yaw (0 is straight ahead)."
+        )
+    if yaw is not None:
+        return _matrix(np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])), "--scan_yaw"
+    if rotation is not None:
+        return rotation, "/tf_static"
+    return np.eye(3), "its name" if frame != given else "--scan_frame"
+
+
+def check_base_frame(topic: str, frame: str, given: str | None) -> None:
+    """Check that odometry is of the robot's base.
+
+    Raises:
+        DatasetError: it is of something else.
+    """
+    if frame and _last(frame) not in BASE_FRAMES and frame != given:
+        raise DatasetError(
+            f"The speeds of {topic} are of the frame {frame!r} (child_frame_id), not of {' or '.join(BASE_FRAMES)}. If "
+            f"that is the robot's base, with x ahead, say so with --odom_frame={frame}."
+        )
+
+
+def _from_base(frame: str, static: Static) -> Array | None:
+    rotation = np.eye(3)
+    for _ in range(_DEEPEST):
+        if _last(frame) in BASE_FRAMES:
+            return rotation
+        if frame not in static:
+            return None
+        frame, turn = static[frame][0], static[frame][1]
+        rotation = turn @ rotation
+    return None
+
+
+def _last(frame: str) -> str:
+    """Return a frame's name without the robot's in front of it."""
+    return frame.rsplit("/", 1)[-1]
+
+
+def _quaternion(transform: Any) -> Array:
+    turn = transform.transform.rotation
+    return np.array([turn.w, turn.x, turn.y, turn.z])
+
+
+def _matrix(quaternion: Array) -> Array:
+    w, x, y, z = quaternion / max(float(np.linalg.norm(quaternion)), 1e-12)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

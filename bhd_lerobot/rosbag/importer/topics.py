@@ -1,0 +1,105 @@
+"""Which topics of a bag are read for what, and who published them."""
+
+from collections.abc import Mapping
+
+from bhd_lerobot.rosbag.importer.headers import is_ours
+from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE
+from bhd_lerobot.rosbag.importer.other import told_other_robot
+from bhd_lerobot.rosbag.storage.read import Bag, Topic
+from bhd_lerobot.rosbag.messages.base import BareTwistPart, GyroPart, OdometryPart, ScanPart, TwistPart
+from bhd_lerobot.errors import DatasetError
+
+TYPES = {
+    "scan": (ScanPart.msgtype,),
+    "odom": (OdometryPart.msgtype,),
+    "cmd": (TwistPart.msgtype, BareTwistPart.msgtype),
+    "imu": (GyroPart.msgtype,),
+    "camera": (IMAGE, COMPRESSED),
+}
+"""What is read -> the types of message that it is read from."""
+
+_MEANING = {
+    "scan": "the scan",
+    "odom": "the robot's speed",
+    "cmd": "the action",
+    "imu": "the yaw rate of the gyroscope",
+    "camera": "the picture",
+}
+
+
+def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) -> Topic:
+    """Return a topic that a role is read from.
+
+    Args:
+        bag: the bag.
+        topics: what it has.
+        role: what the topic is wanted for, a key of `TYPES`.
+        name: of the topic.
+
+    Raises:
+        DatasetError: the bag is of another robot, or the topic is missing, empty, of another type, of two types, or
+            not in ROS 2's serialisation.
+    """
+    option, types = (f"--{role}", TYPES[role])
+    if name not in topics or not topics[name].count:
+        if (other := told_other_robot(bag, topics)) is not None:
+            raise DatasetError(other)
+        there = ", ".join(f"{one.name} ({one.msgtype}, {one.count})" for one in topics.values()) or "none"
+        fitting = [one.name for one in topics.values() if one.msgtype in types and one.count]
+        hint = f" Of the right type: {', '.join(fitting)}." if fitting else ""
+        what = "no message of" if name in topics else "no topic"
+        raise DatasetError(
+            f"{bag.path} has {what} {name}, which {_MEANING[role]} is read from. Name another one with {option}."
+            f"{hint} The bag has: {there}." + "".join(f" Damaged: {problem}." for problem in bag.problems)
+        )
+    if topics[name].msgtype not in types:
+        raise DatasetError(
+            f"{name} in {bag.path} is of type {topics[name].msgtype}; valid for {option}: {', '.join(types)}."
+        )
+    if others := topics[name].others:
+        raise DatasetError(
+            f"{name} in {bag.path} has messages of several types, {', '.join((topics[name].msgtype, *others))}, and "
+            f"nothing says which of them {_MEANING[role]} is. Make a bag with one of them: ros2 bag convert."
+        )
+    if (serialisation := topics[name].serialisation) != "cdr":
+        raise DatasetError(f"{name} in {bag.path} is serialised as {serialisation!r}; only cdr can be read.")
+    return topics[name]
+
+
+def static_topics(scan: str) -> set[str]:
+    """Return the topics that may say how the scanner is mounted: of all robots, and of the scan's namespace."""
+    return {"/tf_static", f"{scan.rpartition('/')[0]}/tf_static"}
+
+
+def told_publishers(topics: Mapping[str, Topic], wanted: Mapping[str, Topic]) -> list[str]:
+    """Return, in sentences, where more than one publisher may have been at work.
+
+    Args:
+        topics: all of a bag.
+        wanted: role -> its topic.
+    """
+    notes = []
+    for role, topic in wanted.items():
+        counts = "newest command counts, as it did for the robot" if role == "cmd" else "newest message counts"
+        if topic.connections:
+            each = " and ".join(str(count) for count in topic.connections)
+            notes.append(
+                f"{topic.name} has messages of {len(topic.connections)} connections ({each}), so of several "
+                f"publishers; the {counts}, whoever sent it"
+            )
+        elif topic.publishers > 1:
+            notes.append(
+                f"{topic.name} had {topic.publishers} publishers when the recording began. Which of them sent a "
+                f"message is not in the bag; the {counts}, whoever sent it"
+            )
+    if is_ours(topics):
+        return notes  # what else there is is known
+    read = wanted["cmd"].name
+    others = [one for one in topics.values() if one.msgtype in TYPES["cmd"] and one.count and one.name != read]
+    if others:
+        there = ", ".join(f"{one.name} ({one.count})" for one in others)
+        notes.append(
+            f"there are commands on other topics, too: {there}. The action is of {read} alone ({wanted['cmd'].count}); "
+            "if that is not what drove the robot, name the topic with --cmd"
+        )
+    return notes

@@ -1,0 +1,230 @@
+"""The topics of a robot's bag as tracks: when something was measured, and what; sorted by time, judged one by one."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import LidarSpec
+from bhd_lerobot.rosbag.importer import frames
+from bhd_lerobot.rosbag.importer.warnings import pace, told_pace, told_speeds
+from bhd_lerobot.rosbag.storage.read import Bag, Messages, Topic
+from bhd_lerobot.rosbag.importer.decodable import sound_messages
+from bhd_lerobot.rosbag.importer.topics import TYPES, static_topics, told_publishers, wanted_topic
+from bhd_lerobot.rosbag.importer.resample import Times, apart, message_times, sane
+from bhd_lerobot.rosbag.importer.scan import resampled_scans
+from bhd_lerobot.rosbag.messages.base import BareTwistPart, GyroPart, TwistPart, odometry
+from bhd_lerobot.rosbag.messages.cdr_read import decode
+from bhd_lerobot.rosbag.messages.parts import NANO, head_stamps, header_stamps
+from bhd_lerobot.errors import DatasetError
+
+Array = NDArray[np.float64]
+
+_APART_NS = NANO // 2  # of two topics' clocks: a scan is stamped at its first ray, and a network delays
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """How a bag of a base is read.
+
+    Attributes:
+        topics: role (``scan``, ``odom``, ``cmd``, ``imu``) -> topic; only roles that are wanted.
+        cameras: name of a camera -> topic.
+        beams: that a scan has in the dataset.
+        lidar: the scanner that the dataset is of.
+        stamps: ``"auto"``, ``"header"`` or ``"receive"``.
+        scan_frame, odom_frame: frames that the user says are the scanner's and the base's.
+        scan_yaw: angle of the scanner in the robot [rad], if the user says it.
+        pose: whether the odometry's pose is wanted, beside its speeds.
+    """
+
+    topics: Mapping[str, str]
+    cameras: Mapping[str, str]
+    beams: int
+    lidar: LidarSpec
+    stamps: str = "receive"
+    scan_frame: str | None = None
+    odom_frame: str | None = None
+    scan_yaw: float | None = None
+    pose: bool = False
+
+
+@dataclass(frozen=True)
+class Track:
+    """Messages of one topic, in the order in which they were written.
+
+    Attributes:
+        topic: its name.
+        msgtype: their type.
+        times: when they happened [ns], shape (n,).
+        order: their places in the bag, shape (n,).
+        values: numbers of each, shape (n, d); of a camera, its place in the bag, shape (n, 1).
+        stamps: of their headers [ns], shape (n,); None if they have none.
+    """
+
+    topic: str
+    msgtype: str
+    times: Times
+    order: Times
+    values: Array
+    stamps: Times | None
+
+    def part(self, mask: NDArray[np.bool_]) -> "Track":
+        """Return some of its messages, sorted by time; those of the same time stay in their order."""
+        rows = np.flatnonzero(mask)
+        return self.rows(rows[np.argsort(self.times[rows], kind="stable")])
+
+    def rows(self, rows: NDArray[np.intp]) -> "Track":
+        """Return some of its messages, in this order."""
+        times = self.times[rows]
+        stamps = times if self.stamps is self.times else None if self.stamps is None else self.stamps[rows]
+        return Track(self.topic, self.msgtype, times, self.order[rows], self.values[rows], stamps)
+
+
+def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, Track]:
+    """Return the tracks of a bag by role; cameras' as ``camera/<name>``.
+
+    Args:
+        bag: the bag.
+        options: what is wanted.
+        notes: what somebody should know is added to it.
+
+    Raises:
+        DatasetError: a topic is missing, empty, of another type or mostly unreadable, or its frame is not known.
+    """
+    topics = bag.topics()
+    wanted = {role: wanted_topic(bag, topics, role, name) for role, name in options.topics.items()}
+    cameras = {f"camera/{name}": wanted_topic(bag, topics, "camera", topic) for name, topic in options.cameras.items()}
+    notes += told_publishers(topics, {**wanted, **cameras})
+    names = {topic.name for topic in wanted.values()} | (static_topics(options.topics["scan"]) & topics.keys())
+    messages = bag.read(names, {topic.name for topic in cameras.values()})
+    static, lost = frames.static_frames(
+        [one for name in sorted(static_topics(options.topics["scan"]) & names) for one in messages[name].data]
+    )
+    if lost:
+        bag.problems.append(f"{bag.path.name}: {lost} messages of /tf_static cannot be read, and are left out")
+    tracks, paces, clocks = {}, {}, {}
+    for role, topic in {**wanted, **cameras}.items():
+        if not len(messages[topic.name].data):
+            damage = "".join(f" Damaged: {problem}." for problem in bag.problems)
+            raise DatasetError(f"{bag.path} has no readable message of {topic.name}.{damage}")
+        found = sound_messages(bag.path, topic, messages[topic.name], bag.problems)
+        stamps = _stamps(topic, found)
+        if stamps is not None and role != "cmd":
+            paces[topic.name] = pace(found.received, stamps)
+        times = message_times(found.received, stamps, options.stamps)
+        if stamps is not None and options.stamps == "auto" and (wrong := int((~sane(found.received, stamps)).sum())):
+            notes.append(
+                f"{topic.name}: {wrong} of {len(times)} header stamps are not within 0.5 s of the reception; the "
+                f"{'headers were' if times is stamps else 'times of reception were'} taken for all of them"
+            )
+        clocks[topic.name] = (found.received, times)
+        values = _values(role, topic, found, _Reading(options, static, lost > 0, notes))
+        fits = np.abs(values) < np.finfo(np.float32).max  # the dataset's numbers are float32
+        finite = np.logical_and.reduce(fits, axis=1)
+        if not finite.all():
+            what = "are no scan of a whole turn" if role == "scan" else "with values that are not finite"
+            notes.append(f"{topic.name}: {int((~finite).sum())} of {len(finite)} messages {what}, left out")
+        track = Track(topic.name, topic.msgtype, times, found.order, values, stamps).rows(np.flatnonzero(finite))
+        if not len(track.times):
+            raise DatasetError(f"{bag.path}: no message of {topic.name} has finite values.")
+        tracks[role] = track
+    notes += told_pace(paces)
+    _check_one_time(bag, wanted["odom"].name, clocks)
+    return tracks
+
+
+def _check_one_time(bag: Bag, reference: str, clocks: Mapping[str, tuple[Times, Times]]) -> None:
+    """Check that the messages of all topics are of one time.
+
+    Raises:
+        DatasetError: they are not: a bare Twist has the recorder's time, and headers may have another computer's.
+    """
+    for topic, clock in clocks.items():
+        ahead = apart(clock, clocks[reference])
+        if abs(ahead) > _APART_NS:
+            raise DatasetError(
+                f"{bag.path}: when they were received together, {topic} is {seconds(abs(ahead))} "
+                f"{'ahead of' if ahead > 0 else 'behind'} {reference}. Their stamps are of different clocks, so "
+                "nothing says which command belongs to which scan; --stamps=receive takes the recorder's for all."
+            )
+
+
+def _stamps(topic: Topic, messages: Messages) -> Times | None:
+    if topic.msgtype == BareTwistPart.msgtype:
+        return None
+    if topic.msgtype in TYPES["camera"]:
+        return head_stamps(topic.name, messages.data)
+    return header_stamps(topic.msgtype, messages.data)
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """What decoding needs to know, and where it says what it did."""
+
+    options: TrackOptions
+    static: frames.Static
+    static_lost: bool
+    notes: list[str]
+
+
+def _values(role: str, topic: Topic, messages: Messages, reading: _Reading) -> Array:
+    data = messages.data
+    if role == "scan":
+        return _scans(topic, data, reading)
+    if role == "odom":
+        children = decode(topic.msgtype, data, ("child_frame_id",))["child_frame_id"].tolist()
+        frames.check_base_frame(topic.name, frames.the_frame(topic.name, children), reading.options.odom_frame)
+        speeds, pose = odometry(data)
+        stamps = header_stamps(topic.msgtype, data)  # by which they were measured; of some drivers they are not set
+        measured = stamps if (np.diff(stamps) > 0).all() else messages.received
+        reading.notes.extend(told_speeds(topic.name, measured, speeds, pose))
+        return np.concatenate([speeds, pose], axis=1) if reading.options.pose else speeds
+    if role == "cmd":
+        kind = BareTwistPart if topic.msgtype == BareTwistPart.msgtype else TwistPart
+        return kind(topic.name, ()).decode(data)
+    if role == "imu":
+        return GyroPart(topic.name, ()).decode(data)
+    return messages.order.astype(np.float64)[:, None]
+
+
+def _scans(topic: Topic, data: Sequence[bytes], reading: _Reading) -> Array:
+    options, notes = reading.options, reading.notes
+    geometry = ("angle_min", "angle_increment", "range_min", "range_max")
+    found: dict[str, Any] = decode(topic.msgtype, data, ("ranges", "header.frame_id", *geometry))
+    frame = frames.the_frame(topic.name, found["header.frame_id"].tolist())
+    rotation, source = frames.scanner_rotation(topic.name, frame, reading.static, options.scan_frame, options.scan_yaw)
+    if reading.static_lost and source not in ("/tf_static", "--scan_yaw"):
+        raise DatasetError(
+            f"Messages of /tf_static cannot be read, and with them may be lost how the scanner of {topic.name} is "
+            "turned. Say where its zero points with --scan_yaw (0 is straight ahead)."
+        )
+    if not np.allclose(rotation, np.eye(3), atol=1e-3):
+        ahead = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
+        over = ", upside down" if rotation[2, 2] < 0 else ""
+        notes.append(f"{topic.name}: the scanner is turned by {ahead:.1f} degrees{over}, from {source}")
+    counts = {len(one) for one in found["ranges"]}
+    if counts != {options.beams}:
+        few = f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
+        notes.append(f"{topic.name}: scans of {few} beams became {options.beams}, each the nearest by angle")
+    reach = found["range_max"][found["range_max"] > 0]
+    if len(reach) and float(reach.min()) < options.lidar.range_max * (1 - 1e-6):
+        notes.append(
+            f"{topic.name}: the scanner sees to {reach.min():.2f} m (range_max); where nothing came back, the dataset "
+            f"has {options.lidar.range_max:g} m all the same"
+        )
+    return resampled_scans(
+        found["ranges"],
+        {name: found[name] for name in geometry},
+        lidar=options.lidar,
+        beams=options.beams,
+        rotation=rotation,
+        topic=topic.name,
+    )
+
+
+def seconds(nanoseconds: int) -> str:
+    """Return a time in words."""
+    return f"{nanoseconds / NANO:.2f} s"

@@ -1,0 +1,127 @@
+"""Pictures in bags: out of a dataset's films, into `sensor_msgs/Image` or `CompressedImage`, and back."""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.rosbag.messages.cdr import encode
+from bhd_lerobot.rosbag.messages.cdr_read import decode
+from bhd_lerobot.rosbag.messages.parts import Frames, header
+from bhd_lerobot.datasets.format.state import corrupt
+from bhd_lerobot.errors import DatasetError
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_JPEG_QUALITY = 95
+# What image_transport writes of an rgb8 picture. It decodes with OpenCV, into blue, green, red; by the last word it
+# knows that red and blue have to change places.
+_FORMAT = "rgb8; jpeg compressed bgr8"
+_COLOURS = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of PIL with 8 bits
+# encoding of a raw image -> its type, channels, and where red, green and blue are in it
+_RAW = {
+    "rgb8": (np.uint8, 3, (0, 1, 2)),
+    "bgr8": (np.uint8, 3, (2, 1, 0)),
+    "rgba8": (np.uint8, 4, (0, 1, 2)),
+    "bgra8": (np.uint8, 4, (2, 1, 0)),
+    "mono8": (np.uint8, 1, (0, 0, 0)),
+}
+
+
+def film_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.uint8]]:
+    """Yield pictures of a film, each of shape (H, W, 3).
+
+    Args:
+        path: the film.
+        start_s: time of the first one [s].
+        count: how many.
+
+    Raises:
+        DatasetCorruptError: the film cannot be read, or ends before.
+    """
+    import av
+
+    found = 0
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            base, rate = stream.time_base, stream.average_rate
+            assert base is not None
+            assert rate is not None
+            half = 0.5 / float(rate)
+            container.seek(max(0, int((start_s - half) / float(base))), stream=stream)
+            for frame in container.decode(stream):
+                if frame.pts is not None and frame.pts * float(base) < start_s - half:
+                    continue
+                yield np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+                found += 1
+                if found == count:
+                    return
+    except (av.error.FFmpegError, IndexError) as error:
+        raise corrupt(path, error) from error
+    raise corrupt(path, f"it ends {count - found} pictures before its episode does")
+
+
+def encode_image(frames: Frames, frame_id: str, image: NDArray[np.uint8], *, compressed: bool) -> bytes:
+    """Return one picture as a message: raw RGB, or JPEG."""
+    fields: dict[str, Any] = {"header": header(frames.stamps, frame_id)}
+    if compressed:
+        from PIL import Image
+
+        file = io.BytesIO()
+        Image.fromarray(image).save(file, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
+        fields |= {"format": _FORMAT, "data": np.frombuffer(file.getvalue(), np.uint8)}
+        return encode(COMPRESSED, fields, 1)[0]
+    height, width, _ = image.shape
+    fields |= {"height": height, "width": width, "encoding": "rgb8", "step": 3 * width, "data": image.reshape(1, -1)}
+    return encode(IMAGE, fields, 1)[0]
+
+
+def decode_image(topic: str, msgtype: str, message: bytes) -> NDArray[np.uint8]:
+    """Return the picture in a message, shape (H, W, 3).
+
+    Raises:
+        DatasetError: it has an encoding that is not known, or is damaged.
+    """
+    if msgtype == COMPRESSED:
+        return _decompressed(topic, message)
+    found = {path: values[0] for path, values in decode(msgtype, [message], _FIELDS).items()}
+    encoding = found["encoding"]
+    if encoding not in _RAW:
+        raise DatasetError(
+            f"The pictures of {topic} have the encoding {encoding!r}; valid: {', '.join(_RAW)}, or a CompressedImage."
+        )
+    dtype, channels, order = _RAW[encoding]
+    height, width, step = int(found["height"]), int(found["width"]), int(found["step"])
+    data = found["data"]
+    if not height * width or len(data) != height * step or step < width * channels:
+        raise DatasetError(f"A picture of {topic} has {len(data)} bytes, which is not {height} x {width} {encoding}.")
+    rows = data.view(dtype).reshape(height, step)[:, : width * channels].reshape(height, width, channels)
+    return np.ascontiguousarray(rows[:, :, order])
+
+
+def _decompressed(topic: str, message: bytes) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    found = {path: values[0] for path, values in decode(COMPRESSED, [message], ("format", "data")).items()}
+    what = f"{found['format']!r}, {len(found['data'])} bytes"
+    try:
+        image = Image.open(io.BytesIO(found["data"].tobytes()))
+        if image.mode in _COLOURS:
+            return np.asarray(image.convert("RGB"))
+    except Image.UnidentifiedImageError as error:
+        raise DatasetError(
+            f"A picture of {topic} ({what}) is neither JPEG nor PNG, and cannot be decoded. Of compressed depth "
+            "nothing is made."
+        ) from error
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise DatasetError(f"A picture of {topic} ({what}) cannot be decoded: {error}.") from error
+    raise DatasetError(
+        f"The pictures of {topic} ({what}) have more than 8 bits (mode {image.mode}), as of a depth camera; valid: "
+        "JPEG and PNG in colour or grey."
+    )
+
+
+_FIELDS = ("encoding", "height", "width", "step", "data")

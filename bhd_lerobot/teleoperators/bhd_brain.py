@@ -1,0 +1,173 @@
+"""Any brain as a LeRobot teleoperator, so that the stock command lines can be driven by it."""
+
+from typing import Any
+
+import numpy as np
+from lerobot.teleoperators.teleoperator import Teleoperator
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.commands import CommandResult
+from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Mixed, Observation
+from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
+from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
+from bhd_lerobot.teleoperators.goal_streamer import GoalStreamer
+from bhd_lerobot.rollout.registry import action_names_of, brains_for, make_brain, robot_of_brain
+
+
+class BhdBrain(Teleoperator):
+    """A brain in place of a person: its actions follow from what the robot in this process last observed.
+
+    LeRobot asks a teleoperator for actions and shows it nothing; this one looks at the simulated robot that is
+    connected in the same process.
+
+    Args:
+        config: the configuration.
+    """
+
+    config_class = BhdBrainConfig
+    name = "bhd_brain"
+
+    def __init__(self, config: BhdBrainConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self._is_connected = False
+        self._brain: Brain | None = None
+        self._robot: SimulatedRobot | None = None
+        self._streamer: GoalStreamer | None = None
+        self._chunk: list[NDArray[np.float64]] = []
+        self._results: list[CommandResult] = []
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        """The actions that it gives: those of the robot that it drives, if that is connected already."""
+        names = action_names_of(self.config.brain)
+        robots = connected_robots()
+        if len(robots) == 1 and robot_of_brain(self.config.brain) in ("", robots[0].name):
+            names = robots[0].action_names
+        return dict.fromkeys(names, float)
+
+    @property
+    def feedback_features(self) -> dict[str, type]:
+        """It takes no feedback."""
+        return {}
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether `connect` was called."""
+        return self._is_connected
+
+    @property
+    def is_calibrated(self) -> bool:
+        """A brain needs no calibration."""
+        return True
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Get ready; the robot may be connected later.
+
+        Raises:
+            DeviceAlreadyConnectedError: it is connected.
+        """
+        if self._is_connected:
+            raise DeviceAlreadyConnectedError(f"{self} is already connected.")
+        self._is_connected = True
+
+    def calibrate(self) -> None:
+        """Nothing to calibrate."""
+
+    def configure(self) -> None:
+        """Nothing to configure beyond the configuration."""
+
+    def get_action(self) -> dict[str, Any]:
+        """Return what the brain wants, given the robot's last observation.
+
+        Raises:
+            DeviceNotConnectedError: `connect` was not called.
+            ConfigError: there is no robot to drive, or several and `robot_id` does not choose.
+        """
+        if not self._is_connected:
+            raise DeviceNotConnectedError(f"{self} is not connected. Call connect() first.")
+        robot = self._find_robot()
+        if robot is not self._robot or self._brain is None:
+            if robot_of_brain(self.config.brain) not in ("", robot.name):
+                raise ConfigError(
+                    f"The brain {self._brain_name!r} does not drive a {robot.name}. Choose one that does by "
+                    f"--teleop.brain.type: {', '.join(brains_for(robot.name))}."
+                )
+            self._brain = make_brain(self.config.brain)
+            names, _ = robot.environment
+            self._brain.bind(robot.observation_names, robot.action_names, self.config.fps or robot.config.fps, names)
+            self._brain.reset(np.zeros(1, np.intp), [self.config.seed], 1, [robot.instruction])
+            self._robot, self._streamer, self._results, self._chunk = robot, None, [], []
+        seen = robot.last_observation
+        state = np.array([[seen[name] for name in robot.observation_names]])
+        images = {name: seen[name][None] for name in robot.camera_shapes}
+        names, told = robot.environment
+        observation = Observation(
+            robot.observation_names, state, images, told[None] if names else None, {0: self._results}
+        )
+        wanted = self._brain.act(observation)
+        if isinstance(wanted, Mixed):
+            raise ConfigError(
+                f"The brain {self._brain_name!r} gives goals in some frames and setpoints in others, which "
+                "`lerobot-teleoperate` and `lerobot-record` cannot do. Use bhd-record."
+            )
+        if isinstance(wanted, Goals):
+            action, self._results = self._stream(robot, wanted)
+        else:
+            action = self._next_of_chunk(wanted) if wanted is None or isinstance(wanted, Chunk) else wanted[0]
+        return dict(zip(robot.action_names, action.tolist(), strict=True))
+
+    def _next_of_chunk(self, wanted: Chunk | None) -> NDArray[np.float64]:
+        """Return what a chunk asks for over the coming frame; when it is used up, its last.
+
+        Raises:
+            ConfigError: the brain goes on with a chunk that it never gave.
+        """
+        if wanted is not None:
+            self._chunk = list(wanted.actions[:, 0])
+        if not self._chunk:
+            raise ConfigError(f"The brain {self._brain_name!r} gave neither an action nor a chunk of them.")
+        return self._chunk.pop(0) if len(self._chunk) > 1 else self._chunk[0]
+
+    def _stream(self, robot: SimulatedRobot, goals: Goals) -> tuple[NDArray[np.float64], list[CommandResult]]:
+        """Return the setpoint that goals mean for the coming frame, and the goals that ended."""
+        body, rates = robot.simulation.body, robot.simulation.rates
+        if not isinstance(body, Arm) or body.actuation != "position":
+            raise ConfigError(
+                f"The brain {self._brain_name!r} gives goals; {robot} takes none. Use a ur5 with robot.control = servo."
+            )
+        if self._streamer is None:
+            self._streamer = GoalStreamer(body, rates, robot.simulation.cerebellum.command[0])
+        reading = robot.simulation.bridge.state()
+        reference, results = self._streamer.frame(goals.commands.get(0, ()), reading.joint_positions[0])
+        return robot.simulation.to_action(reference[None])[0], results
+
+    def send_feedback(self, feedback: dict[str, Any]) -> None:
+        """Do nothing: a brain feels no feedback."""
+
+    def disconnect(self) -> None:
+        """Forget the robot. May be called twice."""
+        self._is_connected = False
+        self._brain = self._robot = self._streamer = None
+
+    @property
+    def _brain_name(self) -> str:
+        return self.config.brain.get_choice_name(type(self.config.brain))
+
+    def _find_robot(self) -> SimulatedRobot:
+        robots = connected_robots()
+        if self.config.robot_id is not None:
+            robots = [robot for robot in robots if robot.id == self.config.robot_id]
+            if not robots:
+                names = [str(robot.id) for robot in connected_robots()]
+                raise ConfigError(unknown_name("teleop.robot_id", self.config.robot_id, names))
+        if len(robots) != 1:
+            found = ", ".join(str(robot) for robot in robots) or "none"
+            raise ConfigError(
+                f"bhd_brain drives one simulated robot of its own process; connected are: {found}. "
+                "Use --robot.type=turtlebot3 or ur5, and --teleop.robot_id if there are several."
+            )
+        return robots[0]

@@ -1,0 +1,177 @@
+"""From the command line of `bhd-train` to its configuration.
+
+Adds to `configuration.parse` what LeRobot's training knows beyond plain fields: `policy.path`, and `resume` from the
+configuration that lies in a checkpoint.
+"""
+
+import logging
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lerobot.policies  # noqa: F401  registers LeRobot's own
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot.utils.device_utils import auto_select_torch_device
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.learned.contract import find_checkpoint
+from bhd_lerobot.rollout import configuration
+from bhd_lerobot.training.config import OWN_CONFIG_NAME, BhdTrainConfig, plain
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a command line asks for.
+
+    Attributes:
+        config: the configuration, not validated.
+        contract: folder or name of the checkpoint whose contract the dataset must fit; None if there is none.
+    """
+
+    config: BhdTrainConfig
+    contract: str | None = None
+
+
+def parse_train(arguments: Sequence[str]) -> Request:
+    """Return what a command line asks for.
+
+    Args:
+        arguments: `--config_path=FILE` and overrides `--a.b=value`; with `--resume=true`, FILE is a checkpoint's
+            `train_config.json`, or the folder of a checkpoint or of a run.
+
+    Raises:
+        ConfigError: an unknown key or policy, a value of the wrong type, or a file that cannot be read.
+    """
+    # LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+    overrides = configuration.read_overrides(arguments)
+    path = overrides.pop(configuration.CONFIG_PATH, None)
+    resume = overrides.get("resume") is True
+    checkpoint: Path | None = None
+    if resume:
+        if path is None:
+            raise ConfigError(f"resume needs --config_path, the {TRAIN_CONFIG_NAME} of a checkpoint or its folder.")
+        checkpoint = _resumed(Path(str(path)).expanduser(), overrides.get("output_dir"))
+        values = _read_checkpoint(checkpoint)
+        values["output_dir"] = str(checkpoint.parent.parent)  # the run may have been moved
+    else:
+        values = configuration.read_file(Path(str(path)).expanduser()) if path is not None else {}
+    for key, value in overrides.items():
+        if key.startswith("policy.") and not isinstance(values.get("policy"), dict):
+            values["policy"] = {}
+        configuration.set_option(values, key, value)
+    return _decoded(values, checkpoint)
+
+
+def _resumed(path: Path, output_dir: Any) -> Path:
+    """Return the checkpoint to go on with; who names the run's folder in another way is told how to name it."""
+    try:
+        return resumed_checkpoint(path)
+    except ConfigError as error:
+        run = None if output_dir is None else Path(str(output_dir)).expanduser()
+        if run is None or not (run / CHECKPOINTS_DIR).is_dir():
+            raise
+        raise ConfigError(
+            f"{error} To go on with the run in {run}: bhd-train --resume=true --config_path={shlex.quote(str(run))}"
+        ) from None
+
+
+def resumed_checkpoint(path: Path) -> Path:
+    """Return the folder of the checkpoint that a path means: a file in it, a folder of it, itself, or its run.
+
+    Raises:
+        ConfigError: there is none; names what was looked for.
+    """
+    folder = path.parent if path.is_file() else path
+    for one in (folder.parent, folder, folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK):
+        if (one / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME).is_file():
+            return one.resolve()
+    raise ConfigError(
+        f"No checkpoint to resume at {path}: neither {TRAIN_CONFIG_NAME} in it, nor in {PRETRAINED_MODEL_DIR}/, nor "
+        f"in {CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}/{PRETRAINED_MODEL_DIR}/."
+    )
+
+
+def _read_checkpoint(checkpoint: Path) -> dict[str, Any]:
+    folder = checkpoint / PRETRAINED_MODEL_DIR
+    values = configuration.read_file(folder / TRAIN_CONFIG_NAME)
+    own = folder / OWN_CONFIG_NAME  # a checkpoint of lerobot-train has none
+    values |= configuration.read_file(own) if own.is_file() else {}
+    # Where it is not said, LeRobot's rule was the only one.
+    values["selection"] = {"hold_out": "instruction", **(values.get("selection") or {})}
+    return values
+
+
+def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
+    values.pop("checkpoint_path", None)
+    contract = _start_from(values, resume=checkpoint is not None)
+    selection = values.get("selection")
+    if isinstance(selection, dict) and isinstance(selection.get("outcome"), str):
+        selection["outcome"] = [selection["outcome"]]
+    _drop_defaults(BhdTrainConfig, values)
+    config = configuration.decode(BhdTrainConfig, values)
+    if checkpoint is not None:
+        config.checkpoint_path = checkpoint
+        config.policy.pretrained_path = checkpoint / PRETRAINED_MODEL_DIR
+    return Request(config, contract)
+
+
+def _drop_defaults(config_class: type, values: dict[str, Any]) -> None:
+    """Leave out what the chosen classes say themselves: LeRobot's defaults do not all have the type of their field."""
+    for key, kind, _ in configuration.options_of(config_class):
+        value = values.get(key)
+        if not isinstance(value, dict):
+            continue
+        chosen = configuration.choices_of(kind).get(str(value.get("type")))
+        if chosen is not None:
+            defaults = {name: default for name, _, default in configuration.options_of(chosen)}
+            values[key] = {
+                name: one
+                for name, one in value.items()
+                if name == "type" or name not in defaults or not _is_same(one, defaults[name])
+            }
+
+
+def _is_same(value: Any, default: Any) -> bool:
+    return type(value) is type(default) and bool(value == default)
+
+
+def _start_from(values: dict[str, Any], *, resume: bool) -> str | None:
+    """Complete the policy's configuration from the checkpoint that a new run starts from; return that checkpoint."""
+    policy = values.get("policy")
+    if policy is not None and not isinstance(policy, dict):
+        raise ConfigError(f"policy is {policy!r}; it has keys of its own, such as policy.type.")
+    policy = dict(policy or {})
+    path = policy.pop("path", None)
+    fine_tune = values.get("fine_tune")
+    source = fine_tune or path
+    # Only where nothing else was asked for: LeRobot's choice comes with a warning where there is no GPU.
+    if ("type" in policy or source is not None) and "device" not in policy:
+        policy["device"] = auto_select_torch_device().type
+    if resume or source is None:
+        if policy:
+            policy.setdefault("push_to_hub", bool(policy.get("repo_id")))
+            values["policy"] = policy
+        return None
+    if fine_tune and path and fine_tune != path:
+        raise ConfigError(f"fine_tune is {fine_tune!r} and policy.path is {path!r}; give one of them.")
+    folder = str(find_checkpoint(source).resolve())  # `last` may move on
+    own = _policy_values(folder)
+    wanted = policy.get("type", own["type"])
+    if wanted != own["type"]:
+        raise ConfigError(f"policy.type is {wanted!r}, but the checkpoint {source} is of type {own['type']!r}.")
+    policy.setdefault("push_to_hub", bool(policy.get("repo_id")))
+    values["policy"] = {**own, "repo_id": None, **policy, "pretrained_path": folder}
+    return folder if fine_tune else None
+
+
+def _policy_values(source: str) -> dict[str, Any]:
+    try:
+        config = PreTrainedConfig.from_pretrained(source)
+        return {"type": config.type, **plain(config)}
+    except Exception as error:  # draccus, for a type that is not installed or a field that does not exist
+        raise ConfigError(f"The configuration of the checkpoint {source} cannot be used: {error}") from error

@@ -1,0 +1,147 @@
+"""Checkpoints of a training run: LeRobot's, written so that a kill at any moment leaves the one before usable."""
+
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot.common.train_utils import get_step_checkpoint_dir, load_training_state, save_checkpoint
+from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
+
+from bhd_lerobot.errors import BhdError, ConfigError, quoted
+from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.training.config import BhdTrainConfig
+
+LOOP_STATE = "bhd_loop.json"
+"""In `training_state`: where the loader was, and what had been measured since the last logged step."""
+
+
+@dataclass
+class TrainingParts:
+    """What a checkpoint consists of.
+
+    Attributes:
+        policy: a LeRobot policy, not wrapped for several processes.
+        optimizer: its optimizer.
+        scheduler: of the learning rate; None if there is none.
+        preprocessor: from a batch to the policy's input.
+        postprocessor: from the policy's output to an action.
+        contract: what the policy is trained on.
+    """
+
+    policy: Any
+    optimizer: Any
+    scheduler: Any
+    preprocessor: Any
+    postprocessor: Any
+    contract: PolicyContract
+
+
+def save(config: BhdTrainConfig, step: int, parts: TrainingParts, loop: dict[str, Any], processes: int = 1) -> Path:
+    """Write a checkpoint, point `last` at it, and return its folder.
+
+    It is built under another name and renamed when it is complete, so there is never half a checkpoint under a
+    checkpoint's name.
+
+    Args:
+        config: of the run.
+        step: training steps that were done.
+        parts: what is saved.
+        loop: state of the loop, JSON values.
+        processes: number of processes that train together.
+
+    Raises:
+        BhdError: it cannot be written; those before it are intact.
+    """
+    assert config.output_dir is not None
+    final = get_step_checkpoint_dir(Path(config.output_dir), config.steps, step)
+    part = final.with_name(f".{final.name}.part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        save_checkpoint(
+            part,
+            step,
+            config,
+            parts.policy,
+            parts.optimizer,
+            parts.scheduler,
+            parts.preprocessor,
+            parts.postprocessor,
+            num_processes=processes,
+            batch_size=config.batch_size,
+        )
+        parts.contract.save(part / PRETRAINED_MODEL_DIR)
+        (part / TRAINING_STATE_DIR / LOOP_STATE).write_text(json.dumps(loop), encoding="utf-8")
+        _flush(part)
+        _rename(part, final)
+        _point(final)
+    except Exception as error:  # safetensors raises errors of its own for a full disk
+        shutil.rmtree(part, ignore_errors=True)
+        raise BhdError(
+            f"The checkpoint of step {step} cannot be written to {final.parent}: {error}. Those before it are intact."
+        ) from error
+    return final
+
+
+def load(checkpoint: Path, parts: TrainingParts) -> tuple[int, dict[str, Any]]:
+    """Load optimizer, scheduler and random states of a checkpoint; return its step and the state of the loop.
+
+    The policy's weights and the processors are loaded when they are made.
+
+    Args:
+        checkpoint: its folder.
+        parts: what is loaded into.
+
+    Raises:
+        ConfigError: it is no checkpoint that training can go on from.
+    """
+    try:
+        step, _, _ = load_training_state(checkpoint, parts.optimizer, parts.scheduler)
+        path = checkpoint / TRAINING_STATE_DIR / LOOP_STATE
+        loop = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    except Exception as error:  # safetensors, JSON, PyTorch: each has its own
+        raise ConfigError(f"Training cannot be resumed from {checkpoint}: {error}") from error
+    return step, loop
+
+
+def clean(output_dir: Path) -> None:
+    """Remove what a kill left of unfinished checkpoints."""
+    for one in (output_dir / "checkpoints").glob(".*"):
+        if one.is_symlink():
+            one.unlink()
+        else:
+            shutil.rmtree(one, ignore_errors=True)
+
+
+def resume_command(checkpoint: Path) -> str:
+    """Return the command that goes on from a run's last checkpoint."""
+    last = checkpoint.parent / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR / "train_config.json"
+    return f"bhd-train --resume=true --config_path={quoted(last)}"
+
+
+def _rename(part: Path, final: Path) -> None:
+    old = final.with_name(f".{final.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if final.exists():  # a kill between the renaming and the link; `last` still points at one before
+        os.replace(final, old)
+    os.replace(part, final)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _point(final: Path) -> None:
+    link = final.with_name(f".{LAST_CHECKPOINT_LINK}.part")
+    link.unlink(missing_ok=True)
+    link.symlink_to(final.name)
+    os.replace(link, final.with_name(LAST_CHECKPOINT_LINK))
+
+
+def _flush(folder: Path) -> None:
+    """Have the system write the files to disk before they get their final name, in case the power fails."""
+    for path in (p for p in folder.rglob("*") if p.is_file()):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,193 @@
+"""Configuration of `bhd-train`: LeRobot's, and a few fields of ours."""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import draccus
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
+
+from bhd_lerobot.datasets.loader.selection import HOLD_OUTS, EpisodeFilter
+from bhd_lerobot.errors import ConfigError, quoted, unknown_name
+
+OWN_CONFIG_NAME = "bhd_train.json"
+"""The fields that LeRobot's `train_config.json` has no place for; beside it in every checkpoint."""
+
+STATISTICS = ("checkpoint", "dataset")
+
+
+@dataclass
+class SelectionConfig:
+    """Which frames are learned from.
+
+    Attributes:
+        outcome: episodes that ended so: `all`, or events that an episode can end with, such as `success`.
+        min_score: episodes with at least this score, 0 to 1; any if nothing.
+        exclude_late: leave out episodes with more late frames than their recording tolerated.
+        intervention_weight: how often frames in which somebody intervened are drawn, compared with others; 0 drops
+            them.
+        hold_out: of what `dataset.eval_split` is the share that is held out: `episode`, of all episodes; `instruction`,
+            of each instruction's, and at least one of each, as `lerobot-train` does.
+    """
+
+    outcome: list[str] = field(default_factory=lambda: ["all"])
+    min_score: float | None = None
+    exclude_late: bool = False
+    intervention_weight: float = 1.0
+    hold_out: str = "episode"
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        _ = self.filter
+        if not 0 <= self.intervention_weight < float("inf"):
+            raise ConfigError(
+                f"selection.intervention_weight is {self.intervention_weight}; it must be 0 or more, and finite."
+            )
+        if self.hold_out not in HOLD_OUTS:
+            raise ConfigError(unknown_name("selection.hold_out", self.hold_out, HOLD_OUTS))
+
+    @property
+    def filter(self) -> EpisodeFilter:
+        """Which episodes are wanted."""
+        return EpisodeFilter(outcome=self.outcome, min_score=self.min_score, exclude_late=self.exclude_late)
+
+    @property
+    def is_everything(self) -> bool:
+        """Whether no episode is left out."""
+        return self.filter.outcomes is None and self.min_score is None and not self.exclude_late
+
+
+@dataclass
+class BhdTrainConfig(TrainPipelineConfig):
+    """Train a policy on a LeRobotDataset, with a loop that resumes to the same bits.
+
+    All fields of LeRobot's `TrainPipelineConfig` mean what they mean for `lerobot-train`. One default differs:
+    `policy.push_to_hub` is true only if it was said.
+
+    Attributes:
+        selection: which frames are learned from.
+        budget_gib: memory that the dataset may take as tensors [GiB]; beyond it LeRobot's own loader is used.
+        fine_tune: checkpoint to start from: a folder, or a name on the Hub. Like `policy.path`, but the dataset is
+            checked against what the checkpoint was trained on.
+        fine_tune_statistics: with `fine_tune`, by which statistics observations and actions are normalised: those of
+            the `checkpoint`, which keep the meaning of its weights, or those of the `dataset`.
+        fine_tune_parameters: which of the policy's parameters are trained, by name or pattern; the others stay as they
+            are. `["*.bias"]` changes so little that a few episodes suffice for a shift (E. Ben Zaken et al., "BitFit",
+            2022).
+        threads: threads of a training process on the CPU; PyTorch's own number if nothing. The last bits of a loss
+            depend on it.
+    """
+
+    selection: SelectionConfig = field(default_factory=SelectionConfig)
+    budget_gib: float = 4.0
+    fine_tune: str | None = None
+    fine_tune_statistics: str = "checkpoint"
+    fine_tune_parameters: list[str] = field(default_factory=lambda: ["*"])
+    threads: int | None = None
+
+    def _resolve_pretrained_from_cli(self) -> None:
+        """Do nothing: `train_arguments.parse_train` has done it, and from its own arguments."""
+
+    def validate(self) -> None:
+        """Check the configuration and fill in what follows from it: LeRobot's rules, and ours.
+
+        Raises:
+            ConfigError: names the value, and what would be valid.
+        """
+        for name, value, least in (
+            ("steps", self.steps, 1),
+            ("batch_size", self.batch_size, 1),
+            ("threads", 1 if self.threads is None else self.threads, 1),
+            ("num_workers", self.num_workers, 0),
+            ("seed", 0 if self.seed is None else self.seed, 0),
+            ("max_eval_samples", self.max_eval_samples, 0),
+            ("log_freq", self.log_freq, 0),
+            ("save_freq", self.save_freq, 0),
+            ("eval_steps", self.eval_steps, 0),
+            ("env_eval_freq", self.env_eval_freq, 0),
+            ("eval.n_episodes", self.eval.n_episodes if self._is_evaluated else 1, 1),
+            ("eval.batch_size", self.eval.batch_size if self._is_evaluated else 1, 1),
+        ):
+            if value < least:
+                raise ConfigError(f"{name} is {value}; it must be at least {least}.")
+        if not 0 < self.tolerance_s < float("inf"):
+            raise ConfigError(f"tolerance_s is {self.tolerance_s}; it must be more than 0, and finite [s].")
+        if not self.budget_gib > 0:
+            raise ConfigError(f"budget_gib is {self.budget_gib}; it must be more than 0.")
+        if self.fine_tune_statistics not in STATISTICS:
+            raise ConfigError(unknown_name("fine_tune_statistics", self.fine_tune_statistics, STATISTICS))
+        if self.policy is None:
+            raise ConfigError(
+                f"No policy is given; set --policy.type, one of {', '.join(policy_types())}, or --fine_tune."
+            )
+        if self.reward_model is not None:
+            raise ConfigError("bhd-train trains policies; for a reward_model use lerobot-train.")
+        if self.dataset.streaming or self.job.is_remote:
+            option = "dataset.streaming" if self.dataset.streaming else "job.target"
+            raise ConfigError(f"{option} is not for bhd-train; use lerobot-train, which reads the same configuration.")
+        if self.output_dir is not None and not self.resume and _is_there(Path(self.output_dir)):
+            raise ConfigError(
+                f"The output folder {self.output_dir} exists. Set another --output_dir, or continue its run with "
+                f"--resume=true --config_path={quoted(Path(self.output_dir) / 'checkpoints/last/pretrained_model')}."
+            )
+        if self.policy.push_to_hub and not self.policy.repo_id:
+            raise ConfigError("policy.push_to_hub is true: set --policy.repo_id=user/name, or push_to_hub to false.")
+        given = self.optimizer, self.scheduler
+        try:
+            super().validate()
+        except (ValueError, OSError, NotImplementedError) as error:
+            raise ConfigError(f"The configuration cannot be used: {error}") from error
+        if self.use_policy_training_preset and not self.resume:
+            self._refuse_unused(*given)
+
+    @property
+    def _is_evaluated(self) -> bool:
+        return self.env is not None and self.env_eval_freq > 0
+
+    def _refuse_unused(self, optimizer: Any, scheduler: Any) -> None:
+        """Refuse an optimizer or scheduler that LeRobot would silently replace by the policy's own."""
+        for name, wanted, used in (("optimizer", optimizer, self.optimizer), ("scheduler", scheduler, self.scheduler)):
+            if wanted is not None and wanted != used:
+                raise ConfigError(
+                    f"{name} is given, but use_policy_training_preset is true, which takes the policy's own. Set "
+                    f"it to false and both optimizer and scheduler, or change policy.{name}_… instead."
+                )
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        """Write LeRobot's fields into the file that LeRobot reads, and ours beside it."""
+        values = plain(self)
+        own = {name: values.pop(name) for name in own_fields()}
+        (save_directory / TRAIN_CONFIG_NAME).write_text(json.dumps(values, indent=4), encoding="utf-8")
+        (save_directory / OWN_CONFIG_NAME).write_text(json.dumps(own, indent=4), encoding="utf-8")
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError as error:  # a name that is too long, a folder that may not be looked into
+        raise ConfigError(f"The output folder {path} cannot be used: {error.strerror}. Set --output_dir.") from error
+
+
+def own_fields() -> list[str]:
+    """Return the names of the fields that LeRobot's configuration does not have."""
+    stock = {one.name for one in dataclasses.fields(TrainPipelineConfig)}
+    return [one.name for one in dataclasses.fields(BhdTrainConfig) if one.name not in stock]
+
+
+def policy_types() -> Sequence[str]:
+    """Return the policies that can be trained, by the name of their type."""
+    return sorted(PreTrainedConfig.get_known_choices())
+
+
+def plain(config: Any) -> dict[str, Any]:
+    """Return a configuration as JSON values, with every default filled in: what `parse_train` would read back."""
+    encoded: Mapping[str, Any] = draccus.encode(config)
+    return json.loads(json.dumps(encoded))

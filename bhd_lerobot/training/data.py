@@ -1,0 +1,167 @@
+"""What a training run learns from, by its configuration; `data/` chooses, splits, checks and serves it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.transforms import ImageTransforms
+
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.loader.loader import Loader, check, imagenet_stats, make_loader
+from bhd_lerobot.datasets.loader.source import local_metadata
+from bhd_lerobot.datasets.format.state import load_info
+from bhd_lerobot.datasets.loader.table import checked_episodes
+from bhd_lerobot.errors import DatasetError, quoted
+from bhd_lerobot.training.config import BhdTrainConfig
+
+
+@dataclass
+class TrainingData:
+    """What is learned from.
+
+    Attributes:
+        train: batches to learn from.
+        held_out: batches of the held-out episodes; None if there are none.
+        frames: samples in an epoch.
+        episodes: number of episodes that are learned from.
+        held_out_episodes: those that are not, by number.
+        how: how the batches are served, in words.
+    """
+
+    train: Loader
+    held_out: Loader | None
+    frames: int
+    episodes: int
+    held_out_episodes: list[int]
+    how: str
+
+
+def open_metadata(config: BhdTrainConfig) -> LeRobotDatasetMetadata:
+    """Return the metadata of the dataset that is learned from, with ImageNet's statistics if those are wanted.
+
+    Raises:
+        DatasetError: there is no such dataset, it is empty, or it has no statistics.
+    """
+    dataset = config.dataset
+    root = Path(dataset.root).expanduser() if dataset.root else None
+    _refuse_empty(root or default_root(dataset.repo_id))
+    chosen = config.selection
+
+    def select(found: LeRobotDatasetMetadata) -> list[int]:
+        return chosen.filter.select(found, dataset.episodes)
+
+    meta = local_metadata(
+        dataset.repo_id, root, dataset.revision, dataset.episodes, None if chosen.is_everything else select
+    )
+    checked_episodes(meta, dataset.episodes)
+    if not meta.stats:
+        raise DatasetError(
+            f"{meta.root} has no statistics, so nothing can be normalised: it was not finalised. "
+            f"Run bhd-data repair {quoted(meta.root)}."
+        )
+    if dataset.use_imagenet_stats:
+        imagenet_stats(meta)
+    return meta
+
+
+def select_episodes(config: BhdTrainConfig, meta: LeRobotDatasetMetadata) -> None:
+    """Put the episodes that `selection` leaves into `dataset.episodes`, so that lerobot-train can go on with the same.
+
+    Raises:
+        DatasetError: none is left; the message says what there is.
+    """
+    if not config.selection.is_everything:
+        config.dataset.episodes = config.selection.filter.select(meta, config.dataset.episodes)
+
+
+def _refuse_empty(root: Path) -> None:
+    """Say so, because LeRobot cannot open the metadata of a dataset without episodes."""
+    if (root / layout.INFO).is_file() and load_info(root)["total_episodes"] == 0:
+        raise DatasetError(f"{root} has no episode, so there is nothing to learn from. Record some with bhd-record.")
+
+
+def open_data(
+    config: BhdTrainConfig,
+    policy: PreTrainedConfig,
+    meta: LeRobotDatasetMetadata,
+    *,
+    device: torch.device,
+    rank: int = 0,
+    world_size: int = 1,
+    say: Callable[[str], None] = lambda message: None,
+) -> TrainingData:
+    """Load the dataset.
+
+    Args:
+        config: what is asked for, with `dataset.episodes` as `select_episodes` left it.
+        policy: the policy's configuration, with its features.
+        meta: of the dataset.
+        device: where batches are needed.
+        rank: this process among `world_size`.
+        world_size: processes that train together.
+        say: gets what the user should know: that LeRobot's own loader is used, and why.
+
+    Raises:
+        BhdError: no episode is left, a value is not finite, or the dataset cannot be read.
+    """
+    dataset = config.dataset
+    keep = kept_features(meta, policy, config.rename_map)
+    deltas = {key: times for key, times in (resolve_delta_timestamps(policy, meta) or {}).items() if key in keep}
+    loaders = make_loader(
+        dataset.repo_id,
+        batch_size=config.batch_size,
+        seed=0 if config.seed is None else config.seed,
+        root=meta.root,
+        revision=dataset.revision,
+        episodes=dataset.episodes,
+        intervention_weight=config.selection.intervention_weight,
+        eval_split=dataset.eval_split,
+        hold_out=config.selection.hold_out,
+        max_eval_samples=config.max_eval_samples,
+        delta_timestamps=deltas or None,
+        drop_n_last_frames=getattr(policy, "drop_n_last_frames", 0),
+        image_transforms=ImageTransforms(dataset.image_transforms) if dataset.image_transforms.enable else None,
+        use_imagenet_stats=dataset.use_imagenet_stats,
+        tolerance_s=config.tolerance_s,
+        video_backend=dataset.video_backend,
+        keep=keep,
+        budget_gib=config.budget_gib,
+        num_workers=config.num_workers,
+        device=device,
+        pin=device.type == "cuda",
+        rank=rank,
+        world_size=world_size,
+        say=say,
+    )
+    stock = getattr(loaders.train, "_loader", None)
+    if stock is not None:
+        # Else each new iterator draws from the common generator, and a resumed run, which makes one more, goes astray.
+        stock.generator = torch.Generator().manual_seed(0)
+    check(loaders.dataset, keep)
+    if loaders.held_out is not None:
+        check(loaders.held_out.dataset, keep)
+    size = getattr(loaders.dataset, "nbytes", None)
+    return TrainingData(
+        train=loaders.train,
+        held_out=loaders.held_out,
+        frames=len(loaders.train.order.samples),
+        episodes=loaders.dataset.num_episodes,
+        held_out_episodes=[] if loaders.held_out is None else sorted(loaders.held_out.dataset.episodes),
+        how=f"LeRobot's, {config.num_workers} workers" if size is None else f"in memory, {size / 2**20:.3g} MiB",
+    )
+
+
+def kept_features(
+    meta: LeRobotDatasetMetadata, policy: PreTrainedConfig, rename_map: dict[str, str] | None = None
+) -> list[str]:
+    """Return the features of the dataset that the policy learns from, by the dataset's names."""
+    wanted: set[Any] = {*(policy.input_features or {}), *(policy.output_features or {})}
+    if policy.reward_delta_indices is not None:
+        wanted |= {"next.reward", "next.done"}
+    return [key for key in meta.features if (rename_map or {}).get(key, key) in wanted]

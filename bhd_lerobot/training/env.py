@@ -1,0 +1,92 @@
+"""Success in a simulated environment, measured by LeRobot's own evaluation while a policy is trained."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.common.train_utils import get_step_identifier
+from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
+from lerobot.scripts.lerobot_eval import eval_policy_all
+from lerobot.utils.random_utils import seeded_context
+
+from bhd_lerobot.envs.register import ENVIRONMENTS
+from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.training.config import BhdTrainConfig
+from bhd_lerobot.training.checkpoint import TrainingParts
+from bhd_lerobot.training.log import Row
+
+
+class EnvEvaluation:
+    """Runs the environment of a training configuration."""
+
+    def __init__(self, config: BhdTrainConfig, parts: TrainingParts, accelerator: Any) -> None:
+        """Prepare it.
+
+        Args:
+            config: with `env` and `eval`.
+            parts: the policy and its processors.
+            accelerator: accelerate's; only its main process evaluates.
+
+        Raises:
+            ConfigError: the environment is of another robot than the dataset.
+        """
+        _check_robot(config, parts.contract.robot_type)
+        self._config, self._parts, self._accelerator = config, parts, accelerator
+        self._before, self._after = make_env_pre_post_processors(env_cfg=config.env, policy_cfg=config.policy)
+
+    def run(self, step: int) -> Row:
+        """Evaluate after a step; the training goes on as if that had not happened.
+
+        Returns:
+            `success` [%], `sum_reward` and `eval_s`, the time that it took [s].
+        """
+        config: Any = self._config
+        row: Row = {}
+        if self._accelerator.is_main_process:
+            seed = config.seed or 0
+            envs = make_env(config.env, n_envs=config.eval.batch_size, use_async_envs=config.eval.use_async_envs)
+            try:
+                with seeded_context(seed), torch.no_grad(), self._accelerator.autocast():
+                    info = eval_policy_all(
+                        envs=envs,
+                        policy=self._parts.policy,
+                        env_preprocessor=self._before,
+                        env_postprocessor=self._after,
+                        preprocessor=self._parts.preprocessor,
+                        postprocessor=self._parts.postprocessor,
+                        n_episodes=config.eval.n_episodes,
+                        videos_dir=Path(config.output_dir)
+                        / "eval"
+                        / f"videos_{get_step_identifier(step, config.steps)}",
+                        max_episodes_rendered=0,
+                        start_seed=seed,
+                        max_parallel_tasks=config.env.max_parallel_tasks,
+                    )
+            except BhdError:
+                raise
+            except Exception as error:  # of a policy, an environment, or a processor between them
+                raise BhdError(
+                    f"The policy cannot be evaluated in env.task={getattr(config.env, 'task', None)!r}: "
+                    f"{' '.join(str(error).split())}. "
+                    "Set --env_eval_freq=0, or the env of the dataset's robot and task."
+                ) from error
+            finally:
+                close_envs(envs)
+                self._parts.policy.train()
+            overall = info["overall"]
+            row = {
+                "success": float(overall["pc_success"]),
+                "sum_reward": float(overall["avg_sum_reward"]),
+                "eval_s": float(overall["eval_s"]),
+            }
+        self._accelerator.wait_for_everyone()
+        return row
+
+
+def _check_robot(config: BhdTrainConfig, robot: str | None) -> None:
+    pair = ENVIRONMENTS.get(str(getattr(config.env, "task", None)))
+    if robot is not None and pair is not None and pair[0] != robot:
+        fitting = ", ".join(sorted(name for name, (kind, _) in ENVIRONMENTS.items() if kind == robot)) or "none"
+        raise ConfigError(
+            f"env.task is {config.env.task!r}, which is for a {pair[0]}; the dataset is of a {robot}. Valid: {fitting}."
+        )

@@ -1,0 +1,283 @@
+"""The training loop: steps, and what happens between them."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bhd_lerobot.errors import BhdError
+from bhd_lerobot.training.log import Row
+from bhd_lerobot.training.step import Learner, NonFiniteLossError, StepResult
+
+Batch = dict[str, Any]
+
+
+class DivergedError(BhdError):
+    """The loss became infinite or not a number."""
+
+
+@dataclass
+class LoopOptions:
+    """When the loop does what; a frequency of 0 is never.
+
+    Attributes:
+        steps: when it is over.
+        batch_size: samples in a step, of all processes.
+        frames: samples in an epoch.
+        log_freq: steps from one row of metrics to the next.
+        eval_freq: steps from one held-out loss to the next; there is one after the last step, too.
+        save_freq: steps from one checkpoint to the next; there is one after the last step, too.
+        env_eval_freq: steps from one evaluation in an environment to the next.
+        seed: of the noise in the held-out loss.
+        held_out: numbers of the episodes that are not learned from.
+    """
+
+    steps: int
+    batch_size: int
+    frames: int
+    log_freq: int
+    eval_freq: int = 0
+    save_freq: int = 0
+    env_eval_freq: int = 0
+    seed: int = 0
+    held_out: Sequence[int] = ()
+
+
+@dataclass
+class Hooks:
+    """What the loop calls; all of it in every process.
+
+    Attributes:
+        held_out: makes an iterator over the held-out batches; None if there are none.
+        log: takes a row of metrics.
+        save: takes the step and the state of the loop, and writes a checkpoint; None if none is wanted.
+        evaluate: takes the step, returns metrics of an evaluation in an environment; None if there is none.
+        progress: takes the step.
+        should_stop: whether to end after this step.
+        mean: over all processes, of numbers in a tensor.
+    """
+
+    held_out: Callable[[], Iterator[Batch]] | None = None
+    log: Callable[[Row], None] = lambda row: None
+    save: Callable[[int, dict[str, Any]], None] | None = None
+    evaluate: Callable[[int], Row] | None = None
+    progress: Callable[[int], None] = lambda step: None
+    should_stop: Callable[[int], bool] = lambda step: False
+    mean: Callable[[Tensor], Tensor] = lambda values: values
+
+
+@dataclass
+class Window:
+    """What was measured since the last row of metrics.
+
+    Attributes:
+        results: one for each step.
+        before: the same, of steps before this process was started, as plain numbers.
+        batches: where each step's samples come from: `episode_index` and `frame_index`.
+        data_s: time that went into getting batches [s].
+        update_s: time that went into learning from them [s].
+        other_s: time that went into what is neither, such as checkpoints [s].
+        started: when it began, in this process.
+    """
+
+    results: list[StepResult] = field(default_factory=list)
+    before: list[dict[str, float]] = field(default_factory=list)
+    batches: list[tuple[Any, Any]] = field(default_factory=list)
+    data_s: float = 0.0
+    update_s: float = 0.0
+    other_s: float = 0.0
+    started: float = field(default_factory=time.perf_counter)
+
+    def numbers(self) -> list[dict[str, float]]:
+        """Return the measurements of every step as plain numbers; waits for the device."""
+        if not self.results:
+            return list(self.before)
+        losses = torch.stack([one.loss for one in self.results]).tolist()
+        norms = torch.stack([one.grad_norm for one in self.results]).tolist()
+        rows = []
+        for result, loss, norm in zip(self.results, losses, norms, strict=True):
+            outputs = {key: float(one) for key, one in result.outputs.items() if _is_number(one)}
+            rows.append({**outputs, "loss": loss, "grad_norm": norm})
+        return [*self.before, *rows]
+
+
+class TrainingLoop:
+    """Steps from where it is to the end.
+
+    Attributes:
+        step: steps that were done.
+        interrupted: whether it ended because it was asked to.
+    """
+
+    def __init__(self, learner: Learner, loader: Any, options: LoopOptions, hooks: Hooks) -> None:
+        """Prepare it at step 0.
+
+        Args:
+            learner: what learns.
+            loader: iterable over the batches of an epoch, with `state_dict` and `load_state_dict`.
+            options: when what happens.
+            hooks: what is called then.
+        """
+        self.learner, self.loader, self.options, self.hooks = learner, loader, options, hooks
+        self.step = 0
+        self.interrupted = False
+        self._window = Window()
+        self._saved: int | None = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return where it is, as JSON values: floats keep all their bits."""
+        return {
+            "frames": self.options.frames,
+            "held_out": list(self.options.held_out),
+            "loader": self.loader.state_dict(),
+            "window": self._window.numbers(),
+        }
+
+    def load_state_dict(self, step: int, state: dict[str, Any]) -> None:
+        """Go on after `step` steps.
+
+        Raises:
+            BhdError: the dataset or the selection is not the one of the state.
+        """
+        if state.get("frames", self.options.frames) != self.options.frames:
+            raise BhdError(
+                f"The run was started on {state['frames']} frames, and now there are {self.options.frames}: the "
+                "dataset or the selection has changed since. To learn from it, start a new run with "
+                "--fine_tune=CHECKPOINT."
+            )
+        before, now = state.get("held_out", list(self.options.held_out)), list(self.options.held_out)
+        if before != now:
+            raise BhdError(
+                f"The run was started with {_listed(before)} held out, and now it would be {_listed(now)}. Leave "
+                "dataset.eval_split and selection.hold_out as they were, or start a new run."
+            )
+        self.step = self._saved = step
+        self._window = Window(before=list(state.get("window", [])))
+        if "loader" in state:
+            self.loader.load_state_dict(state["loader"])
+
+    def run(self) -> None:
+        """Train to the end, or until asked to stop; then a checkpoint of the last step exists.
+
+        Raises:
+            DivergedError: the loss is not finite; nothing was saved since.
+            BhdError: a checkpoint cannot be written.
+        """
+        batches = self._batches()
+        self._window.started = time.perf_counter()
+        while self.step < self.options.steps and not self.interrupted:
+            started = time.perf_counter()
+            raw = next(batches)
+            where = (raw.get("episode_index"), raw.get("frame_index"))
+            batch = self.learner.prepare(raw)
+            loaded = time.perf_counter()
+            try:
+                result = self.learner.step(batch)
+            except NonFiniteLossError as error:
+                raise self._diverged(self.step + 1, error.args[0], where) from None
+            self.step += 1
+            self._window.results.append(result)
+            self._window.batches.append(where)
+            self._window.data_s += loaded - started
+            self._window.update_s += time.perf_counter() - loaded
+            self._between()
+
+    def _between(self) -> None:
+        step, options, hooks = self.step, self.options, self.hooks
+        is_last = step == options.steps
+        self.interrupted = hooks.should_stop(step)
+        is_log, is_saving = _is_due(step, options.log_freq), _is_due(step, options.save_freq) or is_last
+        is_eval = hooks.held_out is not None and options.eval_freq > 0 and (_is_due(step, options.eval_freq) or is_last)
+        row: Row = {"step": step, "epoch": step * options.batch_size / options.frames}
+        if is_log:
+            row |= self._measured()
+        began = time.perf_counter()
+        if is_eval and hooks.held_out is not None:
+            self._check()
+            row["held_out_loss"] = self.learner.held_out_loss(hooks.held_out(), options.seed)
+        if hooks.evaluate is not None and _is_due(step, options.env_eval_freq):
+            row |= hooks.evaluate(step)
+        if len(row) > 2:
+            hooks.log(row)
+        hooks.progress(step)
+        if hooks.save is not None and (is_saving or self.interrupted) and self._saved != step:
+            self._check()
+            hooks.save(step, self.state_dict())
+            self._saved = step
+        self._window.other_s += time.perf_counter() - began
+
+    def _measured(self) -> Row:
+        """Return the means over the window, and start a new one."""
+        self._check()
+        window, rows = self._window, self._window.numbers()
+        elapsed = time.perf_counter() - window.started - window.other_s
+        keys = ["loss", "grad_norm", *(key for key in rows[-1] if key not in ("loss", "grad_norm"))]
+        means = torch.tensor(
+            [math.fsum(row.get(key, 0.0) for row in rows) / len(rows) for key in keys], dtype=torch.float64
+        )
+        count = len(window.results)
+        row: Row = dict(zip(keys, self.hooks.mean(means).tolist(), strict=True))
+        row |= {
+            "lr": self.learner.lr,
+            "data_s": window.data_s / count,
+            "update_s": window.update_s / count,
+            "steps_per_s": count / elapsed,
+            "samples_per_s": count * self.options.batch_size / elapsed,
+        }
+        self._window = Window()
+        return row
+
+    def _check(self) -> None:
+        """Look for a loss that is not finite; where that was done at once, there is none.
+
+        Raises:
+            DivergedError: names the first one.
+        """
+        if not self._window.results:
+            return
+        losses = torch.stack([one.loss for one in self._window.results])
+        bad = (~torch.isfinite(losses)).nonzero()
+        if len(bad):
+            place = int(bad[0, 0])
+            first = self.step - len(losses) + 1 + place
+            raise self._diverged(first, float(losses[place]), self._window.batches[place])
+
+    def _diverged(self, step: int, loss: float, where: tuple[Any, Any]) -> DivergedError:
+        name = f"step {step} (epoch {(step - 1) * self.options.batch_size // self.options.frames})"
+        if all(isinstance(one, Tensor) for one in where):
+            pairs = [f"{int(e)}:{int(f)}" for e, f in zip(*where, strict=True)]
+            shown = ", ".join(pairs[:8]) + (f", … ({len(pairs)} samples)" if len(pairs) > 8 else "")
+            name += f", batch of episode:frame {shown}"
+        saved = "there is none yet" if not self._saved else f"that of step {self._saved} is kept"
+        return DivergedError(
+            f"The loss is {loss} at {name}. Training stops; of the checkpoints, {saved}. Lower the learning rate "
+            "(--policy.optimizer_lr), clip gradients, or look for extreme values in the data."
+        )
+
+    def _batches(self) -> Iterator[Batch]:
+        is_new_epoch = self.loader.state_dict().get("position", 0) == 0
+        while True:
+            if is_new_epoch:
+                # As PyTorch's DataLoader does, so that dropout and noise are those of lerobot-train for the same seed.
+                torch.empty((), dtype=torch.int64).random_()
+            yield from self.loader
+            is_new_epoch = True
+
+
+def _listed(episodes: Sequence[int]) -> str:
+    shown = ", ".join(map(str, episodes[:5])) + (", …" if len(episodes) > 5 else "")
+    return f"{len(episodes)} episodes ({shown})" if episodes else "no episode"
+
+
+def _is_due(step: int, frequency: int) -> bool:
+    return frequency > 0 and step % frequency == 0
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, Tensor):
+        return value.numel() == 1 and value.dtype != torch.bool
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,0 +1,168 @@
+"""What a training run leaves: its folder, and what of it goes to the Hub and to wandb."""
+
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from lerobot.common.train_utils import push_checkpoint_to_hub
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+
+from bhd_lerobot.datasets.remote.hub_errors import hub_errors
+from bhd_lerobot.errors import BhdError, ConfigError, TransferError
+from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
+from bhd_lerobot.training import checkpoint
+from bhd_lerobot.training.config import BhdTrainConfig, plain
+from bhd_lerobot.cli.data.push import check_pushable
+from bhd_lerobot.hub.transfer import prompt_interrupt
+from bhd_lerobot.training.checkpoint import TrainingParts
+from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME, MetricsFile, Row, draw_loss, read_metrics
+
+
+class RunOutput:
+    """Writes a run's folder. Of several processes only the main one does; in the others nothing happens.
+
+    Attributes:
+        folder: the run's folder.
+        checkpoint: the last checkpoint; None if there is none.
+    """
+
+    def __init__(
+        self, config: BhdTrainConfig, parts: TrainingParts, step: int, *, is_main: bool = True, processes: int = 1
+    ) -> None:
+        """Open the folder, with the metrics up to the step that a resumed run goes on from.
+
+        Args:
+            config: of the run.
+            parts: what a checkpoint consists of.
+            step: steps that were done.
+            is_main: whether this process writes.
+            processes: number of processes that train together.
+
+        Raises:
+            ConfigError: the folder cannot be written.
+        """
+        self.folder, self.checkpoint = Path(str(config.output_dir)), config.checkpoint_path
+        policy: Any = config.policy
+        if is_main and policy is not None and (policy.push_to_hub or config.save_checkpoint_to_hub):
+            check_pushable(str(policy.repo_id))  # before hours of training, not after
+        self._config, self._parts, self._processes = config, parts, processes
+        self._metrics = self._open(step) if is_main else None
+        self._wandb = self._make_wandb() if is_main else None
+
+    @property
+    def rows(self) -> list[Row]:
+        """Rows of `metrics.jsonl`; none in other processes than the main one."""
+        return [] if self._metrics is None else self._metrics.rows
+
+    def log(self, row: Row) -> None:
+        """Write a row of metrics.
+
+        Raises:
+            BhdError: it cannot be written.
+        """
+        if self._metrics is None:
+            return
+        try:
+            self._metrics.append(row)
+        except OSError as error:
+            kept = "there is none yet" if self.checkpoint is None else f"{self.checkpoint} is intact"
+            raise BhdError(
+                f"The metrics of step {row['step']} cannot be written to {self._metrics.path}: {error.strerror}. "
+                f"Training stops; of the checkpoints, {kept}. Make room, and resume the run."
+            ) from error
+        if self._wandb is not None:
+            self._wandb.log_dict({key: one for key, one in row.items() if key != "step"}, row["step"])
+
+    def save(self, step: int, loop_state: dict[str, Any]) -> None:
+        """Write a checkpoint, and share it if that was asked for.
+
+        Raises:
+            BhdError: it cannot be written or uploaded; those before it are intact.
+        """
+        if self._metrics is None:
+            return
+        self.checkpoint = checkpoint.save(self._config, step, self._parts, loop_state, self._processes)
+        self.draw(step)
+        config = self._config
+        if config.save_checkpoint_to_hub and config.policy is not None:
+            again = f"When that is mended, go on with:\n  {checkpoint.resume_command(self.checkpoint)}"
+            with self._uploading(str(config.policy.repo_id), "The checkpoint", again):
+                push_checkpoint_to_hub(self.checkpoint, config.policy.repo_id, private=config.policy.private)
+        if self._wandb is not None:
+            self._wandb.log_policy(self.checkpoint)
+
+    def draw(self, step: int) -> None:
+        """Draw the curve. Where that fails, what was learned is worth more than its picture: the run goes on."""
+        if self._metrics is None:
+            return
+        config = self._config
+        heading = f"{config.job_name} on {config.dataset.repo_id}, step {step} of {config.steps}"
+        try:
+            draw_loss(self._metrics.rows, self.folder / PLOT_NAME, heading)
+        except OSError:
+            (self.folder / PLOT_NAME).unlink(missing_ok=True)  # half of a picture
+
+    def push(self) -> None:
+        """Upload the policy of a complete run, if that was asked for.
+
+        Raises:
+            BhdError: it was not uploaded; it is complete on this machine.
+        """
+        policy: Any = self._config.policy
+        if self._metrics is None or policy is None or not policy.push_to_hub:
+            return
+        parts = self._parts
+        again = ""
+        if self.checkpoint is not None:
+            private = ["--private"] if policy.private else []
+            folder = str(self.checkpoint / PRETRAINED_MODEL_DIR)
+            again = f"When that is mended:\n  {shlex.join(['hf', 'upload', policy.repo_id, folder, '.', *private])}"
+        with self._uploading(policy.repo_id, "The policy", again):
+            parts.policy.push_model_to_hub(self._config)
+            parts.preprocessor.push_to_hub(policy.repo_id)
+            parts.postprocessor.push_to_hub(policy.repo_id)
+            if self.checkpoint is not None:
+                from huggingface_hub import HfApi
+
+                file = self.checkpoint / PRETRAINED_MODEL_DIR / CONTRACT_FILE
+                HfApi().upload_file(path_or_fileobj=file, path_in_repo=file.name, repo_id=policy.repo_id)
+
+    @contextmanager
+    def _uploading(self, repo_id: str, what: str, again: str) -> Iterator[None]:
+        """Say, where an upload fails or is interrupted, what is kept and how to repeat it."""
+        kept = "is not on this machine" if self.checkpoint is None else f"is complete at {self.checkpoint}"
+        left = f"{what} {kept}. {again}".rstrip()
+        try:
+            with prompt_interrupt(left), hub_errors(repo_id, "upload to"):
+                yield
+        except TransferError as error:
+            raise TransferError(f"{error}\n{left}") from error
+        except KeyboardInterrupt:
+            print(f"Stopped; {repo_id} may hold a part. {left}", file=sys.stderr)
+            raise
+
+    def _open(self, step: int) -> MetricsFile:
+        config, folder = self._config, self.folder
+        source = config.checkpoint_path.parent.parent if config.checkpoint_path else folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            checkpoint.clean(folder)
+            text = yaml.safe_dump(plain(config), sort_keys=False, default_flow_style=None, width=110)
+            (folder / "config.yaml").write_text(text, encoding="utf-8")
+            config._save_pretrained(folder)
+            return MetricsFile(folder / METRICS_NAME, read_metrics(source / METRICS_NAME, step))
+        except OSError as error:
+            raise ConfigError(
+                f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir."
+            ) from error
+
+    def _make_wandb(self) -> Any:
+        if not (self._config.wandb.enable and self._config.wandb.project):
+            return None
+        from lerobot.common.wandb_utils import WandBLogger
+
+        return WandBLogger(self._config)

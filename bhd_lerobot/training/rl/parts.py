@@ -1,0 +1,212 @@
+"""What a run consists of before it learns: the actor, its processors, its contract."""
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from numpy.typing import NDArray
+
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.envs.spaces import action_bounds
+from bhd_lerobot.envs.vector import BhdVectorEnv
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
+from bhd_lerobot.policies.learned.policy import load_policy
+from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
+from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
+from bhd_lerobot.policies.mlp.processor_mlp import make_bhd_mlp_pre_post_processors
+from bhd_lerobot.rollout.types import Episode
+from bhd_lerobot.rollout.provenance import versions
+from bhd_lerobot.training.rl.config import RlConfig
+
+Stats = dict[str, dict[str, torch.Tensor]]
+_RANDOM_FRAMES = 50  # of each environment, when nothing else tells how large the observations are
+
+
+@dataclass
+class RlParts:
+    """What is learned, and what it needs to run.
+
+    Attributes:
+        actor: the policy, with a chunk of one action and a Gaussian around it.
+        front: the same without convolutions, for its features only.
+        before: its preprocessor.
+        after: its postprocessor.
+        contract: what it is trained on.
+        fresh: whether its weights are still to be initialised.
+    """
+
+    actor: MlpPolicy
+    front: MlpPolicy
+    before: Any
+    after: Any
+    contract: PolicyContract
+    fresh: bool
+
+
+def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] = ()) -> RlParts:
+    """Return the actor and what belongs to it.
+
+    Args:
+        config: of the run.
+        env: the environments.
+        episodes: what the observations' scale is estimated from; a short random run if there are none.
+
+    Raises:
+        ConfigError: the checkpoint cannot be started from.
+    """
+    simulation, task = env.stage.simulation, env.stage.task
+    contract = PolicyContract(
+        robot_type=config.robot.type,
+        fps=simulation.rates.fps,
+        observation_names=tuple(simulation.observation_names),
+        action_names=tuple(simulation.action_names),
+        environment_names=tuple(task.environment_names),
+        cameras={},
+        units="SI",
+        task=task.parameters(),
+        trainer="bhd-train, ppo",
+        versions=versions(),
+    )
+    if config.start_from is not None:
+        return _from_checkpoint(config.start_from, contract, config.start_action, see_ignored=config.see_ignored)
+    if config.resume:
+        # With the normalisation that the run began with.
+        return _from_checkpoint(str(config.output_dir), contract)
+    mlp = config.policy.actor()
+    mlp.input_features = {OBS_STATE: PolicyFeature(FeatureType.STATE, (len(contract.observation_names or ()),))}
+    if task.environment_names:
+        mlp.input_features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (len(task.environment_names),))
+    mlp.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, (len(simulation.action_names),))}
+    mlp.set_dataset_feature_metadata({OBS_STATE: {"names": list(simulation.observation_names)}})
+    mlp.validate_features()
+    stats = _observed(episodes) if episodes else _random_run(env, config.seed)
+    low, high = action_bounds(simulation.body, simulation.action_names)
+    stats[ACTION] = {"mean": _tensor((low + high) / 2), "std": _tensor((high - low) / 2)}
+    before, after = make_bhd_mlp_pre_post_processors(mlp, stats)
+    torch.manual_seed(config.seed)
+    return RlParts(MlpPolicy(mlp), _front(mlp), before, after, contract, fresh=True)
+
+
+def _from_checkpoint(path: str, contract: PolicyContract, action: int = 0, *, see_ignored: bool = False) -> RlParts:
+    folder = find_checkpoint(path)
+    loaded = load_policy(folder)
+    who = f"The policy {path!r}"
+    if loaded.kind != "bhd_mlp":
+        raise ConfigError(f"{who} is of the type {loaded.kind!r}; PPO starts from a 'bhd_mlp', or from nothing.")
+    trained = PolicyContract.load(folder)
+    inputs = loaded.config.input_features
+    trained.check(
+        contract.observation_names if OBS_STATE in inputs else None,
+        contract.action_names,
+        contract.fps,
+        contract.environment_names if OBS_ENV_STATE in inputs else None,
+        contract.robot_type,
+        who=who,
+    )
+    for key, names in ((OBS_STATE, contract.observation_names), (ACTION, contract.action_names)):
+        width = loaded.width(key)
+        if width is not None and width != len(names or ()):
+            raise ConfigError(f"{who} has {width} numbers in {key!r}; this robot has {len(names or ())}.")
+    if loaded.config.dropout:
+        raise ConfigError(f"{who} has dropout {loaded.config.dropout}; PPO needs a policy without it.")
+    if loaded.config.scan.channels and loaded.config.scan.transform == "none":
+        raise ConfigError(f"{who} has policy.scan.channels without a transform; train it with inverse or log ranges.")
+    chunk = loaded.config.chunk_size
+    if action >= chunk:
+        raise ConfigError(f"start_action is {action}; {who[0].lower()}{who[1:]} predicts {chunk}: 0 to {chunk - 1}.")
+    if see_ignored and not loaded.config.ignored_columns:
+        raise ConfigError(f"see_ignored is true, and {who[0].lower()}{who[1:]} ignores nothing. Leave it out.")
+    actor = single_action(seeing_all(loaded.policy) if see_ignored else loaded.policy, action)
+    known = dataclasses.replace(contract, dataset=trained.dataset)
+    return RlParts(actor, _front(actor.config), loaded.before, loaded.after, known, fresh=False)
+
+
+def single_action(policy: MlpPolicy, action: int = 0) -> MlpPolicy:
+    """Return a Gaussian policy that predicts one action of another's chunk, with the same weights."""
+    old = policy.config
+    values: dict[str, Any] = {
+        "chunk_size": 1,
+        "n_action_steps": 1,
+        "gaussian": True,
+        "loss": None,
+        "sample": False,
+        "device": "cpu",
+    }
+    config = dataclasses.replace(old, **values)
+    config.scan = copy.deepcopy(old.scan)
+    actor = MlpPolicy(config)
+    size = int(config.action_feature.shape[0])
+    rows = slice(action * size, (action + 1) * size)
+    state = dict(policy.state_dict())
+    last = f"net.{len(policy.net) - 1}"
+    for name in ("weight", "bias"):
+        state[f"{last}.{name}"] = state[f"{last}.{name}"][rows].clone()
+    if "log_std" in state:
+        state["log_std"] = state["log_std"][action : action + 1].clone()
+    else:
+        state["log_std"] = torch.zeros(1, size)
+    actor.load_state_dict(state)
+    return actor
+
+
+def seeing_all(policy: MlpPolicy) -> MlpPolicy:
+    """Return a policy that does the same, and that sees what the other ignores: the weights of that are 0."""
+    config = dataclasses.replace(policy.config, ignore=[], ignored_columns=[])
+    config.scan = copy.deepcopy(policy.config.scan)
+    wider = MlpPolicy(config)
+    state = dict(policy.state_dict())
+    old = state["net.0.weight"]
+    state["net.0.weight"] = old.new_zeros(old.shape[0], wider.feature_size)
+    state["net.0.weight"][:, policy.features_in(wider)] = old
+    wider.load_state_dict(state)
+    return wider
+
+
+def _front(config: MlpConfig) -> MlpPolicy:
+    small = dataclasses.replace(config, hidden_dims=[], scan=dataclasses.replace(config.scan, channels=[]))
+    return MlpPolicy(small).eval()
+
+
+def _observed(episodes: Sequence[Episode]) -> Stats:
+    stats: Stats = {}
+    for column, key in ((keys.OBSERVATION_STATE, OBS_STATE), (keys.ENVIRONMENT_STATE, OBS_ENV_STATE)):
+        parts = [episode.columns[column] for episode in episodes if column in episode.columns]
+        if parts:
+            stats[key] = _scale(np.concatenate(parts))
+    return stats
+
+
+def _random_run(env: BhdVectorEnv, seed: int) -> Stats:
+    """Return the scale of what is seen under random actions, each of which lasts a while."""
+    rng = np.random.default_rng(seed)
+    observation, _ = env.reset()
+    low, high = action_bounds(env.stage.simulation.body, env.stage.simulation.action_names)
+    seen: dict[str, list[NDArray[Any]]] = {"agent_pos": [], "environment_state": []}
+    actions = rng.uniform(low, high, (env.num_envs, len(low))).astype(np.float32)
+    for frame in range(_RANDOM_FRAMES):
+        if frame % 10 == 0:
+            actions = rng.uniform(low, high, (env.num_envs, len(low))).astype(np.float32)
+        for key, parts in seen.items():
+            if key in observation:
+                parts.append(observation[key])
+        observation, _, terminated, truncated, _ = env.step(actions)
+        done = terminated | truncated
+        if done.any():
+            env.reset(options={"reset_mask": done})
+    names = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
+    return {names[key]: _scale(np.concatenate(parts)) for key, parts in seen.items() if parts}
+
+
+def _scale(values: NDArray[Any]) -> dict[str, torch.Tensor]:
+    return {"mean": _tensor(values.mean(axis=0)), "std": _tensor(values.std(axis=0))}
+
+
+def _tensor(values: NDArray[Any]) -> torch.Tensor:
+    return torch.from_numpy(np.asarray(values, np.float32))

@@ -1,0 +1,87 @@
+"""Episodes that judge a policy on the way: those of a run seed of their own, in the evaluation's own loop."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.rollout.registry import make_brain, make_simulation, make_task
+from bhd_lerobot.training.rl.config import RlConfig
+from bhd_lerobot.tasks.task import Event, episode_seed
+
+
+@dataclass(frozen=True)
+class Level:
+    """How good a brain was.
+
+    Attributes:
+        episodes: number of episodes; those that a stop cut short do not count.
+        score: mean score.
+        success: share of successes.
+        reward: mean sum of the task's rewards, under the name `return`.
+        failures: share of each cause of failure.
+    """
+
+    episodes: int
+    score: float
+    success: float
+    reward: float
+    failures: dict[str, float]
+
+    def row(self) -> dict[str, Any]:
+        """Return it as part of a row of `metrics.jsonl`."""
+        return {
+            "val_score": self.score,
+            "val_success": self.success,
+            "val_return": self.reward,
+            **{f"val_{cause}": share for cause, share in self.failures.items()},
+        }
+
+
+class Validation:
+    """Runs brains on the validation episodes.
+
+    Args:
+        config: of the run.
+    """
+
+    def __init__(self, config: RlConfig) -> None:
+        own = config.validation
+        self._n = min(own.n_envs, own.n_episodes)
+        self._simulation = make_simulation(config.robot, self._n, config.env.threads)
+        self._task_config, self._fps = config.task, self._simulation.rates.fps
+        self._specs = [EpisodeSpec(i, episode_seed(own.seed, i, "train")) for i in range(own.n_episodes)]
+
+    def run(self, brain: Any, stop: Callable[[], bool] = lambda: False) -> list[Episode]:
+        """Return the episodes of a brain, given by its configuration."""
+        task = make_task(self._task_config, self._n, self._fps)
+        return list(EpisodeLoop(self._simulation, task, make_brain(brain)).run(self._specs, stop))
+
+    def checkpoint(self, folder: Any, stop: Callable[[], bool] = lambda: False) -> Level | None:
+        """Return how good the policy in a folder is; None if a stop came first."""
+        return level(self.run(LearnedBrainConfig(path=str(folder)), stop))
+
+    def close(self) -> None:
+        """Free the simulations."""
+        self._simulation.close()
+
+
+def level(episodes: Sequence[Episode]) -> Level | None:
+    """Return how good a brain was; None without episodes."""
+    if not episodes:
+        return None
+    n = len(episodes)
+    causes = Counter(one.outcome.event.cause for one in episodes if one.outcome.event != Event.SUCCESS)
+    return Level(
+        episodes=n,
+        score=float(np.mean([one.outcome.score for one in episodes])),
+        success=float(np.mean([one.outcome.success for one in episodes])),
+        reward=float(np.mean([np.sum(one.columns[keys.REWARD]) for one in episodes])),
+        failures={cause: count / n for cause, count in sorted(causes.items())},
+    )

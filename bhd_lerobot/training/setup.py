@@ -1,0 +1,244 @@
+"""What a training run is made of, from LeRobot's pieces: accelerator, policy, processors, and their checks."""
+
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import Accelerator  # type: ignore[import-untyped]
+from accelerate.utils import DistributedDataParallelKwargs, DistributedType  # type: ignore[import-untyped]
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import FeatureType
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.optim.factory import make_optimizer_and_scheduler
+from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.utils.constants import ACTION
+from lerobot.utils.feature_utils import dataset_to_policy_features
+from lerobot.utils.random_utils import set_seed
+
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
+from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
+from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
+from bhd_lerobot.training.config import BhdTrainConfig
+
+
+def make_accelerator(config: BhdTrainConfig) -> Accelerator:
+    """Return accelerate's accelerator, set up as `lerobot-train` does.
+
+    Raises:
+        ConfigError: a way of sharing the work that this loop does not know.
+    """
+    policy: Any = config.policy
+    mixed = {"bfloat16": "bf16", "float16": "fp16", "float32": "no"}.get(getattr(policy, "dtype", None) or "")
+    if not hasattr(policy, "dtype") and policy.use_amp:
+        kind = torch.get_autocast_dtype(torch.device(policy.device).type)
+        mixed = {torch.bfloat16: "bf16", torch.float16: "fp16"}[kind]
+    accelerator = Accelerator(
+        step_scheduler_with_optimizer=False,
+        mixed_precision=mixed,
+        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
+        cpu=policy.device == "cpu",
+    )
+    known = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
+    if accelerator.distributed_type not in known:
+        raise ConfigError(
+            f"accelerate was launched with {accelerator.distributed_type.value}; bhd-train shares the work by whole "
+            "copies of the policy only (DDP). Use lerobot-train for FSDP."
+        )
+    torch.backends.cudnn.deterministic = config.cudnn_deterministic
+    torch.backends.cudnn.benchmark = not config.cudnn_deterministic
+    torch.backends.cuda.matmul.allow_tf32 = True
+    return accelerator
+
+
+def refuse_unsupported(config: BhdTrainConfig) -> None:
+    """Refuse what only LeRobot's own loop does.
+
+    Raises:
+        ConfigError: names the option.
+    """
+    for name in ("peft", "sample_weighting"):
+        if getattr(config, name) is not None:
+            raise ConfigError(f"{name} is not for bhd-train; use lerobot-train, which reads the same configuration.")
+
+
+def check_contract(path: str, meta: LeRobotDatasetMetadata) -> None:
+    """Check that a dataset is of what a checkpoint was trained on.
+
+    Args:
+        path: folder of the checkpoint's model.
+        meta: of the dataset.
+
+    Raises:
+        DatasetMismatchError: another robot, rate, unit, or other features; names both sides.
+    """
+    trained, here = PolicyContract.load(path), PolicyContract.from_dataset(meta)
+    cameras = {name: shape for name, shape in (here.cameras or {}).items() if name in (trained.cameras or {})}
+    units = [one.units or "unknown units" for one in (trained, here)]
+    if trained.units is not None and units[0] != units[1]:
+        raise DatasetMismatchError(
+            f"The dataset {meta.repo_id} does not fit the checkpoint {path}: its values are in {units[1]}, and the "
+            f"checkpoint was trained on values in {units[0]}. Convert them, or start with --policy.path, unchecked."
+        )
+    try:
+        trained.check(
+            here.observation_names,
+            here.action_names,
+            here.fps,
+            here.environment_names,
+            here.robot_type,
+            cameras=cameras or None,
+            who="The checkpoint",
+        )
+    except ConfigError as error:
+        raise DatasetMismatchError(f"The dataset {meta.repo_id} does not fit the checkpoint {path}. {error}") from error
+
+
+def check_features(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]) -> None:
+    """Check that the dataset has what the policy's configuration names.
+
+    Args:
+        policy: its configuration; without input features it takes those of the dataset.
+        meta: of the dataset.
+        rename_map: from the dataset's names to the policy's.
+
+    Raises:
+        DatasetError: a feature is missing or has another shape; names it and those that there are.
+    """
+    features = {rename_map.get(k, k): one for k, one in dataset_to_policy_features(meta.features).items()}
+    there = ", ".join(features)
+    if not any(one.type is FeatureType.ACTION for one in features.values()):
+        raise DatasetError(f"{meta.root} has no {ACTION!r}, so there is nothing to imitate. It has {there}.")
+    for key, wanted in {**(policy.input_features or {}), **(policy.output_features or {})}.items():
+        if wanted.type is FeatureType.VISUAL and key not in features and getattr(policy, "empty_cameras", 0) > 0:
+            continue
+        if key not in features:
+            raise DatasetError(
+                f"The policy needs {key!r} of shape {tuple(wanted.shape)}, which {meta.root} lacks; it has {there}. "
+                "Record it, or train a policy without it."
+            )
+        # Policies with a largest size pad what is smaller.
+        is_fixed = wanted.type is not FeatureType.VISUAL and not hasattr(policy, "max_state_dim")
+        if is_fixed and tuple(features[key].shape) != tuple(wanted.shape):
+            raise DatasetError(
+                f"The policy needs {key!r} of shape {tuple(wanted.shape)}; in {meta.root} it has the shape "
+                f"{tuple(features[key].shape)}."
+            )
+
+
+def build_policy(config: BhdTrainConfig, meta: LeRobotDatasetMetadata, accelerator: Any = None) -> Any:
+    """Return the policy, new or from its checkpoint, on its device; all of its randomness is the seed's.
+
+    Raises:
+        BhdError: the dataset does not fit the policy, or its weights cannot be loaded.
+    """
+    policy: Any = config.policy
+    check_features(policy, meta, config.rename_map)
+    if policy.pretrained_path is not None:
+        # One folder on this machine, so that what is checked is what LeRobot loads.
+        policy.pretrained_path = find_checkpoint(policy.pretrained_path, policy.pretrained_revision).resolve()
+        check_checkpoint(policy.pretrained_path)
+    if config.seed is not None:
+        set_seed(config.seed, accelerator=accelerator)
+    try:
+        return make_policy(policy, ds_meta=meta, rename_map=config.rename_map)
+    except BhdError:
+        raise
+    except Exception as error:  # each policy, safetensors and the Hub's client have their own
+        whence = f" from {policy.pretrained_path}" if policy.pretrained_path else ""
+        raise ConfigError(
+            f"The policy {policy.type!r} cannot be made{whence} for {meta.root}, which has "
+            f"{', '.join(dataset_to_policy_features(meta.features))}: {error}"
+        ) from error
+
+
+def select_parameters(policy: Any, patterns: Sequence[str]) -> None:
+    """Let only some of a policy's parameters be trained.
+
+    Args:
+        policy: the policy; what it keeps from training itself stays so.
+        patterns: names of parameters, or patterns of them such as ``*.bias``.
+
+    Raises:
+        ConfigError: a pattern matches none, or there is no pattern.
+    """
+    trained = {name: one for name, one in policy.named_parameters() if one.requires_grad}
+    unknown = [pattern for pattern in patterns if not any(fnmatchcase(name, pattern) for name in trained)]
+    if unknown or not patterns:
+        names = list(trained)
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        raise ConfigError(
+            f"fine_tune_parameters is {list(patterns)}; {repr(unknown[0]) if unknown else 'it'} matches no "
+            f"parameter of the policy, which has {', '.join(names[:_NAMED])}{more}. Give names, or ['*'] for all."
+        )
+    for name, one in trained.items():
+        one.requires_grad_(any(fnmatchcase(name, pattern) for pattern in patterns))
+
+
+_NAMED = 20  # parameters that a message names
+
+
+def build_optimizer(config: BhdTrainConfig, policy: Any) -> tuple[Any, Any]:
+    """Return the optimizer and the scheduler of the learning rate, or None for that.
+
+    Raises:
+        ConfigError: a value that PyTorch refuses.
+    """
+    try:
+        return make_optimizer_and_scheduler(config, policy)
+    except (ValueError, TypeError, ImportError) as error:
+        options = "policy.optimizer_… and policy.scheduler_…" if config.use_policy_training_preset else "optimizer.…"
+        raise ConfigError(f"The optimizer cannot be made: {error}. Change the options {options}.") from error
+
+
+def build_processors(
+    config: BhdTrainConfig, policy: Any, meta: LeRobotDatasetMetadata, device: torch.device, *, keep_statistics: bool
+) -> tuple[Any, Any]:
+    """Return pre- and postprocessor as `lerobot-train` makes them.
+
+    Args:
+        config: of the run.
+        policy: the policy.
+        meta: of the dataset, with its statistics.
+        device: where the policy is.
+        keep_statistics: normalise as the checkpoint does instead of by the dataset's statistics.
+
+    Raises:
+        ConfigError: the checkpoint's processors cannot be used.
+    """
+    active: Any = config.policy
+    if active.pretrained_path is None:
+        return make_pre_post_processors(active, dataset_stats=meta.stats)
+    features = {**policy.config.input_features, **policy.config.output_features}
+    norm_map = policy.config.normalization_mapping
+    before: dict[str, dict[str, Any]] = {
+        "device_processor": {"device": device.type},
+        "normalizer_processor": {"features": features, "norm_map": norm_map},
+        "rename_observations_processor": {"rename_map": config.rename_map},
+    }
+    after: dict[str, dict[str, Any]] = {
+        "unnormalizer_processor": {"features": policy.config.output_features, "norm_map": norm_map},
+    }
+    if not keep_statistics:
+        before["normalizer_processor"]["stats"] = meta.stats
+        after["unnormalizer_processor"]["stats"] = meta.stats
+    if getattr(active, "use_relative_actions", False):
+        before["relative_actions_processor"] = {
+            "enabled": True,
+            "exclude_joints": getattr(active, "relative_exclude_joints", []),
+            "action_names": getattr(active, "action_feature_names", None),
+        }
+        after["absolute_actions_processor"] = {"enabled": True}
+    kwargs: dict[str, Any] = {} if keep_statistics else {"dataset_stats": meta.stats}
+    try:
+        return make_pre_post_processors(
+            active,
+            pretrained_path=str(active.pretrained_path),
+            pretrained_revision=active.pretrained_revision,
+            preprocessor_overrides=before,
+            postprocessor_overrides=after,
+            **kwargs,
+        )
+    except Exception as error:  # LeRobot raises whatever a step raises
+        raise ConfigError(f"The processors of {Path(active.pretrained_path)} cannot be used: {error}") from error

@@ -1,0 +1,117 @@
+"""What `bhd-train` says before and after."""
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from bhd_lerobot.errors import quoted
+from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.robots.host.simulation import describe
+from bhd_lerobot.training.config import BhdTrainConfig
+from bhd_lerobot.rollout.registry import SIMULATED_ROBOTS
+from bhd_lerobot.training.checkpoint import resume_command
+from bhd_lerobot.training.data import TrainingData
+from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME
+from bhd_lerobot.tasks.config_task import TaskConfig
+
+if TYPE_CHECKING:
+    from bhd_lerobot.training.train import TrainResult
+
+_EXAMPLE_TASKS = {"turtlebot3": "avoid", "ur5": "pick"}
+
+
+def tell_start(console: Console, config: BhdTrainConfig, policy: Any, data: TrainingData, step: int) -> None:
+    """Say what is about to be trained on what."""
+    learnable = sum(one.numel() for one in policy.parameters() if one.requires_grad)
+    total = sum(one.numel() for one in policy.parameters())
+    frozen = f", {total - learnable:,} more are fixed" if total > learnable else ""
+    held_out = f", {len(data.held_out_episodes)} held out" if data.held_out_episodes else ""
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_row(
+        "policy", escape(f"{policy.config.type}, {learnable:,} parameters{frozen}, on {policy.config.device}")
+    )
+    table.add_row("data", f"{data.episodes} episodes{held_out}, {data.frames:,} samples in an epoch")
+    table.add_row("loader", escape(data.how))
+    epochs = config.steps * config.batch_size / data.frames
+    table.add_row("steps", f"{config.steps:,} of {config.batch_size} samples: {epochs:.3g} epochs")
+    if step:
+        table.add_row("resumed", f"after step {step}")
+    table.add_row("run folder", escape(str(config.output_dir)))
+    console.print(table)
+
+
+def tell_summary(console: Console, config: BhdTrainConfig, result: "TrainResult") -> None:
+    """Say how it ended, where everything is, and how to go on."""
+    losses = [row["loss"] for row in result.rows if row.get("loss") is not None]
+    held_out = [row["held_out_loss"] for row in result.rows if row.get("held_out_loss") is not None]
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_row("steps", f"{result.step:,} of {config.steps:,} in {result.wall_s:.1f} s")
+    if losses:
+        table.add_row("loss", _course(losses))
+    if held_out:
+        table.add_row("held-out loss", _course(held_out))
+    table.add_row("metrics", escape(str(result.output_dir / METRICS_NAME)))
+    table.add_row("curve", escape(str(result.output_dir / PLOT_NAME)))
+    if result.checkpoint is not None:
+        table.add_row("checkpoint", escape(str(result.checkpoint / PRETRAINED_MODEL_DIR)))
+    console.print(table)
+    lines = []
+    if result.stopped_by:
+        lines.append(
+            f"Stopped by {result.stopped_by.name}. " + ("Go on with:" if result.checkpoint else "Nothing saved.")
+        )
+        if result.checkpoint is not None:
+            lines.append(f"  {resume_command(result.checkpoint)}")
+    elif result.checkpoint is not None:
+        lines += how_to_evaluate(result.contract, str(result.checkpoint))
+    for line in lines:
+        console.print(escape(line), soft_wrap=True, highlight=False)
+
+
+def _course(losses: Sequence[float]) -> str:
+    if len(losses) == 1:
+        return f"{losses[0]:.4g}, logged once"
+    return f"{losses[0]:.4g} at first, {losses[-1]:.4g} at the end"
+
+
+def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
+    """Return what to say about evaluating a checkpoint: a line, and a command on held-out episodes of its task.
+
+    The command names the options of robot and task that are not at their defaults: with others the observations or
+    actions do not fit. A dataset that another program recorded does not say its task; then it is one of the robot's.
+    """
+    path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
+    kinds = {str(kind.get_choice_name(kind)): kind for kind in SIMULATED_ROBOTS}
+    task = (contract.task or {}).get("type")
+    if contract.robot_type not in kinds:
+        rollout = f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={quoted(path)} --duration=60"
+        return ["Let it drive the robot for a minute with:", f"  {rollout}"]
+    if task not in TaskConfig.get_known_choices():
+        task = _EXAMPLE_TASKS[contract.robot_type]
+        said = f"The dataset does not say its task. Evaluate it in simulation at {task!r}, for example, with:"
+    else:
+        said = "Evaluate it with:"
+    options = _options("robot", contract.robot or {}, describe(kinds[contract.robot_type]()))
+    asked = _options("task", contract.task or {}, asdict(TaskConfig.get_choice_class(task)()))
+    command = (
+        f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task}{asked} --brain.path={quoted(path)}"
+    )
+    return [said, f"  {command}"]
+
+
+def _options(name: str, values: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
+    """Return the options that make a configuration have these values, each with a space before it."""
+    options = ""
+    for key, value in values.items():
+        if isinstance(value, Mapping) and isinstance(usual.get(key), Mapping):
+            options += _options(f"{name}.{key}", value, usual[key])
+        elif isinstance(value, str | bool | int | float | list) and key in usual and value != usual[key]:
+            options += f" --{name}.{key}={shlex.quote(value if isinstance(value, str) else json.dumps(value))}"
+    return options
