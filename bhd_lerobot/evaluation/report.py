@@ -74,7 +74,7 @@ def write_report(given: ReportInput, path: Path) -> None:
     links = "".join(f'<a href="#{key}">{title}</a>' for title, key, _ in shown)
     facts = given.results.config
     title = f"{facts['task']['type'].capitalize()} with {facts['robot']['type']}: {_listed(list(given.results.brains))}"
-    template = Template(resources.files(__package__).joinpath("eval_report.html").read_text(encoding="utf-8"))
+    template = Template(resources.files(__package__).joinpath("report.html").read_text(encoding="utf-8"))
     page = template.substitute(
         title=escape(title),
         lead=_lead(given) + f"<nav>{links}</nav>",

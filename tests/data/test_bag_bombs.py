@@ -27,11 +27,11 @@ COMPRESS = {"zstd": zstd.compress, "lz4": lz4.frame.compress, "": bytes}
 CHILD = """
 import json, resource, sys
 from pathlib import Path
-from bhd_lerobot.data import bag_unpack
+from bhd_lerobot.rosbag.storage import unpack
 from bhd_lerobot.rosbag.storage.find import find_bags
 from bhd_lerobot.errors import BhdError
-bag_unpack.LEAST_BYTES = 32 << 20
-bag_unpack.zstd()
+unpack.LEAST_BYTES = 32 << 20
+unpack.zstd()
 import lz4.frame, tempfile, sqlite3
 sqlite3.connect(":memory:").close()
 pages = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

@@ -141,7 +141,7 @@ from pathlib import Path
 sys.path[:0] = [{str(folder)!r}]
 import support
 from bhd_lerobot.datasets.edit.edits import delete, keep, split
-from bhd_lerobot.runs import data
+from bhd_lerobot.cli.data import main as data
 root, place = Path({str(root)!r}), Path({str(tmp_path / "volume")!r})
 def empty():
     os.system(f"umount --lazy {{place}} 2>/dev/null")

@@ -64,7 +64,7 @@ VIDEO = value({"bytes": 3000, "pyav": "15.1.0", "libavcodec": "61.19.101", "shar
 TRIALS = """
 import os, signal, sys
 from bhd_lerobot.realtime.privileges import RealtimeSettings
-from bhd_lerobot.runs import wakeup
+from bhd_lerobot.apps.doctor import latency_test
 
 def noisy():
     os.write(1, b"a library prints\\n\\n")

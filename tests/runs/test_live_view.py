@@ -183,7 +183,7 @@ def test_a_viewer_that_is_not_there_is_found_out_before_the_run(robot: Simulatio
 def test_a_viewer_that_goes_away_keeps_nobody_from_ending(tmp_path: Path) -> None:
     program = (
         "import socket\n"
-        "from bhd_lerobot.runs import live_view\n"
+        "from bhd_lerobot.recording import live_view\n"
         "from bhd_lerobot.recording.record import main\n"
         "live_view._END_S = 0.5\n"
         "server = socket.create_server(('127.0.0.1', 0))\n"

@@ -13,17 +13,17 @@ from bhd_lerobot.cli.start import INTERRUPTED, ending_when_unread, leaving_on_in
 
 # Modules, in the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
 COMMANDS = (
-    "data_info",
-    "data_timing",
-    "data_check",
-    "data_repair",
-    "data_mark",
-    "data_edit",
-    "data_view",
-    "data_push",
-    "data_pull",
-    "data_export",
-    "data_import",
+    "info",
+    "timing",
+    "check",
+    "repair",
+    "mark",
+    "edit",
+    "view",
+    "push",
+    "pull",
+    "export",
+    "import_bag",
 )
 
 
@@ -52,7 +52,7 @@ def _parser() -> _Parser:
     parser = _Parser(prog="bhd-data", description=__doc__.split(": ", 1)[1])
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", required=True)
     for name in COMMANDS:
-        importlib.import_module(f"bhd_lerobot.runs.{name}").add_to(commands)
+        importlib.import_module(f"bhd_lerobot.cli.data.{name}").add_to(commands)
     return parser
 
 
