@@ -19,7 +19,7 @@ test: venv ## run the tests; PYTEST_ARGS='-k name' narrows them down
 	$(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal $(PYTEST_ARGS)
 
 sweep: venv ## disturb every command that writes at each of its steps (half an hour), of which `make test` tries some
-	BHD_SWEEP=full $(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal tests/data/sweeps $(PYTEST_ARGS)
+	BHD_SWEEP=full $(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal tests/datasets/sweeps $(PYTEST_ARGS)
 
 lint: venv ## check style, docstrings and types
 	$(PYTHON_IN_VENV) -m ruff check

@@ -18,11 +18,11 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.record import paired
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.recording.record import record
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.configuration import parse
-from bhd_lerobot.recording.record import record
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 
 GOALS = {1: 20.0, 32: 60.0}  # simulations to times real time

@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 
+from bhd_lerobot.evaluation.statistics import wilson
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.policies.language.language_brain import LanguageBrain
 from bhd_lerobot.policies.manipulation.pick import PickBrain
@@ -19,7 +20,6 @@ from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
-from bhd_lerobot.evaluation.statistics import wilson
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Task, episode_seed

@@ -20,13 +20,13 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from benchmarks._spread import ratios, spread, write
-from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.rosbag.exporter.export import ExportOptions, export_bags
-from bhd_lerobot.rosbag.storage.find import find_bags
-from bhd_lerobot.rosbag.importer.restore import restore
-from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.cli.data import main as data
 from bhd_lerobot.cli.data.export import robot_view
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.rosbag.exporter.export import ExportOptions, export_bags
+from bhd_lerobot.rosbag.importer.restore import restore
+from bhd_lerobot.rosbag.storage.find import find_bags
 
 FPS = 10
 

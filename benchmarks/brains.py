@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
+from bhd_lerobot.evaluation.statistics import mean, ratio_of_means, wilson
 from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
-from bhd_lerobot.evaluation.statistics import mean, ratio_of_means, wilson
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import Event, Outcome, episode_seed
 

@@ -20,17 +20,17 @@ os.environ["OMP_NUM_THREADS"] = "1"
 from rich.console import Console
 
 from benchmarks._spread import ratios, spread, write
-from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.crew import Crew
 from bhd_lerobot.cluster.loop import ClusterLoop, open_crew
+from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.recording.record import open_recorder, save_episode
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.rollout.provenance import episode_metadata
-from bhd_lerobot.recording.record import open_recorder, save_episode
 from bhd_lerobot.rollout.registry import make_brain, make_robot, make_task
+from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.task import episode_seed
 
 GOAL = 1.7  # two workers against one

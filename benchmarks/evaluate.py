@@ -32,12 +32,12 @@ from rich.console import Console
 
 from benchmarks._spread import ratios, spread, write
 from bhd_lerobot.envs.config_env import BhdEnvConfig
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import find_checkpoint
-from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.rollout.configuration import parse
-from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate
 from bhd_lerobot.recording.record import main as record_main
+from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.training.train import main as train_main
 
 GOAL = 10.0

@@ -28,12 +28,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks._spread import ratios, spread, write
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.remote.hub import HubDataset
-from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.remote.push import push
 from bhd_lerobot.datasets.remote.store import StoreDataset
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 
 GOAL = 0.9  # of the speed of the bare client
 WIDTH = 512  # numbers in a frame

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks._spread import write
+from bhd_lerobot.evaluation.statistics import mean, wilson
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
-from bhd_lerobot.evaluation.statistics import mean, wilson
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, Outcome, episode_seed
 

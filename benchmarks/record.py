@@ -27,11 +27,11 @@ from rich.table import Table
 
 from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.errors import RenderingError
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.recording.record import record
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
-from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.configuration import parse
-from bhd_lerobot.recording.record import record
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 

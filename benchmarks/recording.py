@@ -22,9 +22,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.video import VideoSettings
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 
 FPS = 10
 STATE = 362

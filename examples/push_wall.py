@@ -10,10 +10,10 @@ import numpy as np
 
 from bhd_lerobot.bodies.body import Rates, Shape
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.world import World

@@ -23,18 +23,18 @@ from bhd_lerobot.control.commands import GoalPhase, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.turtlebot3_simulation import observation_names
 from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, OBSERVED
-from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
-from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.training.config import BhdTrainConfig, own_fields
 from bhd_lerobot.rollout.replay import ReplayConfig
-from bhd_lerobot.training.rl.config import RlConfig
 from bhd_lerobot.tasks import avoid, navigate, pick, reach
 from bhd_lerobot.tasks.task import Event
+from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
+from bhd_lerobot.training.config import BhdTrainConfig, own_fields
+from bhd_lerobot.training.rl.config import RlConfig
 
 FILE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
 

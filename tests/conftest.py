@@ -12,6 +12,8 @@ from pathlib import Path
 
 from hypothesis import settings
 
+pytest_plugins = ["tests.recorded_datasets"]
+
 _HF_HOME = Path(tempfile.mkdtemp(prefix="bhd-test-hf-"))
 
 os.environ["HF_HOME"] = str(_HF_HOME)

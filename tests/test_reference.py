@@ -13,17 +13,17 @@ from types import ModuleType
 
 import pytest
 
+from bhd_lerobot.apps.monitor import monitor
+from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.cli.data import main
-from bhd_lerobot.apps.monitor import monitor
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.recording.record import record
+from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.replay import ReplayConfig
-from bhd_lerobot.training.rl.config import is_rl, parse_rl
 from bhd_lerobot.training.arguments import parse_train
+from bhd_lerobot.training.rl.config import is_rl, parse_rl
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -15,9 +15,9 @@ from benchmarks.realtime.owner import OwnerSpec
 from benchmarks.realtime.robots import OwnedRobot, standing_still
 from benchmarks.realtime.stamps import Loss, Stop, judge_loss, judge_stop, reference_speed
 from bhd_lerobot.control.fifo import RingReader
-from bhd_lerobot.realtime.frame_log import FrameLog
-from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
+from bhd_lerobot.realtime.block import Word
+from bhd_lerobot.realtime.frame_log import FrameLog
 from bhd_lerobot.realtime.plant_link import PlantLink, PlantPhase
 
 _MOVING = {"ur5": 1e-4, "turtlebot3": 0.1}  # reference speed from which a press counts [rad a tick; m/s and rad/s]

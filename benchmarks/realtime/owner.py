@@ -59,9 +59,9 @@ class OwnerSpec:
 
     def robot_config(self) -> Any:
         """Return the robot's configuration, on the wall clock."""
-        from bhd_lerobot.robots.host.config import RealtimeConfig
         from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
         from bhd_lerobot.robots.config_ur5 import UR5Config
+        from bhd_lerobot.robots.host.config import RealtimeConfig
 
         kind: Any = {"ur5": UR5Config, "turtlebot3": TurtleBot3Config}[self.robot]
         return kind(id=self.name, clock="realtime", realtime=RealtimeConfig(**self.realtime), **self.config)
@@ -202,8 +202,8 @@ class Episodes:
         """Record one episode; return what is to be said of it."""
         from bhd_lerobot.datasets.format import features as keys
         from bhd_lerobot.rollout.episode import EpisodeLoop
-        from bhd_lerobot.rollout.types import EpisodeSpec
         from bhd_lerobot.rollout.provenance import episode_metadata
+        from bhd_lerobot.rollout.types import EpisodeSpec
 
         task, recorder = self._task(seconds), self._recorder
         loop = EpisodeLoop(self._simulation, task, self._brain)

@@ -17,8 +17,8 @@ from benchmarks.realtime.owner import OwnerSpec, as_argument
 from benchmarks.realtime.stamps import StampError, block_samples
 from benchmarks.realtime.statistics import Samples
 from benchmarks.realtime.watcher import Watcher
-from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.shared_memory import FOLDER, PREFIX
 
 _START_S = 180.0

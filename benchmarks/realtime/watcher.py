@@ -5,9 +5,9 @@ import numpy as np
 from benchmarks.realtime.cases import CaseError
 from benchmarks.realtime.stamps import Array, records_of
 from bhd_lerobot.control.fifo import RingReader
-from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.errors import BhdError
+from bhd_lerobot.realtime.block import LiveBlock
 
 
 class Watcher:

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from bhd_lerobot.errors import ClusterError
 from bhd_lerobot.cluster.config import RayConfig
+from bhd_lerobot.errors import ClusterError
 
 _LOCAL = "local"
 _KNOCK_S = 5.0  # a machine that is there answers a connection much sooner

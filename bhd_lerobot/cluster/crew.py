@@ -11,12 +11,12 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from bhd_lerobot.errors import ClusterError
 from bhd_lerobot.cluster import remote as cluster_remote
 from bhd_lerobot.cluster.cluster import free_places, size_of, tell_crowd, tell_machines
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.job import Job
 from bhd_lerobot.cluster.task import Call, Task, Worker, cause_of, error_of
+from bhd_lerobot.errors import ClusterError
 
 _QUEUED = 2  # tasks that a worker has at a time: it goes on with the next while a result travels
 _WINDOW = 4  # tasks for each worker, finished or not, by which the run may be ahead of the oldest that is missing

@@ -7,16 +7,16 @@ from typing import Any
 
 from rich.console import Console
 
-from bhd_lerobot.control.tolerance import TimingTolerance
-from bhd_lerobot.datasets.format.video import VideoSettings
-from bhd_lerobot.errors import ClusterError
-from bhd_lerobot.policies.brain import Brain
-from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.cluster.cluster import connected
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.crew import Crew
 from bhd_lerobot.cluster.job import Job, fingerprint, histograms_of, read_checkpoints, unpack
 from bhd_lerobot.cluster.task import Task as ClusterTask
+from bhd_lerobot.control.tolerance import TimingTolerance
+from bhd_lerobot.datasets.format.video import VideoSettings
+from bhd_lerobot.errors import ClusterError
+from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Task

@@ -5,9 +5,9 @@ from typing import Any
 
 from lerobot.robots.config import RobotConfig
 
+from bhd_lerobot.cluster.config import RayConfig, check_engine
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.config_brain import BrainConfig
-from bhd_lerobot.cluster.config import RayConfig, check_engine
 from bhd_lerobot.rollout.registry import SIMULATED_ROBOTS, robot_of_brain, robot_of_task
 from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.task import SPLITS

@@ -16,20 +16,20 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from bhd_lerobot.cluster.loop import open_crew
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
-from bhd_lerobot.robots.host.simulation import Simulation, describe
-from bhd_lerobot.cluster.loop import open_crew
 from bhd_lerobot.evaluation.config import YARDSTICKS, EvalConfig
-from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.evaluation.console import tell_summary
 from bhd_lerobot.evaluation.metrics import JerkMeasure
 from bhd_lerobot.evaluation.report import Film, ReportInput, write_report
 from bhd_lerobot.evaluation.results import EvalResults, summarise, write_json, write_table
 from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
+from bhd_lerobot.recording.report import ESTOP_STATUS, tell_refusals
+from bhd_lerobot.robots.host.simulation import Simulation, describe
+from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.provenance import versions
-from bhd_lerobot.recording.report import ESTOP_STATUS, tell_refusals
 from bhd_lerobot.rollout.registry import make_robot, make_simulation
 from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals

@@ -9,10 +9,10 @@ from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.recording.config import DatasetConfig, RecordConfig
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import Episode
-from bhd_lerobot.rollout.provenance import episode_metadata
 from bhd_lerobot.recording.record import open_recorder, save_episode
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.provenance import episode_metadata
+from bhd_lerobot.rollout.types import Episode
 
 
 class BrainRecorder:

@@ -14,15 +14,15 @@ from typing import Any
 
 import yaml
 
+from bhd_lerobot.datasets.timing.tables import ms
 from bhd_lerobot.evaluation import plots
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.rollout.configuration import encode
 from bhd_lerobot.evaluation.html import cell, chart, share, significant, table
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.results import EvalResults
 from bhd_lerobot.evaluation.text import number, percent, sentences
+from bhd_lerobot.rollout.configuration import encode
 from bhd_lerobot.rollout.plots import Trajectory
-from bhd_lerobot.datasets.timing.tables import ms
 
 FILM_BYTES = 12_000_000  # films in the page; those beyond stay files beside it
 LISTED = 100  # failed episodes of a brain that are listed

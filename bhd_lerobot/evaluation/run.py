@@ -8,19 +8,19 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.format.features import PHYSICS_STATE
-from bhd_lerobot.errors import BhdError
-from bhd_lerobot.policies.brain import Brain, Observation
-from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.cluster.crew import Crew
 from bhd_lerobot.cluster.loop import ClusterLoop
+from bhd_lerobot.datasets.format.features import PHYSICS_STATE
+from bhd_lerobot.errors import BhdError
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
 from bhd_lerobot.evaluation.record import BrainRecorder
+from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.plots import Trajectory
 from bhd_lerobot.rollout.registry import make_brain, make_task
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import episode_seed
 
 FILMS = 2  # failures of each brain that are filmed, unless said otherwise

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.cli.data.info import meaning_of
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.remote.card import CardFacts, compose
-from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
 from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
+from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
+from bhd_lerobot.datasets.remote.card import CardFacts, compose
 from bhd_lerobot.datasets.remote.listing import PICTURE
 from bhd_lerobot.datasets.remote.push import Card
-from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import BhdError
-from bhd_lerobot.cli.data.info import meaning_of
 from bhd_lerobot.evaluation.statistics import wilson
 
 SHOWN = 12  # episodes in a picture from above

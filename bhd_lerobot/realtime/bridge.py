@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
-from bhd_lerobot.control.motion.goal_codec import decode_feedback
-from bhd_lerobot.realtime.block import LiveBlock, Word
 from bhd_lerobot.control.messages import (
     NANOSECONDS,
     CerebellumState,
@@ -20,8 +18,10 @@ from bhd_lerobot.control.messages import (
     SendResult,
     mode_reason,
 )
-from bhd_lerobot.realtime.requests import RequestClient
+from bhd_lerobot.control.motion.goal_codec import decode_feedback
 from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.realtime.block import LiveBlock, Word
+from bhd_lerobot.realtime.requests import RequestClient
 
 
 class LiveBridge:

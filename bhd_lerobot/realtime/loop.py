@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.realtime.grid import Slot, TickGrid
-from bhd_lerobot.realtime.block import Phase, Word
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
+from bhd_lerobot.realtime.block import Phase, Word
+from bhd_lerobot.realtime.grid import Slot, TickGrid
 
 
 @dataclass(frozen=True)

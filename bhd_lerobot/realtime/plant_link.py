@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.fifo import StateRing
-from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.realtime.block import LiveBlock
 
 _COMMANDS = 8  # that are kept; only the newest counts
 

@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Any, Self
 
-from bhd_lerobot.realtime.system_calls import CAP_IPC_LOCK, CAP_SYS_NICE, MCL_CURRENT, MCL_FUTURE, SystemCalls
 from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.realtime.system_calls import CAP_IPC_LOCK, CAP_SYS_NICE, MCL_CURRENT, MCL_FUTURE, SystemCalls
 
 SLACK_NS = 1  # 0 would mean "the default"
 

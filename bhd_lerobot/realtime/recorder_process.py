@@ -8,9 +8,9 @@ import signal
 import sys
 import time
 
-from bhd_lerobot.realtime.frame_log import FrameCollector, FrameLog
-from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
 from bhd_lerobot.errors import BhdError
+from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
+from bhd_lerobot.realtime.frame_log import FrameCollector, FrameLog
 
 _PAUSE_S = 0.002  # the ring holds seconds, but the brain waits for the frames
 

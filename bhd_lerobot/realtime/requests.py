@@ -13,6 +13,7 @@ import numpy as np
 
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
+from bhd_lerobot.control.messages import NANOSECONDS, Reason, Request
 from bhd_lerobot.control.motion.goal_codec import (
     NAME_BYTES,
     RESULT_DTYPE,
@@ -25,9 +26,8 @@ from bhd_lerobot.control.motion.goal_codec import (
     encode_result,
     goal_dtype,
 )
-from bhd_lerobot.realtime.mailbox import Mailbox
-from bhd_lerobot.control.messages import NANOSECONDS, Reason, Request
 from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.realtime.mailbox import Mailbox
 
 TIMEOUT_S = 1.0  # [s] a cerebellum that does not answer for so long is not running
 

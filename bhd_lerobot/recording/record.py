@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from bhd_lerobot.cli.data.push import check_pushable, left_by_interrupt, push_command, push_dataset, tell
+from bhd_lerobot.cluster.loop import ClusterLoop, open_crew
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
 from bhd_lerobot.datasets.format.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
@@ -19,26 +21,24 @@ from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetEditedError, RealtimeError, RenderingError
-from bhd_lerobot.policies.brain import Brain
-from bhd_lerobot.robots.host.simulation import Simulation, describe
-from bhd_lerobot.cluster.loop import ClusterLoop, open_crew
-from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import run
-from bhd_lerobot.cli.data.push import check_pushable, left_by_interrupt, push_command, push_dataset, tell
 from bhd_lerobot.hub.transfer import prompt_interrupt
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.language_rows import language_column
 from bhd_lerobot.recording.live_view import live_view
+from bhd_lerobot.recording.report import RecordResult, tell_refusals, tell_summary
+from bhd_lerobot.recording.resume_advice import instead_of_resuming
+from bhd_lerobot.robots.host.simulation import Simulation, describe
+from bhd_lerobot.rollout.configuration import run
+from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.marks import KEYS, Marks
 from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.provenance import episode_metadata
-from bhd_lerobot.recording.report import RecordResult, tell_refusals, tell_summary
 from bhd_lerobot.rollout.registry import make_brain, make_robot, make_simulation, make_task
-from bhd_lerobot.recording.resume_advice import instead_of_resuming
 from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import stop_on_signals
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Task, episode_seed, outcomes_of
 
 _ATTEMPTS = 3  # that an episode gets to be punctual

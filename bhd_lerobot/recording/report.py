@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.types import Episode
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.signals import StopRequest
+from bhd_lerobot.rollout.types import Episode
 
 ESTOP_STATUS = 3  # exit status of a run that an emergency stop ended
 

@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.arm.controller import ArmController
+from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import ResultCode
-from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Reason
 from bhd_lerobot.control.motion.planning import Planning
-from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.latency import LatePlant
 from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
+from bhd_lerobot.robots.latency import LatePlant
 from bhd_lerobot.robots.tool_space import TOOL_NAMES, pose_matrices
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop

@@ -17,8 +17,8 @@ from bhd_lerobot.robots.faults import add_faults
 from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
 from bhd_lerobot.rollout.images import EpisodeImages, Observer
-from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Event, Task, outcomes_of
 
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.

@@ -3,17 +3,17 @@
 from collections.abc import Callable
 from typing import Any
 
-from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain, AvoidanceConfig
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import ANY_ROBOT, Brain
 from bhd_lerobot.policies.config_brain import BrainConfig
 from bhd_lerobot.policies.dagger.brain import CorrectedBrain, CorrectedConfig, robot_of_both
-from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
 from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
-from bhd_lerobot.policies.navigation.navigator import NavigatorBrain, NavigatorConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain, AvoidanceConfig
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.policies.navigation.navigator import NavigatorBrain, NavigatorConfig
 from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS, SIMULATIONS, make_robot, make_simulation
 from bhd_lerobot.tasks.catalog import make_task, robot_of_task
 

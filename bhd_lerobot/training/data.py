@@ -11,12 +11,12 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.transforms import ImageTransforms
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.format.state import load_info
 from bhd_lerobot.datasets.loader.loader import Loader, check, imagenet_stats, make_loader
 from bhd_lerobot.datasets.loader.source import local_metadata
-from bhd_lerobot.datasets.format.state import load_info
 from bhd_lerobot.datasets.loader.table import checked_episodes
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError, quoted
 from bhd_lerobot.training.config import BhdTrainConfig
 

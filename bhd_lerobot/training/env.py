@@ -11,8 +11,8 @@ from lerobot.utils.random_utils import seeded_context
 
 from bhd_lerobot.envs.register import ENVIRONMENTS
 from bhd_lerobot.errors import BhdError, ConfigError
-from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.checkpoint import TrainingParts
+from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.log import Row
 
 

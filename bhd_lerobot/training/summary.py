@@ -14,12 +14,12 @@ from rich.table import Table
 from bhd_lerobot.errors import quoted
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.robots.host.simulation import describe
-from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.rollout.registry import SIMULATED_ROBOTS
+from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.training.checkpoint import resume_command
+from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.data import TrainingData
 from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME
-from bhd_lerobot.tasks.config_task import TaskConfig
 
 if TYPE_CHECKING:
     from bhd_lerobot.training.train import TrainResult

@@ -16,18 +16,18 @@ from rich.markup import escape
 import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.policies.learned.contract import PolicyContract
-from bhd_lerobot.training import checkpoint as train_checkpoint
-from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.rollout.configuration import describe
-from bhd_lerobot.training.rl.config import is_rl
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
+from bhd_lerobot.training import checkpoint as train_checkpoint
 from bhd_lerobot.training.arguments import Request, parse_train
 from bhd_lerobot.training.checkpoint import TrainingParts, resume_command
+from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.data import TrainingData, open_data, open_metadata, select_episodes
 from bhd_lerobot.training.env import EnvEvaluation
 from bhd_lerobot.training.log import Row, TrainingProgress
 from bhd_lerobot.training.loop import Hooks, LoopOptions, TrainingLoop
 from bhd_lerobot.training.output import RunOutput
+from bhd_lerobot.training.rl.config import is_rl
 from bhd_lerobot.training.setup import (
     build_optimizer,
     build_policy,

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, GoalPhase, Pose, ResultCode
-from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.trajectory import MotionLimits
 
 Array = NDArray[np.float64]

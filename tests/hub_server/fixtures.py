@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.push import PushReport, push
-from tests.data import support
+from bhd_lerobot.datasets.storage import layout
+from tests.datasets import support
 from tests.hub_server.client import real_client
 from tests.hub_server.server import HubServer
 

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.brain import Brain, Observation, find_columns, find_scan
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 
 ACTIONS = ("x.vel", "theta.vel")

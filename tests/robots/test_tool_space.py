@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.bodies.ur5 import JOINTS
-from bhd_lerobot.control.messages import Limit, Mode, Reason
 from bhd_lerobot.control.geometry.poses import pose_vectors
+from bhd_lerobot.control.messages import Limit, Mode, Reason
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.tool_space import TOOL_NAMES, pose_matrices
 from bhd_lerobot.robots.ur5 import UR5

@@ -21,8 +21,8 @@ from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.latency import MAX_LATENCY
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.variation import MAX_LATENCY_S, RandomisationConfig, draw_object_changes, draw_variation

@@ -19,17 +19,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from bhd_lerobot.apps.demo.lessons import LESSONS, PICK, Lesson, Recording
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.evaluation import evaluate
-from bhd_lerobot.recording import record
-from bhd_lerobot.rollout import replay
-from bhd_lerobot.training import train
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import parse
-from bhd_lerobot.apps.demo.lessons import LESSONS, PICK, Lesson, Recording
 from bhd_lerobot.evaluation.results import EvalResults
 from bhd_lerobot.evaluation.text import number, percent, verdict
+from bhd_lerobot.recording import record
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout import replay
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.training import train
 from bhd_lerobot.training.arguments import parse_train
 
 LOG = "log.txt"

@@ -15,10 +15,10 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-from bhd_lerobot.realtime.privileges import GRANT_BANDWIDTH, Grant, real_interpreter
 from bhd_lerobot.apps.doctor.child import Outcome
 from bhd_lerobot.apps.doctor.findings import COMPLAINTS, Finding, complain, fine
 from bhd_lerobot.apps.doctor.latency_test import WakeUps
+from bhd_lerobot.realtime.privileges import GRANT_BANDWIDTH, Grant, real_interpreter
 
 DISTRIBUTION = "lerobot_robot_bhd"
 ROBOTS = ("turtlebot3", "ur5")

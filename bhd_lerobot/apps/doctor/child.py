@@ -12,8 +12,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal
 
-from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
 from bhd_lerobot.errors import BhdError
+from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
 
 
 @dataclass(frozen=True)

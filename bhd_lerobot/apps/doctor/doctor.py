@@ -12,12 +12,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bhd_lerobot.realtime.privileges import RealtimeSettings
-from bhd_lerobot.errors import BhdError, ConfigError
-from bhd_lerobot.apps.doctor import checks
-from bhd_lerobot.apps.doctor import child
+from bhd_lerobot.apps.doctor import checks, child
 from bhd_lerobot.apps.doctor.findings import Finding, Status
 from bhd_lerobot.apps.doctor.latency_test import BINS_US, WakeUps, measure
+from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.realtime.privileges import RealtimeSettings
 
 _LEAST_POINTS = 1000  # or the 99th percentile rests on fewer than ten wake-ups
 _COLOURS = {Status.OK: "green", Status.WARNING: "yellow", Status.PROBLEM: "red"}

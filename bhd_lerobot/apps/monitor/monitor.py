@@ -15,12 +15,12 @@ from typing import Self
 from rich.console import Console
 from rich.live import Live
 
-from bhd_lerobot.control.estop_terminal import KeyTerminal, standard_input
-from bhd_lerobot.realtime.block import LiveBlock
-from bhd_lerobot.realtime.shared_memory import names
-from bhd_lerobot.errors import BhdError, ConfigError, RealtimeError
 from bhd_lerobot.apps.monitor.state import MonitorState, Sampler
 from bhd_lerobot.apps.monitor.view import KEYS, WIDTH, one_line, render
+from bhd_lerobot.control.estop_terminal import KeyTerminal, standard_input
+from bhd_lerobot.errors import BhdError, ConfigError, RealtimeError
+from bhd_lerobot.realtime.block import LiveBlock
+from bhd_lerobot.realtime.shared_memory import names
 
 _REFRESH_S = 0.125
 _LOOK_S = 0.5  # that a single snapshot measures rates over

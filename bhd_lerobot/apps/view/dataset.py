@@ -12,17 +12,17 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.disk import RootLock
-from bhd_lerobot.datasets.format.episode_table import PREFIX
-from bhd_lerobot.datasets.format.expected import wrong_values
-from bhd_lerobot.datasets.edit.mark import possible_outcomes
-from bhd_lerobot.datasets.storage.places import check_inside
-from bhd_lerobot.datasets.format.state import UNREADABLE, DatasetState, Row, corrupt, load_state, slot_of
-from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.apps.view.episode import packed_episode
 from bhd_lerobot.apps.view.marking import mark_episode
+from bhd_lerobot.datasets.edit.mark import possible_outcomes
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.episode_table import PREFIX
+from bhd_lerobot.datasets.format.expected import wrong_values
+from bhd_lerobot.datasets.format.state import UNREADABLE, DatasetState, Row, corrupt, load_state, slot_of
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import RootLock
+from bhd_lerobot.datasets.storage.places import check_inside
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.tasks.task import OUTCOMES
 
 _CACHED_BYTES = 128 * 2**20  # of packed episodes: some hundred of an arm, enough to go back and forth

@@ -8,14 +8,14 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.messages import Limit, Mode, Watchdog
-from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.format.episode_table import PREFIX
-from bhd_lerobot.datasets.format.state import DatasetState, Row
 from bhd_lerobot.apps.view.geometry import scene_of, views_of
 from bhd_lerobot.apps.view.groups import names_of, sections
 from bhd_lerobot.apps.view.marking import marks_of
 from bhd_lerobot.apps.view.packing import pack
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.episode_table import PREFIX
+from bhd_lerobot.datasets.format.state import DatasetState, Row
 from bhd_lerobot.tasks.task import Event
 
 # Long, and of no use on the page, or shown in a form of its own.

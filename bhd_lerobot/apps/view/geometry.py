@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.apps.view.groups import names_of, scan_of
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
@@ -15,7 +16,6 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
-from bhd_lerobot.apps.view.groups import names_of, scan_of
 
 Arrays = dict[str, NDArray]
 _AWAY_M = 10.0  # an object this high floats where nobody sees it: it is not there

@@ -9,10 +9,10 @@ from typing import Any
 
 from aiohttp import web
 
-from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.apps.view.dataset import ViewedDataset, stamp_of
 from bhd_lerobot.apps.view.guard import add_headers, guard, new_token
 from bhd_lerobot.apps.view.packing import to_json
+from bhd_lerobot.errors import BhdError, ConfigError
 
 HOST = "127.0.0.1"
 STATIC = Path(__file__).parent / "static"

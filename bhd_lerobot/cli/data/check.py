@@ -15,13 +15,13 @@ from rich.table import Table
 from bhd_lerobot.bodies.body import Arm, MobileBase, PositionLimits
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.summary import is_being_written
+from bhd_lerobot.datasets.recovery.fix import fix
 from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.datasets.validate.values import Limits
-from bhd_lerobot.datasets.recovery.fix import fix
-from bhd_lerobot.datasets.format.summary import is_being_written
 from bhd_lerobot.errors import DatasetLockedError
-from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
 
 # No option of a robot changes its limits, and its configuration takes seconds to import.
 _BODIES: dict[str | None, Callable[[], Arm | MobileBase]] = {"turtlebot3": turtlebot3_burger, "ur5": ur5}

@@ -4,12 +4,12 @@ import argparse
 import random
 from pathlib import Path
 
-from bhd_lerobot.datasets.edit.edits import EditReport, delete, keep, merge, split
-from bhd_lerobot.datasets.format.summary import check_not_empty, dataset_info
-from bhd_lerobot.datasets.format.state import load_state
-from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.cli.data.command import Commands, add_command, root_of
 from bhd_lerobot.cli.data.episode_list import parse_episodes
+from bhd_lerobot.datasets.edit.edits import EditReport, delete, keep, merge, split
+from bhd_lerobot.datasets.format.state import load_state
+from bhd_lerobot.datasets.format.summary import check_not_empty, dataset_info
+from bhd_lerobot.errors import ConfigError
 
 
 def add_to(commands: Commands) -> None:

@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import ArmChain, WheelDrive
 from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.cli.data.command import Commands, add_command, root_of
+from bhd_lerobot.cli.data.episode_list import parse_episodes
 from bhd_lerobot.control.geometry.poses import pose_vectors
-from bhd_lerobot.rosbag.exporter.export import START_S, ExportOptions, export_bags
-from bhd_lerobot.rosbag.storage.write import FORMATS
 from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.rosbag.exporter.export import START_S, ExportOptions, export_bags
 from bhd_lerobot.rosbag.messages.arm import ARM_FRAME, TOOL_FRAME
 from bhd_lerobot.rosbag.messages.base import FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME, BaseNoise
 from bhd_lerobot.rosbag.messages.views import JointFrame, RobotView, StaticFrame
-from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.cli.data.command import Commands, add_command, root_of
-from bhd_lerobot.cli.data.episode_list import parse_episodes
+from bhd_lerobot.rosbag.storage.write import FORMATS
 
 _BASE_LINK = (0.0, 0.0, 0.010)  # [m] over the floor, turtlebot3_burger.urdf
 _CASTER = (-0.081, 0.0, -0.004)  # [m] in base_link, the same

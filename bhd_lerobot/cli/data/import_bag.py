@@ -6,18 +6,18 @@ import sys
 from pathlib import Path
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.cli.data.command import Commands, add_command
+from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.errors import ConfigError, quoted, unknown_name
 from bhd_lerobot.rosbag.importer.dataset import ImportReport, RobotImport
-from bhd_lerobot.rosbag.storage.find import check_distinct, find_bags
 from bhd_lerobot.rosbag.importer.headers import is_ours
-from bhd_lerobot.rosbag.storage.place import refuse_existing
-from bhd_lerobot.rosbag.storage.read import Bag
 from bhd_lerobot.rosbag.importer.restore import restore
 from bhd_lerobot.rosbag.importer.robot import import_robot
 from bhd_lerobot.rosbag.importer.tracks import TrackOptions
-from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.rosbag.messages.types import require_rosbags
-from bhd_lerobot.errors import ConfigError, quoted, unknown_name
-from bhd_lerobot.cli.data.command import Commands, add_command
+from bhd_lerobot.rosbag.storage.find import check_distinct, find_bags
+from bhd_lerobot.rosbag.storage.place import refuse_existing
+from bhd_lerobot.rosbag.storage.read import Bag
 from bhd_lerobot.tasks.task import OUTCOMES
 
 ROBOTS = ("turtlebot3",)

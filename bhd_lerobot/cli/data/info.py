@@ -12,13 +12,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, roots_of
 from bhd_lerobot.control.timing import TimingSummary
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info, is_being_written
-from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, roots_of
 from bhd_lerobot.datasets.timing.report import timing_of
 from bhd_lerobot.datasets.timing.tables import fitting, ms
+from bhd_lerobot.errors import DatasetError
 
 
 def add_to(commands: Commands) -> None:

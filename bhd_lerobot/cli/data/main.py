@@ -7,9 +7,9 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from bhd_lerobot.cli.start import INTERRUPTED, ending_when_unread, leaving_on_interrupt
 from bhd_lerobot.datasets.storage.atomic import noting_what_is_done
 from bhd_lerobot.errors import BhdError, unknown_name
-from bhd_lerobot.cli.start import INTERRUPTED, ending_when_unread, leaving_on_interrupt
 
 # Modules, in the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
 COMMANDS = (

@@ -2,10 +2,10 @@
 
 import argparse
 
-from bhd_lerobot.datasets.edit.mark import mark
-from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.cli.data.command import Commands, add_command, root_of
 from bhd_lerobot.cli.data.episode_list import parse_episodes
+from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.task import OUTCOMES
 
 

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bhd_lerobot.cli.data.command import Commands, add_command
+from bhd_lerobot.cli.data.episode_list import parse_episodes, short
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.remote.listing import check_repo_id, counted, is_url, megabytes
 from bhd_lerobot.datasets.remote.url import check_url, shown
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetWriteError, TransferError
-from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.hub.transfer import (
     command_line,
     folder_of,
@@ -23,7 +24,6 @@ from bhd_lerobot.hub.transfer import (
     storage_options,
     tell_of_folder,
 )
-from bhd_lerobot.cli.data.episode_list import parse_episodes, short
 
 if TYPE_CHECKING:
     from bhd_lerobot.datasets.remote.pull import PullReport, Select

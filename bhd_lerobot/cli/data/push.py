@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.remote.listing import check_repo_id, counted, is_url, listed, megabytes
 from bhd_lerobot.datasets.remote.url import check_url
 from bhd_lerobot.errors import BhdError, ConfigError
-from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.hub.transfer import (
     command_line,
     folder_of,
@@ -116,11 +116,11 @@ def push_dataset(
     Raises:
         BhdError: it was not uploaded; the message says why, that the dataset is kept, and how to repeat.
     """
+    from bhd_lerobot.datasets.format.state import DatasetState
     from bhd_lerobot.datasets.remote.hub import HubDataset
     from bhd_lerobot.datasets.remote.push import Card, push
     from bhd_lerobot.datasets.remote.store import StoreDataset
     from bhd_lerobot.datasets.remote.url import shown
-    from bhd_lerobot.datasets.format.state import DatasetState
 
     def make(state: DatasetState, has_picture: bool) -> Card:
         from bhd_lerobot.hub.card import CardOptions, make_card

@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.cli.data.command import Commands, add_command, root_of
+from bhd_lerobot.datasets.recovery.repair import repair
 
 
 def add_to(commands: Commands) -> None:

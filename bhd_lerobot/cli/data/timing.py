@@ -6,10 +6,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
 from bhd_lerobot.datasets.timing.report import load_timing
 from bhd_lerobot.datasets.timing.tables import print_timing
+from bhd_lerobot.errors import ConfigError
 
 _PICTURES = (".png", ".pdf", ".svg")
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
+from bhd_lerobot.errors import ConfigError
 
 PORT = 8766
 

@@ -4,13 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.arm.setpoints import SetpointFilter
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.controller import Controller
-from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.messages import Limit, Mode
+from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.arm.setpoints import SetpointFilter
 
 # A joint this far from its reference for so long does not follow it; goals end with PATH_TOLERANCE at that distance.
 BLOCKED_RAD, BLOCKED_S = 0.1, 0.05

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.base import limits as safety
-from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.base.diff_drive import DiffDrive
+from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.messages import Limit, Mode
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import ArmChain, PositionLimits
+from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry import inverse_kinematics
 from bhd_lerobot.control.geometry.collision import CollisionModel
-from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.forward_kinematics import DOF, ForwardKinematics
 from bhd_lerobot.errors import ConfigError
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
-from bhd_lerobot.control.motion.goal_book import NO_FAILURE, REASONS, GoalBook
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.motion.goal_book import NO_FAILURE, REASONS, GoalBook
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
 from bhd_lerobot.control.motion.planning import InlinePlanning, Planning, PlanOrders
 from bhd_lerobot.control.motion.player import TrajectoryPlayer

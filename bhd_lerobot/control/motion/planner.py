@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import Arm
-from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_TOOL_SPEED, check
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_TOOL_SPEED, check
 from bhd_lerobot.control.motion.line import ToolLimits, along_line
 from bhd_lerobot.control.motion.trajectory import (
     MotionLimits,

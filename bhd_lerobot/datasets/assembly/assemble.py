@@ -15,17 +15,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.datasets.assembly.files import build_data, build_videos
-from bhd_lerobot.datasets.storage.disk import Disk, to_json
+from bhd_lerobot.datasets.assembly.picks import Files, Pick, Plan
+from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.datasets.format.episode_table import PREFIX, stored_stats
 from bhd_lerobot.datasets.format.identity import comparable, differences
-from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.datasets.format.meta_files import tasks_table, write_meta
-from bhd_lerobot.datasets.assembly.picks import Files, Pick, Plan
-from bhd_lerobot.datasets.storage.atomic import has_unfinished_episodes, link_others
 from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, read_frames, slot_of
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import has_unfinished_episodes, link_others
+from bhd_lerobot.datasets.storage.disk import Disk, to_json
+from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.errors import DatasetError, DatasetMismatchError, quoted
 
 EDITS = "meta/edits.jsonl"

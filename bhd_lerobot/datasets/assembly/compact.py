@@ -11,16 +11,23 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.format import statistics
-from bhd_lerobot.datasets.format import video
-from bhd_lerobot.datasets.storage.disk import Disk, RootLock
+from bhd_lerobot.datasets.format import statistics, video
 from bhd_lerobot.datasets.format.episode_table import stored_stats
-from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, PARQUET_OPTIONS, write_meta
-from bhd_lerobot.datasets.storage.atomic import Workspace, link_others
 from bhd_lerobot.datasets.format.schema import Schema, as_numpy
-from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, ordered_slots, read_frames, slot_columns, slot_of
+from bhd_lerobot.datasets.format.state import (
+    DatasetState,
+    Row,
+    corrupt,
+    ordered_slots,
+    read_frames,
+    slot_columns,
+    slot_of,
+)
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import Workspace, link_others
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock
+from bhd_lerobot.datasets.storage.layout import Slot
 
 EpisodeStats = dict[str, statistics.Stats]
 

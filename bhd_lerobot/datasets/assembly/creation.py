@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
-from bhd_lerobot.datasets.storage.atomic import is_free, making
 from bhd_lerobot.datasets.format.schema import Schema
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import is_free, making
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.errors import DatasetError, DatasetExistsError, DatasetLockedError
 
 _RESUME = "Resume it (--resume=true), remove it"  # what can be done if a dataset to be recorded is there

@@ -8,13 +8,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.format import video
-from bhd_lerobot.datasets.storage.disk import Disk
-from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, PARQUET_OPTIONS
 from bhd_lerobot.datasets.assembly.picks import Group, Plan, Run
+from bhd_lerobot.datasets.format import video
+from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, PARQUET_OPTIONS
 from bhd_lerobot.datasets.format.state import corrupt, read_frames, slot_columns
 from bhd_lerobot.datasets.format.video_splice import splice
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import DatasetMismatchError
 
 type Take = Callable[[Path, Path], None]

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, slot_of
+from bhd_lerobot.datasets.storage.layout import Slot
 
 
 @dataclass(frozen=True)

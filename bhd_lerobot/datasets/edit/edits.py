@@ -10,12 +10,12 @@ from typing import Any
 
 import pyarrow as pa
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.assembly.assemble import EDITS, assemble, check_alike
 from bhd_lerobot.datasets.assembly.creation import build_root
-from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
-from bhd_lerobot.datasets.format.identity import FORMAT
 from bhd_lerobot.datasets.assembly.picks import Pick
+from bhd_lerobot.datasets.format.identity import FORMAT
+from bhd_lerobot.datasets.format.state import DatasetState, load_state, no_dataset, read_json
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import (
     Workspace,
     clean,
@@ -27,7 +27,7 @@ from bhd_lerobot.datasets.storage.atomic import (
     remove_abandoned,
     uninterrupted,
 )
-from bhd_lerobot.datasets.format.state import DatasetState, load_state, no_dataset, read_json
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, quoted
 
 

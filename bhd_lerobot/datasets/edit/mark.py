@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.edit.edits import Change, EditReport, Tell, check_episodes, rewrite
 from bhd_lerobot.datasets.assembly.picks import Pick
+from bhd_lerobot.datasets.edit.edits import Change, EditReport, Tell, check_episodes, rewrite
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.schema import as_numpy
 from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, read_frames, slot_of
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
 

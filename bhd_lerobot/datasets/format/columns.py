@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.format.state import load_state, ordered_slots, read_frames
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError
 
 

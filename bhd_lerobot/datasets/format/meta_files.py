@@ -8,12 +8,12 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.format import statistics
-from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.datasets.format.episode_table import episode_table
-from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.datasets.format.state import Row, slot_columns
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import Disk
+from bhd_lerobot.datasets.storage.layout import Slot
 
 PARQUET_OPTIONS: dict[str, Any] = {"compression": "snappy", "use_dictionary": False, "write_page_checksum": True}
 """Plain pages: dictionaries cost three times the time on floats and save nothing. Checksums find damaged values."""

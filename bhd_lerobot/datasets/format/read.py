@@ -7,8 +7,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.format.state import corrupt, load_state, slot_of
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError
 
 

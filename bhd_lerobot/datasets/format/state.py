@@ -11,12 +11,12 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.format.expected import repeated, wrong_columns, wrong_row, wrong_values
 from bhd_lerobot.datasets.format.info import InfoError, kind_of, parse_object, read_info
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import complete_interrupted
 from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.datasets.storage.places import check_links
-from bhd_lerobot.datasets.storage.atomic import complete_interrupted
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError, quoted
 
 UNREADABLE = (OSError, pa.ArrowException, ValueError)

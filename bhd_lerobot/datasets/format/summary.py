@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.datasets.format.episode_table import PREFIX
 from bhd_lerobot.datasets.format.state import load_state
+from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.errors import DatasetError, DatasetLockedError
 
 

@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.places import check_inside
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import corrupt
 from bhd_lerobot.datasets.loader.table import FrameTable
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.places import check_inside
 from bhd_lerobot.errors import DatasetError, MemoryBudgetError, UnsupportedDatasetError
 
 if TYPE_CHECKING:

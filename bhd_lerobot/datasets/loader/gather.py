@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bhd_lerobot.datasets.loader.frame_cache import FrameCache
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
+from bhd_lerobot.datasets.loader.frame_cache import FrameCache
 from bhd_lerobot.datasets.loader.table import FrameTable
 from bhd_lerobot.errors import DatasetError, unknown_name
 

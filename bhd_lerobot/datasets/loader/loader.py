@@ -8,7 +8,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from bhd_lerobot.datasets.loader.batches import BatchLoader, Loader, Placing, first_frames, ordered_samples, per_task_samples
+from bhd_lerobot.datasets.loader.batches import (
+    BatchLoader,
+    Loader,
+    Placing,
+    first_frames,
+    ordered_samples,
+    per_task_samples,
+)
 from bhd_lerobot.datasets.loader.check import check
 from bhd_lerobot.datasets.loader.fallback import Serving, open_source
 from bhd_lerobot.datasets.loader.gather import Batch

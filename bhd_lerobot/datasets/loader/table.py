@@ -10,11 +10,11 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.places import wrong_info
-from bhd_lerobot.datasets.storage.atomic import complete_interrupted
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import corrupt, load_info
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import complete_interrupted
+from bhd_lerobot.datasets.storage.places import wrong_info
 from bhd_lerobot.errors import DatasetError, unknown_name
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.datasets.format import info as meta_info
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.validate.findings import few
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import UNREADABLE
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.validate.findings import few
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError
 
 _PICTURES = ("video", "image")

@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 
 from bhd_lerobot.datasets.format.episode_table import PREFIX, read_stats
 from bhd_lerobot.datasets.format.expected import repeated, wrong_row
-from bhd_lerobot.datasets.recovery.videos import Found
 from bhd_lerobot.datasets.format.state import UNREADABLE, Row, column_types
 from bhd_lerobot.datasets.format.statistics import Stats
+from bhd_lerobot.datasets.recovery.videos import Found
 
 _OURS = re.compile(rb"(?<=bhd/)[a-z][a-z0-9_]*(?![a-zA-Z0-9_])")
 """Names of our columns in the bytes of a footer."""

@@ -11,16 +11,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.assembly.compact import compact
-from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.datasets.format.episode_table import stored_stats
-from bhd_lerobot.datasets.validate.findings import Finding, Severity
 from bhd_lerobot.datasets.format.meta_files import write_meta
-from bhd_lerobot.datasets.storage.atomic import Workspace, has_unfinished_episodes, link_others, real, remove_abandoned
-from bhd_lerobot.datasets.recovery.statistics import stats_of
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState, corrupt, load_info, load_state, ordered_slots, read_frames
+from bhd_lerobot.datasets.recovery.statistics import stats_of
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import Workspace, has_unfinished_episodes, link_others, real, remove_abandoned
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.datasets.validate.findings import Finding, Severity
 
 
 def is_fixable(finding: Finding) -> bool:

@@ -7,14 +7,14 @@ is the other recording's and is never looked at.
 from pathlib import Path
 from typing import Any
 
+from bhd_lerobot.datasets.format.parquet_rescue import rescue
+from bhd_lerobot.datasets.format.state import read_tasks
+from bhd_lerobot.datasets.recovery.columns import misfit, read_info, wrong_rate
+from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.recovery.salvage import schema_of, shapes_of
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk, to_json
 from bhd_lerobot.datasets.validate.findings import one_line
-from bhd_lerobot.datasets.format.parquet_rescue import rescue
-from bhd_lerobot.datasets.recovery.salvage import schema_of, shapes_of
-from bhd_lerobot.datasets.recovery.columns import misfit, read_info, wrong_rate
-from bhd_lerobot.datasets.recovery.evidence import Told
-from bhd_lerobot.datasets.format.state import read_tasks
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError
 
 

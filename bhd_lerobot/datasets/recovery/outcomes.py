@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.assembly.assemble import EDITS
-from bhd_lerobot.datasets.validate.findings import few
-from bhd_lerobot.datasets.recovery.videos import Found
-from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
+from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.recovery.videos import Found
+from bhd_lerobot.datasets.validate.findings import few
 from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 RECOVERED = "recovered"

@@ -6,17 +6,9 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.format import video
 from bhd_lerobot.datasets.assembly.compact import compact
-from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
-from bhd_lerobot.datasets.recovery.fix import compute_stats
+from bhd_lerobot.datasets.format import video
 from bhd_lerobot.datasets.format.parquet_rescue import is_cut_off, is_parquet
-from bhd_lerobot.datasets.storage.atomic import real, remove_abandoned, roll_forward
-from bhd_lerobot.datasets.recovery.info import adopt_info, give_back
-from bhd_lerobot.datasets.recovery.salvage import salvage
-from bhd_lerobot.datasets.recovery.videos import whole_frames
-from bhd_lerobot.datasets.recovery.evidence import Told
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import (
     REPAIR_MAY_HELP,
@@ -29,6 +21,14 @@ from bhd_lerobot.datasets.format.state import (
     read_json,
     slot_of,
 )
+from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.recovery.fix import compute_stats
+from bhd_lerobot.datasets.recovery.info import adopt_info, give_back
+from bhd_lerobot.datasets.recovery.salvage import salvage
+from bhd_lerobot.datasets.recovery.videos import whole_frames
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import real, remove_abandoned, roll_forward
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
 from bhd_lerobot.errors import DatasetCorruptError
 
 

@@ -10,12 +10,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, PARQUET_OPTIONS
+from bhd_lerobot.datasets.format.state import Row, read_tasks, slot_columns
+from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.recovery.videos import Found
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk
-from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, PARQUET_OPTIONS
-from bhd_lerobot.datasets.recovery.videos import Found
-from bhd_lerobot.datasets.recovery.evidence import Told
-from bhd_lerobot.datasets.format.state import Row, read_tasks, slot_columns
 from bhd_lerobot.errors import DatasetCorruptError
 
 _LOST_TASK = "(the instruction was lost)"

@@ -16,22 +16,22 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.assembly.assemble import EDITS, WRITTEN
-from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.datasets.format.expected import wrong_columns, wrong_values
-from bhd_lerobot.datasets.validate.findings import few
 from bhd_lerobot.datasets.format.meta_files import tasks_table, write_meta
 from bhd_lerobot.datasets.format.parquet_rescue import rescue
-from bhd_lerobot.datasets.storage.atomic import WORK, Workspace, link_others
+from bhd_lerobot.datasets.format.state import corrupt, read_identity, repair_with_info
 from bhd_lerobot.datasets.recovery.columns import lost_cameras, misfit, read_info
-from bhd_lerobot.datasets.recovery.videos import Films, Found
+from bhd_lerobot.datasets.recovery.evidence import Told
 from bhd_lerobot.datasets.recovery.guard import check_readable, check_unused
 from bhd_lerobot.datasets.recovery.outcomes import RECOVERED, logged, recall
 from bhd_lerobot.datasets.recovery.rows import info_of, rows_of, tasks_of, write_data
 from bhd_lerobot.datasets.recovery.statistics import stats_of
-from bhd_lerobot.datasets.recovery.evidence import Told
-from bhd_lerobot.datasets.format.state import corrupt, read_identity, repair_with_info
+from bhd_lerobot.datasets.recovery.videos import Films, Found
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import WORK, Workspace, link_others
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.datasets.validate.findings import few
 from bhd_lerobot.errors import DatasetCorruptError, UnsupportedDatasetError
 
 

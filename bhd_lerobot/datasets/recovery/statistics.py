@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.datasets.format.state import Row, slot_of
+from bhd_lerobot.datasets.storage import layout
 
 
 def stats_of(

@@ -12,12 +12,12 @@ from typing import Any
 
 import pyarrow as pa
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.format import video
-from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.datasets.format.expected import wrong_part
-from bhd_lerobot.datasets.recovery.video_files import cut_out, encode
 from bhd_lerobot.datasets.format.state import Row, slot_columns, slot_of
+from bhd_lerobot.datasets.recovery.video_files import cut_out, encode
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import Disk
 
 _FRAMES = "images/{key}/episode-{episode:06d}"  # where LeRobot keeps the frames of a film that is not encoded yet
 

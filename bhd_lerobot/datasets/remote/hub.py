@@ -4,10 +4,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.remote.hub_errors import hub_errors, require_token
-from bhd_lerobot.datasets.remote.listing import Item, RemoteFile, check_repo_id, in_order, largest_first, listed, refuse_damaged
+from bhd_lerobot.datasets.remote.listing import (
+    Item,
+    RemoteFile,
+    check_repo_id,
+    in_order,
+    largest_first,
+    listed,
+    refuse_damaged,
+)
 from bhd_lerobot.datasets.remote.pool import run_all
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, TransferError
 
 if TYPE_CHECKING:

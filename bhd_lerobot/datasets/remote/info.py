@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.format.info import InfoError, checked_info, parse_object
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError
 
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.disk import RootLock
-from bhd_lerobot.datasets.storage.places import check_inside
-from bhd_lerobot.datasets.storage.atomic import complete_interrupted, has_unfinished_episodes
+from bhd_lerobot.datasets.format.state import DatasetState, load_state
 from bhd_lerobot.datasets.remote.listing import MANIFEST, SUBSET, Item, is_recorded, listed
 from bhd_lerobot.datasets.remote.subset import read_subset
-from bhd_lerobot.datasets.format.state import DatasetState, load_state
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import complete_interrupted, has_unfinished_episodes
+from bhd_lerobot.datasets.storage.disk import RootLock
+from bhd_lerobot.datasets.storage.places import check_inside
 from bhd_lerobot.errors import DatasetError, DatasetLockedError, quoted
 
 _TEMPORARY = ("images",)  # LeRobot's own, of frames whose film is not encoded yet

@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.storage.disk import RootLock, write_errors
-from bhd_lerobot.datasets.storage.places import wrong_path
-from bhd_lerobot.datasets.storage.atomic import clean, complete_interrupted, has_unfinished_episodes, is_free
+from bhd_lerobot.datasets.format.state import load_state
+from bhd_lerobot.datasets.remote.info import parse_info
 from bhd_lerobot.datasets.remote.listing import (
     MANIFEST,
     SUBSET,
@@ -27,11 +25,13 @@ from bhd_lerobot.datasets.remote.listing import (
     refuse_overlap,
     total,
 )
-from bhd_lerobot.datasets.remote.info import parse_info
 from bhd_lerobot.datasets.remote.pool import run_all
 from bhd_lerobot.datasets.remote.staging import Staging
 from bhd_lerobot.datasets.remote.subset import Subset, SubsetNote, files_of, read_subset, subset_note
-from bhd_lerobot.datasets.format.state import load_state
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import clean, complete_interrupted, has_unfinished_episodes, is_free
+from bhd_lerobot.datasets.storage.disk import RootLock, write_errors
+from bhd_lerobot.datasets.storage.places import wrong_path
 from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, TransferError, quoted
 
 type Select = Callable[[Path], Sequence[int]]

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.assembly.assemble import EDITS
-from bhd_lerobot.datasets.remote.card import is_generated
 from bhd_lerobot.datasets.edit.edits import edits_of
+from bhd_lerobot.datasets.format.state import DatasetState
+from bhd_lerobot.datasets.remote.card import is_generated
+from bhd_lerobot.datasets.remote.info import parse_info
 from bhd_lerobot.datasets.remote.listing import (
     CARD,
     LISTED,
@@ -22,10 +23,9 @@ from bhd_lerobot.datasets.remote.listing import (
     refuse_overlap,
     total,
 )
-from bhd_lerobot.datasets.remote.info import parse_info
 from bhd_lerobot.datasets.remote.local import LocalDataset, open_local
 from bhd_lerobot.datasets.remote.pool import run_all
-from bhd_lerobot.datasets.format.state import DatasetState
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError, DatasetExistsError
 
 

@@ -7,11 +7,11 @@ import stat
 from collections.abc import Iterable
 from pathlib import Path
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.assembly.assemble import EDITS
-from bhd_lerobot.datasets.storage.disk import Disk
-from bhd_lerobot.datasets.storage.atomic import PULL, is_fixed, move_in, note_done, uninterrupted
 from bhd_lerobot.datasets.remote.listing import MANIFEST, SUBSET, is_recorded
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import PULL, is_fixed, move_in, note_done, uninterrupted
+from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import DatasetError
 
 _MARKER = ".bhd-pull"

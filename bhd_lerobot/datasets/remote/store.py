@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.remote.errors import store_errors
 from bhd_lerobot.datasets.remote.listing import (
     LISTED,
     MANIFEST,
@@ -23,10 +23,10 @@ from bhd_lerobot.datasets.remote.listing import (
     refuse_damaged,
     stream_digest,
 )
-from bhd_lerobot.datasets.remote.errors import store_errors
 from bhd_lerobot.datasets.remote.manifest import Manifest, parse_manifest
 from bhd_lerobot.datasets.remote.pool import WORKERS, run_all
 from bhd_lerobot.datasets.remote.url import LOCAL, open_place, shown
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import TransferError
 
 _FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", "webhdfs", "webdav", "dbfs"}

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.format import video
-from bhd_lerobot.datasets.validate.files import RESTORE, Files, read_files
-from bhd_lerobot.datasets.validate.values import Limits, ValueCheck
 from bhd_lerobot.datasets.format.episode_table import PREFIX
-from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted
+from bhd_lerobot.datasets.validate.files import RESTORE, Files, read_files
+from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity
+from bhd_lerobot.datasets.validate.values import Limits, ValueCheck
 
 __all__ = ["CHECKS", "DatasetCheck", "Finding", "Severity", "check_dataset"]
 

@@ -14,14 +14,14 @@ import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.validate.names import check_names
-from bhd_lerobot.datasets.validate.statistics import UNREAD
 from bhd_lerobot.datasets.format.expected import wrong_types
-from bhd_lerobot.datasets.validate.findings import Findings, few, one_line
 from bhd_lerobot.datasets.format.info import InfoError, parse_object, read_info, wrong_feature
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import UNREADABLE, no_dataset, repair_with_info
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.validate.findings import Findings, few, one_line
+from bhd_lerobot.datasets.validate.names import check_names
+from bhd_lerobot.datasets.validate.statistics import UNREAD
 from bhd_lerobot.errors import DatasetError
 
 _COPY = "Restore it from a copy, or try bhd-data repair."

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.validate.findings import Findings, few
 from bhd_lerobot.datasets.format.parquet_rescue import is_cut_off
-from bhd_lerobot.datasets.storage.places import check_links
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import WORK, is_decided
+from bhd_lerobot.datasets.storage.places import check_links
+from bhd_lerobot.datasets.validate.findings import Findings, few
 from bhd_lerobot.errors import DatasetError
 
 if TYPE_CHECKING:

@@ -15,13 +15,13 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.expected import wrong_columns
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.validate.files import RESTORE, Files, stats_remedy
+from bhd_lerobot.datasets.validate.findings import Findings, few, name_of, one_line
 from bhd_lerobot.datasets.validate.frozen import FrozenCheck
 from bhd_lerobot.datasets.validate.statistics import UNREAD, Moments, wrong_statistic
 from bhd_lerobot.datasets.validate.steps import StepCheck
-from bhd_lerobot.datasets.format.expected import wrong_columns
-from bhd_lerobot.datasets.validate.findings import Findings, few, name_of, one_line
 
 Limits = Mapping[str, Mapping[str, tuple[float, float]]]
 """Feature -> name of one of its numbers -> least and largest value."""

@@ -10,15 +10,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.assembly.compact import EpisodeStats
-from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.datasets.format.episode_table import episode_table
-from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.datasets.format.meta_files import PARQUET_OPTIONS, tasks_table
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_columns, slot_of
 from bhd_lerobot.datasets.format.video import VideoSettings, video_info
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import Disk
+from bhd_lerobot.datasets.storage.layout import Slot
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bhd_lerobot.datasets.storage.disk import Disk, write_errors
 from bhd_lerobot.datasets.format.schema import LANGUAGE, Column, Schema
 from bhd_lerobot.datasets.format.video import CameraEncoder, EncodedVideo, VideoSettings
+from bhd_lerobot.datasets.storage.disk import Disk, write_errors
 from bhd_lerobot.errors import FrameError, unknown_name
 
 _FIRST_CAPACITY = 64

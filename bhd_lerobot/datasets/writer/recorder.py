@@ -8,19 +8,19 @@ from typing import Any, Self
 
 import numpy as np
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.datasets.format import statistics
-from bhd_lerobot.datasets.writer.commit import Committer, EpisodeContent
 from bhd_lerobot.datasets.assembly.compact import EpisodeStats, compact
 from bhd_lerobot.datasets.assembly.creation import create_root, new_info
-from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
-from bhd_lerobot.datasets.writer.episode import EpisodeWriter
+from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.datasets.format.episode_table import checked_metadata, metadata_types
 from bhd_lerobot.datasets.format.identity import FORMAT, as_json, check_identity, default_root
-from bhd_lerobot.datasets.recovery.repair import RepairReport, settle
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.format.video import VideoSettings
+from bhd_lerobot.datasets.recovery.repair import RepairReport, settle
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
+from bhd_lerobot.datasets.writer.commit import Committer, EpisodeContent
+from bhd_lerobot.datasets.writer.episode import EpisodeWriter
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, FrameError
 
 _INTACT = "Episodes saved before are intact."

@@ -15,9 +15,16 @@ from bhd_lerobot.errors import ConfigError, InstructionError
 from bhd_lerobot.policies.brain import Observation, find_columns
 from bhd_lerobot.policies.config_brain import BrainConfig
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
-from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject, neutral_yaw, plan_grasp, pointing_down, read_objects
-from bhd_lerobot.policies.manipulation.skills import Plan, Skill, make_plan
+from bhd_lerobot.policies.manipulation.grasp import (
+    Grasp,
+    SeenObject,
+    neutral_yaw,
+    plan_grasp,
+    pointing_down,
+    read_objects,
+)
 from bhd_lerobot.policies.manipulation.scene_objects import scene_object
+from bhd_lerobot.policies.manipulation.skills import Plan, Skill, make_plan
 
 _SQUEEZE = 0.03  # [m] how far inside the object the fingers are sent: the gripper's force limit does the rest
 _MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers

@@ -19,8 +19,16 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, find_columns
-from bhd_lerobot.policies.navigation.clearance import HALF_TRACK, HEADINGS, LIDAR_X, LONGEST, QUANTUM, SPACING, make_paths
 from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.navigation.clearance import (
+    HALF_TRACK,
+    HEADINGS,
+    LIDAR_X,
+    LONGEST,
+    QUANTUM,
+    SPACING,
+    make_paths,
+)
 from bhd_lerobot.policies.navigation.goal_map import GoalMap
 from bhd_lerobot.policies.navigation.scan import ScanReader
 from bhd_lerobot.policies.navigation.steering import NARROW, Freedom, Steering, check_driving, keep_heading, wrap

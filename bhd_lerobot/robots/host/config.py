@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from bhd_lerobot.realtime.privileges import RealtimeSettings
-from bhd_lerobot.realtime.loop import LoopLimits
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.realtime.loop import LoopLimits
+from bhd_lerobot.realtime.privileges import RealtimeSettings
 
 CLOCKS = ("lockstep", "realtime")
 

@@ -15,17 +15,17 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from bhd_lerobot.realtime.frame_log import FrameLog
-from bhd_lerobot.realtime.block import LiveLayout, Word
-from bhd_lerobot.realtime.sections import BrainSide, section_sizes
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.realtime.block import LiveLayout, Word
+from bhd_lerobot.realtime.frame_log import FrameLog
+from bhd_lerobot.realtime.sections import BrainSide, section_sizes
 from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.robots.host.process import LiveSpec
-from bhd_lerobot.robots.host.state import state_dtype
 from bhd_lerobot.robots.host.remote_plant import plant_shape
 from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.host.state import state_dtype
 
 _LIFE_S = 0.02  # between two signs of life of this process
 _START_S = 120.0  # that a process may take to import, build its model and warm up

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.cerebellum import MOVING
-from bhd_lerobot.realtime.grid import Slot, TickGrid
-from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.realtime.block import Word
+from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantPhase
 from bhd_lerobot.robots.host.plant_stop import PlantStop
 

@@ -17,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.fifo import StateRing
-from bhd_lerobot.realtime.grid import Slot, TickGrid
-from bhd_lerobot.realtime.block import LiveBlock, Word
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink
 from bhd_lerobot.errors import BhdError, RealtimeError
-from bhd_lerobot.robots.host.process import LiveSpec, run_worker
+from bhd_lerobot.realtime.block import LiveBlock, Word
+from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink
 from bhd_lerobot.robots.host.plant_loop import PlantLoop, PlantTick
 from bhd_lerobot.robots.host.plant_stop import make_stop
+from bhd_lerobot.robots.host.process import LiveSpec, run_worker
 from bhd_lerobot.robots.host.simulation import Simulation
 
 _WARM_UP_S = 0.2

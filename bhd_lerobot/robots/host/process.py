@@ -23,19 +23,19 @@ from typing import Any, Protocol
 import numpy as np
 
 from bhd_lerobot.bodies.body import Arm, Body, Rates
-from bhd_lerobot.realtime.grid import Slot, TickGrid
-from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
-from bhd_lerobot.realtime.sections import cerebellum_side, plan_link
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.control.motion.planning import Planning
-from bhd_lerobot.realtime.plant_link import PlantLink
-from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
-from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import BhdError
-from bhd_lerobot.robots.host.state import StatePublisher
+from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
+from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
+from bhd_lerobot.realtime.plant_link import PlantLink
+from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
+from bhd_lerobot.realtime.sections import cerebellum_side, plan_link
 from bhd_lerobot.robots.host.remote_plant import RemoteSimulation
 from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.host.state import StatePublisher
 
 _WARM_UP_S = 0.2  # ticks before the first real one: caches, pages and branches are as they will be
 _POLL_S = 0.02

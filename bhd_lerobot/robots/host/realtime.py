@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.control.fifo import RingReader
-from bhd_lerobot.realtime.block import Word
-from bhd_lerobot.realtime.bridge import LiveBridge
 from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.realtime.block import Word
+from bhd_lerobot.realtime.bridge import LiveBridge
 from bhd_lerobot.robots.host.link import LiveLink
-from bhd_lerobot.robots.host.state import raised
 from bhd_lerobot.robots.host.simulation import Frame, FrameReport, Simulation
+from bhd_lerobot.robots.host.state import raised
 from bhd_lerobot.sim.world import Snapshot
 
 _SILENCE_S = 2.0  # so long after it was due a frame that does not come means that the loop or the recorder is stuck

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.messages import Mode
-from bhd_lerobot.realtime.plant_link import PlantLink, PlantShape, RemotePlant
 from bhd_lerobot.realtime.loop import Serve
+from bhd_lerobot.realtime.plant_link import PlantLink, PlantShape, RemotePlant
 from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
 
 _LATCHED = (Mode.ESTOP, Mode.FAULT)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.cerebellum import MOVING, Cerebellum
 from bhd_lerobot.control.fifo import StateRing
+from bhd_lerobot.control.messages import Limit, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import FEEDBACK_DTYPE, encode_feedback
 from bhd_lerobot.realtime.grid import Slot, TickGrid
-from bhd_lerobot.control.messages import Limit, Reason, Watchdog
 from bhd_lerobot.robots.host.simulation import Simulation
 
 LIMITS, WATCHDOGS = tuple(limit for limit in Limit if limit), tuple(watchdog for watchdog in Watchdog if watchdog)

@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pyarrow import types as arrow
 
-from bhd_lerobot.rosbag.storage import checksum
-from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.rosbag.messages import types
-from bhd_lerobot.rosbag.messages import views
-from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, encode_image, film_frames
-from bhd_lerobot.rosbag.storage.write import Stream
 from bhd_lerobot.datasets.format.episode_table import PREFIX
+from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES, LANGUAGE
+from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.errors import DatasetError, UnsupportedDatasetError
+from bhd_lerobot.rosbag.messages import types, views
 from bhd_lerobot.rosbag.messages.base import OdometryPart, ScanPart
 from bhd_lerobot.rosbag.messages.cdr import encode
+from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, encode_image, film_frames
 from bhd_lerobot.rosbag.messages.parts import (
     NANO,
     Frames,
@@ -29,9 +29,8 @@ from bhd_lerobot.rosbag.messages.parts import (
     stamp_tree,
 )
 from bhd_lerobot.rosbag.messages.split import check_topics, parts_of
-from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES, LANGUAGE
-from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
-from bhd_lerobot.errors import DatasetError, UnsupportedDatasetError
+from bhd_lerobot.rosbag.storage import checksum
+from bhd_lerobot.rosbag.storage.write import Stream
 
 _PLAIN = (arrow.is_string, arrow.is_boolean, arrow.is_integer, arrow.is_floating, arrow.is_list, arrow.is_null)
 _LONGEST_S = 1e8  # three years, which nobody records

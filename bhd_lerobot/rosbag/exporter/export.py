@@ -9,17 +9,16 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.rosbag.messages import types
-from bhd_lerobot.rosbag.messages import views
-from bhd_lerobot.rosbag.exporter.episode import EpisodeTopics
-from bhd_lerobot.rosbag.storage.place import complete_or_not
-from bhd_lerobot.rosbag.storage.write import BagWriter
 from bhd_lerobot.datasets.edit.edits import check_reported, opened
-from bhd_lerobot.datasets.storage.atomic import refuse_inside
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, ordered_slots, read_frames
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import refuse_inside
 from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rosbag.exporter.episode import EpisodeTopics
+from bhd_lerobot.rosbag.messages import types, views
+from bhd_lerobot.rosbag.storage.place import complete_or_not
+from bhd_lerobot.rosbag.storage.write import BagWriter
 
 START_S = 1_000_000_000  # [s] since 1970: a dataset does not know on which day it was recorded
 

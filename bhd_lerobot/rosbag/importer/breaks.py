@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.rosbag.importer.tracks import Array, Track, seconds
-from bhd_lerobot.rosbag.importer.resample import CLOCK_STEP_NS, NANO, STEP_BACK_NS, Times, clock_jumps
 from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rosbag.importer.resample import CLOCK_STEP_NS, NANO, STEP_BACK_NS, Times, clock_jumps
+from bhd_lerobot.rosbag.importer.tracks import Array, Track, seconds
 
 _TOLD = 5  # of the same kind, one by one
 _MIXED = 0.01  # share of messages whose stamps go back, beyond which (and beyond `_TOLD`) no restart explains it

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.rosbag.importer.dataset import RobotImport
-from bhd_lerobot.rosbag.importer.tracks import Array, Track
 from bhd_lerobot.rosbag.importer.resample import NANO, Times, newest
+from bhd_lerobot.rosbag.importer.tracks import Array, Track
 from bhd_lerobot.rosbag.messages.base import GYRO, ODOMETRY, TWIST
 from bhd_lerobot.tasks.task import Event
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.rosbag.storage.place import complete_or_not
-from bhd_lerobot.rosbag.importer.tracks import TrackOptions
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetWriteError
+from bhd_lerobot.rosbag.importer.tracks import TrackOptions
+from bhd_lerobot.rosbag.storage.place import complete_or_not
 
 
 @dataclass

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rosbag.messages.cdr_read import readable
 from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE
 from bhd_lerobot.rosbag.storage.read import Messages, Topic
-from bhd_lerobot.rosbag.messages.cdr_read import readable
-from bhd_lerobot.errors import DatasetError
 
 MOST = 0.1
 """Share of a topic's messages that may be unreadable. Beyond it is no accident, and what is left is no record."""

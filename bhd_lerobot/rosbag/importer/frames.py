@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages.base import FOOTPRINT_FRAME, SCAN_FRAME
 from bhd_lerobot.rosbag.messages.types import type_store
-from bhd_lerobot.errors import DatasetError
 
 Array = NDArray[np.float64]
 Static = Mapping[str, tuple[str, Array]]

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.rosbag.storage import checksum
-from bhd_lerobot.rosbag.messages import types
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.exporter.episode import EPISODE_TOPIC
-from bhd_lerobot.rosbag.storage.read import Bag, Topic
+from bhd_lerobot.rosbag.messages import types
 from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.parts import NANO
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rosbag.storage import checksum
+from bhd_lerobot.rosbag.storage.read import Bag, Topic
 
 REMEDY = "Export it again, or import it as a bag of a real robot, with --resample."
 

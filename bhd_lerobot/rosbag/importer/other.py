@@ -3,14 +3,14 @@
 from collections.abc import Mapping
 from typing import Any
 
-from bhd_lerobot.rosbag.messages import types
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.exporter.episode import EPISODE_TOPIC
 from bhd_lerobot.rosbag.importer.headers import is_ours
-from bhd_lerobot.rosbag.storage.read import Bag, Topic
+from bhd_lerobot.rosbag.messages import types
 from bhd_lerobot.rosbag.messages.base import OdometryPart, ScanPart
 from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.views import JOINT_STATE
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rosbag.storage.read import Bag, Topic
 
 _ROBOT = "turtlebot3"
 _BASE = (ScanPart.msgtype, OdometryPart.msgtype)

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.rosbag.storage import checksum
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.rosbag.messages import types
-from bhd_lerobot.rosbag.importer.dataset import ImportReport, all_or_nothing
+from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.format.schema import LANGUAGE
+from bhd_lerobot.datasets.format.video import VideoSettings
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import DatasetError, DatasetMismatchError
 from bhd_lerobot.rosbag.exporter.episode import (
     OUTCOME_COLUMNS,
     OUTCOME_TOPIC,
@@ -19,18 +21,16 @@ from bhd_lerobot.rosbag.exporter.episode import (
     STATE_TOPIC,
     image_topic,
 )
+from bhd_lerobot.rosbag.importer.dataset import ImportReport, all_or_nothing
 from bhd_lerobot.rosbag.importer.headers import REMEDY, episode_headers
-from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, decode_image
-from bhd_lerobot.rosbag.storage.read import Bag, Picker
-from bhd_lerobot.datasets.format.identity import default_root
-from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.rosbag.messages import types
 from bhd_lerobot.rosbag.messages.base import BareTwistPart, OdometryPart, ScanPart
 from bhd_lerobot.rosbag.messages.cdr_read import decode
+from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, decode_image
 from bhd_lerobot.rosbag.messages.parts import NANO, Part, head_stamps, header_stamps, own_topic
 from bhd_lerobot.rosbag.messages.split import PARTS
-from bhd_lerobot.datasets.format.schema import LANGUAGE
-from bhd_lerobot.datasets.format.video import VideoSettings
-from bhd_lerobot.errors import DatasetError, DatasetMismatchError
+from bhd_lerobot.rosbag.storage import checksum
+from bhd_lerobot.rosbag.storage.read import Bag, Picker
 
 _SAME = ("robot_type", "fps", "features", "recording", "video")
 
@@ -136,9 +136,7 @@ class _BagEpisodes:
                 columns[key] = self._vector(feature, parts, at)
             elif feature["dtype"] in ("string", "language") and key != keys.SUBTASK:
                 columns[key] = self._texts(key, observed)
-        changed = [
-            key for key, values in columns.items() if checksum.of_column(values) != episode["checksums"][key]
-        ]
+        changed = [key for key, values in columns.items() if checksum.of_column(values) != episode["checksums"][key]]
         if changed:
             raise DatasetError(
                 f"{self._bag.path}: {changed[0]} of episode {episode['episode_index']} is not what was exported: its "

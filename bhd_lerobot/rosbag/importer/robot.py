@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.rosbag.storage import checksum
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.importer.breaks import stretches, told_silences
 from bhd_lerobot.rosbag.importer.columns import frame_columns, told_silence
 from bhd_lerobot.rosbag.importer.dataset import ImportReport, RobotImport, all_or_nothing
-from bhd_lerobot.rosbag.importer.video import CAMERA, Film
-from bhd_lerobot.rosbag.storage.read import Bag
-from bhd_lerobot.rosbag.importer.tracks import Track, read_tracks, seconds
-from bhd_lerobot.datasets.format.identity import default_root
-from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.rosbag.importer.resample import NANO, Grid, grids
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rosbag.importer.tracks import Track, read_tracks, seconds
+from bhd_lerobot.rosbag.importer.video import CAMERA, Film
+from bhd_lerobot.rosbag.storage import checksum
+from bhd_lerobot.rosbag.storage.read import Bag
 from bhd_lerobot.tasks.task import Event
 
 _TOLD = 8  # sentences in an error; a damaged bag may give hundreds

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 
-from bhd_lerobot.rosbag.importer.headers import is_ours
-from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE
-from bhd_lerobot.rosbag.importer.other import told_other_robot
-from bhd_lerobot.rosbag.storage.read import Bag, Topic
-from bhd_lerobot.rosbag.messages.base import BareTwistPart, GyroPart, OdometryPart, ScanPart, TwistPart
 from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rosbag.importer.headers import is_ours
+from bhd_lerobot.rosbag.importer.other import told_other_robot
+from bhd_lerobot.rosbag.messages.base import BareTwistPart, GyroPart, OdometryPart, ScanPart, TwistPart
+from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE
+from bhd_lerobot.rosbag.storage.read import Bag, Topic
 
 TYPES = {
     "scan": (ScanPart.msgtype,),

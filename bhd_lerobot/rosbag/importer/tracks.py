@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.importer import frames
-from bhd_lerobot.rosbag.importer.warnings import pace, told_pace, told_speeds
-from bhd_lerobot.rosbag.storage.read import Bag, Messages, Topic
 from bhd_lerobot.rosbag.importer.decodable import sound_messages
-from bhd_lerobot.rosbag.importer.topics import TYPES, static_topics, told_publishers, wanted_topic
 from bhd_lerobot.rosbag.importer.resample import Times, apart, message_times, sane
 from bhd_lerobot.rosbag.importer.scan import resampled_scans
+from bhd_lerobot.rosbag.importer.topics import TYPES, static_topics, told_publishers, wanted_topic
+from bhd_lerobot.rosbag.importer.warnings import pace, told_pace, told_speeds
 from bhd_lerobot.rosbag.messages.base import BareTwistPart, GyroPart, TwistPart, odometry
 from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.parts import NANO, head_stamps, header_stamps
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rosbag.storage.read import Bag, Messages, Topic
 
 Array = NDArray[np.float64]
 

@@ -4,13 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.writer.episode import EpisodeWriter
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rosbag.importer.decodable import MOST
+from bhd_lerobot.rosbag.importer.resample import Times, newest
+from bhd_lerobot.rosbag.importer.tracks import Track
 from bhd_lerobot.rosbag.messages.images import decode_image
 from bhd_lerobot.rosbag.storage.read import Bag, Picker
-from bhd_lerobot.rosbag.importer.decodable import MOST
-from bhd_lerobot.rosbag.importer.tracks import Track
-from bhd_lerobot.datasets.writer.episode import EpisodeWriter
-from bhd_lerobot.rosbag.importer.resample import Times, newest
-from bhd_lerobot.errors import DatasetError
 
 CAMERA = "camera/"
 """What the role of a camera's track begins with; its name follows."""

@@ -5,10 +5,10 @@ from typing import Any, override
 
 import numpy as np
 
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages.cdr import encode
 from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.parts import WXYZ, XYZ, Array, Frames, Part, header
-from bhd_lerobot.errors import DatasetError
 
 TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 ARM_FRAME, TOOL_FRAME = "base", "tool"

@@ -7,10 +7,10 @@ from typing import Any, override
 import numpy as np
 
 from bhd_lerobot.bodies.body import LidarSpec
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages.cdr import encode
 from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.parts import NANO, WXYZ, XYZ, Array, Frames, Part, header
-from bhd_lerobot.errors import DatasetError
 
 TWIST = ("x.vel", "theta.vel")
 ODOMETRY = ("x.pos", "y.pos", "theta.pos")

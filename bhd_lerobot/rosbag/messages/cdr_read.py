@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages.cdr import ARRAY, BASE, NAME, NUMPY
 from bhd_lerobot.rosbag.messages.types import type_store
-from bhd_lerobot.errors import DatasetError
 
 
 def decode(msgtype: str, messages: Sequence[bytes | memoryview], wanted: Sequence[str]) -> dict[str, NDArray[Any]]:

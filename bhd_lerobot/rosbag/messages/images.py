@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.datasets.format.state import corrupt
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages.cdr import encode
 from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.parts import Frames, header
-from bhd_lerobot.datasets.format.state import corrupt
-from bhd_lerobot.errors import DatasetError
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _JPEG_QUALITY = 95

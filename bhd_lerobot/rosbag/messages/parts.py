@@ -13,10 +13,10 @@ from typing import Any, ClassVar, override
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages import types
 from bhd_lerobot.rosbag.messages.cdr import encode
 from bhd_lerobot.rosbag.messages.cdr_read import decode
-from bhd_lerobot.errors import DatasetError
 
 Array = NDArray[np.float64]
 NANO = 1_000_000_000

@@ -6,6 +6,7 @@ from typing import Any
 
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.errors import UnsupportedDatasetError
 from bhd_lerobot.rosbag.messages.arm import TOOL, JointsPart, PosePart
 from bhd_lerobot.rosbag.messages.base import (
     GYRO,
@@ -19,7 +20,6 @@ from bhd_lerobot.rosbag.messages.base import (
     TwistPart,
 )
 from bhd_lerobot.rosbag.messages.parts import IntegersPart, NumbersPart, Part, own_topic
-from bhd_lerobot.errors import UnsupportedDatasetError
 
 PARTS: Mapping[str, type[Part]] = {
     kind.__name__: kind

@@ -7,9 +7,9 @@ from typing import Any
 
 import yaml
 
+from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.rosbag.storage.qos import offered
 from bhd_lerobot.rosbag.storage.read import FILES, Bag, first_time
-from bhd_lerobot.errors import ConfigError, DatasetError
 
 _UNREADABLE = (
     *(OSError, yaml.YAMLError, RecursionError),  # the file, its YAML, or how deep that is

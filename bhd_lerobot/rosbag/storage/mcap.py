@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.storage.qos import offered
 from bhd_lerobot.rosbag.storage.unpack import MESSAGE_BYTES, Budget
-from bhd_lerobot.errors import DatasetError
 
 _MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 3, 4, 5, 6, 11, 15

@@ -4,8 +4,8 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from bhd_lerobot.datasets.storage.disk import Disk, write_errors
 from bhd_lerobot.datasets.storage.atomic import is_free, making, real, remove_abandoned
+from bhd_lerobot.datasets.storage.disk import Disk, write_errors
 from bhd_lerobot.errors import DatasetExistsError
 
 

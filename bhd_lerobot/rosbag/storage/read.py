@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.storage.mcap import McapFile
 from bhd_lerobot.rosbag.storage.sqlite import SqliteFile
 from bhd_lerobot.rosbag.storage.unpack import Budget, plain_file
-from bhd_lerobot.errors import DatasetError
 
 FILES: dict[str, Any] = {".mcap": McapFile, ".db3": SqliteFile}
 """Ending of a file's name -> what reads it."""

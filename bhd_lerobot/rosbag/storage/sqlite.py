@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.storage.qos import offered
 from bhd_lerobot.rosbag.storage.unpack import Budget, temporary_copy
-from bhd_lerobot.errors import DatasetError
 
 _STEPS = 10_000  # of SQLite's own machine, between two looks at how many there were
 _LEAST_STEPS, _STEPS_PER_BYTE = 10_000_000, 20

@@ -7,8 +7,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from bhd_lerobot.rosbag.messages.types import DEFINITIONS, require_rosbags, type_store
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.rosbag.messages.types import DEFINITIONS, require_rosbags, type_store
 
 FORMATS = ("mcap", "sqlite3")
 _VERSION: Literal[8] = 8  # of rosbag2's metadata: the newest whose quality of service Humble reads, too

@@ -10,9 +10,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.training.rl.features import ActionUnits, FeatureStack, rows_of
 from bhd_lerobot.training.rl.shaping import Shaping
-from bhd_lerobot.tasks.task import Event
 
 # The policy's mean is never cut off: what lies outside of the robot's limits is the cerebellum's business, in training
 # as everywhere else.

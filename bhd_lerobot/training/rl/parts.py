@@ -21,8 +21,8 @@ from bhd_lerobot.policies.learned.policy import load_policy
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
 from bhd_lerobot.policies.mlp.processor_mlp import make_bhd_mlp_pre_post_processors
-from bhd_lerobot.rollout.types import Episode
 from bhd_lerobot.rollout.provenance import versions
+from bhd_lerobot.rollout.types import Episode
 from bhd_lerobot.training.rl.config import RlConfig
 
 Stats = dict[str, dict[str, torch.Tensor]]

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.training.rl.sections import RewardConfig
 from bhd_lerobot.tasks.task import Event
+from bhd_lerobot.training.rl.sections import RewardConfig
 
 Array = NDArray[np.float64]
 

@@ -20,6 +20,8 @@ import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError, install_extra, quoted
 from bhd_lerobot.rollout import configuration
+from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
+from bhd_lerobot.training.log import METRICS_NAME, MetricsFile, read_metrics
 from bhd_lerobot.training.rl import checkpoint as checkpoints
 from bhd_lerobot.training.rl.config import RlConfig, parse_rl
 from bhd_lerobot.training.rl.features import ActionUnits, FeatureStack
@@ -28,8 +30,6 @@ from bhd_lerobot.training.rl.log import PLOT_NAME, Episodes, RlProgress, Row, dr
 from bhd_lerobot.training.rl.parts import RlParts, make_parts
 from bhd_lerobot.training.rl.shaping import Shaping
 from bhd_lerobot.training.rl.validation import Level, Validation, level
-from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
-from bhd_lerobot.training.log import METRICS_NAME, MetricsFile, read_metrics
 
 
 @dataclass

@@ -1,0 +1,516 @@
+"""`bhd-monitor` beside a real block: it reads, changes nothing but the emergency stop, and notices how a robot ends."""
+
+import functools
+import json
+import os
+import pty
+import select
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.apps.monitor import monitor
+from bhd_lerobot.apps.monitor.monitor import Keys, find, main, watch
+from bhd_lerobot.apps.monitor.state import CELLS, DECADES, Count, Sampler, cells
+from bhd_lerobot.control.commands import Feedback, GoalPhase
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
+from bhd_lerobot.control.motion.goal_codec import encode_feedback
+from bhd_lerobot.control.timing import TimingStatistics
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.realtime import shared_memory
+from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Phase, Word
+from bhd_lerobot.realtime.frame_log import FrameLog
+from bhd_lerobot.realtime.shared_memory import SharedBlock, names
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS, state_dtype
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.rollout.registry import make_simulation
+from tests.recording.support import options
+from tests.waiting import until
+
+S = 1_000_000_000
+NAME = f"test-monitor-{os.getpid()}"
+
+
+@functools.cache
+def published() -> np.dtype:
+    config: Any = parse(RecordConfig, options(Path("unused"), robot__beams=4))
+    return state_dtype(make_simulation(config.robot))
+
+
+class Robot:
+    """The maker's side of a block, on a clock of its own: what a running TurtleBot3 writes, written by hand."""
+
+    def __init__(self, name: str = NAME) -> None:
+        dtype = published()
+        layout = LiveLayout(
+            2, dtype, 16, 64, {"statistics": TimingStatistics.nbytes, "frames": FrameLog.nbytes(dtype, 8)}
+        )
+        about = {"robot": "turtlebot3", "fps": 10, "control_hz": 200, "frames": 8, "commands": ["x.vel", "theta.vel"]}
+        self.block = layout.create(name, about)
+        self.made = int(self.block.about["made_ns"])
+        self.now = self.made + 100 * S
+        self.log = FrameLog(dtype, 8, self.block.section("frames"))
+        self.statistics = TimingStatistics(S // 200, self.block.section("statistics"))
+        self.state = np.zeros((), dtype)
+        self.start()
+
+    def start(self, stretch: int = 1) -> None:
+        words = self.block.words
+        words[Word.START], words[Word.STRETCH], words[Word.PHASE] = self.now, stretch, Phase.RUNNING
+        self.state["stretch"], self.state["executed"], self.state["mode"] = stretch, 0, Mode.HOLD
+        self.statistics.reset()
+        self.tick(0)
+
+    def tick(self, ticks: int = 1, **fields: Any) -> None:
+        """Let ticks pass, of which the last one publishes."""
+        self.now += ticks * S // 200
+        state, words = self.state, self.block.words
+        state["executed"] += ticks
+        state["due_ns"], state["start_ns"], state["sensed_ns"] = self.now, self.now, self.now
+        for name, value in fields.items():
+            state[name] = value
+        words[Word.EXECUTED] = state["executed"]
+        self.block.ring.publish(state)
+        for word in (Word.BRAIN_ALIVE, Word.CEREBELLUM_ALIVE, Word.RECORDER_ALIVE):
+            words[word] = self.now
+
+    def sampler(self) -> tuple[Sampler, LiveBlock]:
+        block = LiveBlock.watch(self.block.name)
+        return Sampler(block, lambda: self.now), block
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    made = Robot()
+    yield made
+    made.block.close()
+
+
+@pytest.fixture
+def only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hide the robots of others that run on this machine."""
+    monkeypatch.setattr(monitor, "names", lambda: [name for name in names() if name.startswith(NAME)])
+
+
+# --- the block -------------------------------------------------------------------------------------------------------
+
+
+def test_who_watches_can_write_nothing_but_the_emergency_stop(robot: Robot) -> None:
+    _, block = robot.sampler()
+    for array in (block.words, block.estop_word):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+    with pytest.raises(ValueError, match="read-only"):
+        block.fifo.push(1, 0, np.zeros((1, 2)), np.ones(1, np.bool_))
+    with pytest.raises(ValueError, match="read-only"):
+        block.ring.publish(robot.state)
+    before = bytes(robot.block.section("words"))
+    block.set_estop()
+    after = robot.block.words.copy()
+    assert after[Word.ESTOP] == 1
+    after[Word.ESTOP] = 0
+    assert after.tobytes() == before
+    block.close()
+
+
+def test_writing_beside_a_section_is_refused(robot: Robot) -> None:
+    block = SharedBlock.watch(NAME)
+    with pytest.raises(ConfigError, match="section 'words'"):
+        block.write("words", 64 * 8, b"x")
+    with pytest.raises(ConfigError, match="section 'words'"):
+        block.write("words", -1, b"x")
+    block.close()
+
+
+def test_who_watches_does_not_hold_the_name() -> None:
+    robot = Robot(f"{NAME}-held")
+    _, block = robot.sampler()
+    assert block.is_held
+    robot.block.close()
+    assert not block.is_held
+    again = Robot(f"{NAME}-held")
+    assert not block.is_held  # another robot of the same name is another robot
+    assert block.words[Word.STRETCH] == 1  # what was seen last can still be read
+    block.close()
+    block.close()
+    assert not block.is_held
+    assert again.block.name in names()
+    again.block.close()
+    with pytest.raises(RealtimeError, match="No running robot is called"):
+        LiveBlock.watch(f"{NAME}-held")
+
+
+def files(name: str) -> list[Path]:
+    return list(shared_memory.FOLDER.glob(f"{shared_memory.PREFIX}{name}.*"))
+
+
+def test_what_nobody_holds_any_more_is_not_watched() -> None:
+    name = f"{NAME}-dead"
+    code = (
+        "import os; from bhd_lerobot.realtime.shared_memory import SharedBlock\n"
+        f"SharedBlock.create({name!r}, {{'words': 512}}, {{}}); os._exit(9)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=False)
+    assert files(name)
+    with pytest.raises(RealtimeError, match="nobody holds it any more"):
+        SharedBlock.watch(name)
+    shared_memory.sweep()
+    assert not files(name)
+
+
+# --- states ----------------------------------------------------------------------------------------------------------
+
+
+def test_rates_are_those_of_the_last_two_seconds(robot: Robot) -> None:
+    sampler, block = robot.sampler()
+    first = sampler.sample()
+    assert (first.control_rate, first.frame_rate, first.command_rate) == (None, None, None)
+    for _ in range(40):
+        robot.tick(25, setpoints=robot.state["setpoints"] + 1)
+        entry = np.zeros((), robot.log.dtype)
+        robot.log.append(entry)
+        shown = sampler.sample()
+    assert shown.control_rate == pytest.approx(200)
+    assert shown.frame_rate == pytest.approx(8)
+    assert shown.command_rate == pytest.approx(8)
+    assert shown.executed == 1000
+    for _ in range(30):
+        robot.tick(10)  # half as fast from now on
+        robot.now += 10 * S // 200
+        robot.block.words[Word.CEREBELLUM_ALIVE] = robot.now
+        shown = sampler.sample()
+    assert shown.control_rate == pytest.approx(100, rel=0.03)
+    robot.now += 5 * S
+    assert sampler.sample().control_rate == 0  # a loop that hangs
+    block.close()
+
+
+def test_rates_begin_anew_with_an_episode_and_need_one(robot: Robot) -> None:
+    sampler, block = robot.sampler()
+    sampler.sample()
+    robot.tick(200, limits=[0, 5, 0, 0, 0])
+    assert sampler.sample().limits["VELOCITY"].per_second == pytest.approx(5)
+    robot.block.words[Word.PHASE] = Phase.STANDING
+    standing = sampler.sample()
+    assert (standing.control_rate, standing.episode_time, standing.observation_age) == (None, None, None)
+    robot.tick(1, limits=0)
+    robot.start(2)
+    assert sampler.sample().control_rate is None
+    robot.tick(200, limits=[0, 1, 0, 0, 0])
+    shown = sampler.sample()
+    assert shown.limits["VELOCITY"] == Count(1, pytest.approx(1))
+    assert shown.episode == 2
+    block.close()
+
+
+def test_a_state_is_told_in_seconds_and_names(robot: Robot) -> None:
+    words = robot.block.words
+    robot.block.fifo.push(1, 0, np.zeros((1, 2)), np.ones(1, np.bool_))
+    robot.tick(
+        400,
+        mode=Mode.TRACKING,
+        setpoints=7,
+        command_age_ns=30_000_000,
+        oldest_ns=150_000_000,
+        requested=[[0.2, 1.0]],
+        command=[[0.1, 0.5]],
+        measured=[[0.09, 0.4]],
+        odometry=[[1.0, 2.0, 3.0]],
+        limits=[int(limit == Limit.EFFORT) for limit in LIMITS],
+        watchdogs=[2 * int(watchdog == Watchdog.BRAIN) for watchdog in WATCHDOGS],
+        refusals=[9 if reason in (Reason.ACCEPTED, Reason.STALE) else 0 for reason in Reason],
+    )
+    words[Word.SKIPPED], words[Word.OVERRUNS], words[Word.CATCH_UP_LOST], words[Word.RECORDER_DROPS] = 3, 4, 5, 6
+    robot.now += S // 100
+    sampler, block = robot.sampler()
+    shown = sampler.sample()
+    assert (shown.id, shown.robot, shown.mode, shown.phase) == (NAME, "turtlebot3", "TRACKING", "RUNNING")
+    assert shown.uptime == pytest.approx(102.01)
+    assert shown.episode_time == pytest.approx(2.01)
+    assert shown.command_age == pytest.approx(0.04)
+    assert shown.observation_age == pytest.approx(0.16)
+    assert shown.alive == {**dict.fromkeys(("brain", "cerebellum", "recorder"), pytest.approx(0.01)), "plant": None}
+    assert [(d.name, d.requested, d.applied, d.measured) for d in shown.dimensions] == [
+        ("x.vel", 0.2, 0.1, 0.09),
+        ("theta.vel", 1.0, 0.5, 0.4),
+    ]
+    assert (shown.fifo_fill, shown.fifo_capacity) == (1, 16)
+    assert (shown.skipped, shown.overruns, shown.catch_up_lost, shown.recorder_drops) == (3, 4, 5, 6)
+    assert {name: one.count for name, one in shown.limits.items() if one.count} == {"EFFORT": 1}
+    assert {name: one.count for name, one in shown.watchdogs.items() if one.count} == {"BRAIN": 2}
+    assert shown.refusals == {"STALE": 9}
+    assert shown.pose == {"x": 1.0, "y": 2.0, "yaw": 3.0}
+    assert len(robot.block.fifo) == 1
+    json.dumps(shown.as_dict(), allow_nan=False)
+    block.close()
+
+
+def test_under_a_goal_there_is_progress_and_no_setpoint(robot: Robot) -> None:
+    encode_feedback(Feedback("2-down", GoalPhase.EXECUTING, 0.25, 1.5, 0.01), robot.state["feedback"])
+    robot.tick(1, mode=Mode.TRACKING, setpoints=7)
+    sampler, block = robot.sampler()
+    shown = sampler.sample()
+    assert shown.goal is not None
+    assert {
+        "task_id": "2-down",
+        "phase": "EXECUTING",
+        "progress": 0.25,
+        "remaining_s": 1.5,
+    }.items() <= shown.goal.items()
+    assert (shown.command_age, shown.dimensions[0].requested) == (None, None)
+    block.close()
+
+
+def test_timing_is_that_of_the_ticks(robot: Robot) -> None:
+    sampler, block = robot.sampler()
+    assert sampler.sample().lateness is None
+    for _ in range(99):
+        robot.statistics.add(0, 20_000, 320_000)
+    robot.statistics.add(0, 2_000_000, 4_000_000)
+    late, takes = sampler.sample().lateness, sampler.sample().duration
+    assert late is not None
+    assert takes is not None
+    assert (late.p50, late.p99, late.max) == (pytest.approx(20e-6, rel=0.13), pytest.approx(20e-6, rel=0.13), 2e-3)
+    assert sum(late.histogram) == sum(takes.histogram) == 100
+    assert (max(late.histogram), late.histogram.index(99)) == (99, 6)  # 16 to 25 us
+    assert takes.max == 2e-3
+    block.close()
+
+
+def test_every_tick_is_in_one_cell_of_the_histogram() -> None:
+    fine = np.arange(142)
+    shown = cells(fine)
+    assert len(shown) == DECADES * CELLS
+    assert sum(shown) == fine.sum()
+    assert shown[0] == 0 + 1 + 2 + 3 + 4
+    statistics = TimingStatistics(S)
+    for exponent in range(DECADES + 2):
+        statistics.add(0, 10 ** (exponent + 3) + 1, 10 ** (exponent + 3) + 2)
+    found = np.flatnonzero(cells(statistics.histograms[1])).tolist()
+    assert found == [0, 5, 10, 15, 20, 25, 29]
+
+
+def test_before_anything_is_published_there_is_something_to_show() -> None:
+    layout = LiveLayout(2, np.dtype([("x", np.float64)]), 4, 4, {})
+    made = layout.create(f"{NAME}-bare", {"robot": "ur5", "fps": 25, "control_hz": 500, "commands": []})
+    block = LiveBlock.watch(made.name)
+    shown = Sampler(block).sample()
+    assert (shown.phase, shown.mode, shown.episode, shown.lateness) == ("STARTING", None, 0, None)
+    block.close()
+    made.close()
+
+
+# --- how robots end --------------------------------------------------------------------------------------------------
+
+
+def test_how_a_robot_ended_is_told(robot: Robot) -> None:
+    sampler, block = robot.sampler()
+    assert sampler.end() is None
+    words = robot.block.words
+    words[Word.PHASE] = Phase.ENDED
+    for pause, end in ((0, 0), (1, 0), (0, 1)):
+        words[Word.PAUSE], words[Word.END] = pause, end
+        assert "its brain's process is gone" in str(sampler.end())
+    words[Word.PAUSE] = words[Word.END] = 1
+    assert sampler.end() == "ended"
+    robot.block.words[Word.PHASE] = Phase.RUNNING
+    assert sampler.end() is None
+    robot.block.close()
+    assert "killed" in str(sampler.end())
+    block.close()
+
+
+@pytest.mark.usefixtures("only")
+def test_a_robot_that_ends_while_it_is_watched(robot: Robot, capsys: pytest.CaptureFixture[str]) -> None:
+    words = robot.block.words
+    for phase, status, message in ((Phase.ENDED, 0, "has ended."), (Phase.RUNNING, 1, "killed")):
+        words[Word.PHASE], words[Word.PAUSE], words[Word.END] = phase, 1, 1
+        ender = threading.Timer(0.2, robot.block.close)
+        if phase == Phase.RUNNING:
+            ender.start()
+        assert main([NAME]) == status
+        said = capsys.readouterr()
+        assert f"The robot {NAME!r}" in said.err
+        assert message in said.err
+        assert NAME in said.out  # no terminal: a line now and then
+        ender.cancel()
+
+
+# --- finding ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("only")
+def test_the_only_robot_is_found_and_of_several_one_is_to_be_named(robot: Robot) -> None:
+    found = find(None)
+    assert found.name == NAME
+    found.close()
+    other = Robot(f"{NAME}-other")
+    beside = SharedBlock.create(f"{NAME}-no-robot", {"a": 8}, {})
+    with pytest.raises(RealtimeError, match=rf"Several robots run: {NAME} \(turtlebot3\), {NAME}-other"):
+        find(None)
+    with pytest.raises(
+        RealtimeError, match=rf"'nobody'\. Running: {NAME} \(turtlebot3\), {NAME}-other \(turtlebot3\)\."
+    ):
+        find("nobody")
+    found = find(NAME)
+    assert found.name == NAME
+    found.close()
+    other.block.close()
+    beside.close()
+
+
+@pytest.mark.usefixtures("only")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "No robot runs"),
+        (["nobody"], "'nobody'"),
+        (["--seconds=0"], "--seconds is 0"),
+        (["--seconds=nan"], "is nan"),
+    ],
+)
+def test_what_cannot_be_done_is_said_with_status_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+# --- without a terminal ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("only")
+def test_snapshots_as_text_and_as_json(robot: Robot, capsys: pytest.CaptureFixture[str]) -> None:
+    robot.block.words[Word.PHASE] = Phase.STANDING
+    assert main([NAME, "--once"]) == 0
+    text = capsys.readouterr().out
+    assert "HOLD" in text
+    assert "x.vel" in text
+    assert "\x1b" not in text
+    assert "emergency stop" not in text
+    assert main(["--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["id"], told["mode"], told["control_hz"]) == (NAME, "HOLD", 200)
+    assert main(["--json", "--seconds=0.01"]) == 0
+    assert [json.loads(line)["id"] for line in capsys.readouterr().out.splitlines()] == [NAME, NAME]
+
+
+def test_watching_shows_until_the_user_leaves(robot: Robot) -> None:
+    sampler, block = robot.sampler()
+    shown: list[Any] = []
+    with Keys(lambda: None, None) as keys:
+
+        def show(state: Any) -> None:
+            shown.append(state)
+            if len(shown) == 3:
+                keys.quit.set()
+
+        assert watch(sampler, show, keys, 0.001, float("inf")) is None
+        assert not keys.there
+    assert len(shown) == 3
+    block.close()
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+
+# It is to be its controlling terminal, in whose foreground it is.
+LOGIN = (
+    "import os, sys; os.login_tty(int(sys.argv[1]))\n"
+    "from bhd_lerobot.apps.monitor.monitor import main; sys.exit(main(sys.argv[2:]))"
+)
+
+
+class Terminal:
+    """`bhd-monitor` in a terminal of its own."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.master, slave = pty.openpty()
+        termios.tcsetwinsize(slave, (24, 80))
+        self.before = termios.tcgetattr(slave)
+        self.slave = slave
+        self.output = b""
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", LOGIN, str(slave), *arguments],
+            pass_fds=(slave,),
+            env={**os.environ, "TERM": "xterm-256color"},
+        )
+
+    def see(self, text: str) -> None:
+        def there() -> bool:
+            while select.select([self.master], [], [], 0)[0]:
+                self.output += os.read(self.master, 65536)
+            return text.encode() in self.output
+
+        until(there)
+
+    def press(self, key: bytes) -> None:
+        os.write(self.master, key)
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self.master)
+        os.close(self.slave)
+
+
+@pytest.fixture
+def terminal(robot: Robot) -> Iterator[Terminal]:
+    made = Terminal(NAME)
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("key", [b"e", b" "])
+def test_a_key_stops_the_robot_at_once_and_q_leaves(robot: Robot, terminal: Terminal, key: bytes) -> None:
+    terminal.see("emergency stop")
+    assert robot.block.words[Word.ESTOP] == 0
+    terminal.press(b"x")
+    terminal.press(key)
+    until(lambda: robot.block.words[Word.ESTOP] == 1)
+    terminal.see("EMERGENCY STOP was set here")
+    terminal.press(b"q")
+    assert terminal.process.wait(60) == 0
+    assert termios.tcgetattr(terminal.slave) == terminal.before  # the terminal is as it was
+    assert robot.block.words[Word.PHASE] == Phase.RUNNING  # and so is the robot
+
+
+def test_leaving_by_ctrl_c_gives_the_terminal_back(robot: Robot, terminal: Terminal) -> None:
+    terminal.see("emergency stop")
+    terminal.press(b"\x03")
+    assert terminal.process.wait(60) == 130
+    assert termios.tcgetattr(terminal.slave) == terminal.before
+    assert robot.block.words[Word.ESTOP] == 0
+
+
+def test_a_stop_does_not_wait_for_a_picture() -> None:
+    master, slave = pty.openpty()
+    pressed = threading.Event()
+    usable = monitor.KeyTerminal.usable
+    try:
+        monitor.KeyTerminal.usable = staticmethod(lambda descriptor: True)  # type: ignore[method-assign]
+        with Keys(pressed.set, slave) as keys:
+            os.write(master, b"e")
+            assert pressed.wait(30)  # nobody draws or asks for anything meanwhile
+            assert not keys.quit.is_set()
+            os.write(master, b"q")
+            assert keys.quit.wait(30)
+        assert keys.pressed == 1
+    finally:
+        monitor.KeyTerminal.usable = usable  # type: ignore[method-assign]
+        os.close(master)
+        os.close(slave)
+
+
+def test_it_starts_fast_because_it_imports_little() -> None:
+    code = "import sys, bhd_lerobot.apps.monitor.monitor; print(*sorted({'torch', 'lerobot', 'mujoco'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

@@ -1,0 +1,264 @@
+"""How `bhd-monitor` looks: everything fits, nothing jumps, and what matters is told."""
+
+import dataclasses
+import io
+from typing import Any
+
+import pytest
+from rich.cells import cell_len
+from rich.console import Console
+
+from bhd_lerobot.apps.monitor import state as monitor_state
+from bhd_lerobot.apps.monitor.state import CELLS, DECADES, Count, Dimension, MonitorState, Spread
+from bhd_lerobot.apps.monitor.view import KEYS, bars, duration, one_line, render, unit
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
+from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS
+
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "gripper")
+
+
+def spread(**overrides: Any) -> Spread:
+    histogram = [0] * (DECADES * CELLS)
+    histogram[8:11] = [40, 1000, 3]
+    return Spread(**{"p50": 45e-6, "p99": 120e-6, "max": 2.3e-3, "histogram": tuple(histogram), **overrides})
+
+
+def state(**overrides: Any) -> MonitorState:
+    values: dict[str, Any] = {
+        "id": "wally",
+        "robot": "ur5",
+        "clock": "realtime",
+        "uptime": 3723.4,
+        "phase": "RUNNING",
+        "episode": 4,
+        "episode_time": 12.34,
+        "mode": "TRACKING",
+        "estop": False,
+        "estop_latched": False,
+        "control_rate": 499.97,
+        "control_hz": 500,
+        "frame_rate": 25.01,
+        "fps": 25,
+        "command_rate": 24.9,
+        "executed": 6170,
+        "skipped": 0,
+        "overruns": 2,
+        "catch_up_lost": 0,
+        "recorder_drops": 0,
+        "lateness": spread(),
+        "duration": spread(),
+        "fifo_fill": 3,
+        "fifo_capacity": 256,
+        "command_age": 0.0123,
+        "observation_age": 0.0019,
+        "dimensions": tuple(Dimension(f"{name}.pos", 0.5, 0.25, 0.2499) for name in JOINTS),
+        "limits": {name: Count(0, 0.0) for name in monitor_state.LIMITS},
+        "watchdogs": {name: Count(0, 0.0) for name in monitor_state.WATCHDOGS},
+        "refusals": {},
+        "alive": {"brain": 0.004, "cerebellum": 0.0005, "recorder": 0.003, "plant": None},
+        "goal": None,
+        "pose": {},
+    }
+    return MonitorState(**values | overrides)
+
+
+EXTREME = state(
+    id="a-robot-with-a-name-that-is-much-longer-than-anybody-would-ever-call-a-robot-of-theirs",
+    uptime=360000.0,
+    mode="UNCONFIGURED",
+    episode=99999,
+    episode_time=86399.9,
+    control_rate=10000.0,
+    control_hz=10000,
+    frame_rate=1000.0,
+    fps=1000,
+    command_rate=1000.0,
+    executed=864_000_000,
+    skipped=99_999_999,
+    overruns=9_999_999,
+    catch_up_lost=99_999_999,
+    recorder_drops=9_999_999,
+    lateness=spread(p50=1.234, p99=99.9, max=999.0),
+    fifo_fill=256,
+    command_age=0.9994,
+    observation_age=99.96,
+    dimensions=tuple(Dimension(f"{name}_with_a_long_name.pos", -3.14159, -100.0, None or -99.99999) for name in JOINTS),
+    limits={name: Count(999_999, 499.9) for name in monitor_state.LIMITS},
+    watchdogs={name: Count(999_999, 499.9) for name in monitor_state.WATCHDOGS},
+    refusals=dict.fromkeys(monitor_state.REASONS[1:], 999_999),
+    alive=dict.fromkeys(("brain", "cerebellum", "recorder", "plant"), 123.4),
+    goal={"task_id": "g" * 64, "phase": "CONVERTING", "progress": 1.7, "remaining_s": 123.4, "position_error": 0.1},
+    estop=True,
+)
+EMPTY = state(
+    **dict.fromkeys(("mode", "episode_time", "control_rate", "frame_rate", "command_rate", "lateness", "duration")),
+    phase="STARTING",
+    command_age=None,
+    observation_age=None,
+    dimensions=(),
+    limits={},
+    watchdogs={},
+    alive={},
+)
+
+
+def lines(shown: MonitorState, width: int = 80, height: int | None = None, **options: Any) -> list[str]:
+    console = Console(file=io.StringIO(), width=width, height=height or 100)
+    console.print(render(shown, height=height, **options))
+    return console.file.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("shown", [state(), EXTREME, EMPTY], ids=["usual", "extreme", "empty"])
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (120, 40), (80, 10), (200, 60)])
+def test_it_fits_and_the_keys_are_always_there(shown: MonitorState, width: int, height: int) -> None:
+    printed = lines(shown, width, height)
+    assert len(printed) <= height
+    assert max(cell_len(line) for line in printed) <= 80
+    assert printed[-1].strip() == KEYS
+
+
+def test_an_arm_is_shown_completely_in_24_lines() -> None:
+    printed = lines(
+        state(goal={"task_id": "2-down", "phase": "EXECUTING", "progress": 0.5, "remaining_s": 1.0}), 80, 24
+    )
+    assert not any("…" in line for line in printed)
+    for word in ("wally", "TRACKING", "control", "p99", "queue", "brain", "wrist_3.pos", "gripper.pos", "2-down"):
+        assert any(word in line for line in printed), word
+    assert [line.split()[0] for line in printed[-4:-1]] == ["limits", "watchdogs", "refused"]
+
+
+def test_nothing_jumps_when_numbers_change() -> None:
+    def places(shown: MonitorState) -> list[list[int]]:
+        """Return where the labels stand."""
+        labels = ("control", "executed", "overruns", "skipped", "p99", "queue", "command age", "observation age")
+        labels += ("brain", "cerebellum", "recorder ", "plant", "applied", "limits", "loop", "episode", "refused")
+        return [
+            [n, line.find(label)] for label in labels for n, line in enumerate(lines(shown, 80, 24)) if label in line
+        ]
+
+    usual = places(state())
+    assert usual == places(state(control_rate=None, frame_rate=9.0, command_rate=None, executed=1, overruns=99999))
+    assert usual == places(state(command_age=None, observation_age=0.1234, mode="HOLD", phase="STANDING"))
+    assert usual == places(state(alive={"brain": 12.34, "cerebellum": 0.12, "recorder": 99e-6, "plant": 0.999}))
+    assert usual == places(state(limits={"VELOCITY": Count(12, 0.5)}, refusals={"STALE": 3}, episode_time=None))
+
+
+def text(shown: MonitorState, **options: Any) -> str:
+    return "\n".join(lines(shown, 80, 24, **options))
+
+
+def test_what_happened_is_told_with_its_rate_the_most_frequent_first() -> None:
+    shown = text(
+        state(
+            limits={"VELOCITY": Count(3, 0.0), "ACCELERATION": Count(120, 2.5), "EFFORT": Count(0, 0.0)},
+            watchdogs={"COMMAND_AGE": Count(2, None)},
+            refusals={"STALE": 7, "NON_FINITE": 1},
+        )
+    )
+    assert "acceleration 120 (2.5/s)   velocity 3 (0.0/s)" in shown
+    assert "effort" not in shown
+    assert "command age 2" in shown
+    assert "stale 7   non finite 1" in shown
+
+
+def test_requested_against_applied_with_units_and_without_a_request_under_a_goal() -> None:
+    moved = (Dimension("x.vel", 0.2, 0.15, -0.00001), Dimension("theta.vel", None, -1.0, -0.98))
+    shown = text(state(dimensions=moved, pose={"x": 1.5, "y": -2.25, "yaw": 3.125}))
+    rows = {row.split()[0]: row.split()[1:] for row in shown.splitlines() if row.strip()}
+    assert rows["x.vel"] == ["0.2000", "0.1500", "0.0000", "m/s"]
+    assert rows["theta.vel"] == ["–", "-1.0000", "-0.9800", "rad/s"]
+    assert "x    1.500 m   y   -2.250 m   yaw   3.125 rad" in shown
+    assert unit("gripper.pos") == "m"
+    assert unit("elbow.pos") == "rad"
+
+
+def test_progress_of_a_goal() -> None:
+    goal = {"task_id": "2-down", "phase": "EXECUTING", "progress": 0.5, "remaining_s": 1.25}
+    assert "2-down           executing ██████████░░░░░░░░░░  50%,   1.2 s left" in text(state(goal=goal))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"estop": True}, "e-stop not latched yet"),
+        ({"estop": True, "estop_latched": True, "mode": "ESTOP"}, "emergency stop latched"),
+        ({"alive": {"cerebellum": 3.25}}, "cerebellum silent   3 s"),
+    ],
+)
+def test_what_matters_most_stands_beside_the_mode(changes: dict[str, Any], message: str) -> None:
+    assert message in lines(state(**changes), 80, 24)[1]
+    assert message not in text(state())
+
+
+def styles(shown: MonitorState, word: str) -> set[str]:
+    """Return the styles in which a word is written."""
+    console = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, color_system="standard")
+    segments = console.render(render(shown, height=24))
+    return {str(segment.style) for segment in segments if word in segment.text and segment.style is not None}
+
+
+def test_every_mode_has_its_colour() -> None:
+    colours = {mode.name: styles(state(mode=mode.name), mode.name) for mode in Mode}
+    assert all(len(found) == 1 for found in colours.values())
+    assert colours["ESTOP"] == colours["FAULT"] == {"bold white on red"}
+    assert len({min(colours[name]) for name in ("HOLD", "TRACKING", "STOPPING", "ESTOP", "INACTIVE")}) == 5
+
+
+def test_what_is_not_as_wanted_stands_out() -> None:
+    assert "yellow" in styles(state(control_rate=480.0), "480.0")
+    assert "yellow" not in styles(state(), "500.0")
+    assert "yellow" in styles(state(skipped=77), "77")
+    assert "bold red" in styles(state(alive={"brain": 0.7}), "700 ms")
+    assert "yellow" in styles(state(alive={"brain": 0.2}), "200 ms")
+    assert "bold red" in styles(state(fifo_fill=256), "256")
+
+
+def test_a_message_takes_the_place_of_the_keys() -> None:
+    printed = lines(state(), 80, 24, message="stopped")
+    assert printed[-1].strip() == "stopped"
+    assert KEYS not in "\n".join(printed)
+    assert KEYS not in "\n".join(lines(state(), keys=""))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shown"),
+    [
+        (None, "–"), (0.0, "0 µs"), (1e-6, "1 µs"), (999e-6, "999 µs"), (0.9996e-3, "1.00 ms"), (1.234e-3, "1.23 ms"),
+        (9.996e-3, "10.0 ms"), (0.1234, "123 ms"), (0.9994, "999 ms"), (0.9996, "1.00 s"), (12.345, "12.3 s"),
+        (123.4, "123 s"), (12345.6, "12346 s"),
+    ],
+)  # fmt: skip
+def test_times_have_three_digits_and_a_unit(seconds: float | None, shown: str) -> None:
+    assert duration(seconds) == shown
+
+
+def test_one_tick_in_a_million_is_to_be_seen() -> None:
+    assert bars([0, 1, 1_000_000, 0, 1000]) == " ▁█ ▄"
+    assert bars([0, 0]) == "  "
+    assert bars([1]) == "▁"
+
+
+def test_one_line_tells_the_most_important() -> None:
+    line = one_line(state(refusals={"STALE": 2}, limits={"VELOCITY": Count(3, None)}))
+    assert "\n" not in line
+    for part in ("wally TRACKING", "500.0 of 500 Hz", "p99 120 µs max 2.30 ms", "overruns 2", "limits 3, refused 2"):
+        assert part in line
+    assert one_line(EMPTY).startswith("wally UNKNOWN starting; control – of 500 Hz")
+
+
+def test_the_names_are_those_of_what_the_states_count() -> None:
+    assert tuple(limit.name for limit in LIMITS) == monitor_state.LIMITS
+    assert tuple(watchdog.name for watchdog in WATCHDOGS) == monitor_state.WATCHDOGS
+    assert len(monitor_state.REASONS) == len(Reason)
+    assert set(monitor_state.LIMITS) == {one.name for one in Limit} - {"NONE"}
+    assert set(monitor_state.WATCHDOGS) == {one.name for one in Watchdog} - {"NONE"}
+
+
+def test_as_json_there_is_nothing_that_json_does_not_know() -> None:
+    plain = dataclasses.replace(
+        state(), command_age=float("nan"), dimensions=(Dimension("a", None, float("inf"), 1.0),)
+    )
+    told = plain.as_dict()
+    assert told["command_age"] is None
+    assert told["dimensions"] == [{"name": "a", "requested": None, "applied": None, "measured": 1.0}]
+    assert told["limits"]["VELOCITY"] == {"count": 0, "per_second": 0.0}

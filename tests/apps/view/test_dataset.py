@@ -1,0 +1,113 @@
+"""Datasets behind the page that change, are odd, damaged or in use."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.apps.view.dataset import ViewedDataset
+from bhd_lerobot.apps.view.packing import unpack
+from bhd_lerobot.datasets.storage.disk import RootLock
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError
+from tests.apps.view.support import served
+from tests.datasets.loader.support import FRONT, record_ours
+
+
+def test_a_dataset_that_changes_is_noticed_and_read_again(tmp_path) -> None:
+    root = record_ours(tmp_path / "d", 2)
+    with served(root) as server:
+        assert (found := server.json("/api/stamp"))["now"] == found["shown"]
+        shutil.rmtree(root)
+        assert server.json("/api/stamp")["now"] == ""
+        status, _, content = server.ask("/api/dataset")
+        assert status == 409
+        assert "does not exist" in content.decode()
+        record_ours(root, 3)
+        assert (found := server.json("/api/stamp"))["now"] != found["shown"]
+        # An episode may have another number now: what the page shows is neither filled in with it nor marked.
+        status, _, content = server.ask("/api/episodes/0")
+        assert status == 409
+        assert "has changed on disk" in content.decode()
+        status, content = server.mark(0, {"outcome": "success"})
+        assert status == 409
+        assert "has changed on disk" in content.decode()
+        assert len(server.json("/api/dataset")["episodes"]["frames"]) == 3
+        lock = RootLock(root)
+        try:
+            status, content = server.mark(0, {"outcome": "success"})
+        finally:
+            lock.release()
+        assert status == 409
+        assert "being recorded, repaired or edited" in content.decode()
+
+
+def test_an_empty_dataset(tmp_path) -> None:
+    features = {"action": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
+    DatasetRecorder.create("t/none", 10, features, robot_type="toy", root=tmp_path / "d", recording={}).finalize()
+    with served(tmp_path / "d") as server:
+        assert server.json("/api/dataset")["episodes"]["frames"] == []
+        assert server.ask("/api/episodes/0")[0] == 409
+
+
+def test_one_frame_and_numbers_that_are_none(tmp_path) -> None:
+    features = {"action": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
+    features["control.age"] = {"dtype": "float32", "shape": (1,), "names": None}
+    recorder = DatasetRecorder.create("t/one", 10, features, robot_type="toy", root=tmp_path / "d", recording={})
+    for age in (np.nan, np.inf):
+        writer = recorder.begin_episode()
+        writer.set_columns({"action": np.zeros((1, 1), np.float32), "control.age": np.full(1, age, np.float32)})
+        recorder.save(writer, task="stand", metadata={"score": float("nan"), "scene": "{broken"})
+    recorder.finalize()
+    dataset = ViewedDataset(tmp_path / "d")
+    header, arrays = unpack(dataset.packed(1))
+    assert header["not_finite"] == {"control.age": 1}
+    assert header["scene"] is None
+    assert header["metadata"]["score"] is None
+    assert np.isinf(arrays["control.age"]).all()
+    with pytest.raises(DatasetError, match="no episode 2"):
+        dataset.packed(2)
+
+
+def test_damaged_missing_and_locked_datasets_are_refused(base, tmp_path) -> None:
+    with pytest.raises(DatasetError, match="does not exist"):
+        ViewedDataset(tmp_path / "none")
+    lock = RootLock(base)
+    try:
+        with pytest.raises(DatasetLockedError, match="being recorded, repaired or edited"):
+            ViewedDataset(base)
+    finally:
+        lock.release()
+    root = Path(shutil.copytree(base, tmp_path / "d"))
+    path = next((root / "data").rglob("*.parquet"))
+    path.unlink()
+    with pytest.raises(DatasetCorruptError, match=path.name):
+        ViewedDataset(root)
+
+
+@pytest.mark.parametrize("change", [{"fps": 0}, {"fps": "fast"}, {"features": 3}, {"features": {"action": {}}}])
+def test_a_description_of_another_shape_is_refused(tmp_path, change) -> None:
+    root = record_ours(tmp_path / "d", 1)
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps({**info, **change}))
+    with pytest.raises(DatasetCorruptError, match=r"info\.json"):
+        ViewedDataset(root)
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_film_that_is_not_there_is_missing_and_nothing_else_is(base, tmp_path, at_once: bool) -> None:
+    root = Path(shutil.copytree(base, tmp_path / "d"))
+    film = next(root.rglob("*.mp4"))
+    if at_once:
+        film.unlink()
+    with served(root) as server:
+        film.unlink(missing_ok=True)
+        assert server.ask(f"/films/{FRONT}/0/0.mp4")[0] == 404
+        assert server.ask("/api/episodes/0")[0] == 200
+        path = next((root / "data").rglob("*.parquet"))
+        path.write_bytes(path.read_bytes()[:-9])
+        status, _, content = server.ask("/api/episodes/1")
+        assert status == 409
+        assert path.name in content.decode()

@@ -1,0 +1,97 @@
+"""`bhd-data check`: what it prints, and with what status it ends."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from bhd_lerobot.cli.data import check, main, repair
+from bhd_lerobot.cli.data.check import limits_of
+from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS
+from tests.recording.support import run_record
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("check") / "d"
+    run_record(root, n_envs=2, seed=4)
+    return root
+
+
+def broken(recorded: Path, tmp_path: Path, value: float) -> Path:
+    """A copy with an applied forward speed that is not what was recorded."""
+    root = Path(shutil.copytree(recorded, tmp_path / "d"))
+    path = next((root / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    rows = table.to_pydict()
+    rows["control.applied_action"][5][0] = value
+    pq.write_table(pa.table(rows, schema=table.schema), path)
+    return root
+
+
+def test_what_was_just_recorded_is_sound(recorded: Path, capsys) -> None:
+    assert main.main(["check", str(recorded)]) == 0
+    assert "sound, no errors" in capsys.readouterr().out
+
+
+def test_as_json(recorded: Path, capsys) -> None:
+    assert main.main(["check", str(recorded), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["sound"] is True
+    assert told["episodes"] == 3
+    assert {one["severity"] for one in told["findings"]} <= {"note", "warning"}
+
+
+def test_errors_and_with_strict_warnings_end_with_status_1(recorded: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    root = broken(recorded, tmp_path, 0.5)
+    assert main.main(["check", str(root)]) == 1  # statistics are not those of the data
+    text = capsys.readouterr().out
+    assert "the robot's limits are -0.22 and 0.22" in text
+    assert "not sound, 1 error, " in text
+    shutil.rmtree(root)
+    root = Path(shutil.copytree(recorded, tmp_path / "d"))
+    (root / "data/chunk-000/file-009.parquet").write_bytes(b"left")
+    assert main.main(["check", str(root)]) == 0
+    assert main.main(["check", str(root), "--strict"]) == 1
+    assert "file-009" in capsys.readouterr().out
+
+
+def test_no_dataset_is_status_2(tmp_path: Path, capsys) -> None:
+    assert main.main(["check", str(tmp_path)]) == 2
+    assert "is not a LeRobot dataset" in capsys.readouterr().err
+
+
+def test_limits_are_those_of_the_robots() -> None:
+    assert limits_of("turtlebot3")["control.applied_action"]["x.vel"] == (-0.22, 0.22)
+    arm = limits_of("ur5")
+    low, high = arm["observation.state"]["shoulder_pan.pos"]
+    assert low == -high
+    assert 6.2 < high < 6.3
+    assert arm["observation.state"]["gripper.pos"] == (0.0, 0.085)
+    assert limits_of("so101_follower") == limits_of(None) == {}
+
+
+def test_every_robot_of_ours_has_the_limits_of_its_configuration() -> None:
+    for kind in SIMULATED_ROBOTS:
+        limits = kind().body().limits
+        told = limits_of(kind.get_choice_name(kind))["control.applied_action"]
+        assert list(told) == list(limits.names)
+        for index, (low, high) in enumerate(told.values()):
+            arm = hasattr(limits, "upper")
+            assert high == (limits.upper if arm else limits.velocity)[index]
+            assert low == (limits.lower[index] if arm else -high)
+
+
+@pytest.mark.parametrize(("command", "said"), [("check", "nothing was changed"), ("repair", "run it again to finish")])
+def test_ctrl_c_is_a_line_and_status_130(recorded: Path, capsys, monkeypatch, command: str, said: str) -> None:
+    def interrupted(*args: object, **kwargs: object) -> None:
+        raise KeyboardInterrupt
+
+    module = {"check": check, "repair": repair}[command]
+    monkeypatch.setattr(module, command, interrupted)
+    assert main.main([command, str(recorded)]) == 130
+    assert capsys.readouterr().err == f"Stopped; {said}.\n"

@@ -1,0 +1,515 @@
+"""Import of bags of a real TurtleBot3, written by the tests with rosbags."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.turtlebot3_simulation import observation_names
+from tests.cli.data.import_support import TASK, imported, refused, run
+from tests.rosbag import support as bags
+from tests.rosbag.support import NANO, START, drive, without, write
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("real") / "plain", drive())
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("stamped", [False, True])
+def test_humble_and_jazzy_in_both_storages_become_what_was_measured(tmp_path, storage, stamped):
+    source = write(tmp_path / "bag", drive(stamped=stamped), storage)
+    info = imported(source, tmp_path / "d")
+    columns = read_episode(tmp_path / "d", 0)
+    (episode,) = info.episodes
+    start = json.loads(episode.metadata["source"])["start_ns"]
+    times = (start - START) / NANO + np.arange(episode.frames) / 10
+    assert columns["control.time"] == pytest.approx(np.arange(episode.frames) / 10, abs=1e-9)
+    assert 55 <= episode.frames <= 60
+    # Of each topic the newest until then: at most a period old, and not from later.
+    forward = columns["observation.state"][:, 0]
+    known = np.array([bags.speed(t)[0] for t in times])
+    assert np.abs(forward - known).max() < 0.05 * 0.075
+    asked = np.array([bags.command(t)[0] for t in times])
+    assert np.abs(columns["action"][:, 0] - asked).max() < 0.05 * 0.15
+    assert np.array_equal(columns["action"], columns["control.applied_action"])
+    assert (columns["control.age"] >= 0).all()
+    assert (columns["control.age"] < 0.25).all()
+    assert columns["control.age"].max() > 0.15  # the scan's
+    assert not columns["control.late"].any()
+    assert (columns["control.mode"] == 3).all()
+    assert columns["next.done"].tolist() == [False] * (episode.frames - 1) + [True]
+    assert main.main(["check", str(tmp_path / "d")]) == 0
+
+
+def test_the_schema_is_that_of_our_recordings(tmp_path, plain):
+    info = imported(plain, tmp_path / "d", "--odometry", "--beams=36")
+    names = list(observation_names(TurtleBot3Config(beams=36, odometry=True)))
+    assert info.features["observation.state"] == {"dtype": "float32", "shape": [41], "names": names}
+    assert info.features["action"]["names"] == ["x.vel", "theta.vel"]
+    assert (info.fps, info.robot_type, info.tasks) == (10, "turtlebot3", ("Drive around.",))
+    columns = read_episode(tmp_path / "d", 0)
+    state = {name: columns["observation.state"][:, column] for column, name in enumerate(names)}
+    # Odometry starts at the episode's start, ahead is x.
+    assert [state[name][0] for name in ("x.pos", "y.pos", "theta.pos")] == [0, 0, 0]
+    way = np.hypot(state["x.pos"], state["y.pos"])
+    assert np.all(np.diff(way) >= 0)
+    assert way[-1] == pytest.approx(0.1 * columns["control.time"][-1], abs=0.02)
+
+
+def test_a_scan_is_the_newest_one_and_lies_right(tmp_path, plain):
+    imported(plain, tmp_path / "d")
+    columns = read_episode(tmp_path / "d", 0)
+    scans = columns["observation.state"][:, 2:]
+    angle = 2 * np.pi * np.arange(360) / 360
+    stamps = np.array([message.header.stamp.sec * NANO + message.header.stamp.nanosec
+                       for topic, _, message in drive() if topic == "/scan"])  # fmt: skip
+    start = json.loads(dataset_info(tmp_path / "d").episodes[0].metadata["source"])["start_ns"]
+    received = np.array([at for topic, at, _ in drive() if topic == "/scan"])
+    for frame, scan in enumerate(scans):
+        stamp = stamps[np.searchsorted(received, start + frame * NANO // 10, side="right") - 1]
+        assert scan == pytest.approx(bags.distance(angle, (stamp - START) / NANO), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "scanner",
+    [{"clockwise": True}, {"angle_min": -np.pi}, {"beams": 223}, {"beams": 720, "clockwise": True, "angle_min": 1.0}],
+)
+def test_other_scanners_see_the_same(tmp_path, plain, scanner):
+    imported(plain, tmp_path / "a")
+    imported(write(tmp_path / "bag", drive(**scanner)), tmp_path / "b")
+    ours, theirs = (read_episode(tmp_path / name, 0)["observation.state"] for name in ("a", "b"))
+    assert np.abs(ours - theirs).max() < 1.4 * np.pi / scanner.get("beams", 360) + 1e-5
+
+
+def test_what_happens_later_changes_nothing_before(tmp_path, plain):
+    """The law of no look-ahead, for whole bags: after t everything is another drive, with a gap and a clock jump."""
+    until = START + 3 * NANO
+    other = [one for one in drive() if one[1] <= until]
+    other += [(topic, time + NANO, bags.twist(9, 9) if topic == "/cmd_vel" else message)
+              for topic, time, message in drive(seed=5) if time > until]  # fmt: skip
+    imported(plain, tmp_path / "a")
+    imported(write(tmp_path / "bag", other), tmp_path / "b", "--stamps=auto")
+    ours, theirs = read_episode(tmp_path / "a", 0), read_episode(tmp_path / "b", 0)
+    start = json.loads(dataset_info(tmp_path / "a").episodes[0].metadata["source"])["start_ns"]
+    count = (until - start) // (NANO // 10) - 1
+    assert count > 20
+    for key, values in ours.items():
+        if key != "next.done":
+            assert np.array_equal(values[:count], theirs[key][:count]), key
+
+
+def test_gaps_are_flagged_or_begin_an_episode(tmp_path, capsys):
+    def keep(message):
+        time = (message[1] - START) / NANO
+        short = message[0] == "/odom" and 1.0 < time < 1.5
+        long = message[0] == "/scan" and 3.0 < time < 4.6
+        return not short and not long
+
+    source = write(tmp_path / "bag", list(filter(keep, drive(seconds=8))))
+    info = imported(source, tmp_path / "d")
+    error = capsys.readouterr().err
+    assert "/scan was silent for 1." in error
+    (told,) = (line for line in error.splitlines() if "older than 0.3 s; control.late is true" in line)
+    assert len(info.episodes) == 2
+    columns = read_episode(tmp_path / "d", 0)
+    late = columns["control.late"]
+    assert np.array_equal(late, columns["control.age"] > 0.3)
+    assert 1 <= late.sum() <= 3
+    total = late.sum() + read_episode(tmp_path / "d", 1)["control.late"].sum()
+    assert f"{total} of {info.frames} frames, in " in told
+    assert columns["control.time"][-1] < 3.3
+    assert [json.loads(one.metadata["source"])["why"] for one in info.episodes] == ["start", "gap"]
+    assert main.main(["check", str(tmp_path / "d")]) == 0
+    one = imported(source, tmp_path / "one", "--max_gap=2")
+    assert len(one.episodes) == 1
+
+
+@pytest.mark.parametrize(("jump", "told"), [(-3600, "jumped back 1 times"), (86400 * 365, "clock jumped ahead")])
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_clock_jumps_split_the_episode(tmp_path, capsys, jump, told, storage):
+    first, second = drive(seconds=4), drive(seconds=4, start=START + (4 + jump) * NANO)
+    info = imported(write(tmp_path / "bag", first + second, storage), tmp_path / "d")
+    assert told in capsys.readouterr().err
+    assert len(info.episodes) == 2
+    alone = imported(write(tmp_path / "alone", first), tmp_path / "alone_d")
+    frames = alone.episodes[0].frames  # in a gap there may be a few more, whose readings are fresh enough
+    assert 0 <= info.episodes[0].frames - frames <= 3
+    for key, values in read_episode(tmp_path / "alone_d", 0).items():
+        assert key == "next.done" or np.array_equal(values, read_episode(tmp_path / "d", 0)[key][:frames]), key
+
+
+def test_silence_of_the_commands_is_a_standstill(tmp_path, capsys):
+    messages = [one for one in drive(stamped=True) if one[0] != "/cmd_vel" or not 2 < (one[1] - START) / NANO < 4]
+    source = write(tmp_path / "bag", messages)
+    imported(source, tmp_path / "d")
+    columns = read_episode(tmp_path / "d", 0)
+    silent = columns["control.watchdog"] == 1
+    assert 13 <= silent.sum() <= 16
+    assert (columns["action"][silent] == 0).all()
+    assert (columns["action"][~silent] != 0).all()
+    assert (columns["control.mode"] == np.where(silent, 2, 3)).all()
+    assert columns["control.command_age"].max() <= 0.5
+    imported(source, tmp_path / "held", "--command_timeout=inf")
+    held = read_episode(tmp_path / "held", 0)
+    assert (held["action"] != 0).all()
+    assert held["control.command_age"].max() > 1.5
+
+
+def test_what_is_too_fast_is_limited_and_said_to_be(tmp_path):
+    messages = [(t, at, bags.twist(0.5, 0.1) if t == "/cmd_vel" else message) for t, at, message in drive()]
+    imported(write(tmp_path / "bag", messages), tmp_path / "d")
+    columns = read_episode(tmp_path / "d", 0)
+    asked = columns["control.mode"] == 3
+    assert asked.sum() > 50
+    assert (columns["action"][asked] == np.float32([0.5, 0.1])).all()
+    assert (columns["control.applied_action"][asked] == np.float32([0.22, 0.1])).all()
+    assert (columns["control.limits"][asked] == 2).all()
+
+
+@pytest.mark.parametrize(
+    ("missing", "parts"),
+    [
+        ("/odom", ["no topic /odom", "speed", "--odom", "/scan (sensor_msgs/msg/LaserScan, 30)", "/cmd_vel"]),
+        ("/scan", ["no topic /scan", "--scan"]),
+        ("/cmd_vel", ["no topic /cmd_vel", "action", "--cmd"]),
+    ],
+)
+def test_a_bag_without_a_topic_is_refused_with_those_it_has(tmp_path, capsys, missing, parts):
+    source = write(tmp_path / "bag", list(filter(without(missing), drive())))
+    error = refused(source, tmp_path / "d", capsys)
+    for part in parts:
+        assert part in error
+
+
+def joint_states(*names):
+    state = bags.T["sensor_msgs/msg/JointState"](
+        header=bags.header(START, ""), name=list(names), position=np.zeros(len(names)),
+        velocity=np.zeros(0), effort=np.zeros(0),
+    )  # fmt: skip
+    return [("/joint_states", START, state)]
+
+
+def test_a_bag_of_an_arm_is_said_to_be_one(tmp_path, capsys):
+    arm = write(tmp_path / "arm", joint_states("shoulder_pan_joint", "elbow_joint"))
+    error = refused(arm, tmp_path / "d", capsys)
+    assert "seems to be of an arm: /joint_states has the joints shoulder_pan_joint, elbow_joint, and" in error
+    assert "is for bags of a TurtleBot3" in error
+    base = write(tmp_path / "base", joint_states("wheel_left_joint", "wheel_right_joint"))
+    assert "no topic /scan" in refused(base, tmp_path / "d", capsys)
+    blind = [*joint_states("elbow_joint"), *filter(without("/scan"), drive())]
+    assert "no topic /scan" in refused(write(tmp_path / "blind", blind), tmp_path / "d", capsys)
+
+
+def test_another_topic_can_be_named_and_must_be_of_the_right_type(tmp_path, capsys):
+    source = write(tmp_path / "bag", [(f"/tb3{topic}", at, message) for topic, at, message in drive()])
+    error = refused(source, tmp_path / "d", capsys)
+    assert "Of the right type: /tb3/" in error
+    named = ["--scan=/tb3/scan", "--odom=/tb3/odom", "--cmd=/tb3/cmd_vel"]
+    error = refused(source, tmp_path / "d", capsys, *named, "--odom=/tb3/scan")
+    assert "is of type sensor_msgs/msg/LaserScan; valid for --odom: nav_msgs/msg/Odometry" in error
+    assert len(imported(source, tmp_path / "d", *named).episodes) == 1
+
+
+def test_other_frames_are_asked_about(tmp_path, capsys, plain):
+    source = write(tmp_path / "bag", drive(frame="laser"))
+    error = refused(source, tmp_path / "d", capsys)
+    for part in ("frame 'laser'", "--scan_frame=laser", "--scan_yaw"):
+        assert part in error
+    imported(plain, tmp_path / "a")
+    imported(source, tmp_path / "b", "--scan_frame=laser", f"--scan_yaw={np.pi / 2}")
+    ours, theirs = (read_episode(tmp_path / name, 0)["observation.state"][:, 2:] for name in ("a", "b"))
+    assert np.array_equal(theirs, np.roll(ours, 90, axis=1))
+    messages = [(t, at, bags.odometry(at, child="imu") if t == "/odom" else message) for t, at, message in drive()]
+    odd = write(tmp_path / "odd", messages)
+    assert "--odom_frame=imu" in refused(odd, tmp_path / "d", capsys)
+    imported(odd, tmp_path / "c", "--odom_frame=imu")
+    mixed = [(t, at, bags.scan(at, frame="other") if t == "/scan" and at % 2 else m) for t, at, m in drive()]
+    assert "several frames" in refused(write(tmp_path / "mixed", mixed), tmp_path / "d", capsys)
+
+
+def test_a_static_transform_says_how_the_scanner_is_turned(tmp_path, capsys, plain):
+    types = bags.T
+    transforms = [
+        types["geometry_msgs/msg/TransformStamped"](
+            header=bags.header(START, parent),
+            child_frame_id=child,
+            transform=types["geometry_msgs/msg/Transform"](
+                translation=bags.Vector(x=0.0, y=0.0, z=0.1),
+                rotation=bags.Quaternion(x=0.0, y=0.0, z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2))),
+            ),
+        )
+        for parent, child, yaw in (("base_link", "mast", np.pi / 4), ("mast", "laser", np.pi / 4))
+    ]
+    static = ("/tf_static", START, types["tf2_msgs/msg/TFMessage"](transforms=transforms))
+    imported(write(tmp_path / "bag", [static, *drive(frame="laser")]), tmp_path / "b")
+    assert "turned by 90.0 degrees, from /tf_static" in capsys.readouterr().err
+    imported(plain, tmp_path / "a")
+    ours, theirs = (read_episode(tmp_path / name, 0)["observation.state"][:, 2:] for name in ("a", "b"))
+    assert np.array_equal(theirs, np.roll(ours, 90, axis=1))
+
+
+def test_a_static_transform_that_is_lost_is_asked_for(tmp_path, capsys, plain):
+    quaternion = bags.Quaternion(x=0.0, y=0.0, z=float("nan"), w=1.0)
+    transform = bags.T["geometry_msgs/msg/TransformStamped"](
+        header=bags.header(START, "base_link"),
+        child_frame_id="base_scan",
+        transform=bags.T["geometry_msgs/msg/Transform"](
+            translation=bags.Vector(x=0.0, y=0.0, z=0.1), rotation=quaternion
+        ),
+    )
+    static = ("/tf_static", START, bags.T["tf2_msgs/msg/TFMessage"](transforms=[transform]))
+    bag = write(tmp_path / "bag", [static, *drive()])
+    assert "--scan_yaw (0 is straight ahead)" in refused(bag, tmp_path / "d", capsys)
+    imported(bag, tmp_path / "d", "--scan_yaw=0")
+    assert "1 messages of /tf_static cannot be read" in capsys.readouterr().err
+    imported(plain, tmp_path / "a")
+    ours, theirs = (read_episode(tmp_path / name, 0)["observation.state"] for name in ("a", "d"))
+    assert np.array_equal(ours, theirs)
+
+
+def test_stamps_that_cannot_be_true_are_told_and_the_reception_counts(tmp_path, capsys):
+    messages = [
+        (topic, at, bags.odometry(at - 1000 * NANO) if topic == "/odom" else message) for topic, at, message in drive()
+    ]
+    source = write(tmp_path / "bag", messages)
+    imported(source, tmp_path / "d", "--stamps=auto")
+    assert "/odom: 120 of 120 header stamps are not within 0.5 s" in capsys.readouterr().err
+    error = refused(source, tmp_path / "e", capsys, "--stamps=header")
+    assert re.search(r"/scan is (1000|999)\.\d\d s ahead of /odom. Their stamps are of different clocks", error)
+    imported(source, tmp_path / "e")
+    assert "header stamps" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("late_ms", [0, 1, 20, 50, 99])
+def test_an_action_is_the_answer_to_its_observation(tmp_path, late_ms):
+    """A brain answers each observation after a while; the action of a frame is that answer, not the one before."""
+    base = [one for one in drive(seconds=4) if one[0] != "/cmd_vel"]
+    imported(write(tmp_path / "silent", [*base, ("/cmd_vel", base[0][1], bags.twist(0, 0))]), tmp_path / "a")
+    start = json.loads(dataset_info(tmp_path / "a").episodes[0].metadata["source"])["start_ns"]
+    answers = [
+        ("/cmd_vel", start + frame * NANO // 10 + late_ms * NANO // 1000, bags.twist(frame / 1000, -frame / 500))
+        for frame in range(60)
+    ]
+    imported(write(tmp_path / "bag", sorted([*base, *answers], key=lambda one: one[1])), tmp_path / "b")
+    action = read_episode(tmp_path / "b", 0)["action"]
+    assert action[:, 0] == pytest.approx(np.arange(len(action)) / 1000)
+    assert action[:, 1] == pytest.approx(-np.arange(len(action)) / 500)
+
+
+def test_frames_without_a_command_are_told(tmp_path, capsys):
+    messages = [one for one in drive() if one[0] != "/cmd_vel" or one[1] < START + NANO]
+    info = imported(write(tmp_path / "bag", messages), tmp_path / "d")
+    error = capsys.readouterr().err
+    columns = read_episode(tmp_path / "d", 0)
+    silent = int((columns["control.mode"] == 2).sum())
+    assert 30 < silent < info.frames
+    assert f"{silent} of {info.frames} frames" in error
+    assert "--command_timeout=inf" in error  # it drives on
+    imported(tmp_path / "bag", tmp_path / "e", "--command_timeout=inf")
+    assert "no command" not in capsys.readouterr().err
+
+
+def test_commands_of_another_clock_are_refused(tmp_path, capsys):
+    messages = [(topic, at + 1000 * NANO if topic == "/cmd_vel" else at, message) for topic, at, message in drive()]
+    assert "Their stamps are of different clocks" in refused(write(tmp_path / "bag", messages), tmp_path / "d", capsys)
+
+
+def test_a_computer_whose_clock_is_off_is_noticed_where_it_matters(tmp_path, capsys):
+    """Else each observation would have the command of another time."""
+    make = {"/scan": bags.scan, "/odom": bags.odometry}
+    fast = [(topic, at, make[topic](at + 3 * NANO // 2) if topic in make else one) for topic, at, one in drive()]
+    source = write(tmp_path / "bag", fast)
+    error = refused(source, tmp_path / "d", capsys, "--stamps=header")
+    assert "/cmd_vel is 1.50 s behind /odom. Their stamps are of different clocks" in error
+    assert imported(source, tmp_path / "d").frames == imported(source, tmp_path / "a", "--stamps=auto").frames > 30
+    # With headers everywhere it does not matter whether the recorder's clock is that of the robot, or as fast.
+    slow = [(topic, START + 2 * (at - START), one) for topic, at, one in drive(stamped=True)]
+    assert imported(write(tmp_path / "slow", slow), tmp_path / "s", "--stamps=header").frames > 30
+
+
+def test_a_step_of_the_recorders_clock_begins_an_episode(tmp_path, capsys):
+    """As of NTP: what was heard before and after must not be sorted into each other."""
+    half = START + 4 * NANO
+    messages = [(topic, at if at < half else at - 3 * NANO // 10, message) for topic, at, message in drive(seconds=8)]
+    assert len(imported(write(tmp_path / "bag", messages), tmp_path / "d").episodes) == 2
+    assert "the clock jumped back" in capsys.readouterr().err
+
+
+def test_a_truncated_bag_is_taken_to_its_end_and_told(tmp_path, capsys, plain):
+    whole = (plain / "plain.mcap").read_bytes()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(whole[: len(whole) // 2])
+    info = imported(path, tmp_path / "d")
+    error = capsys.readouterr().err
+    assert f"damaged: cut.mcap: it ends at byte {len(whole) // 2}" in error
+    (problem,) = json.loads(info.episodes[0].metadata["source"])["problems"]
+    assert "ends at byte" in problem
+    imported(plain, tmp_path / "whole")
+    ours, theirs = read_episode(tmp_path / "whole", 0), read_episode(tmp_path / "d", 0)
+    frames = len(theirs["action"]) - 3  # the last ones may have lost a message
+    assert 20 < frames < len(ours["action"])
+    for key, values in ours.items():
+        assert key == "next.done" or np.array_equal(values[:frames], theirs[key][:frames]), key
+    path.write_bytes(whole[:3000])
+    assert "cut.mcap" in refused(path, tmp_path / "e", capsys)
+
+
+def test_several_bags_become_several_episodes(tmp_path, plain):
+    folder = tmp_path / "drives"
+    folder.mkdir()
+    for index in range(2):
+        write(folder / f"drive_{index}", drive(seed=index + 1))
+    info = imported(folder, tmp_path / "d")
+    assert [json.loads(one.metadata["source"])["bag"] for one in info.episodes] == ["drive_0", "drive_1"]
+    arguments = ["import", str(plain), str(folder), "--repo_id=t/t", f"--root={tmp_path / 'e'}", TASK]
+    assert main.main(arguments) == 0
+    assert len(dataset_info(tmp_path / "e").episodes) == 3
+
+
+def test_values_that_are_not_finite_count_as_lost(tmp_path, capsys):
+    messages = [
+        (topic, at, bags.twist(np.nan, 0) if topic == "/cmd_vel" and number % 20 == 0 else message)
+        for number, (topic, at, message) in enumerate(drive())
+    ]
+    imported(write(tmp_path / "bag", messages), tmp_path / "d")
+    assert "with values that are not finite, left out" in capsys.readouterr().err
+    assert np.isfinite(read_episode(tmp_path / "d", 0)["action"]).all()
+
+
+def test_pictures_and_gyroscope(tmp_path):
+    types = bags.T
+    messages = drive(seconds=3)
+    for number in range(60):
+        at = START + number * NANO // 20
+        grey = np.full(16 * 24 * 3, 4 * number, np.uint8)
+        image = types["sensor_msgs/msg/Image"](
+            header=bags.header(at, "camera"), height=16, width=24, encoding="bgr8", is_bigendian=0, step=72, data=grey
+        )
+        messages.append(("/camera/image", at + 10**6, image))
+        zero = bags.Vector(x=0.0, y=0.0, z=0.0)
+        imu = types["sensor_msgs/msg/Imu"](
+            header=bags.header(at, "imu_link"), orientation=bags.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=np.zeros(9), angular_velocity=bags.Vector(x=0.0, y=0.0, z=number / 10),
+            angular_velocity_covariance=np.zeros(9), linear_acceleration=zero,
+            linear_acceleration_covariance=np.zeros(9),
+        )  # fmt: skip
+        messages.append(("/imu", at + 10**6, imu))
+    source = write(tmp_path / "bag", sorted(messages, key=lambda one: one[1]))
+    info = imported(source, tmp_path / "d", "--camera=front=/camera/image", "--imu=/imu", "--beams=36")
+    assert info.features["observation.images.front"]["shape"] == [16, 24, 3]
+    columns = read_episode(tmp_path / "d", 0)
+    start = json.loads(info.episodes[0].metadata["source"])["start_ns"]
+    newest = (start - START + np.arange(len(columns["action"])) * NANO // 10) // (NANO // 20)
+    assert columns["observation.state"][:, -1] == pytest.approx(newest / 10)
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("t/t", root=tmp_path / "d", video_backend="pyav")
+    for frame in (0, 10, 20):
+        grey = dataset[frame]["observation.images.front"].numpy().mean() * 255
+        assert grey == pytest.approx(4 * newest[frame], abs=4)
+
+
+def test_an_outcome_is_taken_or_marked_later(tmp_path, plain):
+    info = imported(plain, tmp_path / "d", "--outcome=success")
+    columns = read_episode(tmp_path / "d", 0)
+    assert (info.episodes[0].metadata["outcome"], columns["event"][-1], columns["next.success"][-1]) == (
+        "success",
+        1,
+        1,
+    )
+    assert not columns["event"][:-1].any()
+    assert "outcome" not in imported(plain, tmp_path / "e").episodes[0].metadata
+    assert main.main(["mark", str(tmp_path / "e"), "--episodes=0", "--outcome=collision"]) == 0
+    assert dataset_info(tmp_path / "e").episodes[0].metadata["outcome"] == "collision"
+
+
+def test_an_exported_bag_can_be_treated_as_a_robots(tmp_path, plain):
+    imported(plain, tmp_path / "d")
+    assert main.main(["export", str(tmp_path / "d"), f"--output={tmp_path / 'bags'}"]) == 0
+    assert run(tmp_path / "bags", tmp_path / "back", "--resample") == 0
+    ours, theirs = read_episode(tmp_path / "d", 0), read_episode(tmp_path / "back", 0)
+    for key in ("observation.state", "action"):
+        assert np.array_equal(ours[key], theirs[key]), key
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--robot=ur5"], "Unknown robot 'ur5'"),
+        (["--fps=0"], "--fps is 0"),
+        (["--beams=7"], "it must divide 360"),
+        (["--stamps=mine"], "Unknown stamps 'mine'"),
+        (["--outcome=winning"], "Unknown outcome 'winning'"),
+        (["--max_gap=0.1"], "--max_gap is 0.1"),
+        (["--max_gap=nan"], "--max_gap is nan"),
+        (["--max_age=-1"], "--max_age is -1"),
+        (["--command_timeout=0"], "--command_timeout is 0"),
+        (["--min_episode_s=inf"], "--min_episode_s is inf"),
+        (["--min_episode_s=100"], "No episode of 100 s or more"),
+        (["--camera=front"], "NAME=TOPIC"),
+        (["--camera=front=/nothing"], "no topic /nothing"),
+        (["--scan_yaw=nan"], "--scan_yaw is nan"),
+        (["--task="], "Say what the robot was to do"),
+    ],
+)
+def test_options_that_cannot_be_honoured_are_refused(tmp_path, plain, capsys, arguments, told):
+    assert told in refused(plain, tmp_path / "d", capsys, *arguments)
+
+
+def test_a_dataset_that_is_there_stays(tmp_path, plain, capsys):
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "mine").write_text("x")
+    assert run(plain, tmp_path / "d") == 2
+    assert "exists already" in capsys.readouterr().err
+    assert (tmp_path / "d" / "mine").read_text() == "x"
+    assert run(tmp_path / "none", tmp_path / "e") == 2
+    assert "no bag at" in capsys.readouterr().err
+
+
+def test_a_bag_that_is_named_twice_is_refused(tmp_path, plain, capsys):
+    arguments = ["import", str(plain), f"{plain}/../plain", "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
+    assert main.main(arguments) == 2
+    assert "must not be named twice" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("source", ["mcap", "sqlite3", "ours"])
+def test_random_damage_is_read_or_refused_and_never_a_surprise(tmp_path, source):
+    if source == "ours":
+        assert run(write(tmp_path / "bag", drive(seconds=2)), tmp_path / "d") == 0
+        assert main.main(["export", str(tmp_path / "d"), f"--output={tmp_path / 'bags'}", "--one_bag"]) == 0
+        (path,) = (tmp_path / "bags").glob("*.mcap")
+    else:
+        (path,) = (one for one in write(tmp_path / "bag", drive(seconds=2), source).iterdir() if one.suffix != ".yaml")
+    whole, damaged = path.read_bytes(), tmp_path / f"damaged{path.suffix}"
+    statuses = set()
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        content = np.frombuffer(whole, np.uint8).copy()
+        reach = len(content) if seed % 2 else 6000
+        content[rng.integers(0, reach, rng.choice([1, 3, 20]))] = rng.integers(0, 256)
+        damaged.write_bytes(content.tobytes())
+        root = tmp_path / f"out_{seed}"
+        arguments = ["import", str(damaged), "--repo_id=t/t", f"--root={root}"] + [TASK] * (source != "ours")
+        status = main.main(arguments)
+        statuses.add(status)
+        assert status in (0, 2)
+        assert root.exists() == (status == 0)
+    assert statuses == {0, 2}
+
+
+def test_a_bag_that_cannot_be_used_leaves_no_dataset(tmp_path, plain, capsys):
+    bad = write(tmp_path / "bad", list(filter(without("/odom"), drive())))
+    good = tmp_path / "good"
+    shutil.copytree(plain, good)
+    arguments = ["import", str(good), str(bad), "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
+    assert main.main(arguments) == 2
+    assert "no topic /odom" in capsys.readouterr().err
+    assert not (tmp_path / "d").exists()

@@ -1,0 +1,206 @@
+"""bhd-data: what it shows, and what it says about what is broken."""
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from tests.datasets import support
+from tests.recording.support import run_record
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    root = tmp_path_factory.mktemp("data") / "d"
+    run_record(root, n_envs=2, seed=4)
+    return root
+
+
+def test_info_shows_outcome_and_timing_of_every_episode(recorded, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+    assert main.main(["info", str(recorded)]) == 0
+    text = capsys.readouterr().out
+    for part in ("turtlebot3, 10 frames/s", "finalised", "avoidance", "late p99", "overruns", "control.applied_action"):
+        assert part in text
+    assert "since the episode's start [s]" in text  # square brackets are not markup
+
+
+def test_info_as_json_holds_everything(recorded, capsys):
+    assert main.main(["info", "--root", str(recorded), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert [episode["index"] for episode in summary["episodes"]] == [0, 1, 2]
+    for episode in summary["episodes"]:
+        assert json.loads(episode["metadata"]["timing"])["overruns"] == 0
+        assert len(episode["metadata"]["initial_state"]) > 20
+        assert set(json.loads(episode["metadata"]["versions"])) == {"bhd_lerobot", "lerobot", "mujoco", "numpy"}
+    assert summary["recording"]["brain"]["type"] == "avoidance"
+
+
+def test_info_of_several_datasets(recorded, tmp_path, capsys):
+    other = tmp_path / "[b]other"  # square brackets are not markup
+    run_record(other, dataset__num_episodes=1, robot__beams=18)
+    assert main.main(["info", "--short", str(recorded), str(other)]) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"{recorded}: turtlebot3, 3 episodes, 90 frames, 9 s, ")
+    assert first.endswith(" MB, timeout 3")
+    assert second.startswith(f"{other}: turtlebot3, 1 episodes, 30 frames, 3 s, ")
+    # One that is none does not hide the others.
+    assert main.main(["info", str(tmp_path / "none"), str(recorded), "--short"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == first + "\n"
+    assert "does not exist" in captured.err
+    assert main.main(["info", "--json", str(recorded), str(other)]) == 0
+    assert [one["root"] for one in json.loads(capsys.readouterr().out)] == [str(recorded), str(other)]
+    assert main.main(["info", str(other), str(recorded)]) == 0
+    told = capsys.readouterr().out
+    assert str(other) in told.replace("\n", "")
+    assert told.count("Features") == 2
+
+
+def test_an_empty_dataset_is_called_empty(tmp_path, capsys):
+    features = {"action": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
+    root = tmp_path / "d"
+    DatasetRecorder.create("t/none", 10, features, robot_type="toy", root=root, recording={}).finalize()
+    new = ["--output", str(tmp_path / "new")]
+    for status, command in (
+        *((0, ["info"]), (0, ["info", "--short"]), (1, ["check"]), (0, ["repair"]), (1, ["check", "--strict"])),
+        *((2, ["timing"]), (2, ["filter", "--outcome", "all", *new]), (2, ["split", "--parts", "a=0.5", *new])),
+        *((2, ["delete", "--episodes", "0"]), (2, ["mark", "--episodes", "0", "--outcome", "failure"])),
+    ):
+        assert main.main([command[0], str(root), *command[1:]]) == status
+        captured = capsys.readouterr()
+        assert "empty" in captured.out + captured.err, command
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_dataset_is_named_in_one_way(recorded, capsys, monkeypatch):
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(recorded.parent))
+    for arguments in (["--repo_id", "d"], ["--root", str(recorded)], [str(recorded)]):
+        assert main.main(["repair", *arguments]) == 0
+    capsys.readouterr()
+    for arguments in (
+        [str(recorded), "--repo_id", "t/t"],
+        [str(recorded), "--root", "x"],
+        ["--root", "x", "--repo_id", "t/t"],
+        [],
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main.main(["repair", *arguments])
+        assert stop.value.code == 2
+        error = capsys.readouterr().err
+        assert "name the dataset, in one way: its folder (ROOT or --root), or --repo_id" in error
+        assert all(one in error for one in arguments)
+
+
+def test_help_names_every_value_by_what_it_is():
+    """Not by the name that the program has for it, such as ROOT_OPTION."""
+    (commands,) = (one for one in main._parser()._actions if isinstance(one, argparse._SubParsersAction))
+    for name in ["info", "timing", "check", "repair", "mark", "merge", "filter", "delete", "split", "view"]:
+        for action in commands.choices[name]._actions:
+            assert action.nargs == 0 or (action.metavar and action.help), f"{name}: {action.dest}"
+            assert "_" not in str(action.metavar)
+
+
+def test_repair_of_a_sound_dataset_has_nothing_to_do(recorded, capsys):
+    assert main.main(["repair", str(recorded)]) == 0
+    assert "nothing to do" in capsys.readouterr().out
+
+
+def test_repair_reports_what_it_dropped(recorded, tmp_path, capsys):
+    root = tmp_path / "d"
+    shutil.copytree(recorded, root)
+    leftover = root / "data" / "chunk-000" / "file-007.parquet"
+    leftover.write_bytes(b"half an episode")
+    assert main.main(["repair", str(root)]) == 0
+    assert "file-007.parquet" in capsys.readouterr().out
+    assert not leftover.exists()
+
+
+def test_a_corrupted_file_is_named_left_alone_and_repaired(recorded, tmp_path, capsys):
+    root = tmp_path / "d"
+    shutil.copytree(recorded, root)
+    path = next((root / "data").rglob("*.parquet"))
+    content = bytearray(path.read_bytes())
+    content[-50:] = bytes(50)
+    path.write_bytes(content)
+    assert main.main(["info", str(root)]) == 2
+    error = capsys.readouterr().err
+    assert path.name in error
+    assert path.read_bytes() == content
+    assert main.main(["repair", str(root)]) == 0
+    out = capsys.readouterr().out
+    assert path.name in out
+    assert "lost: nothing" in out
+    assert (tmp_path / "d.damaged-1" / path.relative_to(root)).read_bytes() == content
+    assert main.main(["check", str(root)]) == 0
+
+
+def test_no_dataset_and_no_argument(tmp_path, capsys):
+    assert main.main(["info", str(tmp_path / "none")]) == 2
+    assert "does not exist" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stop:
+        main.main(["info"])
+    assert stop.value.code == 2
+
+
+@pytest.mark.parametrize("arguments", [["info"], ["info", "--json"], ["check"]])
+def test_output_that_nobody_reads_ends_the_command_without_a_word(recorded, arguments):
+    command = [sys.executable, "-m", "bhd_lerobot.cli.data.main", *arguments, str(recorded)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run(
+            command, env=environment, stdout=writing, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, check=False
+        )
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+
+
+def test_a_recording_that_goes_on_is_no_interrupted_one(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    root = tmp_path / "d"
+    recorder = support.create(root)
+    support.record(recorder)
+    told = "not finalised: it is being recorded or changed at this moment"
+    for command in (["info"], ["info", "--short"]):
+        assert main.main([*command, str(root)]) == 0
+        assert told in capsys.readouterr().out
+    for command in ("check", "repair", "view"):
+        assert main.main([command, str(root)]) == 2
+        assert "being" in capsys.readouterr().err
+    recorder._lock.release()  # as if it had been killed
+    assert main.main(["info", "--short", str(root)]) == 0
+    assert "an interrupted recording; `bhd-data repair` finishes it" in capsys.readouterr().out
+    assert main.main(["repair", str(root)]) == 0
+    assert main.main(["check", str(root)]) == 0
+    capsys.readouterr()
+    assert main.main(["info", "--short", str(root)]) == 0
+    assert "not finalised" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("chek x", "Did you mean 'check'?"),
+        ("view x --prt 0", "Did you mean '--port'?"),
+        ("info --shrt", "Did you mean '--short'?"),
+        ("check a b", "an argument too many: b"),
+    ],
+)
+def test_a_slip_of_the_keyboard_is_told_the_nearest_name(line, said, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main.main(line.split())
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err

@@ -1,0 +1,103 @@
+"""bhd-data pull: what is told about some episodes and about places without checksums, and how odd metadata end."""
+
+import json
+import shlex
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.datasets.remote.listing import MANIFEST, SUBSET
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.training.config import BhdTrainConfig
+from tests.hub_server.server import HubServer
+from tests.training.support import make_dataset
+
+pytest_plugins = ["tests.hub_server.fixtures"]
+
+
+@pytest.fixture(scope="module")
+def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_dataset(tmp_path_factory.mktemp("lesson") / "set")
+
+
+def test_some_episodes_by_number_and_by_outcome(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
+    assert main.main(["push", str(lesson), "me/d"]) == 0
+    capsys.readouterr()
+    assert main.main(["pull", "me/d", f"--root={tmp_path / 'a'}", "--episodes=0,3-4"]) == 0
+    said = capsys.readouterr().out
+    assert "3 episodes of 6: 0,3-4" in said
+    assert '--dataset.episodes="[0, 3, 4]"' in said
+    assert main.main(["pull", "me/d", f"--root={tmp_path / 'b'}", "--outcome=success", "--min_score=0.3"]) == 0
+    assert "2 episodes of 6: 4-5" in capsys.readouterr().out
+    assert main.main(["pull", "me/d", f"--root={tmp_path / 'c'}", "--outcome=fault"]) == 2
+    assert "No episode of me/d is left after filtering" in capsys.readouterr().err
+    assert not [one for one in tmp_path.iterdir() if "c" in one.name]
+
+
+def test_the_command_that_is_suggested_is_one_that_works(lesson: Path, tmp_path: Path, capsys) -> None:
+    """With the user's own values, also where the place has no name that is one on the Hub."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    url, target = f"file://{tmp_path}/shelf", tmp_path / "my copy"
+    assert main.main(["push", str(lesson), url, "--no_card"]) == 0
+    capsys.readouterr()
+    assert main.main(["pull", url, f"--root={target}", "--episodes=1,3-4"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"{target}: 3 episodes of 6: 1,3-4"
+    assert "hold all 6. Name yours where you load them" in lines[-2]
+    words = shlex.split(lines[-1])
+    assert words[0] == "bhd-train"
+    dataset = parse(BhdTrainConfig, [*words[1:], "--policy.type=bhd_mlp", "--policy.push_to_hub=false"]).dataset
+    assert (Path(dataset.root), dataset.episodes) == (target, [1, 3, 4])
+    loaded = LeRobotDataset(dataset.repo_id, root=dataset.root, episodes=dataset.episodes)
+    assert loaded.num_episodes == 3
+    assert json.loads((target / SUBSET).read_bytes())["episodes"] == [1, 3, 4]
+
+
+def test_what_was_compared_by_size_only_is_told(lesson: Path, tmp_path: Path, capsys) -> None:
+    url = f"file://{tmp_path}/shelf"
+    assert main.main(["push", str(lesson), url, "--no_card"]) == 0
+    (tmp_path / "shelf" / MANIFEST).unlink()
+    pull = ["pull", url, f"--root={tmp_path / 'e'}"]
+    assert main.main(pull) == 0
+    assert "by size" not in capsys.readouterr().out
+    assert main.main(pull) == 0
+    assert f"compared by size only, because no checksums are listed at {url}; --verify" in capsys.readouterr().out
+    assert main.main([*pull, "--verify"]) == 0
+    assert "by size" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        (layout.INFO, b"[1]"),
+        (layout.INFO, b"\xff"),
+        (layout.TASKS, b"PAR1"),
+        (layout.STATS, b"[]"),
+        ("meta/episodes/chunk-000/file-000.parquet", {"episode_index": ["a", "b"]}),
+        ("meta/episodes/chunk-000/file-000.parquet", {"other": [1]}),
+        ("meta/episodes/chunk-000/file-000.parquet", {"episode_index": [*range(6)], "length": ["x"] * 6}),
+    ],
+)
+def test_odd_metadata_end_in_words(hub: HubServer, lesson: Path, tmp_path: Path, capsys, change: tuple) -> None:
+    """Whatever lies there, no traceback: an error, or all of it as it is there, and that it is not sound."""
+    name, broken = change
+    assert main.main(["push", str(lesson), "me/d", "--no_card"]) == 0
+    files = hub.dataset("me/d").files()
+    if isinstance(broken, dict):
+        sink = pa.BufferOutputStream()
+        pq.write_table(pa.table(broken), sink)
+        broken = sink.getvalue().to_pybytes()
+    files[name] = type(files[name])(broken, lfs=files[name].lfs)
+    for number, select in enumerate(([], ["--episodes=0"], ["--outcome=success"])):
+        capsys.readouterr()
+        target = tmp_path / f"e{number}"
+        status = main.main(["pull", "me/d", f"--root={target}", *select])
+        said = capsys.readouterr()
+        assert said.err.startswith("error: ") == (status == 2) != target.exists()
+        if status != 2:
+            assert (status == 1) == ("is not sound" in said.out)

@@ -1,0 +1,367 @@
+"""bhd-data push and pull, and what uploads by itself: against a Hub on this machine, through the real client."""
+
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.cli.data.check import limits_of
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.remote.card import is_generated
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.errors import TransferError
+from bhd_lerobot.evaluation.statistics import wilson
+from bhd_lerobot.hub.transfer import repeat_line
+from bhd_lerobot.recording import record as record_module
+from tests.hub_server.fixtures import content
+from tests.hub_server.server import Fault, HubServer
+from tests.recording.support import options as record_options
+from tests.recording.support import run_record
+from tests.training.support import MLP, curve, make_dataset, run_train
+from tests.training.support import options as train_options
+from tests.waiting import until
+
+pytest_plugins = ["tests.hub_server.fixtures"]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("recorded") / "d"
+    run_record(root, n_envs=2, seed=4, dataset__num_episodes=4)
+    return root
+
+
+@pytest.fixture(scope="module")
+def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_dataset(tmp_path_factory.mktemp("lesson") / "set")
+
+
+@pytest.fixture
+def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working folder, which is empty."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def text_of(hub: HubServer, name: str, path: str = "README.md") -> str:
+    return hub.dataset(name).files()[path].content.decode()
+
+
+def test_there_and_back(hub: HubServer, recorded: Path, tmp_path: Path, capsys) -> None:
+    before = content(recorded)
+    assert main.main(["push", str(recorded), "me/avoid"]) == 0
+    assert "me/avoid: 4 episodes\n  sent" in capsys.readouterr().out
+    assert main.main(["push", str(recorded), "--repo_id=me/avoid"]) == 0
+    assert "nothing to send" in capsys.readouterr().out
+    assert main.main(["pull", "me/avoid", f"--root={tmp_path / 'e'}"]) == 0
+    assert "fetched" in capsys.readouterr().out
+    assert content(recorded) == before
+    assert {**content(tmp_path / "e")} == before | {
+        name: hub.dataset("me/avoid").files()[name].content for name in ("README.md", "preview.png")
+    }
+    assert not [one for one in check_dataset(tmp_path / "e", limits_of).findings if one.severity.word == "error"]
+    # The card came along; to push what was pulled sends nothing.
+    assert main.main(["push", str(tmp_path / "e"), "me/avoid"]) == 0
+    assert "nothing to send" in capsys.readouterr().out
+
+
+def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) -> None:
+    assert main.main(["push", str(recorded), "me/avoid", "--tags=roaming,small", "--licence=mit"]) == 0
+    card = text_of(hub, "me/avoid")
+    assert is_generated(card)
+    front = yaml.safe_load(card.split("---\n")[1])
+    assert front["license"] == "mit"
+    assert front["task_categories"] == ["robotics"]
+    assert front["tags"] == ["LeRobot", "bhd_lerobot", "turtlebot3", "avoid", "roaming", "small"]
+    assert front["configs"] == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
+    summary = dataset_info(recorded)
+    for key in summary.features:
+        assert f"| `{key}` |" in card
+    assert "m/s" in card
+    outcomes = [str(one.metadata["outcome"]) for one in summary.episodes]
+    for outcome in set(outcomes):
+        assert f"| {outcome} | {outcomes.count(outcome)} | {outcomes.count(outcome) / 4:.0%} |" in card
+    successes = sum(bool(one.metadata["success"]) for one in summary.episodes)
+    share = wilson(successes, 4)
+    assert f"{successes} of 4 episodes succeeded: {share.value:.1%}" in card
+    assert f"{share.low:.1%} to {share.high:.1%}" in card
+    folded = re.search(r"<details>.*```json\n(.*)\n```\n\n</details>", card, re.DOTALL)
+    assert folded is not None
+    assert json.loads(folded[1]) == json.loads((recorded / "meta/bhd.json").read_text())
+    assert 'LeRobotDataset("me/avoid")' in card
+    assert "](preview.png)" in card
+    picture = hub.dataset("me/avoid").files()["preview.png"].content
+    from matplotlib.image import imread
+
+    (Path(os.environ["HF_HOME"]) / "p.png").write_bytes(picture)
+    image = imread(Path(os.environ["HF_HOME"]) / "p.png")
+    assert image.shape[0] > 200
+    assert image[..., :3].std() > 0.05
+
+
+def test_pictures_of_cameras_and_of_curves(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
+    films = make_dataset(tmp_path / "films", episodes=2, camera=True)
+    for root, said in ((films, "as `observation.images.front` saw it"), (lesson, "what was observed, and the actions")):
+        assert main.main(["push", str(root), f"me/{root.name}"]) == 0
+        assert said in text_of(hub, f"me/{root.name}")
+        assert hub.dataset(f"me/{root.name}").files()["preview.png"].content.startswith(b"\x89PNG")
+
+
+def test_an_edited_card_is_kept_and_that_is_said(hub: HubServer, lesson: Path, capsys) -> None:
+    assert main.main(["push", str(lesson), "me/d"]) == 0
+    card = hub.dataset("me/d").files()["README.md"]
+    card.content = card.content.replace(b"# d", b"# A fine dataset")
+    assert main.main(["push", str(lesson), "me/d"]) == 0
+    assert "README.md was edited by somebody and is left as it is; --replace_card" in capsys.readouterr().out
+    assert "# A fine dataset" in text_of(hub, "me/d")
+    assert main.main(["push", str(lesson), "me/d", "--replace-card"]) == 0
+    assert "# A fine dataset" not in text_of(hub, "me/d")
+
+
+def test_a_url(recorded: Path, tmp_path: Path, capsys) -> None:
+    url = f"file://{tmp_path}/shelf/avoid"
+    assert main.main(["push", str(recorded), url]) == 0
+    assert f"bhd-data pull {url} --root=data/here" in (tmp_path / "shelf/avoid/README.md").read_text()
+    assert main.main(["push", str(recorded), url]) == 0
+    assert "nothing to send" in capsys.readouterr().out
+    assert main.main(["pull", url, f"--root={tmp_path / 'e'}"]) == 0
+    assert content(tmp_path / "e").items() >= content(recorded).items()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["push"], "Say where to"),
+        (["push", "ROOT"], "Say where to"),
+        (["push", "ROOT", "me"], "neither a name on the Hub"),
+        (["push", "ROOT", "me/a", "me/b"], "too much"),
+        (["push", "ROOT", "s3://b/d", "--tag=x"], "is a URL"),
+        (["push", "ROOT", "me/a", "--storage_options={}"], "is for URLs"),
+        (["push", "ROOT", "memory://b/d", "--storage_options=[1]"], "give a JSON object"),
+        (["push", "ROOT", "memory://b/d", "--storage_options={"], "is not JSON"),
+        (["push", "memory://b/d"], "Name the folder"),
+        (["push", "nowhere", "me/a"], "does not exist"),
+        (["push", "", "me/a"], "A name is empty"),
+        (["push", "ROOT", "me/a", "--tag="], "--tag is empty"),
+        (["push", "a\0b", "me/a"], "cannot be the folder"),
+        (["push", "~nobodyatall/d", "me/a"], "cannot be the folder"),
+        (["push", "ROOT", "me/a", "--verify"], "--verify is for URLs"),
+        (["push", "ROOT", "ftp://"], "names no folder"),
+        (["push", "ROOT", "zip://d.zip"], "no place for a dataset"),
+        (["push", "ROOT", "s3://"], "names no folder"),
+        (["push", "ROOT", "s3:///d"], "names no bucket"),
+        (["push", "ROOT", "foo://b/d"], "Protocol not known"),
+        (["push", "ROOT", "file://rel/d"], "is not a whole path. Write file:///"),
+        (["push", "ROOT", "ftp://127.0.0.1:9/d"], "cannot be reached"),
+        (["pull"], "Say where from"),
+        (["pull", "me/a", "--repo_id=me/b"], "Say where from, once"),
+        (["pull", "memory://b/d"], "Say where to"),
+        (["pull", "memory://b/d", "--root=x", "--revision=main"], "has no revisions"),
+        (["pull", "me/a", "--root=x", "--episodes=all"], "such as 0,3,5-9"),
+        (["pull", "me/a", "--root=x", "--outcome=good"], "Unknown outcome 'good'"),
+        (["pull", "me/a", "--root=x", "--min_score=2"], "from 0 to 1"),
+        (["pull", "me/a", "--root="], "--root is empty"),
+        (["pull", ""], "A name is empty"),
+        (["pull", "me/a", "--root=a\0b"], "cannot be the folder"),
+        (["pull", "me/a", f"--root={'x' * 5000}"], "File name too long"),
+        (["pull", "me/a", "--root=x", "--verify"], "--verify is for URLs"),
+        (["pull", "gs:///d", "--root=x"], "names no bucket"),
+        (["pull", "file://rel/d", "--root=x"], "is not a whole path"),
+    ],
+)
+@pytest.mark.usefixtures("hub")
+def test_bad_arguments(lesson: Path, empty: Path, capsys, arguments: list[str], words: str) -> None:
+    assert main.main([str(lesson) if one == "ROOT" else one for one in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert words in error
+    assert "\0" not in error
+    assert list(empty.iterdir()) == []
+
+
+def test_a_failure_says_what_is_kept_and_how_to_repeat(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
+    hub.expired.add("hf_me")
+    assert main.main(["push", str(lesson), "me/d", "--branch=b", "--private", "--tags=a b,c"]) == 2
+    error = capsys.readouterr().err
+    assert f"The dataset at {lesson} is unchanged" in error
+    command = error.strip().splitlines()[-1].strip()
+    hub.expired.clear()
+    assert main.main(shlex.split(command)[1:]) == 0  # as printed
+    assert hub.dataset("me/d").private
+    assert "meta/info.json" in hub.dataset("me/d").files("b")
+    hub.expired.add("hf_me")
+    assert main.main(["pull", "me/d", f"--root={tmp_path / 'my e'}", "--revision=b", "--episodes=1"]) == 2
+    command = capsys.readouterr().err.strip().splitlines()[-1].strip()
+    hub.expired.clear()
+    assert main.main(shlex.split(command)[1:]) == 0
+    assert (tmp_path / "my e" / "meta/info.json").is_file()
+
+
+def test_ctrl_c_ends_a_stalled_upload_at_once(hub: HubServer, lesson: Path) -> None:
+    gate = threading.Event()
+    hub.faults = [Fault("^PUT", times=-1, wait=gate)]
+    environment = {**os.environ, "HF_HUB_DISABLE_XET": "1"}
+    command = [sys.executable, "-m", "bhd_lerobot.cli.data.main", "push", str(lesson), "me/d", "--no-card"]
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    try:
+        until(lambda: hub.asked("^PUT"))
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate()
+    finally:
+        process.kill()
+        gate.set()
+    assert process.returncode == 130
+    assert f"Stopped; the dataset at {lesson} is unchanged" in error
+    assert f"bhd-data push {lesson} me/d --no_card" in error
+    assert "Traceback" not in error
+    assert list(hub.dataset("me/d").files()) == [".gitattributes"]
+
+
+# --- what uploads by itself
+
+
+def test_recording_uploads_by_the_same_code(hub: HubServer, tmp_path: Path, capsys) -> None:
+    root = tmp_path / "d"
+    short = {"dataset__repo_id": "me/avoid", "dataset__push_to_hub": "true", "dataset__num_episodes": 1}
+    _, said = run_record(root, **short, dataset__private="true", dataset__tags="[avoid]")
+    assert "me/avoid: 1 episodes" in said
+    assert hub.dataset("me/avoid").private
+    assert is_generated(text_of(hub, "me/avoid"))
+    hub.faults = [Fault("/preupload/", times=-1, status=403)]
+    assert record_module.main(record_options(tmp_path / "e", **short, seed=1)) == 2
+    error = capsys.readouterr().err
+    assert "no permission" in error
+    assert f"bhd-data push {tmp_path / 'e'} me/avoid" in error
+    assert len(dataset_info(tmp_path / "e").episodes) == 1
+
+
+def test_recording_does_not_begin_what_cannot_be_uploaded(hub: HubServer, tmp_path: Path, monkeypatch, capsys) -> None:
+    wanted = {"dataset__push_to_hub": "true", "dataset__num_episodes": 1}
+    assert record_module.main(record_options(tmp_path / "d", **wanted, dataset__repo_id="avoid")) == 2
+    assert "user/name" in capsys.readouterr().err
+    monkeypatch.delenv("HF_TOKEN")
+    assert record_module.main(record_options(tmp_path / "d", **wanted)) == 2
+    assert "no token" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_training_on_what_was_pulled_begins_with_the_same_loss(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
+    assert main.main(["push", str(lesson), "me/d"]) == 0
+    assert main.main(["pull", "me/d", f"--root={tmp_path / 'pulled'}"]) == 0
+    short = {"steps": 2, "log_freq": 1, "save_freq": 0, "save_checkpoint": "false"}
+    run_train(train_options(lesson, tmp_path / "one", MLP, **short))
+    run_train(train_options(tmp_path / "pulled", tmp_path / "two", MLP, **short))
+    # By name alone, downloaded by LeRobot.
+    run_train(train_options(None, tmp_path / "three", MLP, **short, dataset__repo_id="me/d"))  # type: ignore[arg-type]
+    wanted = curve(tmp_path / "one")
+    assert len(wanted) == 2
+    assert curve(tmp_path / "two") == curve(tmp_path / "three") == wanted
+
+
+def test_a_policy_that_cannot_be_uploaded_is_kept(hub: HubServer, lesson: Path, tmp_path: Path, monkeypatch) -> None:
+    short = {"steps": 1, "policy__push_to_hub": "true", "policy__repo_id": "me/brain"}
+    result, _ = run_train(train_options(lesson, tmp_path / "good", MLP, **short))
+    pushed = hub.repositories["models/me/brain"].files()
+    folder = result.checkpoint / "pretrained_model"  # type: ignore[operator]
+    for name in ("config.json", "model.safetensors", "bhd.json"):
+        assert pushed[name].content == (folder / name).read_bytes()
+    hub.faults = [Fault("/preupload/", times=-1, status=403)]
+    with pytest.raises(TransferError, match="no permission") as caught:
+        run_train(train_options(lesson, tmp_path / "bad", MLP, **short))
+    checkpoint = tmp_path / "bad/checkpoints/000001"
+    assert (checkpoint / "pretrained_model/model.safetensors").is_file()
+    assert f"The policy is complete at {checkpoint}" in str(caught.value)
+    assert f"hf upload me/brain {checkpoint}/pretrained_model ." in str(caught.value)
+    monkeypatch.delenv("HF_TOKEN")
+    with pytest.raises(TransferError, match="no token"):
+        run_train(train_options(lesson, tmp_path / "none", MLP, **short))
+    assert not (tmp_path / "none/checkpoints").exists()
+
+
+def test_streaming_gives_the_same_samples(hub: HubServer, recorded: Path, monkeypatch) -> None:
+    import datasets
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
+
+    assert main.main(["push", str(recorded), "me/avoid"]) == 0
+    monkeypatch.setattr(datasets.config, "HF_ENDPOINT", hub.url)
+    monkeypatch.setattr(datasets.config, "HF_HUB_OFFLINE", False)
+    deltas = {"action": [0.0, 0.1, 0.2]}
+    reference = LeRobotDataset("t/t", root=recorded, delta_timestamps=deltas)
+    for where in ({"repo_id": "me/avoid"}, {"repo_id": "t/t", "root": recorded}):
+        streamed = StreamingLeRobotDataset(**where, delta_timestamps=deltas, buffer_size=20, shuffle=False)  # type: ignore
+        seen = set()
+        for sample in streamed:
+            wanted = reference[int(sample["index"])]
+            assert set(sample) == set(wanted)
+            for key in ("observation.state", "action", "action_is_pad", "simulation.state"):
+                np.testing.assert_array_equal(np.asarray(sample[key]), np.asarray(wanted[key]), key)
+            seen.add(int(sample["index"]))
+        assert seen == set(range(len(reference)))
+    assert hub.asked(r"GET /datasets/me/avoid/resolve/.*\.parquet")
+    shutil.rmtree(Path(os.environ["HF_LEROBOT_HOME"]) / "hub", ignore_errors=True)
+
+
+def test_a_name_that_looks_like_a_folder_is_told(hub: HubServer, lesson: Path, empty: Path, capsys) -> None:
+    """`store/c3` may be meant as the folder beside this one; nothing in its form says which."""
+    (empty / "store").mkdir()
+    assert main.main(["push", str(lesson), "store/c3"]) == 2
+    error = capsys.readouterr().err
+    assert f"store/c3 is taken for a name on the Hub. The folder here would be file://{empty}/store/c3\n" in error
+    assert "no permission" in error
+    assert main.main(["push", str(lesson), f"file://{empty}/store/c3"]) == 0
+    assert main.main(["pull", "store/c3", "--root=x"]) == 2
+    assert "is taken for a name on the Hub" in capsys.readouterr().err
+    shutil.copytree(lesson, empty / "me" / "d")
+    assert main.main(["push", "me/d", "me/d"]) == 0  # the dataset itself: nobody means to copy it onto itself
+    assert "is taken for" not in capsys.readouterr().err
+
+
+def test_the_command_to_repeat_says_all_that_was_asked_for(tmp_path: Path) -> None:
+    parser = main._parser()
+    for words in (
+        "push A me/d --branch=b --tag=t --private --tags=a,b --licence=mit --no-card --replace-card --replace",
+        "push --root=A --repo_id=me/d --public",
+        "push A s3://b/d --verify --replace --no_card --storage_options={}",
+        "pull me/d --root=A --revision=r --episodes=0,2-4 --outcome=success --min_score=0.5 --replace",
+        "pull --repo_id=me/d --root=A",
+        "pull s3://b/d --root=A --verify --storage_options={}",
+        "pull me/d --root=A --min_score=0",
+    ):
+        asked = parser.parse_args(words.split())
+        source = asked.repo_id or (asked.places[1] if asked.command == "push" else asked.source)
+        places = {"root": "A"} if asked.command == "pull" else {}
+        line = repeat_line(asked, *([] if places else ["A"]), source, **places)
+        again = vars(parser.parse_args(shlex.split(line)[1:]))
+        ways = ("places", "root", "repo_id", "source")
+        assert {k: v for k, v in again.items() if k not in ways} == {
+            k: v for k, v in vars(asked).items() if k not in ways
+        }
+        assert again.get("places", [again.get("source"), again["root"]]) in (["A", source], [source, "A"])
+    assert repeat_line(parser.parse_args(["push", "--root=-x", "me/d"]), "-x", "me/d") == "bhd-data push ./-x me/d"
+
+
+def test_a_picture_of_the_users_is_on_the_card(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
+    mine = Path(shutil.copytree(lesson, tmp_path / "d"))
+    (mine / "preview.png").write_bytes(b"mine")
+    assert main.main(["push", str(mine), "me/d"]) == 0
+    assert hub.dataset("me/d").files()["preview.png"].content == b"mine"
+    assert "![A picture of the dataset](preview.png)" in text_of(hub, "me/d")
+    (mine / "preview.png").unlink()
+    hub.dataset("me/d").files().pop("README.md")
+    capsys.readouterr()
+    assert main.main(["push", str(mine), "me/d"]) == 0
+    assert "its preview.png was put there by somebody and is left as it is; --replace_card" in capsys.readouterr().out
+    assert main.main(["push", str(mine), "me/d", "--replace_card"]) == 0
+    assert hub.dataset("me/d").files()["preview.png"].content.startswith(b"\x89PNG")

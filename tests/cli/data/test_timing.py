@@ -1,0 +1,291 @@
+"""bhd-data timing: what it says of a recording on the wall clock, of one in simulated time, and of what is neither."""
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bhd_lerobot.bodies.body import Rates
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.control.timing import TimingStatistics
+from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.timing import report as timing_report
+from bhd_lerobot.datasets.timing.plots import draw_timing
+from bhd_lerobot.datasets.timing.tables import fitting, ms, ticks
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import ConfigError, DatasetError
+from tests.recording.support import data_columns, run_record
+
+RATES = Rates(500, 500, 25)
+FRAMES, LATE = 60, (17, 42)
+FEATURES = {key: {"dtype": dtype, "shape": (1,), "names": None} for key, (dtype, _) in keys.SCALARS.items()}
+GRANTS = [
+    {"name": "SCHED_FIFO", "wanted": "priority 80", "granted": True, "detail": "", "remedy": ""},
+    {"name": "mlockall", "wanted": "all", "granted": False, "detail": "refused", "remedy": "raise memlock [KiB]"},
+]
+
+
+def make_episode(seed):
+    """Return columns and summary of an episode on the wall clock, with as many late frames as LATE."""
+    rng = np.random.default_rng(seed)
+    per_frame, period = RATES.ticks_per_frame, 10**9 // RATES.control_hz
+    statistics = TimingStatistics(period)
+    lateness = rng.integers(10_000, 60_000, FRAMES * per_frame)
+    lateness[[frame * per_frame + 3 for frame in LATE]] = 1_500_000
+    for k, late in enumerate(lateness.tolist()):
+        statistics.add(k * period, k * period + late, k * period + late + 300_000)
+    columns = {key: np.zeros(FRAMES, dtype) for key, (dtype, _) in keys.SCALARS.items()}
+    columns[keys.TIME] = np.arange(FRAMES) / RATES.fps
+    columns[keys.AGE] = rng.uniform(0.001, 0.002, FRAMES).astype(np.float32)
+    columns[keys.LATENESS] = (lateness.reshape(FRAMES, -1).max(axis=1) / 1e9).astype(np.float32)
+    columns[keys.INFERENCE_TIME] = rng.uniform(0.005, 0.01, FRAMES).astype(np.float32)
+    measured = FrameTiming(columns[keys.TIME], columns[keys.AGE], columns[keys.LATENESS], columns[keys.SKIPPED])
+    columns[keys.LATE] = late_frames(measured, TimingTolerance(), RATES)
+    return columns, statistics.summary(
+        clock="realtime",
+        age=columns[keys.AGE],
+        inference_time=columns[keys.INFERENCE_TIME],
+        late=columns[keys.LATE],
+        drops=3,
+        tolerated=TimingTolerance().limits(RATES),
+    )
+
+
+def save(root, episodes, features=FEATURES):
+    with DatasetRecorder.create("t/t", RATES.fps, features, robot_type="ur5", root=root) as recorder:
+        for columns, metadata in episodes:
+            writer = recorder.begin_episode()
+            writer.set_columns({key: columns[key] for key in features})
+            recorder.save(writer, task="x", metadata=metadata)
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    root = tmp_path_factory.mktemp("timing") / "measured"
+    episodes = []
+    for seed in range(3):
+        columns, summary = make_episode(seed)
+        grants = GRANTS if seed < 2 else GRANTS[:1]
+        episodes.append((columns, {"timing": json.dumps(asdict(summary)), "realtime": json.dumps(grants)}))
+    save(root, episodes)
+    return root
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    root = tmp_path_factory.mktemp("timing") / "simulated"
+    run_record(root, seed=4)
+    return root
+
+
+# --- in lockstep -----------------------------------------------------------------------------------------------------
+
+
+def test_in_lockstep_the_tolerance_has_no_effect(simulated, tmp_path):
+    """A scan is up to 0.2 s old here, and still no frame is late, no episode is bad and no byte is another one."""
+    strict = {"timing__max_age_s": 1e-6, "timing__max_late_frames": 0.0, "timing__reject": "true"}
+    result, _ = run_record(tmp_path / "strict", seed=4, **strict)
+    assert result.recorded == 3
+    columns = data_columns(tmp_path / "strict")
+    assert max(columns[keys.AGE]) > 0.01
+    for key in keys.PUNCTUALITY:
+        assert not any(columns[key])
+    assert columns == data_columns(simulated)
+
+
+def test_a_tolerance_in_the_configuration_is_checked(tmp_path):
+    with pytest.raises(ConfigError, match=r"timing\.max_late_frames is 2"):
+        run_record(tmp_path / "d", timing__max_late_frames=2)
+
+
+# --- the report ------------------------------------------------------------------------------------------------------
+
+
+def test_all_episodes_together_are_sums_maxima_and_bounds(measured):
+    report = timing_report.load_timing(measured)
+    parts, total = [one.summary for one in report.episodes], report.total.summary
+    for name in ("ticks", "skipped", "overruns", "frames", "late_frames", "drops"):
+        assert getattr(total, name) == sum(getattr(one, name) for one in parts)
+    for name in ("lateness_p99", "lateness_max", "duration_p50", "age_max", "inference_max"):
+        assert getattr(total, name) == max(getattr(one, name) for one in parts)
+    assert len(report.total.intervals) == 3 * (FRAMES - 1)  # from one episode to the next there is none
+    assert total.tolerated == parts[0].tolerated
+
+
+def test_of_rate_errors_the_largest_is_shown_with_its_sign(measured):
+    report = timing_report.load_timing(measured)
+    errors = (0.5, -2.0, 1.0)
+    pairs = zip(report.episodes, errors, strict=True)
+    episodes = tuple(replace(one, summary=replace(one.summary, rate_error=error)) for one, error in pairs)
+    assert replace(report, episodes=episodes).total.summary.rate_error == -2.0
+
+
+def test_limits_that_differ_are_not_shown_as_one(measured):
+    report = timing_report.load_timing(measured)
+    first, *rest = report.episodes
+    other = replace(first, summary=replace(first.summary, tolerated={"lateness": 1.0}))
+    assert replace(report, episodes=(other, *rest)).total.summary.tolerated == {}
+
+
+def test_the_tables_hold_what_was_measured(measured, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "170")
+    picture = tmp_path / "new" / "t.png"
+    assert main.main(["timing", str(measured), "--output", str(picture)]) == 0
+    text = capsys.readouterr().out
+    for part in ("wall clock", "3600 run", "6 of 180 (3.3%)", "max 1.50 ms", "tolerated 1.00 ms", "9 frames or states"):
+        assert part in text
+    for part in ("granted, episodes 0-1", "granted, episode 2", "raise memlock [KiB]", "lateness [ms]", "rate"):
+        assert part in text
+    assert str(picture) in text.replace("\n", "")
+    assert min(Image.open(picture).size) > 500
+
+
+@pytest.mark.parametrize("width", [20, 80, 100, 170])
+def test_a_narrow_terminal_gets_fewer_columns_and_none_cut_off(measured, tmp_path, capsys, monkeypatch, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    assert main.main(["timing", str(measured), "--output", str(tmp_path / "t.svg")]) == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= max(width, len(str(tmp_path)) + 20)
+    assert ("inference [ms]" in text) == (width >= 170)
+    if width >= 80:
+        assert "…" not in text[text.index("Episodes") : text.index("granted")]
+
+
+def test_one_episode(measured, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    assert main.main(["timing", str(measured), "--episode", "1"]) == 0
+    text = capsys.readouterr().out
+    assert "episode 1" in text
+    assert "2 of 60" in text
+    assert (tmp_path / "outputs" / "timing" / "measured_episode_000001.png").exists()
+
+
+def test_json_holds_everything_and_draws_only_if_asked(measured, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main.main(["timing", str(measured), "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert [one["index"] for one in values["episodes"]] == [0, 1, 2]
+    assert values["clock"] == "realtime"
+    assert values["all"]["late_frames"] == 6
+    assert values["episodes"][1]["realtime"] == GRANTS
+    assert values["episodes"][0]["interval"]["max"] == pytest.approx(1 / RATES.fps)
+    assert list(tmp_path.iterdir()) == []
+    assert main.main(["timing", str(measured), "--json", "--output", "t.pdf"]) == 0
+    json.loads(capsys.readouterr().out)
+    assert (tmp_path / "t.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_simulated_recording_says_so(simulated, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert main.main(["timing", str(simulated), "--output", str(tmp_path / "t.png")]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Time was simulated" in text
+    assert "frame interval" in text
+    for part in ("late frames", "granted", "rate error"):
+        assert part not in text
+    assert np.asarray(Image.open(tmp_path / "t.png")).std() > 1
+
+
+def test_info_tells_the_timing_where_there_is_room(measured, simulated, capsys, monkeypatch):
+    for width, seen in ((80, ("late frames", "skipped")), (170, ("late frames", "late p99", "drops", "age max"))):
+        monkeypatch.setenv("COLUMNS", str(width))
+        assert main.main(["info", str(measured)]) == 0
+        text = capsys.readouterr().out
+        assert "wall-clock time: 6 of 180 frames" in text
+        assert all(part in text for part in seen)
+    assert main.main(["info", str(simulated)]) == 0
+    assert "simulated time" in capsys.readouterr().out
+
+
+# --- datasets of before, and of others -------------------------------------------------------------------------------
+
+
+def test_a_dataset_from_before_these_columns_loads(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "170")
+    columns, _ = make_episode(0)
+    old = {"ticks": 1200, "overruns": 0, "lateness_p50": 0.0, "lateness_p99": 0.0, "lateness_max": 0.0}
+    old["duration_max"] = 0.0
+    features = {k: v for k, v in FEATURES.items() if k not in (keys.SKIPPED, keys.INFERENCE_TIME, keys.LATE)}
+    columns[keys.LATENESS][:] = 0
+    save(tmp_path / "old", [(columns, {"timing": json.dumps(old)})], features)
+    assert main.main(["info", str(tmp_path / "old")]) == 0
+    assert "late frames" in capsys.readouterr().out
+    assert main.main(["timing", str(tmp_path / "old"), "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert (values["clock"], values["all"]["frames"], values["all"]["late_frames"]) == ("lockstep", FRAMES, 0)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "words"),
+    [
+        ({"other": "x"}, "says nothing about its timing"),
+        ({"timing": "{"}, "not JSON"),
+        ({"timing": '{"overruns": 0}'}, "not complete"),
+        ({"timing": "[]"}, "not complete"),
+    ],
+)
+def test_what_holds_no_timing_is_named(tmp_path, metadata, words):
+    columns, _ = make_episode(0)
+    save(tmp_path / "d", [(columns, metadata)])
+    with pytest.raises(DatasetError, match=words):
+        timing_report.load_timing(tmp_path / "d")
+
+
+def test_a_dataset_of_another_program(tmp_path, capsys):
+    feature = {"x": {"dtype": "float32", "shape": (1,), "names": None}}
+    save(tmp_path / "d", [({"x": np.zeros(5, np.float32)}, {})], feature)
+    assert main.main(["info", str(tmp_path / "d")]) == 0
+    capsys.readouterr()
+    assert main.main(["timing", str(tmp_path / "d")]) == 2
+    assert "another program recorded it" in capsys.readouterr().err
+
+
+def test_bad_arguments_are_named_and_nothing_is_written(measured, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("not a dataset")
+    (tmp_path / "folder").mkdir()
+    save(tmp_path / "empty", [])
+    before = sorted(tmp_path.rglob("*"))
+    for arguments, words in (
+        (["none"], "does not exist"),
+        (["file"], "file is not a LeRobot dataset"),
+        (["folder"], "has no meta/info.json"),
+        (["empty"], "holds no episode yet"),
+        (["empty", "--episode", "0"], "no episode 0"),
+        ([str(measured), "--episode", "3"], "no episode 3 in"),
+        ([str(measured), "--episode", "-1"], "from 0 to 2"),
+        ([str(measured), "--output", "t.txt"], ".png, .pdf, .svg"),
+        ([str(measured), "--output", "file/t.png"], "cannot be written"),
+    ):
+        assert main.main(["timing", *arguments]) == 2
+        assert words in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+    for arguments in ([], ["d", "--episode", "one"]):
+        with pytest.raises(SystemExit) as stop:
+            main.main(["timing", *arguments])
+        assert stop.value.code == 2
+
+
+# --- the picture, and words ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 5000])
+def test_episodes_of_any_length_are_drawn(measured, tmp_path, frames):
+    report = timing_report.load_timing(measured, 0)
+    (one,) = report.episodes
+    columns = {key: np.resize(column, frames) for key, column in one.columns.items()}
+    columns[keys.TIME] = np.arange(frames) / RATES.fps
+    changed = replace(one, columns=columns, intervals=np.diff(columns[keys.TIME]))
+    draw_timing(replace(report, episodes=(changed,)), tmp_path / "t.png")
+    assert np.asarray(Image.open(tmp_path / "t.png")).std() > 1
+
+
+def test_small_words():
+    assert [ms(seconds) for seconds in (0, 0.00999, 0.009999, 0.1234, 2)] == ["0.00", "9.99", "10.0", "123", "2000"]
+    assert [ticks(number) for number in (-0.001, 0.3, -2)] == ["+0.00", "+0.30", "-2.00"]
+    columns = [("ab\nabc", ["1"]), ("d", ["12345"])]
+    assert [len(fitting(columns, width)) for width in (6, 7, 14, 15)] == [0, 1, 1, 2]

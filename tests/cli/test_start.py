@@ -1,0 +1,147 @@
+"""Ctrl-C in the first seconds of a command, while Python imports what it needs."""
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from bhd_lerobot.cli import start
+from bhd_lerobot.cli.data import main
+
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]
+STARTS = {"bhd-eval": start.evaluate}  # the others have the names of their commands
+
+
+def started(folder: Path, program: str, *, ignored: bool = False) -> subprocess.CompletedProcess:
+    """Run a module that interrupts itself as the console scripts run ours."""
+    (folder / "slow.py").write_text(program)
+    how = "signal.SIG_IGN" if ignored else "signal.default_int_handler"
+    command = f"import signal, sys; signal.signal(signal.SIGINT, {how}); import bhd_lerobot.cli.start as s; "
+    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    return subprocess.run(
+        [sys.executable, "-c", command + "sys.exit(s.run('slow'))"],
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        f"try:\n    {INTERRUPT.replace(chr(10), chr(10) + '    ')}pass\nexcept BaseException:\n    pass\n",
+        f"{INTERRUPT}raise AssertionError('it went on')\n",
+    ],
+    ids=["in a library that catches everything", "in an import"],
+)
+def test_ctrl_c_during_an_import_is_a_line_and_status_130(tmp_path: Path, program: str) -> None:
+    done = started(tmp_path, program + "def main():\n    raise AssertionError('it went on')\n")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (130, "", 1)
+    assert done.stderr.startswith("Stopped before it began")
+
+
+def test_ctrl_c_afterwards_is_minded_by_the_program_or_else_a_line(tmp_path: Path) -> None:
+    own = f"def main():\n    try:\n        {INTERRUPT.replace(chr(10), chr(10) + '        ')}pass\n"
+    done = started(tmp_path, own + "    except KeyboardInterrupt:\n        return 7\n")
+    assert (done.returncode, done.stderr) == (7, "")
+    done = started(tmp_path, f"def main():\n    {INTERRUPT.replace(chr(10), chr(10) + '    ')}return 0\n")
+    assert (done.returncode, done.stderr) == (130, "Stopped.\n")
+
+
+def test_ctrl_c_while_the_process_ends_is_no_traceback(tmp_path: Path) -> None:
+    at_exit = "import atexit, os, signal\natexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
+    done = started(tmp_path, f"{at_exit}def main():\n    print('done', flush=True)\n    return 0\n")
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "done\n", "")
+
+
+def test_where_ctrl_c_is_ignored_it_stays_ignored(tmp_path: Path) -> None:
+    done = started(tmp_path, f"{INTERRUPT}def main():\n    return 5\n", ignored=True)
+    assert (done.returncode, done.stderr) == (5, "")
+
+
+def test_threads_that_wait_sleep_unless_somebody_said_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = "import os\nsaid = os.environ['OMP_WAIT_POLICY']\ndef main():\n    print(said)\n    return 0\n"
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    assert started(tmp_path, program).stdout == "PASSIVE\n"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    assert started(tmp_path, program).stdout == "ACTIVE\n"
+
+
+@pytest.mark.parametrize("script", sorted(SCRIPTS))
+def test_every_command_begins_this_way(script: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    begin = STARTS.get(script) or getattr(start, script.removeprefix("bhd-"))
+    begun: list[str] = []
+    monkeypatch.setattr(start, "run", lambda module: begun.append(module) or 3)
+    assert begin() == 3
+    (module,) = begun
+    assert callable(importlib.import_module(module).main)
+    assert SCRIPTS[script] == f"bhd_lerobot.cli.start:{begin.__name__}"
+
+
+@pytest.mark.parametrize(
+    ("program", "slow"),
+    [
+        ("import bhd_lerobot.cli.start, bhd_lerobot.cli.data.main", "numpy torch lerobot rich yaml pyarrow mujoco"),
+        ("import bhd_lerobot.cli.data.main as d; d._parser()", "torch lerobot pandas mujoco pinocchio matplotlib ray"),
+    ],
+    ids=["before Ctrl-C is minded", "for the help"],
+)
+def test_nothing_slow_is_imported(program: str, slow: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", f"{program}; import sys; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+    )
+    loaded = {name.partition(".")[0] for name in done.stdout.split()}
+    assert not loaded & {*slow.split(), "huggingface_hub"}
+
+
+def test_the_handler_before_comes_back() -> None:
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with start.leaving_on_interrupt():
+            assert signal.getsignal(signal.SIGINT) is start._leave
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        with pytest.raises(SystemExit):
+            main.main(["--help"])
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, former)
+
+
+@pytest.mark.parametrize("command", ["bhd-record", "bhd-replay", "bhd-data"])
+def test_help_that_nobody_reads_to_its_end_ends_without_a_word(command: str) -> None:
+    """As of ``--help | head``; bhd-data has tests of its other output."""
+    module, _, function = SCRIPTS[command].partition(":")
+    program = f"import sys; sys.argv = [{command!r}, '--help']; import {module} as m; sys.exit(m.{function}())"
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdout=writing,
+            stderr=subprocess.PIPE,
+            stdin=subprocess.DEVNULL,
+            check=False,
+        )
+    finally:
+        os.close(writing)
+    assert done.returncode in (0, 128 + signal.SIGPIPE)
+    assert b"Traceback" not in done.stderr

@@ -1,0 +1,100 @@
+"""What a cluster cannot do is refused before there is a dataset, with the remedy."""
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+from importlib import metadata
+from types import SimpleNamespace
+
+import pytest
+
+from bhd_lerobot.cluster import cluster as cluster_module
+from bhd_lerobot.cluster import config, remote
+from bhd_lerobot.cluster.config import RayConfig
+from bhd_lerobot.errors import ClusterError, ConfigError
+from tests.recording.support import run_record
+
+
+def test_a_machine_without_our_package_can_say_so(tmp_path):
+    cloudpickle = pytest.importorskip("ray.cloudpickle")
+    cloudpickle.register_pickle_by_value(remote)
+    try:
+        (tmp_path / "worker").write_bytes(cloudpickle.dumps(remote.RemoteWorker))
+    finally:
+        cloudpickle.unregister_pickle_by_value(remote)
+    program = (
+        "import sys; sys.modules['bhd_lerobot'] = None\n"
+        "import importlib.util, pickle; importlib.util.find_spec = lambda name: None\n"
+        "worker = pickle.load(open(sys.argv[1], 'rb'))()\n"
+        "print(worker.describe(('numpy', 'no_such_package'))['facts'])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "worker")], capture_output=True, text=True, check=True
+    )
+    facts = eval(done.stdout)  # what was printed by the line above
+    assert facts["numpy"] == metadata.version("numpy")
+    assert facts["no_such_package"] == facts["source of bhd_lerobot"] == "not installed"
+
+
+def test_options_that_a_cluster_cannot_honour_are_refused(tmp_path):
+    pytest.importorskip("ray")
+    for wrong, message in (
+        ({"robot__clock": "realtime"}, "robot.clock is 'realtime'"),
+        ({"estop_key": "true"}, "estop_key is true"),
+        ({"engine": "dask"}, "Unknown engine 'dask'"),
+        ({"engine": "local", "ray__num_workers": 2}, "engine is 'local'"),
+        ({"ray__address": "ray://head:10001"}, "Ray's client"),
+        ({"ray__address": "head"}, "host:port"),
+        ({"ray__address": "head:123456"}, "host:port"),
+        ({"ray__num_workers": 0}, "ray.num_workers is 0"),
+        ({"ray__gpus_per_worker": 1.5}, "ray.gpus_per_worker is 1.5"),
+        ({"ray__timeout_s": 0}, "ray.timeout_s is 0"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            run_record(tmp_path / "data", **{"engine": "ray", **wrong})
+    assert not (tmp_path / "data").exists()
+
+
+def test_without_ray_the_command_to_install_it_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(config, "importlib", SimpleNamespace(util=SimpleNamespace(find_spec=lambda _: None)))
+    with pytest.raises(ConfigError, match=r"pip install -e '\.\[ray\]'"):
+        run_record(tmp_path / "data", engine="ray")
+
+
+def test_a_cluster_that_is_not_there_is_told_soon(tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.setattr(cluster_module, "_KNOCK_S", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as mute, socket.create_server(("127.0.0.1", 0)) as other:
+
+        def answer() -> None:
+            connection, _ = other.accept()
+            with connection:
+                connection.recv(100)
+                connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+
+        threading.Thread(target=answer, daemon=True).start()
+        with socket.create_server(("127.0.0.1", 0)) as closed:
+            nobody = closed.getsockname()[1]
+        for address, message in (
+            (f"127.0.0.1:{nobody}", "cannot be reached"),
+            (f"127.0.0.1:{mute.getsockname()[1]}", "does not answer"),
+            (f"127.0.0.1:{other.getsockname()[1]}", "is no Ray cluster"),
+            ("no-such-host.invalid:6379", "cannot be reached"),
+        ):
+            with pytest.raises(ClusterError, match=message) as error:
+                run_record(tmp_path / "data", engine="ray", ray__address=address)
+            assert address in str(error.value)
+            assert "ray start --head" in str(error.value)
+    assert not (tmp_path / "data").exists()
+
+
+def test_workers_that_share_the_processors_of_this_machine_are_told(monkeypatch):
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(cluster_module, "free_places", lambda config: 99)  # Ray was told that there are as many
+    there = len(os.sched_getaffinity(0))
+    told = cluster_module.tell_crowd(RayConfig(num_workers=there + 3), there + 3)
+    assert told == f"{there + 3} workers of 1 CPU share the {there} processors of this machine."
+    assert cluster_module.tell_crowd(RayConfig(num_workers=there), there) == ""
+    assert cluster_module.tell_crowd(RayConfig(address="auto"), there + 3) == ""

@@ -1,0 +1,248 @@
+"""The impedance controller in the modes of the cerebellum, on joints that do not move."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.control.arm.compliance import Compliance
+from bhd_lerobot.control.arm.impedance import ImpedanceController
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Setpoint
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.errors import ConfigError
+
+Array = NDArray[np.float64]
+ARM = ur5(actuation="torque")
+HZ = 500
+EFFORT = np.array(ARM.limits.effort[:6])
+HOME = np.array(ARM.home)
+ALL = np.ones(1, np.bool_)
+
+
+class StuckPlant:
+    """Joints that stay where they are put, whatever the motors do."""
+
+    n = 1
+
+    def __init__(self) -> None:
+        self.position, self.velocity, self.fault = HOME.copy(), np.zeros(7), False
+        self.written: list[Array] = []
+
+    def read(self, out: PlantReading) -> None:
+        out.position[0], out.velocity[0], out.fault[0] = self.position, self.velocity, self.fault
+
+    def write(self, ctrl: Array) -> None:
+        self.written.append(ctrl[0].copy())
+
+
+class StuckRig:
+    def __init__(self) -> None:
+        self.plant = StuckPlant()
+        self.controller = ImpedanceController(ARM, 1, HZ, 20)
+        self.cerebellum = Cerebellum(ARM, self.plant, HZ, controller=self.controller)
+        self.ticks = self.sequence = 0
+        for request in (Request.CONFIGURE, Request.ACTIVATE):
+            assert self.cerebellum.request(request).accepted.all()
+        self.target = self.controller.command.copy()
+
+    @property
+    def now(self) -> int:
+        return self.ticks * 1_000_000_000 // HZ
+
+    @property
+    def mode(self) -> Mode:
+        return Mode(int(self.cerebellum.mode[0]))
+
+    def tick(self, count: int = 1) -> None:
+        for _ in range(count):
+            self.cerebellum.tick(self.now)
+            self.ticks += 1
+
+    def send(self, frames: int = 1) -> None:
+        for _ in range(frames):
+            self.sequence += 1
+            sent = self.cerebellum.offer(Setpoint(self.sequence, self.now, self.target))
+            assert sent.reasons.tolist() == [Reason.ACCEPTED]
+            self.tick(20)
+
+
+def test_the_command_is_the_pose_and_the_opening() -> None:
+    rig = StuckRig()
+    rig.tick()
+    state = rig.cerebellum.state(rig.now)
+    assert state.command.shape == (1, 8)
+    np.testing.assert_allclose(state.measured, state.command, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(state.command[:, 3:7]), 1.0)
+    assert state.command[0, 7] == MAX_OPENING
+    weight = rig.controller.dynamics.terms(HOME[None, :6], np.zeros((1, 6))).gravity
+    np.testing.assert_allclose(state.joint_efforts[:, :6], weight, atol=1e-9)
+
+
+def test_a_wrench_needs_setpoints_and_ends_with_them() -> None:
+    rig = StuckRig()
+    rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
+    rig.tick(100)
+    assert not rig.controller.wrench.any()
+    rig.send(10)
+    assert rig.controller.wrench[0, 0] == 10
+    rig.tick(150)  # no more setpoints
+    assert rig.mode == Mode.HOLD
+    assert not rig.controller.wrench.any()
+    rig.send(10)
+    assert not rig.controller.wrench.any()  # it has to be asked for again
+
+
+def test_a_hard_stop_ends_a_wrench_at_once() -> None:
+    rig = StuckRig()
+    rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
+    rig.send(10)
+    assert rig.controller.wrench[0, 0] == 10
+    rig.cerebellum.estop_word[0] = 1
+    rig.tick()
+    assert not rig.controller.wrench.any()
+
+
+def test_without_spring_and_damper_the_motors_carry_the_arms_own_dynamics() -> None:
+    rig = StuckRig()
+    rig.controller.set_compliance(Compliance(np.zeros(6), damping=np.zeros(6)))
+    rig.plant.velocity[:6] = (0.5, -1.0, 1.5, 1.0, -1.0, 2.0)
+    rig.tick(100)
+    speeds = rig.plant.velocity[None, :6]
+    terms = rig.controller.dynamics.terms(HOME[None, :6], speeds)
+    own = terms.coriolis[0] @ speeds[0] + terms.gravity[0]
+    assert np.abs(terms.coriolis[0] @ speeds[0]).max() > 0.1
+    np.testing.assert_allclose(rig.plant.written[-1][:6], own - 0.01 * EFFORT * speeds[0], atol=1e-9)
+
+
+def test_a_wrench_comes_and_goes_gradually() -> None:
+    rig = StuckRig()
+    rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
+    values = []
+    for _ in range(10):
+        rig.sequence += 1
+        rig.cerebellum.offer(Setpoint(rig.sequence, rig.now, rig.target))
+        for _ in range(20):
+            rig.tick()
+            values.append(rig.controller.wrench[0, 0])
+    assert np.diff(values).max() <= 100 / HZ + 1e-9
+
+
+@pytest.mark.parametrize("wrench", [(1.0, 2.0), (np.nan, 0, 0, 0, 0, 0), (100.0, 0, 0, 0, 0, 0), (0, 0, 0, 0, 0, 20.0)])
+def test_an_impossible_wrench_is_refused(wrench: tuple[float, ...]) -> None:
+    with pytest.raises(ConfigError, match="wrench"):
+        StuckRig().controller.set_wrench(wrench)
+
+
+def test_motors_are_never_asked_for_more_than_they_have_nor_for_jumps() -> None:
+    rig = StuckRig()
+    rig.controller.set_compliance(Compliance((5000.0,) * 3 + (300.0,) * 3, max_force=5000.0, max_moment=1000.0))
+    rig.target[0, :3] += 1.0
+    rig.send(100)
+    torque = np.array(rig.plant.written)[:, :6]
+    assert (np.abs(torque) <= EFFORT).all()
+    assert (np.abs(np.diff(torque, axis=0)) <= EFFORT / 50 + 1e-9).all()
+    assert (np.abs(torque[-1]) == EFFORT).any()
+    assert rig.cerebellum.take_flags()[0][0] & Limit.EFFORT
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-3, 1e200])
+def test_a_quaternion_that_is_none_stops_the_arm(value: float) -> None:
+    rig = StuckRig()
+    rig.target[0, 3:7] = (value, 0, 0, 0)
+    rig.send()
+    assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
+    assert np.isfinite(rig.plant.written).all()
+    np.testing.assert_allclose(rig.controller.command[0, :3], rig.controller.measured(rig.cerebellum.reading)[0, :3])
+
+
+def test_places_beyond_any_reach_are_clipped() -> None:
+    rig = StuckRig()
+    rig.target[0, 0], rig.target[0, 7] = 1e300, 1.0
+    rig.send(100)
+    assert rig.cerebellum.take_flags()[0][0] & Limit.POSITION
+    assert rig.controller.command[0, 7] == pytest.approx(MAX_OPENING)
+    assert np.isfinite(rig.controller.command).all()
+
+
+def test_values_that_are_no_numbers_stop_the_arm() -> None:
+    rig = StuckRig()
+    rig.controller.head_for(np.full((1, 8), np.nan), ALL)
+    rig.tick()
+    assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
+    assert np.isfinite(rig.plant.written[-1]).all()
+
+
+def test_a_broken_encoder_is_a_fault_and_does_not_spread() -> None:
+    rig = StuckRig()
+    rig.send(5)
+    rig.plant.position[2] = np.nan
+    rig.tick(100)
+    assert rig.mode == Mode.FAULT
+    assert np.isfinite(rig.plant.written).all()
+
+
+@pytest.mark.parametrize("cause", [Mode.ESTOP, Mode.FAULT], ids=lambda mode: mode.name)
+def test_a_hard_stop_holds_where_the_tool_is_and_soft_ones_what_was_commanded(cause: Mode) -> None:
+    rig = StuckRig()
+    measured = rig.controller.measured(rig.cerebellum.reading)
+    rig.target[0, 2] += 0.1
+    rig.send(50)  # the plant is stuck: the equilibrium is 0.1 m away from the tool
+    commanded = rig.controller.command.copy()
+    rig.tick(200)
+    assert rig.mode == Mode.HOLD
+    np.testing.assert_allclose(rig.controller.command, commanded, atol=1e-5)
+    if cause == Mode.ESTOP:
+        rig.cerebellum.estop_word[0] = 1
+    else:
+        rig.plant.fault = True
+    rig.tick()
+    assert rig.mode == cause
+    np.testing.assert_allclose(rig.controller.command, measured, atol=1e-9)
+    # Pressed again and again it stays the same stop, even if the arm is pushed away.
+    rig.plant.position[0] += 0.1
+    rig.controller.stop(ALL, cause)
+    rig.tick()
+    np.testing.assert_allclose(rig.controller.command, measured, atol=1e-9)
+
+
+def test_a_hard_stop_is_over_when_the_joints_are_still() -> None:
+    rig = StuckRig()
+    rig.send(5)
+    rig.plant.velocity[0] = 0.2
+    rig.cerebellum.estop_word[0] = 1
+    rig.tick(5)
+    assert rig.cerebellum.request(Request.RESET).reasons.tolist() == [Reason.NOT_AT_REST]
+    rig.plant.velocity[0] = 0.0
+    rig.tick(5)
+    assert rig.cerebellum.request(Request.RESET).accepted.all()
+
+
+def test_a_deactivation_brakes_and_ends_in_safe_off() -> None:
+    rig = StuckRig()
+    rig.target[0, 2] += 0.1
+    rig.send(5)
+    assert rig.cerebellum.request(Request.DEACTIVATE).accepted.all()
+    rig.tick(300)
+    assert rig.mode == Mode.SAFE_OFF
+
+
+def test_a_restart_forgets_the_episode_before() -> None:
+    rig = StuckRig()
+    rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
+    rig.target[0, 2] += 0.1
+    rig.send(10)
+    rig.cerebellum.restart(np.array([0]))
+    assert rig.controller.contact.wrench.tolist() == [[0] * 6]
+    rig.tick(50)  # not configured: it stays where it is
+    np.testing.assert_allclose(rig.controller.command, rig.controller.measured(rig.cerebellum.reading), atol=1e-9)
+    assert not rig.controller.wrench.any()
+
+
+def test_a_position_servo_is_refused() -> None:
+    with pytest.raises(ConfigError, match="actuation"):
+        ImpedanceController(ur5(), 1, HZ, 20)
+    with pytest.raises(ConfigError, match="actuation"):
+        ImpedanceController(replace(ARM, actuation="position"), 1, HZ, 20)

@@ -1,0 +1,587 @@
+"""The state machine of goals, edge by edge, and every way in which a goal can end."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.control.commands import GoalPhase, ResultCode
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.motion.goals import GoalManager
+from bhd_lerobot.control.motion.planner import GoalPlanner
+from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, joints, moved
+
+FAR = joints(2.0)
+NEAR = joints(0.2)
+
+
+def started(n: int = 1, ticks: int = 100, **fields: Any) -> Rig:
+    """Return a rig in the middle of the motion of a goal "a"."""
+    rig = Rig(n)
+    for sim in range(n):
+        assert rig.go("a", sim, **(fields or {"joint_target": FAR})) is None
+    rig.tick(ticks)
+    return rig
+
+
+def at_rest(rig: Rig) -> bool:
+    return not rig.velocity.any() and not rig.acceleration.any()
+
+
+# --- the edges -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"joint_target": FAR},
+        {"target_pose": moved(0.1, 0.1, 0.1)},
+        {"target_pose": moved(0.1, 0.1, 0.1), "motion": "line"},
+        {"gripper": 0.0},
+        {"joint_target": NEAR, "gripper": 0.03},
+    ],
+)
+def test_a_goal_from_idle_to_idle(fields: dict[str, Any]) -> None:
+    rig = Rig()
+    assert rig.phase == GoalPhase.IDLE
+    assert rig.go("a", **fields) is None
+    assert rig.phase == GoalPhase.CONVERTING
+    assert rig.manager.busy.all()
+    assert not rig.manager.following.any()
+    rig.tick()
+    assert rig.phase == GoalPhase.EXECUTING  # in lockstep, conversion takes no time
+    assert rig.manager.following.all()
+    rig.run()
+    assert rig.phase == GoalPhase.IDLE
+    assert rig.results() == [("a", ResultCode.SUCCEEDED)]
+    assert rig.results() == []
+    assert not rig.manager.following.any()
+
+
+def test_goals_that_wait_follow_in_order() -> None:
+    rig = Rig()
+    for name, target in (("a", 0.1), ("b", 0.2), ("c", 0.3)):
+        assert rig.go(name, joint_target=joints(target)) is None
+    rig.run()
+    assert rig.results() == [(name, ResultCode.SUCCEEDED) for name in "abc"]
+    assert rig.position[0, :6].tolist() == list(joints(0.3))
+
+
+def test_feedback_counts_down() -> None:
+    rig = Rig()
+    assert rig.manager.feedback(0) is None
+    rig.go("a", joint_target=FAR)
+    rig.go("b", joint_target=NEAR)
+    waiting = rig.manager.feedback(0)
+    assert waiting is not None
+    assert (waiting.task_id, waiting.phase, waiting.progress) == ("a", GoalPhase.CONVERTING, 0.0)
+    last, left = -1.0, np.inf
+    rig.tick()
+    while rig.manager.feedback(0).task_id == "a":  # type: ignore[union-attr]
+        now = rig.manager.feedback(0)
+        assert now is not None
+        assert now.phase == GoalPhase.EXECUTING
+        assert last <= now.progress <= 1.0
+        assert now.remaining_s <= left
+        last, left = now.progress, now.remaining_s
+        rig.tick()
+    assert last == 1.0
+    assert left == 0.0
+
+
+# --- cancel ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_goal_that_is_cancelled_ends_when_the_arm_has_come_to_rest() -> None:
+    rig = started()
+    assert rig.manager.cancel(0, "a") == ResultCode.SUCCEEDED
+    assert rig.manager.cancel(0, "a") == ResultCode.SUCCEEDED
+    rig.tick()
+    assert rig.results() == []
+    assert rig.phase == GoalPhase.EXECUTING
+    rig.run()
+    assert at_rest(rig)
+    assert rig.results() == [("a", ResultCode.CANCELLED)]
+    assert rig.phase == GoalPhase.IDLE
+    assert HOME[0] < rig.position[0, 0] < FAR[0]
+    assert rig.manager.cancel(0, "a") == ResultCode.UNKNOWN_ID
+
+
+def test_a_goal_that_waits_is_cancelled_at_once() -> None:
+    rig = started()
+    rig.go("b", joint_target=NEAR)
+    assert rig.manager.cancel(0, "b") == ResultCode.SUCCEEDED
+    assert rig.results() == [("b", ResultCode.CANCELLED)]
+    rig.run()
+    assert rig.results() == [("a", ResultCode.SUCCEEDED)]
+    assert rig.manager.cancel(0, "never") == ResultCode.UNKNOWN_ID
+    rig.go("c", joint_target=FAR)
+    rig.manager.cancel(0, "c")
+    assert rig.phase == GoalPhase.IDLE
+    assert not rig.manager.busy.any()
+
+
+def test_after_a_cancelled_goal_the_next_one_follows_from_rest() -> None:
+    rig = started()
+    rig.go("b", joint_target=NEAR)
+    rig.manager.cancel(0, "a")
+    rig.run()
+    assert rig.results() == [("a", ResultCode.CANCELLED), ("b", ResultCode.SUCCEEDED)]
+
+
+def test_a_goal_that_settles_is_cancelled_where_it_stands() -> None:
+    rig = Rig()
+    rig.disturb = lambda r: r.measured_position.__iadd__(0.01)
+    rig.go("a", joint_target=NEAR)
+    while rig.manager.feedback(0) is None or rig.manager.feedback(0).remaining_s > 0 or not rig.manager.following.any():  # type: ignore[union-attr]
+        rig.tick()
+    rig.manager.cancel(0, "a")
+    rig.tick()
+    assert rig.results() == [("a", ResultCode.CANCELLED)]
+    assert not rig.manager.busy.any()
+
+
+def test_a_goal_that_preempts_and_is_cancelled_at_once_leaves_no_motion_behind() -> None:
+    rig = started()
+    rig.go("b", joint_target=NEAR, preempt=True)
+    rig.manager.cancel(0, "b")
+    rig.run()
+    assert rig.results() == [("a", ResultCode.PREEMPTED), ("b", ResultCode.CANCELLED)]
+    assert at_rest(rig)
+    assert rig.position[0, 0] < FAR[0]
+
+
+# --- preempt ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fields", [{"joint_target": NEAR}, {"target_pose": moved(0.1, 0.1)}, {"gripper": 0.04}])
+def test_a_goal_that_preempts_ends_all_others_and_starts_in_motion(fields: dict[str, Any]) -> None:
+    rig = started()
+    rig.go("b", joint_target=joints())
+    speed = rig.velocity[0, 0]
+    rig.go("c", **fields, preempt=True)
+    assert rig.results() == [("a", ResultCode.PREEMPTED), ("b", ResultCode.PREEMPTED)]
+    rig.tick()
+    assert abs(rig.velocity[0, 0] - speed) <= ARM.limits.acceleration[0] / HZ + 1e-9
+    rig.run()
+    assert rig.results() == [("c", ResultCode.SUCCEEDED)]
+
+
+def test_a_goal_that_preempts_a_brake_takes_over_but_never_a_hard_one() -> None:
+    rig = started()
+    rig.manager.cancel(0, "a")
+    rig.tick(2)
+    rig.go("b", joint_target=NEAR, preempt=True)
+    rig.tick()
+    assert rig.phase == GoalPhase.EXECUTING
+    assert rig.velocity[0, 0] > 0
+    rig.run()
+    rig = started()
+    rig.stop(ResultCode.ESTOP, hard=True)
+    rig.go("b", joint_target=NEAR, preempt=True)
+    while not at_rest(rig):
+        assert rig.phase == GoalPhase.CONVERTING
+        rig.tick()
+    rig.run()
+    assert rig.results() == [("a", ResultCode.ESTOP), ("b", ResultCode.SUCCEEDED)]
+
+
+def test_a_goal_that_does_not_preempt_waits_until_the_brake_is_over() -> None:
+    rig = started()
+    rig.stop(ResultCode.CANCELLED, hard=False)
+    rig.go("b", joint_target=NEAR)
+    while not at_rest(rig):
+        assert rig.phase == GoalPhase.CONVERTING
+        rig.tick()
+    rig.run()
+    assert rig.results() == [("a", ResultCode.CANCELLED), ("b", ResultCode.SUCCEEDED)]
+
+
+def test_a_goal_that_cannot_be_planned_brakes_what_others_moved() -> None:
+    rig = Rig()
+    rig.velocity[0, 2] = 1.0
+    rig.go("a", target_pose=moved(2.0))
+    rig.tick()
+    assert rig.manager.following.all()
+    while rig.manager.busy.any():
+        rig.tick()
+    assert at_rest(rig)
+
+
+def test_a_gripper_that_was_stopped_stays_where_it_stopped() -> None:
+    rig = started(ticks=50, gripper=0.01)
+    rig.manager.cancel(0, "a")
+    rig.run()
+    stopped = rig.position[0, 6]
+    assert 0.02 < stopped < 0.08
+    rig.go("b", joint_target=NEAR)
+    rig.run()
+    assert rig.position[0, 6] == stopped
+
+
+def test_a_goal_that_preempts_but_cannot_be_planned_leaves_a_braking_arm() -> None:
+    rig = started()
+    rig.go("b", target_pose=moved(2.0), preempt=True)
+    rig.tick()
+    assert rig.phase == GoalPhase.ERROR
+    assert rig.results() == [("a", ResultCode.PREEMPTED), ("b", ResultCode.UNREACHABLE)]
+    rig.run()
+    assert at_rest(rig)
+
+
+def test_a_goal_that_is_refused_preempts_nothing() -> None:
+    rig = started()
+    refusal = rig.go("b", joint_target=joints(9.0), preempt=True)
+    assert refusal is not None
+    assert refusal.code == ResultCode.JOINT_LIMIT
+    rig.run()
+    assert rig.results() == [("b", ResultCode.JOINT_LIMIT), ("a", ResultCode.SUCCEEDED)]
+
+
+def test_a_gripper_goes_on_to_its_target_under_a_goal_that_leaves_it_as_it_is() -> None:
+    rig = started(ticks=50, gripper=0.01)
+    assert rig.velocity[0, 6] < 0
+    rig.go("b", joint_target=NEAR, preempt=True)
+    rig.run()
+    assert rig.position[0, 6] == 0.01
+
+
+# --- refusals --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("blocked", [ResultCode.NOT_ACTIVE, ResultCode.ESTOP, ResultCode.FAULT])
+def test_an_arm_that_is_blocked_takes_no_goals(blocked: ResultCode) -> None:
+    rig = Rig()
+    refusal = rig.go("a", blocked=blocked, joint_target=NEAR)
+    assert refusal is not None
+    assert (refusal.code, refusal.success) == (blocked, False)
+    assert "activate()" in refusal.message
+    assert rig.results() == [("a", blocked)]
+    assert not rig.manager.busy.any()
+
+
+def test_no_two_goals_of_an_episode_have_the_same_name() -> None:
+    rig = started()
+    rig.go("b", joint_target=NEAR)
+    for name in "ab":
+        live = rig.go(name, joint_target=NEAR)
+        assert live is not None
+        assert live.code == ResultCode.DUPLICATE_ID
+    assert rig.results() == []  # they still get their own
+    rig.run()
+    assert len(rig.results()) == 2
+    assert rig.go("a", joint_target=FAR) is not None
+    assert rig.results() == [("a", ResultCode.DUPLICATE_ID)]
+    rig.manager.restart(np.array([0]))
+    assert rig.go("a", joint_target=NEAR) is None
+
+
+def test_the_queue_is_finite() -> None:
+    rig = Rig(queue=2)
+    assert [rig.go(name, joint_target=NEAR) is None for name in "abc"] == [True, True, False]
+    assert rig.results() == [("c", ResultCode.QUEUE_FULL)]
+    rig.tick()
+    assert rig.go("d", joint_target=NEAR) is None  # "a" is followed and waits no longer
+    assert rig.go("e", joint_target=NEAR, preempt=True) is None
+    rig.run()
+    assert len(rig.results()) == 4
+
+
+@pytest.mark.parametrize("name", [None, 3, ["a"]])
+def test_a_name_that_is_no_text_is_refused(name: Any) -> None:
+    rig = Rig()
+    refusal = rig.go(name, joint_target=NEAR)
+    assert refusal is not None
+    assert refusal.code == ResultCode.BAD_TARGET
+    assert len(rig.results()) == 1
+
+
+def test_a_goal_that_cannot_be_planned_fails_and_the_next_one_is_taken() -> None:
+    rig = Rig()
+    rig.go("a", target_pose=moved(2.0))
+    rig.go("b", joint_target=NEAR)
+    rig.tick()
+    assert rig.phase == GoalPhase.ERROR
+    rig.tick()
+    assert rig.phase == GoalPhase.EXECUTING
+    rig.run()
+    rig.go("c", target_pose=moved(2.0))
+    rig.run()
+    assert rig.phase == GoalPhase.ERROR
+    assert rig.go("d", joint_target=joints()) is None
+    assert rig.phase == GoalPhase.CONVERTING
+    rig.run()
+    assert rig.phase == GoalPhase.IDLE
+    codes = [code for _, code in rig.results()]
+    assert codes == [ResultCode.UNREACHABLE, ResultCode.SUCCEEDED] * 2
+
+
+# --- what is measured ------------------------------------------------------------------------------------------------
+
+
+class Lagging:
+    """An arm that follows its reference with a first-order lag, and joints that are blocked."""
+
+    def __init__(self, rig: Rig, time_constant_s: float) -> None:
+        self.position = rig.position.copy()
+        self.share = 1.0 / (time_constant_s * HZ)
+        self.lowest_opening = 0.0
+        self.blocked: int | None = None
+
+    def __call__(self, rig: Rig) -> None:
+        new = self.position + self.share * (rig.position - self.position)
+        new[:, 6] = np.maximum(new[:, 6], self.lowest_opening)
+        if self.blocked is not None:
+            new[:, self.blocked] = self.position[:, self.blocked]
+        rig.measured_velocity[:] = (new - self.position) * HZ
+        rig.measured_position[:] = self.position = new
+
+
+def lagging(time_constant_s: float) -> tuple[Rig, Lagging]:
+    rig = Rig()
+    rig.disturb = arm = Lagging(rig, time_constant_s)
+    return rig, arm
+
+
+def test_a_goal_is_reached_when_the_joints_are_and_not_when_the_reference_is() -> None:
+    rig, arm = lagging(0.02)
+    rig.go("a", joint_target=FAR)
+    rig.run()
+    assert rig.results() == [("a", ResultCode.SUCCEEDED)]
+    assert np.abs(arm.position[0, :6] - FAR).max() <= 0.002
+    assert np.abs(arm.position[0, :6] - FAR).max() > 0
+
+
+def test_a_joint_that_is_held_back_on_the_way_ends_the_goal() -> None:
+    rig, arm = lagging(0.02)
+    rig.go("a", joint_target=FAR)
+    rig.tick(50)
+    arm.blocked = 0
+    while not rig.manager._books[0]._results:
+        assert np.abs(rig.measured_position - rig.position)[0, :6].max() <= 0.1 + np.pi / HZ
+        rig.tick()
+    assert rig.phase == GoalPhase.ERROR
+    assert rig.manager.busy.all()  # it brakes
+    message = rig.manager.take_results(0)[0]
+    assert message.code == ResultCode.PATH_TOLERANCE
+    assert "shoulder_pan" in message.message
+    rig.run()
+    assert at_rest(rig)
+
+
+def test_an_arm_that_stops_short_of_its_target_has_half_a_second() -> None:
+    rig = Rig()
+    rig.disturb = lambda r: r.measured_position.__setitem__((0, 2), r.measured_position[0, 2] + 0.003)
+    rig.go("a", joint_target=NEAR)
+    while rig.manager.feedback(0) is None or not rig.manager.following.any() or rig.manager._player.active[0]:
+        rig.tick()
+    ticks = rig.run()
+    assert ticks == pytest.approx(0.5 * HZ, abs=3)
+    result = rig.manager.take_results(0)[0]
+    assert result.code == ResultCode.GOAL_TOLERANCE
+    assert "elbow" in result.message
+    assert "0.0030 rad" in result.message
+
+
+def test_a_joint_that_trembles_has_not_arrived() -> None:
+    rig = Rig()
+    rig.disturb = lambda r: r.measured_velocity.__setitem__((0, 4), 0.02)
+    rig.go("a", joint_target=NEAR)
+    rig.run()
+    assert rig.results() == [("a", ResultCode.GOAL_TOLERANCE)]
+
+
+@pytest.mark.parametrize("fields", [{}, {"joint_target": FAR}])
+def test_a_gripper_that_stalls_holds_something(fields: dict[str, Any]) -> None:
+    rig, arm = lagging(0.02)
+    arm.lowest_opening = 0.03
+    rig.go("a", gripper=0.0, **fields)
+    rig.run()
+    result = rig.manager.take_results(0)[0]
+    assert result.success
+    assert "stalled" in result.message
+    assert "0.0300 m" in result.message
+    assert rig.position[0, 6] == 0.0  # it keeps on gripping
+    rig.go("b", joint_target=NEAR)
+    rig.run()
+    assert rig.position[0, 6] == 0.0
+
+
+def test_a_gripper_that_arrives_says_so() -> None:
+    rig, _ = lagging(0.02)
+    rig.go("a", gripper=0.02)
+    rig.run()
+    result = rig.manager.take_results(0)[0]
+    assert result.success
+    assert "reached" in result.message
+
+
+def test_a_gripper_that_creeps_has_a_second_and_a_half() -> None:
+    rig = Rig()
+
+    def creep(one: Rig) -> None:
+        one.measured_position[0, 6], one.measured_velocity[0, 6] = 0.05, -0.003
+
+    rig.disturb = creep
+    rig.go("a", gripper=0.0)
+    rig.tick()
+    moving = round(rig.manager.feedback(0).remaining_s * HZ)  # type: ignore[union-attr]
+    assert rig.run() == pytest.approx(moving + 1.5 * HZ, abs=3)
+    assert rig.results() == [("a", ResultCode.GOAL_TOLERANCE)]
+
+
+def test_a_goal_that_takes_too_long_is_braked() -> None:
+    rig = Rig()
+    rig.go("a", joint_target=FAR, timeout_s=0.4)
+    rig.tick(round(0.4 * HZ) + 1)
+    assert rig.results() == [("a", ResultCode.TIMEOUT)]
+    assert rig.phase == GoalPhase.ERROR
+    assert not at_rest(rig)
+    rig.run()
+    assert at_rest(rig)
+
+
+def test_the_time_of_a_goal_starts_with_its_motion() -> None:
+    alone = Rig()
+    alone.go("a", joint_target=FAR)
+    needed = alone.run() / HZ
+    rig = Rig()
+    for name, target in (("a", FAR), ("b", joints()), ("c", FAR)):
+        rig.go(name, joint_target=target, timeout_s=1.1 * needed)
+    rig.run()
+    assert rig.results() == [(name, ResultCode.SUCCEEDED) for name in "abc"]
+
+
+# --- stops, setpoints, restarts --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("code", "hard", "phase"),
+    [
+        (ResultCode.ESTOP, True, GoalPhase.ERROR),
+        (ResultCode.FAULT, True, GoalPhase.ERROR),
+        (ResultCode.CANCELLED, False, GoalPhase.IDLE),
+    ],
+)
+def test_a_stop_ends_all_goals_at_once_and_brakes(code: ResultCode, hard: bool, phase: GoalPhase) -> None:
+    rig = started(2)
+    rig.go("b", joint_target=NEAR)
+    rig.stop(code, hard, np.array([True, False]))
+    assert rig.results() == [("a", code), ("b", code)]
+    assert rig.phase == phase
+    assert rig.manager.feedback(0) is None
+    assert rig.manager.busy.tolist() == [True, True]
+    assert rig.results(1) == []
+    rig.run()
+    assert rig.results(1) == [("a", ResultCode.SUCCEEDED)]
+    assert rig.position[0, 0] < FAR[0]
+
+
+def test_a_hard_stop_is_shorter_and_stays_hard() -> None:
+    ticks = []
+    for hard in (False, True):
+        rig = started()
+        rig.stop(ResultCode.CANCELLED, hard)
+        ticks.append(rig.run())
+    assert ticks[1] < 0.75 * ticks[0]
+    rig = started()
+    rig.stop(ResultCode.ESTOP, hard=True)
+    rig.tick(3)
+    rig.stop(ResultCode.CANCELLED, hard=False)
+    rig.hard[:] = True
+    assert rig.run() == ticks[1] - 3
+    rig = started()
+    rig.stop(ResultCode.CANCELLED, hard=False)
+    rig.tick(3)
+    rig.stop(ResultCode.ESTOP, hard=True)
+    assert 3 + rig.run() < ticks[0]
+
+
+def test_a_stop_brakes_a_reference_that_others_moved() -> None:
+    rig = Rig()
+    rig.velocity[0, 2] = 1.0
+    rig.stop(ResultCode.ESTOP, hard=True)
+    assert rig.manager.following.all()
+    while rig.manager.busy.any():
+        rig.tick()
+    assert at_rest(rig)
+    assert rig.results() == []
+    assert rig.phase == GoalPhase.IDLE
+    rig.stop(ResultCode.ESTOP, hard=True)
+    assert not rig.manager.busy.any()  # nothing to brake
+
+
+def test_a_setpoint_takes_the_place_of_all_goals() -> None:
+    rig = started(2)
+    rig.go("b", joint_target=NEAR)
+    rig.manager.drop_for_setpoint(np.array([True, False]))
+    assert rig.results() == [("a", ResultCode.REPLACED_BY_SETPOINT), ("b", ResultCode.REPLACED_BY_SETPOINT)]
+    assert rig.manager.following.tolist() == [False, True]
+    assert rig.phase == GoalPhase.IDLE
+    before = rig.position[0].copy()
+    rig.tick(3)
+    assert np.array_equal(rig.position[0], before)  # whoever sends setpoints owns it
+
+
+def test_a_restart_forgets_everything_and_reports_nothing() -> None:
+    rig = started(2)
+    rig.go("b", joint_target=NEAR)
+    rig.go("c", joint_target=joints(9.0))
+    rig.manager.restart(np.array([0]))
+    assert rig.results() == []
+    assert rig.manager.feedback(0) is None
+    assert rig.manager.busy.tolist() == [False, True]
+    assert rig.phase == GoalPhase.IDLE
+
+
+def test_a_brain_hears_of_the_goals_of_its_own_arm_only() -> None:
+    rig = Rig(3)
+    rig.go("a", 1, joint_target=NEAR)
+    rig.run()
+    assert [rig.results(sim) for sim in range(3)] == [[], [("a", ResultCode.SUCCEEDED)], []]
+    assert rig.position[0].tolist() == HOME.tolist()
+
+
+# --- the rest --------------------------------------------------------------------------------------------------------
+
+
+def test_conversion_changes_nothing() -> None:
+    rig = started()
+    before = [array.copy() for array in rig.reference]
+    plans = [rig.manager.convert(0, rig.manager._books[0].followed, rig.reference) for _ in range(2)]  # type: ignore[arg-type]
+    assert np.array_equal(plans[0].target, plans[1].target)  # type: ignore[union-attr]
+    assert all(np.array_equal(one, other) for one, other in zip(before, rig.reference, strict=True))
+
+
+def test_every_code_is_produced_by_some_test() -> None:
+    """A new code needs a test; the names are looked for in the tests of goals and of plans."""
+    files = ("test_goals.py", "test_planner.py", "test_trajectory.py")
+    text = "".join((Path(__file__).parent / name).read_text(encoding="utf-8") for name in files)
+    assert [code.name for code in ResultCode if f"ResultCode.{code.name}" not in text] == []
+
+
+def test_the_manager_makes_its_own_kinematics() -> None:
+    assert isinstance(GoalManager(ARM, 1, HZ).planner.kinematics, ArmKinematics)
+    assert GoalPlanner(ARM, HZ, KINEMATICS).kinematics is KINEMATICS
+
+
+def test_a_tick_without_goals_does_nothing_for_any_robot() -> None:
+    """What it does is counted, not timed: calls of functions, which do not grow with the number of robots."""
+
+    def calls_of(robots: int) -> int:
+        rig, calls = Rig(robots), 0
+
+        def count(frame: object, event: str, argument: object) -> None:
+            nonlocal calls
+            calls += event in ("call", "c_call")
+
+        sys.setprofile(count)
+        try:
+            rig.manager.tick(*rig.reference, rig.measured_position, rig.measured_velocity)
+        finally:
+            sys.setprofile(None)
+        return calls
+
+    assert calls_of(1) == calls_of(64) <= 10

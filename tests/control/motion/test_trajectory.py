@@ -1,0 +1,283 @@
+"""Trajectories: limits, ends, agreement with Ruckig's own evaluation, straightness of lines, and playing them back."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import ruckig
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.motion import line as line_module
+from bhd_lerobot.control.motion.line import Line, ToolLimits, along_line
+from bhd_lerobot.control.motion.player import TrajectoryPlayer
+from bhd_lerobot.control.motion.trajectory import (
+    MotionLimits,
+    PlanFailure,
+    State,
+    Trajectory,
+    at_once,
+    sample,
+    to_rest,
+    to_target,
+)
+from tests.control.goal_rig import HOME, HZ, KINEMATICS, LIMITS, STOP_LIMITS, TOOL, moved
+
+Array = NDArray[np.float64]
+ARM = LIMITS[:6]
+TOOL_LIMITS = ToolLimits(1.0, 5.0)
+
+
+def planned(answer: Trajectory | PlanFailure) -> Trajectory:
+    assert isinstance(answer, Trajectory), answer
+    return answer
+
+
+def excess(start: State, trajectory: Trajectory, limits: MotionLimits) -> float:
+    """Return by how much a trajectory breaks a limit, as a share of it."""
+    before = np.concatenate((start.acceleration[None], trajectory.acceleration[:-1]))
+    return float(
+        max(
+            (np.abs(trajectory.velocity) / limits.velocity).max(),
+            (np.abs(trajectory.acceleration) / limits.acceleration).max(),
+            (np.abs(trajectory.acceleration - before) * HZ / limits.jerk).max(),
+        )
+        - 1.0
+    )
+
+
+def viable(shares: list[list[float]], limits: MotionLimits) -> State:
+    """Return a state out of which the limits can still be kept: the acceleration ends before the speed is too high."""
+    position, velocity, acceleration = np.array(shares)
+    change = acceleration * limits.acceleration
+    room = np.maximum(limits.velocity - change**2 / 2 / limits.jerk, 0.0)
+    return State(position * 4.0, velocity * room, change)
+
+
+states = st.lists(st.lists(st.floats(-1, 1), min_size=6, max_size=6), min_size=3, max_size=3).map(
+    lambda shares: viable(shares, ARM)
+)
+postures = st.lists(st.floats(-4, 4), min_size=6, max_size=6).map(np.array)
+
+
+@given(states, postures)
+def test_a_trajectory_keeps_the_limits_and_ends_at_rest_on_its_target(start: State, target: Array) -> None:
+    trajectory = planned(to_target(start, target, ARM, HZ))
+    assert excess(start, trajectory, ARM) < 1e-6
+    assert np.array_equal(trajectory.target, target)
+    assert not trajectory.velocity[-1].any()
+    assert not trajectory.acceleration[-1].any()
+    assert np.abs(trajectory.position).max() <= 2 * np.pi + 1e-9
+    path = np.concatenate((start.position[None], trajectory.position))
+    assert (np.abs(np.diff(path, axis=0)) <= ARM.velocity / HZ + 1e-9).all()
+
+
+@given(states, st.booleans())
+def test_braking_keeps_the_limits_and_is_as_short_as_they_allow(start: State, hard: bool) -> None:
+    limits = (STOP_LIMITS if hard else LIMITS)[:6]
+    trajectory = planned(to_rest(start, limits, HZ))
+    assert excess(start, trajectory, limits) < 1e-6
+    assert not trajectory.velocity[-1].any()
+    # No longer than undoing the acceleration, and then a ramp up to the largest deceleration and down from it.
+    ramp = np.abs(start.acceleration) / limits.jerk
+    speed = np.abs(start.velocity) + start.acceleration**2 / limits.jerk
+    bound = ramp + speed / limits.acceleration + 2 * np.sqrt(speed / limits.jerk) + limits.acceleration / limits.jerk
+    assert trajectory.ticks <= np.ceil(bound.max() * HZ) + 1
+
+
+@settings(max_examples=50)
+@given(states, postures, st.sampled_from((0.2, 0.5, 1.0)))
+def test_samples_agree_with_ruckig(start: State, target: Array, share: float) -> None:
+    request = ruckig.InputParameter(6)
+    request.current_position, request.current_velocity = start.position, start.velocity
+    request.current_acceleration, request.target_position = start.acceleration, target
+    # With lower limits than the start's speed and acceleration there are stretches that bring it within them.
+    request.max_velocity, request.max_acceleration = ARM.velocity * share, ARM.acceleration * share
+    request.max_jerk = ARM.jerk
+    answer = ruckig.Trajectory(6)
+    assert ruckig.Ruckig(6).calculate(request, answer) == ruckig.Result.Working
+    samples = sample(answer, HZ)
+    assert samples.ticks == 1 or samples.ticks - 1 < answer.duration * HZ <= samples.ticks + 1e-6
+    for row in range(0, samples.ticks, 5):
+        own = np.array(answer.at_time((row + 1) / HZ))
+        mine = np.array([samples.position[row], samples.velocity[row], samples.acceleration[row]])
+        assert np.abs(own - mine).max() < 1e-9
+
+
+def test_all_joints_arrive_together() -> None:
+    trajectory = planned(to_target(State.at_rest(np.zeros(6)), [1.0, 0.5, -0.3, 0.1, 2.0, 0.01], ARM, HZ))
+    assert (trajectory.velocity[-2] != 0).all()
+
+
+def test_an_arm_that_is_there_already_needs_one_tick() -> None:
+    trajectory = planned(to_target(State.at_rest(HOME[:6]), HOME[:6], ARM, HZ))
+    assert trajectory.ticks == 1
+    assert np.array_equal(trajectory.position, HOME[None, :6])
+
+
+def test_a_joint_that_comes_fast_towards_its_end_does_not_leave_its_range() -> None:
+    limits = MotionLimits(*(np.array([value]) for value in (3.0, 10.0, 100.0, -1.0, 1.0)))
+    run_up = planned(to_target(State.at_rest([-1.0]), [1.0], limits, HZ))
+    for tick in range(0, run_up.ticks, 10):
+        start = State(run_up.position[tick], run_up.velocity[tick], run_up.acceleration[tick])
+        for target in (-1.0, 0.0, 1.0, float(run_up.position[tick, 0])):
+            assert np.abs(planned(to_target(start, [target], limits, HZ)).position).max() <= 1.0 + 1e-9
+        assert np.abs(planned(to_rest(start, limits, HZ)).position).max() <= 1.0 + 1e-9
+
+
+def test_a_joint_that_cannot_stop_before_its_end_comes_to_rest_on_it() -> None:
+    limits = MotionLimits(*(np.array([value]) for value in (3.0, 10.0, 100.0, -1.0, 1.0)))
+    start = State.of([0.9], [3.0], [0.0])
+    brake = planned(to_rest(start, limits, HZ))
+    assert brake.target == 1.0
+    assert not brake.velocity[-1].any()
+    # The shortest way to stop from 3 m/s: 0.4 s on average at half the speed.
+    assert brake.position.max() <= 0.9 + 3.0 * 0.4 / 2 + 1e-3
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_numbers_that_are_none_are_a_failure_and_not_an_exception(bad: float) -> None:
+    start = State.of([bad], [0.0], [0.0])
+    limits = MotionLimits(*(np.array([value]) for value in (3.0, 10.0, 100.0, -1.0, 1.0)))
+    for answer in (to_target(start, [0.0], limits, HZ), to_rest(start, limits, HZ)):
+        assert isinstance(answer, PlanFailure)
+        assert answer.code == ResultCode.PLANNING_FAILED
+        assert answer.message
+
+
+# --- lines -----------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=40)
+@given(*[st.floats(-1, 1)] * 4)
+def test_the_tool_stays_on_the_line_and_turns_evenly(x: float, y: float, z: float, turn: float) -> None:
+    goal = moved(0.2 * x, 0.3 * y, 0.15 * z, turn).matrix()
+    answer = along_line(HOME[:6], goal, KINEMATICS, (ARM, TOOL_LIMITS), HZ)
+    assume(not (isinstance(answer, PlanFailure) and answer.code == ResultCode.UNREACHABLE))
+    trajectory = planned(answer)
+    assert excess(State.at_rest(HOME[:6]), trajectory, ARM) < 1e-9
+    assert not trajectory.velocity[-1].any()
+    tools = KINEMATICS.tool(trajectory.position)
+    assert np.abs(tools[-1] - goal).max() < 1e-9
+    way = goal[:3, 3] - TOOL[:3, 3]
+    length = float(np.linalg.norm(way))
+    if length < 1e-3:
+        return
+    along = (tools[:, :3, 3] - TOOL[:3, 3]) @ way / length
+    beside = tools[:, :3, 3] - TOOL[:3, 3] - along[:, None] * way / length
+    assert np.linalg.norm(beside, axis=1).max() < 5e-5
+    assert (np.diff(along) > -1e-9).all()
+    turned = Rotation.from_matrix(TOOL[:3, :3].T @ tools[:, :3, :3]).as_rotvec()
+    even = along[:, None] / length * Rotation.from_matrix(TOOL[:3, :3].T @ goal[:3, :3]).as_rotvec()
+    assert np.abs(turned - even).max() < 1e-4
+    speed = np.diff(along, prepend=0.0) * HZ
+    assert speed.max() <= TOOL_LIMITS.velocity + 1e-6
+    assert np.abs(np.diff(speed, prepend=0.0)).max() * HZ <= TOOL_LIMITS.acceleration * 1.01 + 1e-3
+
+
+def test_a_line_keeps_the_jerk_of_joints_that_must_move_gently() -> None:
+    gentle = dataclasses.replace(ARM, jerk=ARM.jerk / 5)
+    random = np.random.default_rng(0)
+    made = 0
+    for _ in range(40):
+        goal = KINEMATICS.tool(HOME[:6] + random.uniform(-1, 1, 6) * (2.0, 0.3, 0.6, 0.8, 1.2, 1.0))
+        answer = along_line(HOME[:6], goal, KINEMATICS, (gentle, TOOL_LIMITS), HZ)
+        if isinstance(answer, Trajectory):
+            made += 1
+            assert excess(State.at_rest(HOME[:6]), answer, gentle) < 1e-9
+    assert made > 20
+
+
+def test_a_line_takes_as_many_poses_as_it_needs_to_be_straight(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(line_module, "_STEP", 1.0)
+    monkeypatch.setattr(line_module, "_TURN", 10.0)
+    line = Line(TOOL, moved(0.05, 0.25, 0.1, 1.0).matrix())
+    tools = KINEMATICS.tool(planned(along_line(HOME[:6], line.goal, KINEMATICS, (ARM, TOOL_LIMITS), HZ)).position)
+    way = (line.goal - line.start)[:3, 3] / line.length
+    beside = tools[:, :3, 3] - TOOL[:3, 3]
+    assert np.linalg.norm(beside - np.outer(beside @ way, way), axis=1).max() < 5e-5
+    # Where no number of poses suffices, the line is refused.
+    monkeypatch.setattr(line_module, "_DEVIATION", 0.0)
+    answer = along_line(HOME[:6], line.goal, KINEMATICS, (ARM, TOOL_LIMITS), HZ)
+    assert isinstance(answer, PlanFailure)
+    assert answer.code == ResultCode.SINGULAR
+
+
+def test_a_slow_line_keeps_the_speed_of_the_tool() -> None:
+    goal = moved(0.0, 0.2, 0.0).matrix()
+    trajectory = planned(along_line(HOME[:6], goal, KINEMATICS, (ARM, ToolLimits(0.05, 0.2)), HZ))
+    steps = np.linalg.norm(np.diff(KINEMATICS.tool(trajectory.position)[:, :3, 3], axis=0), axis=1) * HZ
+    assert steps.max() == pytest.approx(0.05, rel=1e-3)
+    assert trajectory.ticks / HZ == pytest.approx(0.2 / 0.05 + 0.05 / 0.2, rel=0.05)
+
+
+def test_a_line_can_turn_the_tool_on_the_spot_or_do_nothing() -> None:
+    turning = planned(along_line(HOME[:6], moved(turn=1.0).matrix(), KINEMATICS, (ARM, TOOL_LIMITS), HZ))
+    tools = KINEMATICS.tool(turning.position)
+    assert np.linalg.norm(tools[:, :3, 3] - TOOL[:3, 3], axis=1).max() < 5e-5
+    assert planned(along_line(HOME[:6], TOOL, KINEMATICS, (ARM, TOOL_LIMITS), HZ)).ticks == 1
+
+
+def test_the_poses_of_a_line_are_its_ends_and_what_lies_between() -> None:
+    line = Line(TOOL, moved(0.1, 0.2, 0.0, 1.0).matrix())
+    poses = line.poses(np.array([0.0, 0.5, 1.0]))
+    assert np.abs(poses[0] - TOOL).max() < 1e-12
+    assert np.abs(poses[2] - line.goal).max() < 1e-12
+    assert np.abs(poses[1] - moved(0.05, 0.1, 0.0, 0.5).matrix()).max() < 1e-12
+    assert line.length == pytest.approx(np.hypot(0.1, 0.2))
+
+
+# --- playing ---------------------------------------------------------------------------------------------------------
+
+
+def numbered(ticks: int, first: float) -> Trajectory:
+    rows = first + np.arange(ticks, dtype=np.float64)[:, None] + np.array([0.0, 0.25])
+    return Trajectory(rows, rows + 1000, rows + 2000)
+
+
+@settings(max_examples=30)
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 3000), st.integers(0, 2000)), max_size=12))
+def test_every_row_is_played_once_and_in_order(script: list[tuple[int, int, int]]) -> None:
+    player = TrajectoryPlayer(4, 2)
+    arrays = [np.zeros((4, 2)) for _ in range(3)]
+    expected: list[list[np.ndarray]] = [[] for _ in range(4)]
+    last = np.zeros((4, 2))
+    for number, (sim, ticks, wait) in enumerate(script):
+        trajectory = numbered(ticks, 10_000.0 * number)
+        player.start(sim, trajectory)
+        assert player.remaining(sim) == ticks
+        expected[sim] = list(trajectory.position)
+        for _ in range(min(wait, 50) if number % 2 else wait):
+            player.tick(arrays[0], arrays[1], arrays[2])
+            for one in range(4):
+                if expected[one]:
+                    last[one] = expected[one].pop(0)
+                assert player.remaining(one) == len(expected[one])
+                assert player.active[one] == bool(expected[one])
+            assert np.array_equal(arrays[0], last)
+    moving = arrays[1].any(axis=1)
+    assert np.array_equal(arrays[1][moving], arrays[0][moving] + 1000)
+    assert np.array_equal(arrays[2][moving], arrays[0][moving] + 2000)
+
+
+def test_a_trajectory_that_is_stopped_is_not_played_on() -> None:
+    player = TrajectoryPlayer(2, 2)
+    arrays = [np.zeros((2, 2)) for _ in range(3)]
+    player.start(0, numbered(10, 1.0))
+    player.start(1, numbered(10, 1.0))
+    player.tick(*arrays)
+    player.stop(0)
+    player.tick(*arrays)
+    assert arrays[0][:, 0].tolist() == [1.0, 2.0]
+    assert player.active.tolist() == [False, True]
+    assert player.remaining(0) == 0
+
+
+def test_joined_trajectories_wait_for_each_other() -> None:
+    joined = numbered(3, 1.0).beside(numbered(2, 5.0))
+    assert joined.position[:, [0, 2]].tolist() == [[1, 5], [2, 6], [3, 6]]
+    assert numbered(2, 1.0).then(numbered(1, 3.0)).position[:, 0].tolist() == [1, 2, 3]
+    assert at_once([4.0, 5.0]).ticks == 1

@@ -1,0 +1,394 @@
+"""Merging, keeping, deleting and splitting: laws about what is in the result, whatever is killed or full."""
+
+import errno
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from bhd_lerobot.datasets.assembly import assemble
+from bhd_lerobot.datasets.edit.edits import delete, edits_of, keep, merge, split
+from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.recovery.fix import fix
+from bhd_lerobot.datasets.recovery.repair import repair
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import (
+    ConfigError,
+    DatasetCorruptError,
+    DatasetError,
+    DatasetExistsError,
+    DatasetLockedError,
+    DatasetMismatchError,
+    DatasetWriteError,
+    UnsupportedDatasetError,
+)
+from tests.datasets import support
+from tests.datasets.edit_support import NUMBERS, assert_sound, content, record, steps_of
+from tests.datasets.kill_support import KillServer
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[KillServer]:
+    server = KillServer()
+    yield server
+    server.close()
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Path:
+    return record(tmp_path_factory.mktemp("plain") / "d", list(range(6)))
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory) -> Path:
+    return record(tmp_path_factory.mktemp("filmed") / "d", list(range(4)), video=True)
+
+
+@pytest.mark.parametrize("video", [False, True])
+def test_merged_are_all_episodes_in_order(tmp_path: Path, video: bool) -> None:
+    parts = [record(tmp_path / f"d{i}", episodes, video=video) for i, episodes in enumerate([[3, 1], [0], [5, 4, 2]])]
+    before = [content(part) for part in parts]
+    report = merge(parts, tmp_path / "all")
+    assert content(tmp_path / "all") == [episode for part in before for episode in part]
+    assert [content(part) for part in parts] == before
+    assert (report.episodes, report.frames) == (6, sum(support.length(e) for e in range(6)))
+    assert_sound(tmp_path / "all")
+
+
+@pytest.mark.parametrize("wanted", [[0], [5, 2, 0], [1, 2, 3], [0, 1, 2, 3, 4, 5]])
+def test_kept_are_the_wanted_in_the_wanted_order(plain: Path, tmp_path: Path, wanted: list[int]) -> None:
+    keep(plain, wanted, tmp_path / "kept")
+    whole = content(plain)
+    assert content(tmp_path / "kept") == [whole[episode] for episode in wanted]
+    assert_sound(tmp_path / "kept")
+
+
+def test_films_are_cut_without_encoding(filmed: Path, tmp_path: Path) -> None:
+    keep(filmed, [3, 1], tmp_path / "kept")
+    whole = content(filmed)
+    assert content(tmp_path / "kept") == [whole[3], whole[1]]  # every pixel
+    assert_sound(tmp_path / "kept")
+
+
+@pytest.mark.parametrize("gone", [[0], [5], [1, 3, 4]])
+def test_delete_leaves_the_others(plain: Path, tmp_path: Path, gone: list[int]) -> None:
+    root = shutil.copytree(plain, tmp_path / "d")
+    delete(root, gone)
+    assert content(root) == [episode for index, episode in enumerate(content(plain)) if index not in gone]
+    assert_sound(root)
+    assert not (root / layout.STAGING).exists()
+
+
+@pytest.mark.parametrize("source", ["plain", "filmed"])
+def test_what_was_split_merges_to_what_it_was(request, tmp_path: Path, source: str) -> None:
+    root = request.getfixturevalue(source)
+    split(root, {"train": [0, 1], "val": [2], "test": [3]}, tmp_path / "parts")
+    merge([tmp_path / "parts" / name for name in ("train", "val", "test")], tmp_path / "again")
+    assert content(tmp_path / "again") == content(root)[:4]
+
+
+def test_stock_lerobot_reads_the_result(filmed: Path, tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    merge([filmed, record(tmp_path / "more", [9], video=True)], tmp_path / "all")
+    dataset = LeRobotDataset("t/t", root=tmp_path / "all", video_backend="pyav")
+    frames = [(episode, frame) for episode in [0, 1, 2, 3, 9] for frame in range(support.length(episode))]
+    assert len(dataset) == len(frames)
+    for index in (0, 7, len(frames) - 1):
+        episode, frame = frames[index]
+        assert abs(dataset[index][support.CAMERA].numpy().mean() * 255 - support.grey(episode, frame)) < 3
+        assert dataset[index]["task"] == support.task(episode)
+
+
+def test_data_are_those_of_lerobots_own_merge(plain: Path, tmp_path: Path) -> None:
+    from lerobot.datasets.dataset_tools import merge_datasets
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    more = record(tmp_path / "more", [7, 8])
+    theirs = merge_datasets([LeRobotDataset("t/t", root=root) for root in (plain, more)], "t/m", tmp_path / "theirs")
+    merge([plain, more], tmp_path / "ours")
+    name = "data/chunk-000/file-000.parquet"
+    # Theirs forgets that lists have a fixed length, so values are compared.
+    assert pq.read_table(tmp_path / "ours" / name).to_pydict() == pq.read_table(tmp_path / "theirs" / name).to_pydict()
+    ours = LeRobotDataset("t/t", root=tmp_path / "ours")
+    for key, stat in theirs.meta.stats.items():
+        if key in NUMBERS:
+            continue  # theirs are those of before the episodes were numbered anew
+        for statistic, values in stat.items():
+            assert ours.meta.stats[key][statistic] == pytest.approx(values), (key, statistic)
+
+
+def test_files_that_stay_are_linked(tmp_path: Path) -> None:
+    root = record(tmp_path / "d", [0, 1, 2], video=True)
+    film = next(root.glob("videos/*/*/*.mp4"))
+    before = film.stat().st_ino
+    mark(root, [1], outcome="collision")
+    assert next(root.glob("videos/*/*/*.mp4")).stat().st_ino == before
+    assert content(root)[1].films == content(record(tmp_path / "same", [0, 1, 2], video=True))[1].films
+
+
+def test_many_files_stay_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a file is full the next one is begun, for data and for films."""
+    parts = [record(tmp_path / f"d{i}", [i, i + 1], video=True) for i in range(3)]
+    monkeypatch.setattr("bhd_lerobot.datasets.assembly.files.MEBIBYTE", 10)
+    merge(parts, tmp_path / "all")
+    assert len(list((tmp_path / "all/data").rglob("*.parquet"))) == 3
+    assert len(list((tmp_path / "all/videos").rglob("*.mp4"))) == 3
+    assert content(tmp_path / "all") == [episode for part in parts for episode in content(part)]
+    assert_sound(tmp_path / "all")
+
+
+def test_an_edited_dataset_is_not_continued(tmp_path: Path) -> None:
+    """Its next episode would not be the one that its seed says."""
+    root = record(tmp_path / "d", [0, 1, 2])
+    delete(root, [1])
+    with pytest.raises(DatasetMismatchError, match="edited"):
+        support.resume(root)
+
+
+def test_what_was_done_is_told(tmp_path: Path) -> None:
+    roots = [record(tmp_path / name, [0, 1]) for name in ("a", "b")]
+    merge(roots, tmp_path / "all")
+    delete(tmp_path / "all", [2])
+    keep(tmp_path / "all", [1], tmp_path / "one")
+    assert [edit["edit"] for edit in edits_of(tmp_path / "one")] == ["merge", "delete", "keep"]
+    assert edits_of(tmp_path / "one")[1]["episodes"] == [2]
+    assert edits_of(roots[0]) == []
+
+
+@pytest.mark.parametrize("video", [False, True])
+def test_a_kill_at_any_step_leaves_the_old_or_the_new(server: KillServer, tmp_path: Path, video: bool) -> None:
+    origin = record(tmp_path / "origin", [0, 1, 2, 3], video=video)
+    old = content(origin)
+    new = [old[0], old[2], old[3]]
+    steps = steps_of(lambda: delete(shutil.copytree(origin, tmp_path / "count"), [1]))
+    seen = set()
+    for step in sorted({*range(0, steps, 1 if not video else 3), *range(steps - 4, steps)}):
+        root = shutil.copytree(origin, tmp_path / f"d{step}")
+        assert server.edit("delete", [root], step, episodes=[1])
+        repair(root)
+        assert content(root) in (old, new)
+        seen.add(len(content(root)))
+        assert not (root / layout.STAGING).exists()
+    assert seen == {3, 4}  # the kills came before and after the decision
+
+
+def test_a_kill_while_merging_leaves_no_dataset(server: KillServer, tmp_path: Path) -> None:
+    parts = [record(tmp_path / f"d{i}", [i]) for i in range(2)]
+    steps = steps_of(lambda: merge(parts, tmp_path / "count"))
+    for step in range(steps):
+        target = tmp_path / f"all{step}"
+        assert server.edit("merge", [target, *parts], step)
+        assert not target.exists()
+    merge(parts, target)  # and what the kill left beside it does not stand in the way
+    assert len(content(target)) == 2
+    assert not list(tmp_path.glob(f".{target.name}.bhd-*"))
+
+
+def test_a_full_disk_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = record(tmp_path / "d", [0, 1, 2])
+    before = content(root)
+
+    def full(self: Disk, path: Path, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    for action in (lambda: delete(root, [0]), lambda: keep(root, [0], tmp_path / "kept")):
+        with monkeypatch.context() as patched:
+            patched.setattr(Disk, "write", full)
+            with pytest.raises(DatasetWriteError, match="No space left on device"):
+                action()
+        assert content(root) == before
+        assert not (root / layout.STAGING).exists()
+        assert not (tmp_path / "kept").exists()
+
+
+def test_episodes_of_another_shape_do_not_merge(plain: Path, tmp_path: Path) -> None:
+    features = {
+        **support.FEATURES,
+        "observation.state": {"dtype": "float32", "shape": (2,), "names": ["a.pos", "b.pos"]},
+    }
+    recorder = DatasetRecorder.create("t/t", 20, features, robot_type="toy", root=tmp_path / "other")
+    writer = recorder.begin_episode()
+    writer.set_columns({**support.columns(0), "observation.state": support.columns(0)["observation.state"][:, :2]})
+    recorder.save(writer, task="t", metadata={})
+    recorder.finalize()
+    with pytest.raises(DatasetMismatchError) as error:
+        merge([plain, tmp_path / "other"], tmp_path / "all")
+    assert "observation.state.shape" in str(error.value)
+    assert "fps: there 10, here 20" in str(error.value)
+    assert not (tmp_path / "all").exists()
+
+
+def test_metadata_that_only_some_have_is_empty_in_the_others(plain: Path, tmp_path: Path) -> None:
+    recorder = support.create(tmp_path / "other")
+    recorder.save(support.fill(recorder.begin_episode(), 1), task="t", metadata={"outcome": "stuck", "extra": 3})
+    recorder.finalize()
+    merge([plain, tmp_path / "other"], tmp_path / "all")
+    episodes = dataset_info(tmp_path / "all").episodes
+    assert episodes[0].metadata == support.metadata(0)
+    assert episodes[-1].metadata == {"outcome": "stuck", "extra": 3}
+
+
+def test_metadata_of_another_type_does_not_merge(plain: Path, tmp_path: Path) -> None:
+    recorder = support.create(tmp_path / "other")
+    recorder.save(support.fill(recorder.begin_episode(), 1), task="t", metadata={"outcome": 3})
+    recorder.finalize()
+    with pytest.raises(DatasetMismatchError, match="bhd/outcome"):
+        merge([plain, tmp_path / "other"], tmp_path / "all")
+
+
+def test_bad_requests(plain: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(plain, tmp_path / "d")
+    before = content(root)
+    for action, error, text in (
+        (lambda: merge([root], tmp_path / "x"), ConfigError, "at least two"),
+        (lambda: merge([root, tmp_path / "d/../d"], tmp_path / "x"), ConfigError, "more than once"),
+        (lambda: merge([root, tmp_path / "none"], tmp_path / "x"), DatasetError, "does not exist"),
+        (lambda: merge([root, plain], root), DatasetExistsError, "exists already. Remove it"),
+        (lambda: keep(root, [0], root / "new"), ConfigError, "which is to stay as it is"),
+        (lambda: keep(root, [6], tmp_path / "x"), DatasetError, "no episode 6.*0 to 5"),
+        (lambda: keep(root, [1, 1], tmp_path / "x"), ConfigError, "twice"),
+        (lambda: keep(root, [], tmp_path / "x"), DatasetError, "No episode is left"),
+        (lambda: delete(root, range(6)), DatasetError, "No episode is left"),
+        (lambda: split(root, {"a": [0, 1], "b": [1]}, tmp_path / "x"), ConfigError, "'a' and in 'b'"),
+        (lambda: split(root, {"a": [0], "b": []}, tmp_path / "x"), ConfigError, "would have no episode"),
+    ):
+        with pytest.raises(error, match=text):
+            action()
+    assert content(root) == before
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_dataset_that_is_being_recorded_is_refused(tmp_path: Path) -> None:
+    root = record(tmp_path / "d", [0, 1])
+    lock = RootLock(root)
+    with pytest.raises(DatasetLockedError):
+        delete(root, [0])
+    lock.release()
+    recorder = support.create(tmp_path / "open")
+    support.record(recorder)
+    recorder._lock.release()  # as after a kill
+    with pytest.raises(DatasetError, match="bhd-data repair"):
+        merge([root, tmp_path / "open"], tmp_path / "all")
+
+
+def test_a_damaged_source_is_named(plain: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(plain, tmp_path / "d")
+    path = next(root.glob("data/*/*.parquet"))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    path.write_bytes(bytes(data))
+    with pytest.raises(DatasetCorruptError, match=str(path)):
+        delete(root, [0])
+    assert path.read_bytes() == bytes(data)
+
+
+def test_edits_are_lines_of_json(tmp_path: Path) -> None:
+    root = record(tmp_path / "d", [0, 1, 2])
+    delete(root, [2])
+    mark(root, [0], outcome="stuck", note="ä 'quoted'\nline")
+    lines = (root / assemble.EDITS).read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["edit"] for line in lines] == ["delete", "mark"]
+    assert json.loads(lines[1])["note"] == "ä 'quoted'\nline"
+
+
+def stock(root: Path) -> Path:
+    """Let a dataset be another program's, with a column of its own and files beside."""
+    (root / "meta/bhd.json").unlink()
+    path = next(root.glob("meta/episodes/*/*.parquet"))
+    table = pq.read_table(path)
+    names = [f"person {index}" for index in range(table.num_rows)]
+    pq.write_table(table.append_column("operator", pa.array(names)), path)
+    (root / "meta/subtasks.json").write_text("{}")
+    (root / "data/NOTES.txt").write_text("notes")
+    return root
+
+
+def operators(root: Path) -> list[str]:
+    return pq.read_table(next(root.glob("meta/episodes/*/*.parquet")))["operator"].to_pylist()
+
+
+def test_what_other_programs_wrote_is_kept(plain: Path, tmp_path: Path) -> None:
+    root = stock(shutil.copytree(plain, tmp_path / "d"))
+    keep(root, [4, 1], tmp_path / "kept")
+    assert operators(tmp_path / "kept") == ["person 4", "person 1"]
+    assert (tmp_path / "kept/meta/subtasks.json").exists()
+    merge([tmp_path / "kept", plain], tmp_path / "all")
+    assert operators(tmp_path / "all") == ["person 4", "person 1"] + [None] * 6
+    before = [one.columns for one in content(root)]
+    mark(root, [0], outcome="failure")
+    assert operators(root) == [f"person {index}" for index in range(6)]
+    assert (root / "data/NOTES.txt").read_text() == "notes"
+    assert [one.columns for one in content(root)] == before  # what its columns mean, we do not know
+    (root / "meta/stats.json").unlink()
+    assert fix(root, check_dataset(root).findings)
+    assert operators(root) == [f"person {index}" for index in range(6)]
+
+
+def test_datasets_share_no_file(plain: Path, filmed: Path, tmp_path: Path) -> None:
+    """Other programs write into files; what happens to one dataset must not happen to another."""
+    for number, source in enumerate((plain, filmed)):
+        keep(source, range(4), tmp_path / f"k{number}")
+        split(source, {"all": range(4)}, tmp_path / f"s{number}")
+        for path in tmp_path.rglob("*"):
+            assert path.is_dir() or path.stat().st_nlink == 1, path
+
+
+def test_links_of_a_cache_are_followed(filmed: Path, tmp_path: Path) -> None:
+    """The Hub's client keeps datasets as relative links."""
+    cache = tmp_path / "datasets--me--d"
+    (cache / "blobs").mkdir(parents=True)
+    snapshot = cache / "snapshots" / "abc"
+    for number, path in enumerate(one for one in sorted(filmed.rglob("*")) if one.is_file()):
+        blob, link = cache / "blobs" / str(number), snapshot / path.relative_to(filmed)
+        shutil.copy(path, blob)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(os.path.relpath(blob, link.parent))
+    keep(snapshot, range(4), tmp_path / "kept")
+    assert content(tmp_path / "kept") == content(filmed)
+    mark(snapshot, [0], outcome="stuck")
+    assert content(snapshot)[1:] == content(filmed)[1:]
+
+
+def test_instructions_of_an_episode_that_has_several(tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    features = {"action": {"dtype": "float32", "shape": (1,), "names": ["a"]}}
+    dataset = LeRobotDataset.create("t/t", fps=10, features=features, root=tmp_path / "d", use_videos=False)
+    for episode in range(3):
+        for frame in range(4):
+            dataset.add_frame({"action": np.array([episode], np.float32), "task": f"{episode}" if frame < 2 else "end"})
+        dataset.save_episode()
+    dataset.finalize()
+    keep(tmp_path / "d", [2, 1], tmp_path / "kept")
+    assert [set(one.task) for one in content(tmp_path / "kept")] == [{"2", "end"}, {"1", "end"}]
+    assert_sound(tmp_path / "kept")
+    loaded = LeRobotDataset("t/t", root=tmp_path / "kept")
+    assert [loaded[index]["task"] for index in (0, 3, 4, 7)] == ["2", "end", "1", "end"]
+
+
+def test_depth_of_another_scale_does_not_merge(filmed: Path, tmp_path: Path) -> None:
+    other = shutil.copytree(filmed, tmp_path / "other")
+    info = json.loads((other / "meta/info.json").read_text())
+    info["features"][support.CAMERA]["info"]["video.depth_max"] = 3.0
+    (other / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(DatasetMismatchError, match=r"depth_max: not"):
+        merge([filmed, other], tmp_path / "all")
+
+
+def test_files_at_other_places_are_refused_by_name(plain: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(plain, tmp_path / "d")
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps({**info, "data_path": "frames/{episode_index}.parquet"}))
+    with pytest.raises(UnsupportedDatasetError, match=r"frames/\{episode_index\}"):
+        delete(root, [0])

@@ -1,0 +1,117 @@
+"""Encoding blocks instead of dropping, and joining keeps every frame at its time."""
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from bhd_lerobot.datasets.format import statistics, video
+from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
+from bhd_lerobot.errors import FrameError
+
+SIZE = (32, 48)
+
+
+def encode(path: Path, greys: list[int], settings: VideoSettings) -> Path:
+    encoder = CameraEncoder(path, 10, SIZE, settings)
+    for grey in greys:
+        encoder.add(np.full((*SIZE, 3), grey, np.uint8))
+    assert encoder.finish().shape == (len(greys), 3, 256)
+    return path
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        VideoSettings(),
+        VideoSettings(g=30, extra_options={"bf": 2}),
+        VideoSettings(vcodec="libsvtav1", preset=12, crf=30),
+    ],
+)
+def test_joined_files_hold_every_frame_at_its_time(tmp_path: Path, settings: VideoSettings) -> None:
+    parts = [[20, 60, 100], [140], [180, 40, 90, 130, 200]]
+    paths = [encode(tmp_path / f"{i}.mp4", greys, settings) for i, greys in enumerate(parts)]
+    assert len({video.stream_signature(path) for path in paths}) == 1
+    joined = tmp_path / "joined.mp4"
+    assert video.concatenate(paths, joined, 10) == [3, 1, 5]
+    # Joining what was joined before, as resuming does.
+    twice = tmp_path / "twice.mp4"
+    assert video.concatenate([joined, paths[0]], twice, 10) == [9, 3]
+    wanted = [*parts[0], *parts[1], *parts[2], *parts[0]]
+    with av.open(str(twice)) as container:
+        frames: list[Any] = list(container.decode(container.streams.video[0]))
+    assert [float(frame.pts * frame.time_base) for frame in frames] == pytest.approx([i / 10 for i in range(12)])
+    for frame, grey in zip(frames, wanted, strict=True):
+        assert abs(frame.to_ndarray(format="rgb24").mean() - grey) < 4
+    assert video.count_frames(twice) == 12
+
+
+def test_options_and_info_are_lerobots(tmp_path: Path) -> None:
+    from lerobot.configs import RGBEncoderConfig
+    from lerobot.datasets.video_utils import get_video_info
+
+    for settings in (VideoSettings(), VideoSettings(vcodec="libsvtav1", preset=12, crf=30, fast_decode=1)):
+        encoder = RGBEncoderConfig(**settings.recorded())
+        ours = settings.codec_options()
+        ours.pop("bf", None)
+        assert ours == encoder.get_codec_options(1, as_strings=True)
+        path = encode(tmp_path / "a.mp4", [1, 2], settings)
+        assert video.video_info(path, settings) == get_video_info(path, encoder)
+
+
+def test_a_slow_encoder_makes_the_caller_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go = threading.Event()
+    real = statistics.image_histogram
+    monkeypatch.setattr(statistics, "image_histogram", lambda image: (go.wait(), real(image))[1])
+    encoder = CameraEncoder(tmp_path / "a.mp4", 10, SIZE, VideoSettings(queue_size=2))
+    added: list[int] = []
+
+    def produce() -> None:
+        for i in range(20):
+            encoder.add(np.full((*SIZE, 3), i, np.uint8))
+            added.append(i)
+
+    producer = threading.Thread(target=produce)
+    producer.start()
+    time.sleep(0.3)
+    assert len(added) <= 3, "one image in the encoder, two in the queue"
+    go.set()
+    producer.join()
+    assert len(encoder.finish()) == 20
+    assert video.count_frames(tmp_path / "a.mp4") == 20
+
+
+def test_images_are_copied(tmp_path: Path) -> None:
+    encoder = CameraEncoder(tmp_path / "a.mp4", 10, SIZE, VideoSettings())
+    image = np.zeros((*SIZE, 3), np.uint8)
+    for i in range(10):
+        image[:] = i
+        encoder.add(image)
+    histograms = encoder.finish()
+    assert histograms.argmax(axis=2)[:, 0].tolist() == list(range(10))
+
+
+def test_an_encoder_that_fails_is_heard(tmp_path: Path) -> None:
+    encoder = CameraEncoder(tmp_path / "missing" / "a.mp4", 10, SIZE, VideoSettings(queue_size=1))
+
+    def add_many() -> None:
+        for _ in range(100):
+            encoder.add(np.zeros((*SIZE, 3), np.uint8))
+
+    with pytest.raises(OSError, match="missing"):
+        add_many()
+    encoder.cancel()
+    encoder.cancel()
+
+
+def test_wrong_images_are_refused(tmp_path: Path) -> None:
+    encoder = CameraEncoder(tmp_path / "a.mp4", 10, SIZE, VideoSettings())
+    for image in (np.zeros((48, 32, 3), np.uint8), np.zeros((*SIZE, 3)), [[0]]):
+        with pytest.raises(FrameError, match="must be uint8"):
+            encoder.add(image)  # type: ignore[arg-type]
+    encoder.cancel()
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("encode")]

@@ -1,0 +1,255 @@
+"""Batches from memory are LeRobot's, key by key and bit by bit."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+from torchvision.transforms import v2
+
+from bhd_lerobot.datasets.format.video import VideoSettings
+from bhd_lerobot.datasets.loader import frame_cache
+from bhd_lerobot.datasets.loader.loader import BatchLoader, FrameTable, TableDataset, make_loader
+from bhd_lerobot.errors import DatasetError
+from tests.datasets.loader import support
+from tests.datasets.loader.support import FPS, FRONT, PHOTO, WRIST
+
+CHUNK = [i / FPS for i in range(8)]  # longer than the shortest episode
+WINDOW = [-0.2, 0.0, 0.1]
+AV1 = VideoSettings(vcodec="libsvtav1", preset=12, crf=30)
+B_FRAMES = VideoSettings(g=30, extra_options={"bf": 2})
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Without cameras, by our recorder."""
+    return support.record_ours(tmp_path_factory.mktemp("plain") / "d")
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With two cameras."""
+    return support.record_ours(tmp_path_factory.mktemp("filmed") / "d", 4, (FRONT, WRIST))
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """By stock LeRobot, with video, images in the data files and a matrix."""
+    return support.record_stock(tmp_path_factory.mktemp("foreign") / "d", cameras=True)
+
+
+def both(root: Path, **options: Any) -> tuple[TableDataset, Any]:
+    return TableDataset("t/t", root, **options), support.stock(root, **options)
+
+
+def assert_equal_datasets(root: Path, **options: Any) -> TableDataset:
+    ours, theirs = both(root, **options)
+    for name in ("num_frames", "num_episodes", "fps", "features", "episodes", "root", "absolute_to_relative_idx"):
+        assert getattr(ours, name) == getattr(theirs, name), name
+    assert len(ours) == len(theirs)
+    indices = torch.randperm(len(theirs), generator=torch.Generator().manual_seed(0))
+    support.assert_same(ours.batch(indices), support.collated(theirs, indices.tolist()))
+    for index in (0, len(theirs) // 2, -1):
+        support.assert_same(ours[index], theirs[index])
+    return ours
+
+
+@pytest.mark.parametrize("episodes", [None, [0], [4, 1], [2, 3, 4]])
+@pytest.mark.parametrize(
+    "deltas",
+    [None, {"action": CHUNK}, {"action": CHUNK, "observation.state": WINDOW, "event": WINDOW}, {"action": [0.0]}],
+)
+def test_tables_are_those_of_lerobot(plain: Path, episodes: list[int] | None, deltas: dict[str, list[float]]) -> None:
+    assert_equal_datasets(plain, episodes=episodes, delta_timestamps=deltas)
+
+
+@pytest.mark.parametrize("return_uint8", [False, True])
+@pytest.mark.parametrize("deltas", [None, {"action": CHUNK, FRONT: WINDOW}, {FRONT: [0.0], WRIST: [-0.1]}])
+def test_frames_of_our_recorder_are_those_of_lerobot(
+    filmed: Path, return_uint8: bool, deltas: dict[str, list[float]] | None
+) -> None:
+    assert_equal_datasets(filmed, episodes=[1, 3], delta_timestamps=deltas, return_uint8=return_uint8)
+
+
+@pytest.mark.parametrize("video", [AV1, B_FRAMES], ids=["AV1", "B-frames"])
+@pytest.mark.parametrize("cores", [1, 8])
+def test_frames_of_other_codecs_are_those_of_lerobot_with_any_number_of_threads(
+    tmp_path: Path, video: VideoSettings, cores: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = support.record_ours(tmp_path / "d", 3, (FRONT,), video)
+    monkeypatch.setattr(frame_cache.os, "cpu_count", lambda: cores)
+    assert_equal_datasets(root, delta_timestamps={"action": CHUNK}, return_uint8=True)
+
+
+@pytest.mark.parametrize("episodes", [None, [2, 0]])
+@pytest.mark.parametrize("deltas", [None, {"action": CHUNK, "grid": WINDOW, FRONT: WINDOW, PHOTO: [0.0]}])
+def test_a_dataset_that_stock_lerobot_recorded(
+    foreign: Path, episodes: list[int] | None, deltas: dict[str, list[float]] | None
+) -> None:
+    assert_equal_datasets(foreign, episodes=episodes, delta_timestamps=deltas)
+
+
+def test_random_transforms_draw_as_in_lerobot(filmed: Path) -> None:
+    transform = v2.Compose([v2.RandomHorizontalFlip(), v2.ColorJitter(brightness=0.5)])
+    ours, theirs = both(filmed, image_transforms=transform)
+    torch.manual_seed(3)
+    wanted = support.collated(theirs, [5, 1, 9])
+    torch.manual_seed(3)
+    support.assert_same(ours.batch(torch.tensor([5, 1, 9])), wanted)
+    ours.set_image_transforms(None)
+    assert not torch.equal(ours.batch(torch.tensor([5, 1, 9]))[FRONT], wanted[FRONT])
+
+
+def test_other_decoders_are_asked_through_lerobot(filmed: Path) -> None:
+    ours = TableDataset("t/t", filmed, video_backend="video_reader", return_uint8=True)
+    cache = frame_cache.FrameCache(ours.table, [FRONT], 1e-4)
+    slow = frame_cache.FrameCache.__new__(frame_cache.FrameCache)
+    slow.__dict__.update(cache.__dict__, _backend="pyav", images={FRONT: torch.zeros_like(cache.images[FRONT])})
+    for job in slow._jobs():
+        slow._decode_lerobot(job)
+    assert torch.equal(slow.images[FRONT], cache.images[FRONT])
+
+
+def test_a_language_column_is_in_samples_and_left_out_of_batches_as_in_lerobot(tmp_path: Path) -> None:
+    root = support.record_ours(tmp_path / "d", 2, language=True)
+    ours = assert_equal_datasets(root, delta_timestamps={"action": CHUNK})
+    assert ours[0]["language_persistent"][0]["content"] == "pick it up"
+    assert "language_persistent" not in ours.batch(torch.tensor([0]))
+    loader = make_loader("t/t", root=root, batch_size=4, budget_gib=1e-9, say=lambda _: None).train
+    assert "language_persistent" not in next(iter(loader))
+
+
+def test_a_subset_shares_memory_and_is_what_lerobot_selects(filmed: Path) -> None:
+    whole = TableDataset("t/t", filmed, delta_timestamps={"action": CHUNK}, return_uint8=True)
+    whole.weights = torch.arange(len(whole)).float()
+    part = whole.subset([3, 1])
+    theirs = support.stock(filmed, episodes=[3, 1], delta_timestamps={"action": CHUNK}, return_uint8=True)
+    assert part.table is whole.table
+    assert part.episodes == theirs.episodes
+    indices = list(range(len(theirs)))
+    assert len(part) == len(theirs)
+    support.assert_same(part.batch(torch.tensor(indices)), support.collated(theirs, indices))
+    assert part.weights is not None
+    assert part.weights.tolist() == part.batch(torch.tensor(indices))["index"].tolist()
+    assert part.subset([1]).num_frames == support.length(1)
+    with pytest.raises(DatasetError, match="Episode 0 is not among the 2"):
+        part.subset([0])
+
+
+def test_batches_do_not_share_memory_with_the_dataset_or_each_other(filmed: Path) -> None:
+    dataset = TableDataset("t/t", filmed, delta_timestamps={"action": [0.0], "event": [0.0]}, return_uint8=True)
+    wanted = dataset.batch(torch.arange(3))
+    spoiled = dataset.batch(torch.arange(3))
+    for key, value in spoiled.items():
+        if isinstance(value, torch.Tensor):
+            before = {k: v.clone() for k, v in spoiled.items() if isinstance(v, torch.Tensor) and k != key}
+            value.fill_(1)
+            assert all(torch.equal(spoiled[k], v) for k, v in before.items()), key
+    support.assert_same(dataset.batch(torch.arange(3)), wanted)
+
+
+def test_only_what_is_kept_is_read_and_decoded(filmed: Path) -> None:
+    keep = ["action", WRIST]
+    dataset = TableDataset("t/t", filmed, keep=keep, delta_timestamps={"action": CHUNK})
+    theirs = support.stock(filmed, delta_timestamps={"action": CHUNK})
+    batch, wanted = dataset.batch(torch.tensor([4])), support.collated(theirs, [4])
+    index = ["timestamp", "frame_index", "episode_index", "index", "task_index"]
+    assert set(batch) == {*keep, *index, "action_is_pad", "task"}
+    support.assert_same(batch, {key: wanted[key] for key in wanted if key in batch})
+    assert dataset.camera_keys == [WRIST]
+    assert dataset.nbytes < TableDataset("t/t", filmed).nbytes
+
+
+def test_it_serves_pytorchs_data_loader_and_slices(plain: Path) -> None:
+    ours, theirs = both(plain, delta_timestamps={"action": CHUNK})
+    for mine, other in zip(DataLoader(ours, 7), DataLoader(theirs, 7), strict=True):
+        support.assert_same(mine, other)
+    assert [one["index"].item() for one in ours[3:6]] == [3, 4, 5]
+    with pytest.raises(IndexError, match=f"Sample {len(ours)}"):
+        ours[len(ours)]
+
+
+def test_the_table_by_episode(plain: Path) -> None:
+    table = FrameTable.open(plain, [3, 1], ["action"])
+    assert table.episodes == [1, 3]
+    assert len(table) == support.length(1) + support.length(3)
+    for episode in (1, 3):
+        assert np.array_equal(table.episode(episode)["action"].numpy(), support.columns(episode)["action"])
+    assert "observation.state" not in table.columns
+    assert table.place(table.rows(3).start + 2) == "episode 3, frame 2"
+    with pytest.raises(DatasetError, match="episode 0 is not among 1, 3"):
+        table.rows(0)
+
+
+def test_the_batches_of_a_training_are_those_of_lerobot_train(plain: Path) -> None:
+    from lerobot.datasets.sampler import EpisodeAwareSampler
+
+    ours, theirs = both(plain, episodes=[0, 2, 3], delta_timestamps={"action": CHUNK})
+    sampler = EpisodeAwareSampler(
+        theirs.meta.episodes["dataset_from_index"],
+        theirs.meta.episodes["dataset_to_index"],
+        episode_indices_to_use=theirs.episodes,
+        drop_n_last_frames=2,
+        shuffle=True,
+        seed=11,
+        absolute_to_relative_idx=theirs.absolute_to_relative_idx,
+    )
+    loader = BatchLoader(ours, 4, 11, drop_n_last_frames=2)
+    reference = DataLoader(theirs, 4, sampler=sampler)
+    for _ in range(2):
+        assert len(loader) == len(reference)
+        for mine, other in zip(loader, reference, strict=True):
+            support.assert_same(mine, other)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_the_fallback_serves_the_same_batches_and_says_so_once(filmed: Path, workers: int) -> None:
+    said: list[str] = []
+    options: dict[str, Any] = {
+        "root": filmed,
+        "batch_size": 6,
+        "seed": 5,
+        "eval_split": 0.5,
+        "max_eval_samples": 6,
+        "delta_timestamps": {"action": CHUNK},
+        "drop_n_last_frames": 1,
+        "intervention_weight": 0.0,
+        "say": said.append,
+    }
+    memory = make_loader("t/t", **options)
+    assert (said, memory.message) == ([], "")
+    stock = make_loader("t/t", budget_gib=1e-4, num_workers=workers, **options)
+    assert said == [stock.message]
+    assert "more than the budget of 0.0001 GiB" in stock.message
+    assert "LeRobot's own loader" in stock.message
+    assert type(stock.dataset).__name__ == "LeRobotDataset"
+    assert len(memory.train) == len(stock.train) == 3
+    for _ in range(2):
+        for mine, other in zip(memory.train, stock.train, strict=True):
+            support.assert_same(mine, other)
+            assert memory.train.state_dict() == stock.train.state_dict()
+    assert memory.held_out is not None
+    assert stock.held_out is not None
+    held_out = list(memory.held_out)
+    for mine, other in zip(held_out, stock.held_out, strict=True):
+        support.assert_same(mine, other)
+    assert torch.cat([batch["episode_index"] for batch in held_out]).tolist() == [2, 2, 2, 3, 3, 3]
+    assert np.allclose(memory.dataset.meta.stats[FRONT]["mean"].squeeze(), [0.485, 0.456, 0.406])
+
+
+def test_a_resumed_fallback_goes_on_at_the_same_sample(filmed: Path) -> None:
+    def make() -> Any:
+        return make_loader("t/t", root=filmed, batch_size=3, seed=5, budget_gib=1e-4, say=lambda _: None).train
+
+    loader = make()
+    stream = loader.cycle()
+    for _ in range(len(loader) + 2):
+        next(stream)
+    state = loader.state_dict()
+    wanted = [next(stream)["index"].tolist() for _ in range(len(loader))]
+    again = make()
+    again.load_state_dict(state)
+    stream = again.cycle()
+    assert [next(stream)["index"].tolist() for _ in range(len(loader))] == wanted

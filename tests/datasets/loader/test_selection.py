@@ -1,0 +1,337 @@
+"""Which episodes and frames are learned from, and what a dataset must not lack."""
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from bhd_lerobot.datasets.loader import frame_cache
+from bhd_lerobot.datasets.loader.loader import (
+    BatchLoader,
+    EpisodeFilter,
+    FrameTable,
+    MemoryBudgetError,
+    TableDataset,
+    check,
+    intervention_weights,
+    make_loader,
+    split_episodes,
+)
+from bhd_lerobot.datasets.loader.table import open_metadata
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetError
+from tests.datasets.loader import support
+from tests.datasets.loader.support import FPS, FRONT, WRIST
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five episodes: success, success, collision, timeout, success."""
+    return support.record_ours(tmp_path_factory.mktemp("plain") / "d")
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return support.record_ours(tmp_path_factory.mktemp("filmed") / "d", 2, (FRONT, WRIST))
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return support.record_stock(tmp_path_factory.mktemp("foreign") / "d")
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        ({}, [0, 1, 4]),
+        ({"outcome": "all"}, [0, 1, 2, 3, 4]),
+        ({"outcome": ["collision", "timeout"]}, [2, 3]),
+        ({"min_score": 0.5}, [4]),
+        ({"outcome": "all", "min_score": 0.25}, [1, 2, 3, 4]),
+        ({"outcome": "all", "exclude_late": True}, [0, 1, 3, 4]),  # a tenth of ten frames may be late
+    ],
+)
+def test_episodes_by_what_is_stored_about_them(plain: Path, options: dict[str, Any], wanted: list[int]) -> None:
+    assert EpisodeFilter(**options).select(open_metadata(plain)) == wanted
+    chosen = EpisodeFilter(**options).select(open_metadata(plain), [4, 3, 2])
+    assert chosen == [episode for episode in wanted if episode >= 2]
+
+
+def test_no_episode_left_says_what_there_is(plain: Path) -> None:
+    meta = open_metadata(plain)
+    with pytest.raises(DatasetError, match="outcome stuck was asked for, and it has 5 episodes: 3 success, 1 coll"):
+        EpisodeFilter("stuck").select(meta)
+    with pytest.raises(DatasetError, match=r"a score of at least 0\.9 was asked"):
+        EpisodeFilter("success", min_score=0.9).select(meta, [0, 1])
+
+
+def test_filters_of_what_was_not_recorded(foreign: Path) -> None:
+    meta = open_metadata(foreign)
+    with pytest.raises(DatasetError, match=r"has no bhd/outcome .* another program .* outcome 'all'"):
+        EpisodeFilter().select(meta)
+    assert EpisodeFilter("all").select(meta) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"outcome": "sucess"}, "Did you mean 'success'"),
+        ({"outcome": []}, "No outcome is given"),
+        ({"outcome": ["success", "intervention"]}, "Unknown outcome 'intervention'"),
+        ({"min_score": 1.5}, "min_score is 1.5"),
+        ({"min_score": math.nan}, "min_score is nan"),
+    ],
+)
+def test_wrong_filters_are_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        EpisodeFilter(**options)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_the_split_by_instruction_is_that_of_lerobot(plain: Path, share: float) -> None:
+    from lerobot.configs.default import DatasetConfig
+    from lerobot.datasets.factory import make_train_eval_datasets
+
+    policy = SimpleNamespace(reward_delta_indices=None, action_delta_indices=[0, 1], observation_delta_indices=None)
+    dataset = DatasetConfig("t/t", root=str(plain), eval_split=share, video_backend="pyav")
+    config: Any = SimpleNamespace(dataset=dataset, trainable_config=policy, tolerance_s=1e-4)
+    theirs = make_train_eval_datasets(config)
+    ours = split_episodes(open_metadata(plain), None, share, "instruction")
+    assert ours == tuple(dataset.episodes for dataset in theirs)
+    assert split_episodes(open_metadata(plain), [3, 1], 0.0) == ([3, 1], [])
+
+
+def described(instructions: list[str]) -> Any:
+    """Metadata of a dataset with an episode of each of these instructions."""
+    n, episodes = len(instructions), {"tasks": [[one] for one in instructions]}
+    return SimpleNamespace(root=Path("toy"), total_episodes=n, total_frames=n, episodes=episodes)
+
+
+@pytest.mark.parametrize("kinds", [1, 2, 7, 100])
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.25, 0.9])
+def test_a_share_of_all_episodes_is_held_out(kinds: int, share: float) -> None:
+    meta = described([f"pick object {i % kinds}" for i in range(100)])
+    train, held_out = split_episodes(meta, None, share)
+    assert sorted(train + held_out) == list(range(100))
+    assert len(held_out) == math.ceil(100 * share)
+    for kind in range(kinds):  # in proportion, and of each the last ones
+        ours = [i for i in range(kind, 100, kinds) if i in held_out]
+        assert abs(len(ours) - share * len(range(kind, 100, kinds))) < 1
+        assert ours == list(range(kind, 100, kinds))[100 // kinds + (kind < 100 % kinds) - len(ours) :]
+    assert (train, held_out) == split_episodes(meta, list(range(100)), share)
+    if kinds == 1:
+        assert (train, held_out) == split_episodes(meta, None, share, "instruction")
+    if kinds == 100:  # no stretch of the dataset is without
+        gaps = np.diff([-1, *held_out, 100])
+        assert gaps.max() <= math.ceil(1 / share)
+
+
+def test_few_episodes_with_instructions_of_their_own(plain: Path) -> None:
+    assert split_episodes(open_metadata(plain), [0, 1], 0.1) == ([0], [1])
+
+
+def test_a_split_that_leaves_nothing(plain: Path) -> None:
+    with pytest.raises(DatasetError, match=r"2 episodes have 2 different instructions.* hold_out to 'episode'"):
+        split_episodes(open_metadata(plain), [0, 1], 0.1, "instruction")
+    with pytest.raises(DatasetError, match="there are 1, and at least one is held out"):
+        split_episodes(open_metadata(plain), [3], 0.1)
+    with pytest.raises(ConfigError, match="eval_split is 1"):
+        split_episodes(open_metadata(plain), None, 1)
+    with pytest.raises(ConfigError, match=r"'episodes'\. Did you mean 'episode'"):
+        split_episodes(open_metadata(plain), None, 0.1, "episodes")
+
+
+def test_interventions_are_weighted_or_dropped(plain: Path, foreign: Path) -> None:
+    meta = open_metadata(plain)
+    place = sum(support.length(episode) for episode in (0, 1)) + 1
+    weights = intervention_weights(meta, None, 3.0)
+    assert weights is not None
+    assert weights.tolist() == [3.0 if i == place else 1.0 for i in range(meta.total_frames)]
+    assert intervention_weights(meta, None, 1.0) is None
+    assert intervention_weights(meta, [0, 1], 0.0) is None  # nobody intervened there
+    loader = make_loader("t/t", root=plain, batch_size=8, intervention_weight=0.0).train
+    drawn = torch.cat([batch["index"] for batch in loader])
+    assert sorted(drawn.tolist()) == [i for i in range(meta.total_frames) if i != place]
+    with pytest.raises(DatasetError, match="no column 'event'"):
+        intervention_weights(open_metadata(foreign), None, 0.0)
+    with pytest.raises(ConfigError, match="got -1"):
+        intervention_weights(meta, None, -1)
+
+
+def test_selected_and_split_episodes_reach_the_loaders(plain: Path) -> None:
+    loaders = make_loader("t/t", root=plain, batch_size=64, selection=EpisodeFilter(), eval_split=0.4)
+    assert loaders.held_out is not None
+    assert set(next(iter(loaders.train))["episode_index"].tolist()) == {0}
+    assert set(next(iter(loaders.held_out))["episode_index"].tolist()) == {1, 4}
+
+
+POLICY: dict[str, Any] = {"observation.state": SimpleNamespace(shape=(3,)), "action": SimpleNamespace(shape=(2,))}
+
+
+def test_a_sound_dataset_passes(plain: Path, filmed: Path) -> None:
+    for dataset in (TableDataset("t/t", plain), support.stock(plain), TableDataset("t/t", plain, [2])):
+        check(dataset, POLICY, fps=FPS, names={"action": ["x.vel", "theta.vel"]})
+    check(TableDataset("t/t", filmed), ["action", FRONT])
+
+
+@pytest.mark.parametrize(
+    ("features", "options", "message"),
+    [
+        (
+            ["observation.states"],
+            {},
+            "needs the feature 'observation.states'.* Did you mean 'observation.state'",
+        ),
+        ({**POLICY, "action": (7,)}, {}, r"'action' of .* has shape \(2,\), the policy's has \(7,\)"),
+        (POLICY, {"fps": 25}, "recorded at 10 frames per second, the policy works at 25"),
+        (POLICY, {"names": {"action": ["x.vel", "y.vel"]}}, "has 'theta.vel' as number 1, the policy has 'y.vel'"),
+        (POLICY, {"names": {"action": ["x.vel"]}}, "has 'theta.vel' as number 1, the policy has None"),
+    ],
+)
+def test_what_a_policy_lacks_is_named(plain: Path, features: Any, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        check(TableDataset("t/t", plain), features, **options)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_value_that_is_not_finite_is_named(tmp_path: Path, plain: Path, value: float) -> None:
+    root = support.record_ours(tmp_path / "d")
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    rows = [list(row) for row in table["action"].to_pylist()]
+    place = sum(support.length(episode) for episode in range(3)) + 2
+    rows[place][1] = value
+    column = table.schema.get_field_index("action")
+    changed = pa.array(rows, type=table.schema.field(column).type)
+    pq.write_table(table.set_column(column, table.schema.field(column), changed), path)
+    wanted = rf"episode 3, frame 2: 'action' \(theta.vel\) is {value}, and 1 frames"
+    for dataset in (TableDataset("t/t", root), TableDataset("t/t", root, [1, 3]), support.stock(root, episodes=[1, 3])):
+        with pytest.raises(DatasetError, match=wanted):
+            check(dataset, POLICY)
+        check(dataset, ["observation.state"])
+    check(TableDataset("t/t", root).subset([0, 1]), POLICY)
+
+
+def test_an_empty_dataset(tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    DatasetRecorder.create("t/t", FPS, support.FEATURES, robot_type="toy", root=root, recording={}).finalize()
+    with pytest.raises(DatasetError, match="has no episode"):
+        TableDataset("t/t", root)
+    empty = SimpleNamespace(meta=SimpleNamespace(root=root), num_frames=0)
+    with pytest.raises(DatasetError, match="has no frame"):
+        check(empty, ["action"])
+
+
+def test_no_dataset(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="nowhere does not exist, and it could not be fetched"):
+        TableDataset("t/t", tmp_path / "nowhere")
+    assert not (tmp_path / "nowhere").exists()
+    with pytest.raises(DatasetError, match=r"has no meta/info\.json"):
+        FrameTable.open(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"episodes": [7]}, "There is no episode 7 .* it has 5, from 0 to 4"),
+        ({"episodes": []}, "No episode of .* was asked for"),
+        ({"keep": ["actions"]}, "Unknown feature 'actions'. Did you mean 'action'"),
+        ({"delta_timestamps": {"acton": [0.0]}}, "Unknown feature 'acton'"),
+        ({"delta_timestamps": {"action": [0.0, 0.05]}}, r"must be multiples of 1 / 10 s.* got \[0.05\]"),
+        ({"delta_timestamps": {"subtask": [0.0]}}, "'subtask', which is text"),
+        (
+            {"delta_timestamps": {"action": [0.0]}, "keep": ["event"]},
+            "'action', which is not among the features",
+        ),
+        ({"budget_gib": 0}, "must be positive; got 0"),
+    ],
+)
+def test_wrong_options_are_named(plain: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        TableDataset("t/t", plain, **options)
+
+
+def test_policies_that_drop_more_than_there_is(plain: Path) -> None:
+    with pytest.raises(ConfigError, match="drop_n_last_frames=50 leaves no frame"):
+        BatchLoader(TableDataset("t/t", plain), 4, drop_n_last_frames=50)
+
+
+def test_memory_is_asked_for_before_anything_is_decoded(filmed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[Any] = []
+
+    def decode(cache: Any) -> None:
+        decoded.append(cache)
+
+    monkeypatch.setattr(frame_cache.FrameCache, "_decode_all", decode)
+    frames = support.length(0) + support.length(1)
+    images = 2 * frames * support.SIZE[0] * support.SIZE[1] * 3
+    with pytest.raises(MemoryBudgetError, match=f"{FRONT}, {WRIST}.* more than the budget"):
+        TableDataset("t/t", filmed, budget_gib=images / 2**30)  # the columns come on top
+    monkeypatch.setattr(frame_cache, "available_memory", lambda: images)
+    with pytest.raises(MemoryBudgetError, match="GiB are free"):
+        TableDataset("t/t", filmed)
+    assert decoded == []
+    assert TableDataset("t/t", filmed, keep=["action", FRONT]).camera_keys == [FRONT]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
+@pytest.mark.parametrize("part", ["columns", "images"])
+def test_memory_that_runs_out_leads_to_the_fallback(
+    filmed: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, part: str
+) -> None:
+    def fail(*_: Any) -> None:
+        raise error if part == "images" else MemoryError
+
+    if part == "images":
+        monkeypatch.setattr(frame_cache.FrameCache, "_decode_all", fail)
+    else:
+        monkeypatch.setattr("bhd_lerobot.datasets.loader.table._read", fail)
+    said: list[str] = []
+    loaders = make_loader("t/t", root=filmed, batch_size=4, say=said.append)
+    assert f"Memory ran out while the {part}" in said[0]
+    assert next(iter(loaders.train))[FRONT].dtype == torch.uint8
+
+
+def test_available_memory_respects_the_control_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "meminfo").write_text("MemTotal: 9 kB\nMemAvailable:   4000 kB\n")
+    monkeypatch.setattr(frame_cache, "_MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(frame_cache, "_CGROUP", tmp_path)
+    assert frame_cache.available_memory() == 4000 * 1024
+    (tmp_path / "memory.current").write_text("1000\n")
+    for limit, wanted in (("max", 4000 * 1024), ("5000", 4000), ("500", 0)):
+        (tmp_path / "memory.max").write_text(limit + "\n")
+        assert frame_cache.available_memory() == wanted
+
+
+def test_a_video_that_lacks_frames_is_named(tmp_path: Path) -> None:
+    root = support.record_ours(tmp_path / "d", 2, (FRONT,))
+    other = support.record_ours(tmp_path / "other", 1, (FRONT,))
+    name = f"videos/{FRONT}/chunk-000/file-000.mp4"
+    (root / name).write_bytes((other / name).read_bytes())
+    with pytest.raises(DatasetError, match=f"no image of '{FRONT}' for episode 1, frame 0"):
+        TableDataset("t/t", root)
+    (root / name).write_bytes(b"not a video")
+    with pytest.raises(DatasetCorruptError, match=r"file-000\.mp4 is corrupt"):
+        TableDataset("t/t", root)
+
+
+def test_a_data_file_that_does_not_fit_the_metadata(tmp_path: Path) -> None:
+    root = support.record_ours(tmp_path / "d")
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.slice(0, len(table) - 1), path)
+    with pytest.raises(DatasetCorruptError, match="are not those that meta/episodes says"):
+        TableDataset("t/t", root)
+    assert len(TableDataset("t/t", root, [0, 1])) == support.length(0) + support.length(1)
+    pq.write_table(table.drop_columns(["action"]), path)
+    with pytest.raises(DatasetCorruptError, match="has no column 'action'"):
+        TableDataset("t/t", root)
+    path.write_bytes(np.zeros(100, np.uint8).tobytes())
+    with pytest.raises(DatasetCorruptError, match=r"file-000\.parquet is corrupt"):
+        TableDataset("t/t", root)

@@ -1,0 +1,84 @@
+"""What follows from the rest can be mended; the rest is never touched."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.datasets.recovery.fix import fix, is_fixable
+from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
+from bhd_lerobot.datasets.writer.recorder import RootLock
+from bhd_lerobot.errors import DatasetLockedError
+from tests.datasets.edit_support import content, record
+
+STATS, INFO = "meta/stats.json", "meta/info.json"
+
+
+def stock(root: Path) -> Path:
+    """Let a dataset look as if another program had recorded it."""
+    (root / "meta/bhd.json").unlink()
+    return root
+
+
+def damage(path: Path, change) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def errors(root: Path) -> list[str]:
+    return [str(one) for one in check_dataset(root).findings if one.severity is Severity.ERROR]
+
+
+DAMAGES = {
+    "gone": lambda root: (root / STATS).unlink(),
+    "no JSON": lambda root: (root / STATS).write_text("{"),
+    "wrong mean": lambda root: damage(root / STATS, lambda s: s["observation.state"].update(mean=[9.0, 9.0, 9.0])),
+    "a key is missing": lambda root: damage(root / STATS, lambda s: s.pop("observation.state")),
+    "frames": lambda root: damage(root / INFO, lambda info: info.update(total_frames=3)),
+}
+
+
+@pytest.mark.parametrize("ours", [True, False])
+@pytest.mark.parametrize("name", DAMAGES)
+def test_it_is_as_it_was(tmp_path: Path, name: str, ours: bool) -> None:
+    root = record(tmp_path / "d", [0, 1, 2], video=not ours)
+    if not ours:
+        stock(root)
+    before, stats = content(root), json.loads((root / STATS).read_text())
+    DAMAGES[name](root)
+    assert errors(root)
+    assert fix(root, check_dataset(root).findings)
+    assert errors(root) == []
+    assert content(root) == before
+    after = json.loads((root / STATS).read_text())
+    assert after.keys() == stats.keys()
+    for key, stat in stats.items():
+        for statistic in ("min", "max", "mean", "std", "count"):
+            # Films are encoded, so what is computed from them may differ in the last bits.
+            tolerance = 0.01 if "images" in key else 1e-6
+            np.testing.assert_allclose(after[key][statistic], stat[statistic], rtol=0, atol=tolerance, err_msg=key)
+    assert fix(root, check_dataset(root).findings) == []
+    assert not (root / ".bhd").exists()
+
+
+def test_nothing_is_mended_while_something_else_is_wrong(tmp_path: Path) -> None:
+    """Statistics of wrong data would hide what is wrong."""
+    root = record(tmp_path / "d", [0, 1, 2])
+    DAMAGES["wrong mean"](root)
+    damage(root / INFO, lambda info: info["features"].pop("timestamp"))
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    found = check_dataset(root).findings
+    assert any(is_fixable(one) for one in found)
+    assert fix(root, found) == []
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+
+
+def test_not_while_it_is_recorded(tmp_path: Path) -> None:
+    root = record(tmp_path / "d", [0, 1, 2])
+    DAMAGES["gone"](root)
+    lock = RootLock(root)
+    with pytest.raises(DatasetLockedError):
+        fix(root, check_dataset(root).findings)
+    lock.release()

@@ -1,0 +1,464 @@
+"""What stock LeRobot leaves behind SIGKILL is recovered: every whole episode, as it would have been."""
+
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from bhd_lerobot.datasets.edit.edits import edits_of, keep
+from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.datasets.recovery.repair import repair, settle
+from bhd_lerobot.datasets.storage.disk import Disk
+from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
+from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError, DatasetWriteError
+from tests.datasets.edit_support import Episode, assert_sound, content
+from tests.datasets.kill_support import KillServer
+
+CAMERA = "observation.images.top"
+
+
+@pytest.fixture(scope="module")
+def lerobot() -> Iterator[KillServer]:
+    server = KillServer("tests.datasets.corruption_server")
+    yield server
+    server.close()
+
+
+def recorded(server: KillServer, root: Path, video: str, episodes: int, die: str = "never", **job: Any) -> Path:
+    server.start({"root": str(root), "video": video, "episodes": episodes, "die": die, **job})
+    status = server.end()
+    assert (status == 0) == (die == "never"), status
+    return root
+
+
+@pytest.fixture(scope="module")
+def truth(lerobot: KillServer, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Episode]]:
+    """What a recording that nobody kills is like."""
+    folder = tmp_path_factory.mktemp("truth")
+    episodes = {"none": 8, "film": 4, "image": 3}
+    return {video: content(recorded(lerobot, folder / video, video, count)) for video, count in episodes.items()}
+
+
+def loaded(root: Path, frames: int) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("t/t", root=root, video_backend="pyav")
+    assert len(dataset) == frames
+    assert dataset[frames - 1]["task"]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        ("none", 1, "saved", 1),
+        ("none", 8, "saved", 8),
+        ("none", 4, "frames", 4),
+        ("none", 5, "counting", 5),  # its frames are on the disk, though info.json does not count it
+        ("film", 3, "saved", 3),
+        ("film", 3, "encoding", 3),  # its pictures are still there
+        ("film", 2, "frames", 2),
+        ("film", 3, "counting", 3),
+        ("film", 3, "joining", 3),  # its film is finished, in a temporary folder
+        ("stream", 3, "joining", 3),
+        ("stream", 3, "frames", 3),
+        ("stream", 3, "encoding", 3),  # its film lies in a temporary folder
+        ("image", 3, "saved", 3),
+    ],
+)
+def test_every_whole_episode_is_recovered(
+    lerobot: KillServer, truth: dict, tmp_path: Path, case: tuple[str, int, str, int]
+) -> None:
+    video, episodes, die, recovered = case
+    root = recorded(lerobot, tmp_path / "d", video, episodes, die)
+    report = repair(root)
+    assert report.episodes == recovered
+    assert bool(report.lost) == (recovered < episodes)
+    found = content(root)
+    expected = truth["film" if video == "stream" else video][:recovered]
+    for one, wanted in zip(found, expected, strict=True):
+        assert (one.task, one.columns) == (wanted.task, wanted.columns)
+        assert one.films.keys() == wanted.films.keys()
+        for key in one.films:
+            for a, b in zip(one.films[key], wanted.films[key], strict=True):
+                # A film that had to be encoded anew, or by the streaming encoder, may round otherwise.
+                assert abs(np.frombuffer(a, np.uint8).astype(int) - np.frombuffer(b, np.uint8)).max() <= 3
+    assert_sound(root)
+    loaded(root, report.frames)
+    assert report.aside is not None
+    assert (report.aside / "images").exists() == (video == "film" and die in ("encoding", "frames"))
+    assert not repair(root)  # and now there is nothing to do
+
+
+def test_what_was_lost_is_told(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "stream", 3, "encoding")
+    for folder in root.glob("tmp*"):
+        shutil.rmtree(folder)
+    report = repair(root)
+    assert report.lost == (f"episode 2: no whole film of {CAMERA}",)
+    text = str(report)
+    assert "meta/episodes is corrupt" in text
+    assert f"lost: episode 2: no whole film of {CAMERA}" in text
+    assert str(report.aside) in text
+
+
+def test_the_damaged_files_are_kept(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "film", 2, "encoding")
+    before = {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    for number in (1, 2):
+        report = repair(root)
+        aside = tmp_path / f"d.damaged-{number}"
+        assert report.aside == aside
+        assert {p.relative_to(aside): p.read_bytes() for p in aside.rglob("*") if p.is_file()} == before
+        shutil.rmtree(root)
+        shutil.copytree(aside, root)
+
+
+def test_a_session_that_went_on_and_was_killed(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 3)
+    recorded(lerobot, root, "none", 4, "frames")
+    assert repair(root).episodes == 7
+    assert [(e.task, e.columns) for e in content(root)] == [(e.task, e.columns) for e in truth["none"][:7]]
+    recorded(lerobot, root, "none", 1)  # LeRobot itself goes on with it
+    assert [e.columns for e in content(root)] == [e.columns for e in truth["none"]]
+
+
+def test_random_kills_lose_no_saved_episode(lerobot: KillServer, tmp_path: Path) -> None:
+    rng = random.Random(11)
+    another = recorded(lerobot, tmp_path / "another", "none", 1)
+    for kill in range(4):
+        root, progress = tmp_path / f"d{kill}", tmp_path / f"progress{kill}"
+        job = {"video": "none", "episodes": 10_000, "die": "never", "progress": str(progress)}
+        pid = lerobot.start({"root": str(root), **job})
+        wanted = rng.randrange(2, 16)
+        while not progress.exists() or progress.read_text().count("\n") < wanted:
+            time.sleep(0.002)
+        time.sleep(rng.random() * 0.03)
+        os.kill(pid, 9)
+        lerobot.end()
+        saved = progress.read_text().count("\n")
+        if (root / "meta/info.json").read_text():
+            report = repair(root)
+        else:  # LeRobot was about to write it; the message says what helps
+            with pytest.raises(DatasetCorruptError, match="--info OTHER"):
+                repair(root)
+            report = repair(root, another)
+        assert saved <= report.episodes <= saved + 1
+        assert_sound(root)
+
+
+def test_a_torn_film_costs_the_episodes_behind_the_tear(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
+    origin = recorded(lerobot, tmp_path / "origin", "film", 3, "saved")
+    size = next(origin.glob("videos/*/*/*.mp4")).stat().st_size
+    seen = set()
+    for missing in (1, 60, 120, 180, 240, 300):
+        root = shutil.copytree(origin, tmp_path / f"d{missing}")
+        film = next(root.glob("videos/*/*/*.mp4"))
+        os.truncate(film, size - missing)
+        try:
+            report = repair(root)
+        except DatasetCorruptError as error:
+            assert "No whole episode" in str(error)  # noqa: PT017
+            seen.add(0)
+            continue
+        assert report.lost
+        seen.add(report.episodes)
+        assert [e.films for e in content(root)] == [e.films for e in truth["film"][: report.episodes]]
+        assert_sound(root)
+    assert {2, 1} <= seen
+
+
+def test_torn_data_cost_the_episodes_behind_the_tear(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
+    origin = recorded(lerobot, tmp_path / "origin", "none", 4, "saved")
+    size = next(origin.glob("data/*/*.parquet")).stat().st_size
+    for share in (0.3, 0.6, 0.9):
+        root = shutil.copytree(origin, tmp_path / f"d{share}")
+        os.truncate(next(root.glob("data/*/*.parquet")), int(size * share))
+        report = repair(root)
+        assert 1 <= report.episodes <= 3
+        assert "bytes at its end" in report.lost[0]
+        assert [e.columns for e in content(root)] == [e.columns for e in truth["none"][: report.episodes]]
+
+
+def test_lost_instructions_are_told_and_told_apart(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 4, "saved")
+    (root / "meta/tasks.parquet").write_bytes(b"PAR1")
+    report = repair(root)
+    assert any("meta/tasks.parquet" in line for line in report.lost)
+    texts = [episode.task[0] for episode in content(root)]
+    assert texts[0] == texts[3] != texts[1]
+    assert all("lost" in text for text in texts)
+
+
+def test_nothing_left_changes_nothing(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+    os.truncate(next(root.glob("data/*/*.parquet")), 40)
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    with pytest.raises(DatasetCorruptError, match=r"No whole episode of .* can be recovered; nothing was changed"):
+        repair(root)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    (root / "meta/info.json").write_text("{")
+    with pytest.raises(DatasetCorruptError, match=rf"bhd-data repair {root} --info OTHER"):
+        repair(root)
+
+
+@pytest.mark.parametrize("by", ["folder", "file", "hand"])
+@pytest.mark.parametrize("episodes", [1, 9])
+def test_info_of_another_recording_helps(
+    lerobot: KillServer, truth: dict, tmp_path: Path, by: str, episodes: int
+) -> None:
+    """Whatever it counts: that is no loss of this one."""
+    root = recorded(lerobot, tmp_path / "d", "none", 4, "saved")
+    another = recorded(lerobot, tmp_path / "another", "none", episodes)
+    info = root / "meta/info.json"
+    info.write_text("{")
+    with pytest.raises(DatasetCorruptError, match=f"repair {root} --info OTHER"):
+        repair(root)
+    if by == "hand":
+        shutil.copy(another / "meta/info.json", info)
+        report = repair(root)
+        assert len(report.hints) == (episodes > 4)
+    else:
+        report = repair(root, another if by == "folder" else another / "meta/info.json")
+        assert report.hints == ()
+        assert (tmp_path / "d.damaged-1/meta/info.json").read_text() == "{"
+    assert (report.episodes, report.lost) == (4, ())
+    assert [e.columns for e in content(root)] == [e.columns for e in truth["none"][:4]]
+    assert_sound(root)
+    assert not repair(root)
+
+
+def changed_info(source: Path, target: Path, change: dict[str, Any], fps: int = 10) -> Path:
+    """Write an `info.json` with other features; those that are None are left out."""
+    info = json.loads((source / "meta/info.json").read_text())
+    features = {key: one for key, one in {**info["features"], **change}.items() if one is not None}
+    target.write_text(json.dumps({**info, "features": features, "fps": fps}))
+    return target
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"action": None}, "it does not describe action"),
+        ({"force": {"dtype": "float32", "shape": [1], "names": None}}, "it describes force, which is not there"),
+        ({"action": {"dtype": "float32", "shape": [7], "names": None}}, "action has 7 numbers, and it has 2"),
+        ({CAMERA: None}, f"it does not describe {CAMERA}"),
+        ({}, "it says 25 frames a second, and the timestamps say 10"),
+        ({"note": None}, "no frame of 1 data files can be read"),  # text is in no statistics
+    ],
+)
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_info_of_another_robot_is_the_suspect(
+    lerobot: KillServer, tmp_path: Path, change: dict[str, Any], told: str, by_hand: bool
+) -> None:
+    root = recorded(lerobot, tmp_path / "d", "film", 2, "saved")
+    donor = changed_info(root, tmp_path / "other.json", change, fps=10 if change else 25)
+    if by_hand:
+        if not change or "note" in change:
+            return  # nobody can tell then
+        shutil.copy(donor, root / "meta/info.json")
+    else:
+        (root / "meta/info.json").unlink()
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    with pytest.raises(DatasetCorruptError if by_hand else ConfigError) as error:
+        repair(root, None if by_hand else donor)
+    assert told in str(error.value)
+    assert str(root / "meta/info.json" if by_hand else donor) in str(error.value)
+    assert "--info" in str(error.value)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    assert not (tmp_path / "d.damaged-1").exists()
+
+
+def test_info_of_another_is_given_back_if_nothing_can_be_recovered(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "film", 2, "saved")
+    donor = changed_info(root, tmp_path / "other.json", {})
+    shutil.rmtree(root / "videos")
+    for break_it in (lambda path: path.write_text("{"), Path.unlink):
+        break_it(root / "meta/info.json")
+        before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        with pytest.raises(DatasetCorruptError, match="No whole episode"):
+            repair(root, donor)
+        assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+        assert not (tmp_path / "d.damaged-1").exists()
+
+
+def test_a_camera_that_never_was_is_the_suspect(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+    (root / "meta/stats.json").unlink()
+    camera = {"observation.images.rear": {"dtype": "video", "shape": [32, 48, 3], "names": None}}
+    changed_info(root, root / "meta/info.json", camera)
+    with pytest.raises(DatasetCorruptError, match=r"describes observation\.images\.rear, of which there is no film"):
+        repair(root)
+
+
+def test_a_full_disk_leaves_the_wreck_as_it_was(
+    lerobot: KillServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+    before = {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+    def full(self: Disk, path: Path, data: bytes) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Disk, "write", full)
+        with pytest.raises(DatasetWriteError, match="No space left"):
+            repair(root)
+    assert {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()} == before
+    assert repair(root).episodes == 2
+
+
+def test_a_recording_that_goes_on_is_left_alone(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+    path = next(root.glob("data/*/*.parquet"))
+    code = "import sys; f = open(sys.argv[1], 'ab'); print('open', flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "open\n"
+        with pytest.raises(DatasetLockedError, match=f"Process {process.pid} has"):
+            repair(root)
+        process.communicate("")
+    assert repair(root).episodes == 2
+
+
+def test_a_sound_dataset_of_lerobot_is_left_alone(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "film", 2)
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    assert not repair(root)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    assert not (tmp_path / "d.damaged-1").exists()
+
+
+def test_numbers_are_counted_anew(lerobot: KillServer, tmp_path: Path) -> None:
+    """An episode that is lost in the middle leaves no hole."""
+    root = recorded(lerobot, tmp_path / "d", "none", 3)
+    recorded(lerobot, root, "none", 3, "saved")
+    (root / "data/chunk-000/file-000.parquet").write_bytes(b"")
+    report = repair(root)
+    assert report.episodes == 3
+    table = pq.read_table(next(root.glob("data/*/*.parquet")))
+    assert sorted(set(table["episode_index"].to_pylist())) == [0, 1, 2]
+    assert table["note"].to_pylist()[0] == "3/0"
+    assert_sound(root)
+
+
+# --- no episode ever gets what is another's ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sessions(lerobot: KillServer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sessions of three episodes each, with a film of its own for each session."""
+    root = recorded(lerobot, tmp_path_factory.mktemp("sessions") / "d", "film", 3)
+    return recorded(lerobot, root, "film", 3)
+
+
+def numbers(root: Path) -> list[int]:
+    """Return which episodes a dataset holds, by their frames, after checking that their films are theirs."""
+    found = []
+    for episode in content(root):
+        number = int(episode.columns["observation.state"][0][2])
+        for index, picture in enumerate(episode.films.get(CAMERA, [])):
+            grey = 20 + (37 * number + 11 * index) % 200
+            assert abs(float(np.frombuffer(picture, np.uint8).mean()) - grey) < 4, (number, index)
+        found.append(number)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("gone", "left"),
+    [
+        ("videos/observation.images.top/chunk-000/file-000.mp4", [3, 4, 5]),
+        ("videos/observation.images.top/chunk-000/file-001.mp4", [0, 1, 2]),
+        ("data/chunk-000/file-000.parquet", [3, 4, 5]),
+        ("meta/episodes/chunk-000/file-001.parquet", [0, 1, 2, 3, 4, 5]),
+        ("meta/episodes/chunk-000/file-000.parquet", [3, 4, 5]),  # whose the other film is can only be guessed
+    ],
+)
+def test_what_is_gone_costs_its_own_episodes(sessions: Path, tmp_path: Path, gone: str, left: list[int]) -> None:
+    root = shutil.copytree(sessions, tmp_path / "d")
+    (root / gone).unlink()
+    report = repair(root)
+    assert numbers(root) == left
+    assert bool(report.lost) == (len(left) < 6)
+    assert_sound(root)
+
+
+def test_a_film_with_a_hole_is_a_sound_film(sessions: Path, tmp_path: Path) -> None:
+    """LeRobot reads where the rows say; a film may hold more."""
+    root = shutil.copytree(sessions, tmp_path / "d")
+    film = root / "videos/observation.images.top/chunk-000/file-000.mp4"
+    keep(root, [0, 2], tmp_path / "kept")
+    # As if the rows of the kept ones pointed into the film that still holds all three.
+    path = tmp_path / "kept/meta/episodes/chunk-000/file-000.parquet"
+    shutil.copy(film, tmp_path / "kept/videos/observation.images.top/chunk-000/file-000.mp4")
+    table = pq.read_table(path)
+    for name, values in (("from_timestamp", [0.0, 1.1]), ("to_timestamp", [0.5, 1.8])):
+        place = table.schema.get_field_index(f"videos/{CAMERA}/{name}")
+        table = table.set_column(place, table.schema.field(place), pa.array(values))
+    pq.write_table(table, path)
+    assert numbers(tmp_path / "kept") == [0, 2]
+    assert not repair(tmp_path / "kept")
+    assert numbers(tmp_path / "kept") == [0, 2]
+
+
+def test_an_episode_that_was_recorded_again(lerobot: KillServer, tmp_path: Path) -> None:
+    """Which of its two attempts a film shows is told nowhere."""
+    root = recorded(lerobot, tmp_path / "d", "film", 4, "saved", again=2)
+    report = repair(root)
+    assert numbers(root) == [0, 1]
+    assert "episode 2: a first attempt, which was recorded again" in report.lost
+
+
+def test_a_kill_in_the_first_episode_of_a_second_session(lerobot: KillServer, tmp_path: Path) -> None:
+    """No count is wrong then, and yet LeRobot loads nothing: a file without a footer lies there."""
+    root = recorded(lerobot, tmp_path / "d", "film", 2)
+    recorded(lerobot, root, "film", 1, "encoding")
+    assert [one.check for one in check_dataset(root).findings if one.severity is Severity.ERROR] == ["files"]
+    assert repair(root).episodes == 3
+    assert numbers(root) == [0, 1, 2]
+    loaded(root, 18)
+    first = recorded(lerobot, tmp_path / "first", "film", 1, "encoding")
+    assert repair(first).episodes == 1
+
+
+def test_torn_statistics_are_computed_anew(sessions: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(sessions, tmp_path / "d")
+    before = content(root)
+    (root / "meta/stats.json").write_text("{")
+    assert "statistics of 6 episodes" in str(repair(root))
+    assert content(root) == before
+    assert_sound(root)
+
+
+def test_marks_and_columns_of_others_survive(lerobot: KillServer, tmp_path: Path) -> None:
+    root = recorded(lerobot, tmp_path / "d", "none", 3)
+    mark(root, [1], outcome="success", note="seen")
+    recorded(lerobot, root, "none", 2, "saved")
+    repair(root)
+    assert [one.metadata.get("bhd/outcome") for one in content(root)] == [None, "success", None, None, None]
+    assert [edit.get("note") for edit in edits_of(root)] == ["seen", None]
+    assert edits_of(root)[-1]["episodes"] == [0, 1, 2, 3, 4]
+
+
+def test_our_own_dataset_that_lerobot_went_on_with(lerobot: KillServer, tmp_path: Path) -> None:
+    for count, die in ((1, "counting"), (2, "saved")):
+        root = recorded(lerobot, tmp_path / f"d{count}", "none", 3)
+        (root / "meta/bhd.json").write_text(json.dumps({"format": 1, "recording": {"seed": 1}, "video": {}}))
+        recorded(lerobot, root, "none", count, die)
+        if count == 1:  # our recorder does not throw away what it did not write
+            with pytest.raises(DatasetCorruptError, match="bhd-data repair"):
+                settle(root, Disk())
+        assert repair(root).episodes == 3 + count
+        assert json.loads((root / "meta/bhd.json").read_text())["recording"]["edited"] == {"edit": "recovered"}

@@ -1,0 +1,343 @@
+"""Damage of what our recorder saved: every whole episode is recovered, and what only lost files told is named."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.datasets.edit.edits import delete, edits_of, keep
+from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.recovery import guard
+from bhd_lerobot.datasets.recovery.repair import repair
+from bhd_lerobot.datasets.storage import disk
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetEditedError, DatasetError
+from bhd_lerobot.tasks.task import Event
+from tests.datasets import support
+from tests.datasets.edit_support import assert_sound, content, record
+
+DATA = "data/chunk-000/file-000.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("ours") / "d", [0, 1, 2, 3], video=True)
+
+
+def copied(source: Path, target: Path) -> Path:
+    return Path(shutil.copytree(source, target))
+
+
+def snapshot(root: Path) -> dict[str, bytes]:
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def cut(size: int) -> Callable[[Path], None]:
+    return lambda path: os.truncate(path, path.stat().st_size - size)
+
+
+def without_metadata(root: Path) -> list[Any]:
+    return [(one.task, one.columns, one.films) for one in content(root)]
+
+
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path, tmp_path: Path, is_ours: bool) -> None:
+    for size in (1, 1000):
+        root = copied(recorded, tmp_path / f"d{size}")
+        if not is_ours:
+            (root / "meta/bhd.json").unlink()
+        cut(size)(root / DATA)
+        before = snapshot(root)
+        remedies = [one.remedy for one in check_dataset(root).findings if one.where == DATA]
+        assert remedies
+        assert all("bhd-data repair" in one for one in remedies)
+        report = repair(root)
+        assert (report.episodes, report.lost) == (4, ())
+        assert "lost: nothing" in str(report)
+        assert "in which no episode is whole" in report.hints[0]
+        assert report.aside is not None
+        assert snapshot(report.aside) == before
+        assert content(root) == content(recorded)
+        assert_sound(root)
+        assert not repair(root)
+        if not is_ours:
+            continue
+        # It was edited, so nobody goes on as if nothing had happened.
+        with pytest.raises(DatasetEditedError, match="recovered"):
+            support.resume(root, video=True)
+        assert edits_of(root)[-1]["episodes"] == [0, 1, 2, 3]
+        assert dataset_info(root).recording["seed"] == 1
+
+
+@pytest.mark.parametrize("damage", [cut(20), Path.unlink, lambda path: shutil.rmtree(path.parents[1])])
+def test_episodes_nobody_describes_are_recovered_and_what_is_forgotten_is_named(
+    recorded: Path, tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    root = copied(recorded, tmp_path / "d")
+    damage(root / EPISODES)
+    told = [one.remedy for one in check_dataset(root).findings]
+    assert any("bhd-data repair" in one for one in told)
+    assert not any("removes" in one for one in told)
+    with pytest.raises(DatasetCorruptError, match=r"episode 0 is not described|magic bytes"):
+        dataset_info(root)
+    report = repair(root)
+    assert report.episodes == 4
+    assert without_metadata(root) == without_metadata(recorded)
+    (lost,) = report.lost
+    assert lost.startswith("meta/episodes: ")
+    assert "bhd/" in lost
+    assert lost.endswith("of episodes 0 to 3")
+    assert_sound(root)
+
+
+def test_rows_that_are_left_keep_what_they_tell(tmp_path: Path) -> None:
+    """An interrupted recording has a file for each episode."""
+    root = tmp_path / "d"
+    recorder = support.create(root)
+    for _ in range(3):
+        support.record(recorder)
+    recorder._lock.release()  # as if it had been killed
+    cut(20)(root / "meta/episodes/chunk-000/file-001.parquet")
+    report = repair(root)
+    assert report.episodes == 3
+    assert [one.metadata.get("seed") for one in dataset_info(root).episodes] == [0, None, 2]
+    assert report.lost == ("meta/episodes: bhd/ok, bhd/outcome, bhd/score, bhd/seed, bhd/start of episode 1",)
+
+
+def test_an_unfinished_recording_is_still_finished_and_can_be_resumed(tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    recorder = support.create(root)
+    for _ in range(2):
+        support.record(recorder)
+    recorder.begin_episode()
+    recorder._lock.release()
+    assert repair(root).aside is None
+    assert edits_of(root) == []
+    with support.resume(root) as recorder:
+        support.record(recorder)
+    assert support.verify(root, 3, stats=True) == 3
+
+
+def with_events(root: Path, endings: list[Event]) -> Path:
+    """Record episodes whose last frames tell how they ended, as `bhd-record` does."""
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (1,), "names": ["x"]},
+        "event": {"dtype": "int64", "shape": (1,), "names": None},
+    }
+    options = {"robot_type": "toy", "root": root, "recording": {"seed": 1}}
+    with DatasetRecorder.create("t/t", 10, features, **options) as recorder:  # type: ignore[arg-type]
+        for number, ending in enumerate(endings):
+            writer = recorder.begin_episode()
+            events = np.zeros(5, np.int64)
+            events[-1] = ending
+            writer.set_columns({"observation.state": np.full((5, 1), number, np.float32), "event": events})
+            is_success = ending is Event.SUCCESS
+            told = {"seed": number, "outcome": ending.cause, "success": is_success}
+            recorder.save(writer, task="go", metadata=told)
+    return root
+
+
+def outcomes(root: Path) -> list[tuple[Any, Any]]:
+    return [(one.metadata.get("outcome"), one.metadata.get("success")) for one in dataset_info(root).episodes]
+
+
+def test_outcomes_and_marks_are_told_again(tmp_path: Path) -> None:
+    root = with_events(tmp_path / "d", [Event.SUCCESS, Event.TIMEOUT, Event.COLLISION])
+    mark(root, [1], outcome="success")
+    before = outcomes(root)
+    assert before == [("success", True), ("success", True), ("collision", False)]
+    shutil.rmtree(root / "meta/episodes")
+    report = repair(root)
+    assert outcomes(root) == before
+    assert report.lost == ("meta/episodes: all columns bhd/… but outcome and success of episodes 0 to 2",)
+    assert [edit["edit"] for edit in edits_of(root)] == ["mark", "recovered"]
+    assert_sound(root)
+
+
+def test_marks_of_another_programs_dataset_are_told_again_while_their_numbers_hold(tmp_path: Path) -> None:
+    origin = with_events(tmp_path / "origin", [Event.NOTHING] * 4)
+    (origin / "meta/bhd.json").unlink()
+    mark(origin, [0, 2], outcome="success")
+    root = copied(origin, tmp_path / "numbered")
+    shutil.rmtree(root / "meta/episodes")
+    report = repair(root)
+    assert outcomes(root) == [("success", True), (None, None), ("success", True), (None, None)]
+    assert "the outcomes of episodes 0, 2 are told by meta/edits.jsonl" in report.hints[0]
+    delete(origin, [1])
+    shutil.rmtree(origin / "meta/episodes")
+    assert any("marked before episodes were numbered anew" in one for one in repair(origin).lost)
+    assert outcomes(origin) == [(None, None)] * 3
+
+
+def test_what_the_disk_does_not_give_out_is_not_given_up(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for is_ours in (True, False):
+        root = copied(recorded, tmp_path / f"d{is_ours}")
+        if not is_ours:
+            (root / "meta/bhd.json").unlink()
+        cut(500)(root / DATA)
+        before = snapshot(root)
+
+        def refuse(path: Path, *args: Any, **options: Any) -> Any:
+            if Path(path).suffix == ".mp4":
+                raise PermissionError(13, "Permission denied")
+            return open(path, *args, **options)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(guard, "open", refuse, raising=False)
+            with pytest.raises(DatasetError, match=r"\.mp4 cannot be read: Permission denied.*Nothing was changed"):
+                repair(root)
+        assert snapshot(root) == before
+        assert repair(root).episodes == 4
+
+
+def test_a_kill_at_any_step_leaves_a_wreck_that_is_recovered(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        """Ends the process."""
+
+    step, done = 0, False
+    while not done:
+        root = copied(recorded, tmp_path / f"d{step}")
+        cut(500)(root / DATA)
+        before = (root / DATA).read_bytes()
+        seen: list[str] = []
+
+        def before_step(action: str, path: Path, seen: list[str] = seen, last: int = step) -> None:
+            seen.append(action)
+            if len(seen) == last + 1:
+                raise Killed
+
+        with monkeypatch.context() as patched:
+            patched.setattr(disk, "_before_step", before_step)
+            done = True
+            try:
+                repair(root)
+            except Killed:
+                done = False
+        repair(root)
+        assert content(root) == content(recorded), step
+        assert any(path.read_bytes() == before for path in tmp_path.glob(f"d{step}.damaged-*/{DATA}")), step
+        assert not (root / ".bhd").exists()
+        step += 5
+
+
+def test_who_recorded_it_is_not_guessed(recorded: Path, tmp_path: Path) -> None:
+    root = copied(recorded, tmp_path / "d")
+    cut(500)(root / DATA)
+    (root / "meta/bhd.json").write_text("{")
+    before = snapshot(root)
+    with pytest.raises(DatasetCorruptError, match=r"bhd\.json is corrupt"):
+        repair(root)
+    assert snapshot(root) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["d"]
+
+
+def test_info_of_another_is_not_needed_and_the_advice_works(recorded: Path, tmp_path: Path, capsys) -> None:
+    root = copied(recorded, tmp_path / "d")
+    cut(500)(root / DATA)
+    with pytest.raises(ConfigError, match="Leave --info out"):
+        repair(root, recorded)
+    assert main.main(["repair", str(root)]) == 0
+    assert "4 episodes, 26 frames" in capsys.readouterr().out or content(root) == content(recorded)
+
+
+def test_what_an_interruption_left_is_told_apart(recorded: Path, tmp_path: Path) -> None:
+    edited = copied(recorded, tmp_path / "edited")
+    keep(recorded, [0], tmp_path / "half")
+    shutil.move(tmp_path / "half", edited / ".bhd/compact/new")
+    unfinished = tmp_path / "unfinished"
+    recorder = support.create(unfinished)
+    support.record(recorder)
+    recorder._lock.release()
+    (unfinished / ".bhd/compact/new").mkdir(parents=True)
+    for root, told in ((edited, "Repeat the edit"), (unfinished, "a recording was interrupted")):
+        (found,) = [one for one in check_dataset(root).findings if one.where == ".bhd"]
+        assert told in f"{found.what}. {found.remedy}"
+    repair(edited)
+    assert content(edited) == content(recorded)
+
+
+def test_a_reader_is_not_sent_to_another_root(tmp_path: Path, capsys) -> None:
+    with support.create(tmp_path / "d") as recorder:
+        support.record(recorder)
+        assert main.main(["repair", str(tmp_path / "d")]) == 2
+        told = capsys.readouterr().err
+        assert "Wait until it ends." in told
+        assert "another root" not in told
+        with pytest.raises(DatasetError, match="or choose another root"):
+            support.resume(tmp_path / "d")
+
+
+def test_a_damaged_value_costs_its_episode_only(recorded: Path, tmp_path: Path) -> None:
+    """Pages have checksums: no value is taken that was not written."""
+    groups = pq.read_metadata(recorded / DATA)
+    expected = without_metadata(recorded)
+    for group in (0, 2):
+        root = copied(recorded, tmp_path / f"d{group}")
+        bytes_ = bytearray((root / DATA).read_bytes())
+        column = groups.row_group(group).column(0)
+        bytes_[column.data_page_offset + column.total_compressed_size - 3] ^= 0xFF
+        (root / DATA).write_bytes(bytes_)
+        report = repair(root)
+        assert report.episodes == 3
+        assert any(f"row group {group} cannot be read" in line for line in report.lost)
+        assert f"episode {group}: its frames are gone" in report.lost
+        # The columns that number are counted anew; the others are theirs.
+        kept = [one for number, one in enumerate(expected) if number != group]
+        found = without_metadata(root)
+        assert [one[0] for one in found] == [one[0] for one in kept]
+        assert [one[1]["observation.state"] for one in found] == [one[1]["observation.state"] for one in kept]
+        assert [one[2] for one in found] == [one[2] for one in kept]
+        assert_sound(root)
+
+
+def test_pages_that_are_damaged_cost_their_episodes_only(tmp_path: Path) -> None:
+    root = tmp_path / "d"
+    recorder = support.create(root)
+    for _ in range(3):
+        support.record(recorder)
+    recorder._lock.release()
+    path = root / "data/chunk-000/file-001.parquet"
+    path.write_bytes(path.read_bytes()[:100])
+    report = repair(root)
+    assert report.episodes == 2
+    assert any("file-001.parquet" in line for line in report.lost)
+    assert [one.metadata["seed"] for one in dataset_info(root).episodes] == [0, 2]
+    table = pq.read_table(root / DATA)
+    assert table["episode_index"].to_pylist() == [0] * support.length(0) + [1] * support.length(2)
+    assert edits_of(root)[-1]["episodes"] == [0, 2]
+    assert json.loads((root / "meta/info.json").read_text())["total_episodes"] == 2
+
+
+def test_a_sentence_in_the_name_of_a_folder_is_no_sentence(recorded: Path, tmp_path: Path) -> None:
+    root = copied(recorded, tmp_path / "Dr. Smith")
+    cut(1000)(root / DATA)
+    assert f"What was wrong: {root / DATA} is corrupt" in str(repair(root))
+
+
+@pytest.mark.parametrize(
+    "change", [{"features": {"a": 1}}, {"features": {"a": {}}}, {"fps": 0}, {"codebase_version": None}]
+)
+def test_an_info_that_describes_nothing_is_refused_in_words(recorded: Path, tmp_path: Path, change: dict) -> None:
+    root = copied(recorded, tmp_path / "d")
+    (root / "meta/bhd.json").unlink()
+    cut(1000)(root / DATA)
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps(info | change))
+    before = snapshot(root)
+    with pytest.raises(DatasetError, match=r"info\.json|format"):
+        repair(root)
+    assert snapshot(root) == before

@@ -1,0 +1,61 @@
+"""Fixtures around places below a URL; a test module takes them by `pytest_plugins`."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from bhd_lerobot.datasets.remote.store import StoreDataset
+from tests.datasets import support
+
+EPISODES = 3
+KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
+
+
+@pytest.fixture(scope="session")
+def few_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of `EPISODES` episodes in one data and one video file; copy it before it is changed."""
+    root = tmp_path_factory.mktemp("few_files") / "d"
+    with support.create(root, video=True) as recorder:
+        for _ in range(EPISODES):
+            support.record(recorder, video=True)
+    return root
+
+
+@pytest.fixture(scope="session")
+def s3_url() -> Iterator[str]:
+    """An S3-compatible store with one bucket; yields its address."""
+    from moto.server import ThreadedMotoServer
+
+    server = ThreadedMotoServer(port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"
+    server.stop()
+
+
+@pytest.fixture(params=["memory", "file", "s3"])
+def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    if request.param == "file":
+        return f"file://{tmp_path}/there/d"
+    if request.param == "memory":
+        fsspec.filesystem("memory").store.clear()
+        return "memory://bucket/there/d"
+    use_s3(request.getfixturevalue("s3_url"), monkeypatch)
+    s3 = fsspec.filesystem("s3")
+    if s3.exists("bucket"):
+        s3.rm("bucket", recursive=True)
+    s3.mkdir("bucket")
+    return "s3://bucket/there/d"
+
+
+def use_s3(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {**KEYS, "AWS_ENDPOINT_URL": address}.items():
+        monkeypatch.setenv(name, value)
+    fsspec.filesystem("s3").clear_instance_cache()
+
+
+def stored(url: str) -> dict[str, bytes]:
+    store = StoreDataset(url)
+    return {path: store.read(path) or b"" for path in store.files()}

@@ -1,0 +1,397 @@
+"""Datasets to a Hub on this machine and back, through the real client: what moves, what shows, what goes wrong."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from bhd_lerobot.datasets.loader.source import local_metadata
+from bhd_lerobot.datasets.remote import hub as hub_module
+from bhd_lerobot.datasets.remote.hub import HubDataset
+from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.remote.push import push
+from bhd_lerobot.datasets.remote.subset import files_of
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.errors import (
+    ConfigError,
+    DatasetError,
+    DatasetExistsError,
+    TransferError,
+)
+from tests.datasets import support
+from tests.hub_server.client import real_client
+from tests.hub_server.fixtures import EPISODES, content, send, stored
+from tests.hub_server.server import Fault, HubServer
+
+pytest_plugins = ["tests.hub_server.fixtures"]
+
+
+def test_what_comes_back_is_what_was_recorded(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    report = send(root)
+    assert stored(hub) == content(root)
+    assert (report.episodes, len(report.sent), report.kept) == (EPISODES, len(content(root)), 0)
+    fetched = pull(HubDataset("me/d"), tmp_path / "e")
+    assert content(tmp_path / "e") == content(root)
+    assert (fetched.episodes, fetched.kept) == (None, 0)
+    assert support.verify(tmp_path / "e", EPISODES, video=True, stats=True) == EPISODES
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["d", "e"]  # nothing is left beside it
+
+
+def test_a_push_is_one_commit_with_the_tag_that_lerobot_looks_for(hub: HubServer, root: Path) -> None:
+    send(root)
+    repository = hub.dataset("me/d")
+    assert len(repository.commits) == 2  # the Hub's own first one, and the dataset
+    assert repository.tags == {"v3.0": repository.branches["main"]}
+
+
+def test_a_second_push_and_a_second_pull_move_nothing(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    pull(HubDataset("me/d"), tmp_path / "e")
+    hub.reset()
+    assert (send(root).sent, pull(HubDataset("me/d"), tmp_path / "e").fetched) == ([], [])
+    assert all(one.endswith("/meta/info.json") for one in hub.asked("^PUT|/commit/|/tag/|/resolve/"))
+    assert hub.received == 0
+    assert hub.sent < 10_000  # meta/info.json, to see whether it is the same dataset
+
+
+def test_a_longer_dataset_sends_only_what_differs_and_removes_what_is_old(hub: HubServer, root: Path) -> None:
+    send(root)
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+    hub.reset()
+    report = send(root)
+    assert stored(hub) == content(root)
+    assert report.kept > 0
+    assert layout.INFO in report.sent
+    repository = hub.dataset("me/d")
+    assert repository.tags["v3.0"] == repository.branches["main"]
+
+
+def test_files_that_no_episode_needs_any_more_go(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    with support.create(tmp_path / "small") as recorder:
+        support.record(recorder)
+    report = send(tmp_path / "small", replace=True)
+    assert stored(hub) == content(tmp_path / "small")
+    assert any(path.startswith("videos/") for path in report.deleted)
+
+
+@pytest.mark.parametrize("size", [3, 500])
+def test_nobody_sees_a_part_of_a_dataset(hub: HubServer, root: Path, monkeypatch, size: int) -> None:
+    """Of several commits only the last brings info.json, and the tag moves after it."""
+    monkeypatch.setattr(hub_module, "_COMMIT_SIZE", size)
+    send(root)
+    commits = list(hub.dataset("me/d").commits.values())
+    assert [layout.INFO in files for files in commits] == [False] * (len(commits) - 1) + [True]
+    assert stored(hub) == content(root)
+
+
+def test_an_interrupted_upload_goes_on_where_it_was(hub: HubServer, root: Path) -> None:
+    hub.faults = [Fault("^PUT", times=-1, after=2, after_bytes=100)]
+    with pytest.raises(TransferError, match="connection was lost"):
+        send(root)
+    arrived = hub.received
+    assert arrived > 0
+    assert stored(hub) == {}  # nothing of it can be seen
+    hub.faults = []
+    send(root)
+    assert stored(hub) == content(root)
+    assert hub.received == sum(len(one) for one in hub.dataset("me/d").objects.values())  # no object came twice
+
+
+def test_an_interrupted_download_goes_on_where_it_was(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    target = tmp_path / "e"
+    hub.reset()
+    hub.faults = [Fault("^GET .*/resolve/.*/data/", times=-1, after=1, after_bytes=50)]
+    with pytest.raises(TransferError, match="connection was lost"):
+        pull(HubDataset("me/d"), target)
+    assert not target.exists()  # nothing that looks like a dataset
+    arrived = {path for path in content(tmp_path / ".e.pull") if not path.startswith(".")}
+    assert arrived
+    hub.reset()
+    pull(HubDataset("me/d"), target)
+    assert content(target) == content(root)
+    again = {line.split("/resolve/")[1].partition("/")[2] for line in hub.asked("^GET .*/resolve/")}
+    assert again
+    assert not again & (arrived - {layout.INFO})  # which is read first, to see the format
+
+
+@pytest.mark.parametrize("status", [500, 503])
+def test_a_hub_that_has_an_error_now_and_then_is_asked_again(hub: HubServer, root: Path, status: int) -> None:
+    hub.faults = [Fault("^PUT", times=2, status=status), Fault("/preupload/", status=status)]
+    send(root)
+    assert stored(hub) == content(root)
+
+
+def test_a_connection_that_breaks_during_a_download_is_taken_up(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    hub.faults = [Fault("^GET .*/resolve/.*/data/", times=2, after_bytes=100)]
+    pull(HubDataset("me/d"), tmp_path / "e")
+    assert content(tmp_path / "e") == content(root)
+
+
+@pytest.mark.parametrize(
+    ("token", "name", "words"),
+    [
+        (None, "me/d", "no token"),
+        ("read_me", "me/d", "no permission"),
+        ("hf_me", "other/d", "no permission"),
+        ("nonsense", "me/d", "expired or was revoked"),
+    ],
+)
+def test_who_may_not_write_is_told_why(running_hub: HubServer, root: Path, token, name: str, words: str) -> None:
+    before = content(root)
+    running_hub.repositories.clear()
+    with real_client(running_hub, token), pytest.raises(TransferError, match=words):
+        push(root, HubDataset(name, create=True))
+    assert content(root) == before
+
+
+def test_a_token_that_expires_in_the_middle(hub: HubServer, root: Path) -> None:
+    hub.faults = [Fault("/commit/", status=401)]
+    with pytest.raises(TransferError, match="expired or was revoked"):
+        send(root)
+    send(root)
+    assert stored(hub) == content(root)
+
+
+def test_what_is_not_there_is_named(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    with pytest.raises(TransferError, match="no such repository"):
+        pull(HubDataset("me/none"), tmp_path / "e")
+    with pytest.raises(TransferError, match="no revision 'old'"):
+        pull(HubDataset("me/d", "old"), tmp_path / "e")
+    hub.dataset("me/d").add("empty", {})
+    with pytest.raises(TransferError, match="no LeRobot dataset"):
+        pull(HubDataset("me/d", "empty"), tmp_path / "e")
+    assert not (tmp_path / "e").exists()
+
+
+def test_without_network(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    with pytest.raises(TransferError, match=r"cannot be reached.*HF_ENDPOINT"):
+        send(root)
+    with pytest.raises(TransferError, match="cannot be reached"):
+        pull(HubDataset("me/d"), tmp_path / "e")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    with pytest.raises(TransferError, match="HF_HUB_OFFLINE"):
+        send(root)
+
+
+def test_a_private_repository_stays_so(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
+    push(root, HubDataset("me/d", create=True, private=True))
+    send(root)  # says nothing about it: fine
+    with pytest.raises(TransferError, match="is private; public was asked for"):
+        push(root, HubDataset("me/d", create=True, private=False))
+    monkeypatch.setenv("HF_TOKEN", "hf_other")
+    with pytest.raises(TransferError, match="no such repository"):
+        pull(HubDataset("me/d"), tmp_path / "e")
+
+
+def test_branches_and_tags(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    first = stored(hub)
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+    push(root, HubDataset("me/d", "more", create=True, tag="seven"))
+    assert stored(hub) == first  # neither main nor its tag moved
+    assert stored(hub, "more") == stored(hub, "seven") == content(root)
+    assert stored(hub, "v3.0") == first
+    for revision, episodes in (
+        (None, 6),
+        ("main", 6),
+        ("more", 7),
+        ("seven", 7),
+        (hub.dataset("me/d").tags["v3.0"], 6),
+    ):
+        assert pull(HubDataset("me/d", revision), tmp_path / f"to_{revision}").total_episodes == episodes
+    with pytest.raises(TransferError, match="is a tag"):
+        send(root, "seven")
+
+
+def test_two_who_push_at_once_do_not_mix(hub: HubServer, root: Path, monkeypatch) -> None:
+    send(root)
+    remote = HubDataset("me/d", create=True)
+    files = remote.files
+
+    def files_then_another() -> object:
+        found = files()
+        hub.dataset("me/d").add("main", dict(hub.dataset("me/d").files()) | {})
+        return found
+
+    monkeypatch.setattr(remote, "files", files_then_another)
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+    with pytest.raises(TransferError, match="somebody else changed it"):
+        push(root, remote)
+
+
+def test_damage_on_the_way_is_noticed(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    blob = next(blob for path, blob in hub.dataset("me/d").files().items() if path.startswith("data/"))
+    honest = type(blob).sha256
+    broken = bytearray(blob.content)
+    broken[10] ^= 1
+    listed = blob.sha256
+    blob.content = bytes(broken)
+    try:
+        type(blob).sha256 = property(lambda one: listed if one is blob else honest.fget(one))  # type: ignore
+        with pytest.raises(TransferError, match="came otherwise than it was listed"):
+            pull(HubDataset("me/d"), tmp_path / "e")
+    finally:
+        type(blob).sha256 = honest
+    assert not (tmp_path / "e").exists()
+
+
+def test_names() -> None:
+    for wrong in ("d", "me/d/e", "me/", "/d", "me/d.git", "me/a--b", "me/a..b", "../d", "me/a b", ""):
+        with pytest.raises(ConfigError, match="user/name"):
+            HubDataset(wrong)
+
+
+def test_loading_by_name_downloads_only_the_wanted_episodes(
+    hub: HubServer, root: Path, tmp_path: Path, monkeypatch
+) -> None:
+    send(root)
+    hub.reset()
+    meta = local_metadata("me/d", tmp_path / "one", episodes=[0])
+    assert meta.total_episodes == EPISODES
+    data = {path for path in content(tmp_path / "one") if path.startswith(("data/", "videos/"))}
+    assert data == files_of(root, [0])
+    local_metadata("me/d", tmp_path / "two", select=lambda found: [EPISODES - 1])
+    data = {path for path in content(tmp_path / "two") if path.startswith(("data/", "videos/"))}
+    assert data == files_of(root, [EPISODES - 1])
+
+
+def test_loading_by_name_says_what_is_wrong(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="no such repository"):
+        local_metadata("me/d", tmp_path / "e")
+    send(root)
+    with pytest.raises(DatasetError, match="no revision 'old'"):
+        local_metadata("me/d", tmp_path / "e", revision="old")
+    with pytest.raises(ConfigError, match="does not say which"):
+        local_metadata("me/d", root, revision="main")
+
+
+def test_a_tag_of_a_release_does_not_move(hub: HubServer, root: Path) -> None:
+    push(root, HubDataset("me/d", create=True, tag="one"))
+    push(root, HubDataset("me/d", create=True, tag="one"))  # the same again
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+    with pytest.raises(TransferError, match="has a tag 'one' already"):
+        push(root, HubDataset("me/d", create=True, tag="one"))
+    assert stored(hub) == stored(hub, "one") != content(root)
+
+
+def test_what_the_repository_ignores_is_told(hub: HubServer, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from huggingface_hub import HfApi
+
+    preupload = HfApi.preupload_lfs_files
+
+    def ignoring(self: HfApi, repo_id: str, additions: list, **options: object) -> None:
+        preupload(self, repo_id, additions, **options)
+        additions[0]._should_ignore = True
+
+    monkeypatch.setattr(HfApi, "preupload_lfs_files", ignoring)
+    with pytest.raises(TransferError, match=r"\.gitignore names"):
+        send(root)
+    assert layout.INFO not in HubDataset("me/d").files()
+
+
+def versions(hub: HubServer) -> list[dict[str, bytes]]:
+    """Return what a reader of the repository could ever find, oldest first."""
+    return [
+        {path: blob.content for path, blob in files.items() if path != ".gitattributes"}
+        for files in hub.dataset("me/d").commits.values()
+    ]
+
+
+def longer(root: Path) -> None:
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+
+
+@pytest.mark.parametrize("after", [0, 1, 2])
+def test_a_push_of_several_commits_that_fails_leaves_no_mixture(
+    hub: HubServer, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int
+) -> None:
+    """Whatever commit a reader looks at: with an info.json it is one of the two datasets, to the last byte."""
+    send(root)
+    old = content(root)
+    longer(root)
+    monkeypatch.setattr(hub_module, "_COMMIT_SIZE", 2)
+    hub.faults = [Fault("/commit/", times=-1, after=after)]
+    with pytest.raises(TransferError, match="connection was lost"):
+        send(root)
+    assert [found for found in versions(hub) if layout.INFO in found] == [old]
+    assert (layout.INFO in stored(hub)) == (after == 0)
+    if after:
+        with pytest.raises(TransferError, match=r"no meta/info\.json"):
+            pull(HubDataset("me/d", "main"), tmp_path / "e")
+    pull(HubDataset("me/d"), tmp_path / "f")  # by its tag, as LeRobot does
+    assert content(tmp_path / "f") == old
+    hub.faults = []
+    send(root)
+    assert stored(hub) == content(root)
+    assert [found for found in versions(hub) if layout.INFO in found] == [old, content(root)]
+
+
+def test_an_info_that_stays_the_same_is_gone_between_the_commits_too(hub: HubServer, root: Path, monkeypatch) -> None:
+    """The client leaves a file out of a commit that it has seen there, which must not lose this one."""
+    send(root)
+    monkeypatch.setattr(hub_module, "_COMMIT_SIZE", 2)
+    for number in range(4):
+        (root / f"notes_{number}.md").write_text("mine")
+    send(root)
+    assert [layout.INFO in found for found in versions(hub)] == [False, True, False, False, True]
+    assert stored(hub) == content(root)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        b"[]",
+        b"3",
+        b"\xff\xfe\x00",
+        b"",
+        b"[" * 100_000,
+        b'{"codebase_version": "v3.0"}',
+        b'{"codebase_version": "v3.0", "features": [], "fps": 10}',
+        b'{"codebase_version": "v3.0", "features": {"a": 1}, "fps": 10}',
+        ("fps", "ten"),
+        ("fps", True),
+        ("total_episodes", "6"),
+        ("total_episodes", None),
+        ("total_frames", 1.5),
+        ("total_episodes", float("inf")),
+        ("data_path", 3),
+        ("robot_type", ["a"]),
+        ("codebase_version", 3.0),
+    ],
+)
+def test_an_info_of_another_shape_is_told(hub: HubServer, root: Path, tmp_path: Path, broken) -> None:
+    send(root)
+    info = hub.dataset("me/d").files()[layout.INFO]
+    info.content = (
+        broken if isinstance(broken, bytes) else json.dumps({**json.loads(info.content), broken[0]: broken[1]}).encode()
+    )
+    hub.reset()
+    for select in (None, lambda folder: [0]):
+        with pytest.raises(DatasetError, match=r"me/d (is no LeRobot dataset: .*info\.json|has dataset format 3\.0)"):
+            pull(HubDataset("me/d"), tmp_path / "e", select=select)
+    assert not hub.asked("GET .*/resolve/.*/data/")
+    assert list(tmp_path.iterdir()) == [root]
+    with pytest.raises(DatasetExistsError, match=r"me/d .*--replace"):
+        send(root)
+    send(root, replace=True)
+    assert stored(hub) == content(root)
+
+
+def test_the_hub_needs_no_verifying(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nothing to verify"):
+        send(root, verify=True)
+    send(root)
+    with pytest.raises(ConfigError, match="nothing to verify"):
+        pull(HubDataset("me/d"), tmp_path / "e", verify=True)
+    assert list(tmp_path.iterdir()) == [root]

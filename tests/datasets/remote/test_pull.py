@@ -1,0 +1,287 @@
+"""What a pull makes of the folder that it is told, and of some episodes. From a Hub on this machine."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from bhd_lerobot.datasets.edit.edits import delete
+from bhd_lerobot.datasets.remote import pull as remote_pull
+from bhd_lerobot.datasets.remote.hub import HubDataset
+from bhd_lerobot.datasets.remote.listing import SUBSET
+from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.remote.subset import files_of, read_subset
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import RootLock
+from bhd_lerobot.errors import (
+    DatasetCorruptError,
+    DatasetError,
+    DatasetExistsError,
+    DatasetLockedError,
+    DatasetWriteError,
+    TransferError,
+)
+from tests.datasets import support
+from tests.hub_server.fixtures import EPISODES, content, send
+from tests.hub_server.server import Fault, HubServer
+
+pytest_plugins = ["tests.hub_server.fixtures"]
+
+
+def test_some_episodes_bring_only_their_files_and_load(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    send(root)
+    target = tmp_path / "e"
+    hub.reset()
+    report = pull(HubDataset("me/d"), target, select=lambda folder: [0, 1])
+    assert report.episodes == [0, 1]
+    data = {path for path in content(target) if path.startswith(("data/", "videos/"))}
+    assert data == files_of(root, [0, 1]) < {path for path in content(root) if path.startswith(("data/", "videos/"))}
+    hub.reset()
+    dataset = LeRobotDataset("t/t", root=target, episodes=[0, 1], video_backend="pyav")
+    assert len(dataset) == support.length(0) + support.length(1)
+    assert dataset[len(dataset) - 1][support.CAMERA].shape == (3, 32, 48)
+    assert not hub.requests
+    with pytest.raises(DatasetError, match="some episodes of a dataset only"):
+        send(target)
+    # More of them are added; all of them make it whole.
+    assert pull(HubDataset("me/d"), target, select=lambda folder: [5]).episodes == [0, 1, 5]
+    assert not any(path in line for path in data for line in hub.asked("^GET .*/resolve/"))
+    assert pull(HubDataset("me/d"), target).episodes is None
+    assert content(target) == content(root)
+    assert support.verify(target, EPISODES, video=True) == EPISODES
+
+
+def test_episodes_that_do_not_exist(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    with pytest.raises(DatasetError, match=r"no episode 6.*from 0 to 5"):
+        pull(HubDataset("me/d"), tmp_path / "e", select=lambda folder: [6])
+    assert list(tmp_path.iterdir()) == [root]
+
+
+def test_a_changed_dataset_is_not_overwritten_unless_that_is_said(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    target = tmp_path / "e"
+    pull(HubDataset("me/d"), target)
+    (target / "notes.txt").write_text("mine")
+    (target / layout.STATS).write_text("{}")
+    before = content(target)
+    with pytest.raises(DatasetExistsError, match=r"meta/stats\.json.*--replace"):
+        pull(HubDataset("me/d"), target)
+    assert content(target) == before
+    hub.reset()
+    report = pull(HubDataset("me/d"), target, replace=True)
+    assert report.fetched == [layout.STATS]
+    assert content(target) == content(root) | {"notes.txt": b"mine"}
+
+
+def test_folders_that_are_no_place_for_a_dataset(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("x")
+    (tmp_path / "empty").mkdir()
+    for name in ("file", "full"):
+        with pytest.raises(DatasetExistsError, match="Choose another folder"):
+            pull(HubDataset("me/d"), tmp_path / name)
+    pull(HubDataset("me/d"), tmp_path / "empty")
+    assert content(tmp_path / "empty") == content(root)
+    with pytest.raises(DatasetWriteError, match=r"not a folder|Not a directory"):
+        pull(HubDataset("me/d"), tmp_path / "file" / "below")
+
+
+def test_a_kill_of_version_0_1_between_its_renames_is_repaired(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    target = tmp_path / "e"
+    pull(HubDataset("me/d"), target)
+    (target / ".bhd-pull").touch()
+    target.rename(tmp_path / ".e.old")
+    assert pull(HubDataset("me/d"), target).fetched == []
+    assert content(target) == content(root)
+
+
+def test_a_folder_of_somebody_else_in_its_way_is_left_alone(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    name = ".e.pull"
+    send(root)
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "thesis.txt").write_text("years")
+    with pytest.raises(DatasetError, match="is in the way"):
+        pull(HubDataset("me/d"), tmp_path / "e")
+    assert (tmp_path / name / "thesis.txt").read_text() == "years"
+    assert not (tmp_path / "e").exists()
+
+
+def test_a_full_disk_is_seen_before_and_during(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
+    send(root)
+    usage = shutil.disk_usage(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(remote_pull.shutil, "disk_usage", lambda path: usage._replace(free=100))
+        with pytest.raises(TransferError, match=r"MB are missing.*0.0 MB free"):
+            pull(HubDataset("me/d"), tmp_path / "e")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("huggingface_hub.file_download.http_get", full)
+        with pytest.raises(TransferError, match=r"No space left on device.*Free some space"):
+            pull(HubDataset("me/d"), tmp_path / "e")
+    assert not (tmp_path / "e").exists()
+    pull(HubDataset("me/d"), tmp_path / "e")
+    assert content(tmp_path / "e") == content(root)
+
+
+def test_what_is_not_sound_there_comes_as_it_is_and_that_is_said(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    files = dict(hub.dataset("me/d").files())
+    lost = next(path for path in files if path.startswith("videos/"))
+    del files[lost]
+    commit = hub.dataset("me/d").add("torn", files)
+    report = pull(HubDataset("me/d", commit), tmp_path / "e")
+    assert lost in report.problem
+    blob = files[layout.INFO]
+    files[layout.INFO] = type(blob)(blob.content.replace(b"v3.0", b"v2.1"), lfs=False)
+    hub.dataset("me/d").add("old", files)
+    hub.reset()
+    with pytest.raises(DatasetError, match=r"format v2\.1"):
+        pull(HubDataset("me/d", "old"), tmp_path / "f")
+    assert not hub.asked("GET .*/resolve/.*/data/")  # said before everything was fetched
+
+
+def test_what_belongs_to_no_dataset_survives_an_exchange(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    """A dataset under version control, with links and folders of its own."""
+    send(root)
+    target = tmp_path / "e"
+    pull(HubDataset("me/d"), target)
+    (target / ".git/refs/tags").mkdir(parents=True)
+    (target / ".git/HEAD").write_text("ref")
+    (target / ".cache/app").mkdir(parents=True)
+    (target / ".cache/app/x").write_text("x")
+    (target / "plots").symlink_to(tmp_path)
+    (target / "gone").symlink_to("nowhere")
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+    send(root)
+    assert pull(HubDataset("me/d"), target, replace=True).fetched
+    assert (target / ".git/refs/tags").is_dir()
+    assert (target / ".git/HEAD").read_text() == "ref"
+    assert (target / ".cache/app/x").read_text() == "x"
+    assert (target / "plots").is_symlink()
+    assert (target / "gone").is_symlink()
+    assert not (target / ".bhd-pull").exists()
+
+
+def test_a_folder_that_is_no_dataset_is_never_replaced(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    (tmp_path / "e/data/chunk-000").mkdir(parents=True)
+    (tmp_path / "e/data/chunk-000/file-777.parquet").write_text("mine")
+    with pytest.raises(DatasetExistsError, match="is no dataset"):
+        pull(HubDataset("me/d"), tmp_path / "e", replace=True)
+    assert (tmp_path / "e/data/chunk-000/file-777.parquet").read_text() == "mine"
+
+
+def test_some_episodes_whose_files_hold_all_are_noted_all_the_same(
+    hub: HubServer, tmp_path: Path, root: Path, many_files: Path
+) -> None:
+    """How episodes are packed into files is no business of who asks for some."""
+    packed = tmp_path / "packed"
+    with support.create(packed) as recorder:
+        for _ in range(3):
+            support.record(recorder)
+    send(packed)
+    target = tmp_path / "e"
+    report = pull(HubDataset("me/d"), target, select=lambda folder: [1])
+    assert (report.episodes, report.is_whole, report.is_noted) == ([1], True, True)
+    assert json.loads((target / SUBSET).read_bytes()) == {"source": "me/d", "episodes": [1], "whole": True}
+    hub.reset()
+    assert not send(target).sent  # all of it is there, so it may be pushed; the note stays here
+    assert not pull(HubDataset("me/d"), target, select=lambda folder: [1]).fetched
+    assert pull(HubDataset("me/d"), target, select=lambda folder: [2]).episodes == [1, 2]
+    assert read_subset(target).episodes == [1, 2]
+    report = pull(HubDataset("me/d"), target)
+    assert (report.fetched, report.is_noted) == ([], False)
+    assert content(target) == content(packed)
+    # What is whole stays so, whatever is asked for.
+    assert not pull(HubDataset("me/d"), target, select=lambda folder: [0]).is_noted
+    assert content(target) == content(packed)
+
+
+def test_episodes_whose_files_nobody_names_are_told(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    files = hub.dataset("me/d").files()
+    path = next(path for path in files if path.startswith("meta/episodes/"))
+    table = pq.read_table(next((root / "meta/episodes").rglob("*.parquet")))
+    for dropped in (["data/file_index"], ["episode_index"]):
+        sink = pa.BufferOutputStream()
+        pq.write_table(table.drop(dropped), sink)
+        files[path] = type(files[path])(sink.getvalue().to_pybytes(), lfs=True)
+        with pytest.raises(DatasetCorruptError, match=r"me/d.*corrupt"):
+            pull(HubDataset("me/d"), tmp_path / "e", select=lambda folder: [0])
+        assert pull(HubDataset("me/d"), tmp_path / "all", replace=True).problem
+    assert not (tmp_path / "e").exists()
+
+
+def break_off(hub: HubServer, target: Path, path: str) -> None:
+    """Pull over what is there, and fail at one file."""
+    hub.faults = [Fault(f"^(GET|HEAD) .*/resolve/.*/{path}", times=-1, status=403)]
+    with pytest.raises(TransferError):
+        pull(HubDataset("me/d"), target, replace=True)
+    hub.faults = []
+
+
+def test_what_an_attempt_for_another_version_left_gets_into_no_dataset(
+    hub: HubServer, root: Path, tmp_path: Path
+) -> None:
+    send(root)
+    target, old = tmp_path / "e", content(root)
+    commit = hub.dataset("me/d").branches["main"]
+    pull(HubDataset("me/d"), target)
+    (target / layout.STATS).write_text("{}")
+    before = content(target)
+    break_off(hub, target, layout.STATS)  # files of the dataset are linked beside it
+    with support.resume(root, video=True) as recorder:
+        support.record(recorder, video=True)
+    send(root)
+    break_off(hub, target, layout.STATS)  # with the info.json of the longer one
+    assert content(target) == before  # not written through a link
+    pull(HubDataset("me/d", commit), target, replace=True)
+    assert content(target) == old
+
+
+def test_episodes_of_a_dataset_that_was_given_up_are_not_asked_for(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    target = tmp_path / "e"
+    pull(HubDataset("me/d"), target, select=lambda folder: [5])
+    target.chmod(0o700)
+    delete(root, [0, 1, 2])
+    send(root)
+    report = pull(HubDataset("me/d"), target, select=lambda folder: [0], replace=True)
+    assert report.episodes == [0]
+    assert target.stat().st_mode & 0o777 == 0o700  # nobody else may look into it now, either
+
+
+def test_a_folder_named_by_dots_is_the_folder(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
+    send(root)
+    pull(HubDataset("me/d"), tmp_path / "e")
+    (tmp_path / "e" / layout.STATS).write_text("{}")
+    monkeypatch.chdir(tmp_path / "e/meta")
+    assert pull(HubDataset("me/d"), "..", replace=True).fetched == [layout.STATS]
+    assert content(tmp_path / "e") == content(root)
+
+
+def test_a_pull_does_not_mend_what_another_one_is_at(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    """Between its two renames there is no folder at the target."""
+    send(root)
+    for name in (".e.pull", ".e.old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / ".bhd-pull").touch()
+    lock = RootLock(tmp_path / ".e.pull")
+    with pytest.raises(DatasetLockedError):
+        pull(HubDataset("me/d"), tmp_path / "e")
+    lock.release()
+    assert not (tmp_path / "e").exists()
+    assert (tmp_path / ".e.old").is_dir()

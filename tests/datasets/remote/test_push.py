@@ -1,0 +1,210 @@
+"""What is pushed and what is not: the dataset that is looked at before, and its card. To a Hub on this machine."""
+
+import shutil
+import threading
+from pathlib import Path
+
+import pytest
+
+from bhd_lerobot.datasets.format.state import DatasetState
+from bhd_lerobot.datasets.remote.card import is_generated, sign
+from bhd_lerobot.datasets.remote.hub import HubDataset
+from bhd_lerobot.datasets.remote.listing import MANIFEST
+from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.remote.push import Card, push
+from bhd_lerobot.datasets.remote.store import StoreDataset
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import RootLock
+from bhd_lerobot.errors import (
+    DatasetCorruptError,
+    DatasetError,
+    DatasetLockedError,
+)
+from tests.datasets import support
+from tests.hub_server.fixtures import content, send, stored
+from tests.hub_server.server import Fault, HubServer
+
+pytest_plugins = ["tests.hub_server.fixtures"]
+
+
+def test_a_dataset_that_changes_during_the_upload_is_not_shown(hub: HubServer, root: Path) -> None:
+    gate = threading.Event()
+    hub.faults = [Fault("^PUT", wait=gate)]
+
+    def change() -> None:
+        path = root / layout.STATS
+        path.write_bytes(path.read_bytes() + b" ")
+        gate.set()
+
+    timer = threading.Timer(0.3, change)
+    timer.start()
+    with pytest.raises(DatasetError, match=r"changed by another program.*meta/stats\.json"):
+        send(root)
+    timer.join()
+    assert stored(hub) == {}
+    send(root)
+    assert stored(hub) == content(root)
+
+
+def test_a_dataset_in_use_is_refused(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    lock = RootLock(root)
+    with pytest.raises(DatasetLockedError, match="in use"):
+        send(root)
+    lock.release()
+    send(root)
+    shutil.rmtree(tmp_path / "d")
+    pull(HubDataset("me/d"), root)
+    lock = RootLock(root)
+    with pytest.raises(DatasetLockedError):
+        pull(HubDataset("me/d"), root)
+    lock.release()
+
+
+def test_a_recording_is_refused_until_it_is_finalised(hub: HubServer, tmp_path: Path) -> None:
+    recorder = support.create(tmp_path / "d")
+    support.record(recorder)
+    with pytest.raises(DatasetLockedError, match="in use"):
+        send(tmp_path / "d")
+    recorder._lock.release()  # as after a kill
+    with pytest.raises(DatasetError, match=r"not finalised.*bhd-data repair"):
+        send(tmp_path / "d")
+    recorder.finalize()
+    send(tmp_path / "d")
+    assert stored(hub) == content(tmp_path / "d")
+
+
+def test_damaged_and_empty_datasets_are_refused(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    next((root / "data").rglob("*.parquet")).unlink()
+    with pytest.raises(DatasetCorruptError, match="parquet"):
+        send(root)
+    support.create(tmp_path / "empty").finalize()
+    with pytest.raises(DatasetError, match="no episode"):
+        send(tmp_path / "empty")
+    with pytest.raises(DatasetError, match="does not exist"):
+        send(tmp_path / "none")
+    assert not hub.repositories
+
+
+def test_hidden_files_and_leftovers_stay_here(hub: HubServer, root: Path) -> None:
+    (root / ".cache").mkdir()
+    (root / ".cache" / "x").write_text("x")
+    (root / "notes.md").write_text("mine")
+    leftover = root / "data/chunk-000/file-077.parquet"
+    leftover.write_bytes(b"x")
+    report = send(root)
+    assert report.left_out == ["data/chunk-000/file-077.parquet"]
+    assert "notes.md" in stored(hub)
+    assert not [path for path in stored(hub) if path.startswith(".") or "077" in path]
+
+
+def card(text: str = "# made\n") -> Card:
+    return Card(sign(text), b"picture")
+
+
+def test_a_generated_card_is_renewed_and_a_persons_is_kept(hub: HubServer, root: Path) -> None:
+    send(root, make_card=lambda state, has_picture: card())
+    assert stored(hub)["preview.png"] == b"picture"
+    assert not send(root, make_card=lambda state, has_picture: card("# made anew\n")).kept_card
+    assert b"anew" in stored(hub)["README.md"]
+    edited = stored(hub)["README.md"].replace(b"anew", b"by hand")
+    assert not is_generated(edited.decode())
+    hub.dataset("me/d").objects.clear()
+    files = hub.dataset("me/d").files()
+    files["README.md"].content = edited
+    report = send(root, make_card=lambda state, has_picture: card("# third\n"))
+    assert report.kept_card
+    assert stored(hub)["README.md"] == edited
+    assert not send(root, make_card=lambda state, has_picture: card("# third\n"), replace_card=True).kept_card
+    assert b"third" in stored(hub)["README.md"]
+
+
+def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path) -> None:
+    send(root, make_card=lambda state, has_picture: card())
+    (root / "README.md").write_text("# my own\n")
+    assert not send(root, make_card=lambda state, has_picture: card("# second\n")).kept_card
+    assert stored(hub)["README.md"] == b"# my own\n"
+    assert not send(root, make_card=lambda state, has_picture: card("# third\n")).kept_card  # it is the same
+    (root / "README.md").write_text("# my own, newer\n")
+    assert send(root).kept_card  # the one there is a person's, too
+    assert stored(hub)["README.md"] == b"# my own\n"
+
+
+def test_a_folder_behind_a_link_is_not_taken_for_gone(
+    hub: HubServer, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is not seen must not be removed at the other end."""
+    copied = Path(shutil.copytree(root, tmp_path / "copied"))
+    send(root)
+    before = HubDataset("me/d").files()
+    (copied / "videos").rename(tmp_path / "big")
+    (copied / "videos").symlink_to(tmp_path / "big")
+    for declared, said in (("", "is a link to .*big"), (tmp_path / "big", "behind a link")):
+        monkeypatch.setenv("BHD_LINKED_FOLDERS", str(declared))
+        with pytest.raises(DatasetError, match=said):
+            send(copied)
+    assert HubDataset("me/d").files() == before
+
+
+@pytest.mark.parametrize("where", ["notes.txt", "data/chunk-000/file-000.parquet", "meta/info.json"])
+def test_a_link_to_the_outside_is_refused(hub: HubServer, root: Path, tmp_path: Path, where: str) -> None:
+    """What it points to is nobody's business, or would be missed where the dataset is copied to."""
+    secret = tmp_path / "outside"
+    if (root / where).exists():
+        (root / where).rename(secret)
+    else:
+        secret.write_text("password")
+    step = root / ".step"
+    step.symlink_to(secret)
+    (root / where).symlink_to(step)  # by way of a link that stays inside
+    with pytest.raises(DatasetError, match=r"is a link to .*outside, outside of the dataset.*cp -rL") as caught:
+        send(root)
+    assert str(root / where) in str(caught.value)
+    assert not hub.repositories  # nothing was asked of the Hub
+    whole = tmp_path / "whole"
+    shutil.copytree(root, whole)  # which follows links, as cp -rL does
+    send(whole)
+
+
+def test_a_link_within_the_dataset_is_followed(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    (root / "notes.txt").write_text("mine")
+    (root / "same.txt").symlink_to("notes.txt")
+    root.rename(tmp_path / "real")
+    root.symlink_to(tmp_path / "real")  # the folder itself may be a link
+    send(root)
+    assert stored(hub)["same.txt"] == b"mine"
+
+
+def test_the_list_of_files_of_a_url_is_not_sent(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    """A folder that was pushed to as a URL is a dataset as well."""
+    shelf = tmp_path / "shelf"
+    push(root, StoreDataset(f"file://{shelf}"))
+    assert (shelf / MANIFEST).is_file()
+    assert MANIFEST not in send(shelf).sent
+    assert stored(hub) == content(root)
+    # One that an earlier version sent goes, and does not come along.
+    hub.dataset("me/d").files()[MANIFEST] = hub.dataset("me/d").files()[layout.INFO]
+    pull(HubDataset("me/d"), tmp_path / "e")
+    assert content(tmp_path / "e") == content(root)
+    assert send(root).deleted == [MANIFEST]
+
+
+def test_a_picture_of_the_users_is_kept_at_either_end(hub: HubServer, root: Path) -> None:
+    told = []
+
+    def make(state: DatasetState, has_picture: bool) -> Card:
+        told.append(has_picture)
+        return card()
+
+    (root / "preview.png").write_bytes(b"mine")
+    assert not send(root, make_card=make).kept_picture
+    assert stored(hub)["preview.png"] == b"mine"
+    assert not send(root, make_card=make).sent
+    (root / "preview.png").unlink()
+    hub.dataset("me/d").files().pop("README.md")
+    report = send(root, make_card=make)
+    assert report.kept_picture
+    assert stored(hub)["preview.png"] == b"mine"
+    assert told == [True, True, True]
+    assert not send(root, make_card=make, replace_card=True).kept_picture
+    assert stored(hub)["preview.png"] == b"picture"
+    assert told[-1] is False

@@ -1,0 +1,485 @@
+"""New content takes its place in one step, wherever that is; the sweeps say what happens when it is disturbed."""
+
+import json
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.datasets.edit.edits import delete, keep, merge, split
+from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.loader.table import open_metadata
+from bhd_lerobot.datasets.recovery.repair import repair
+from bhd_lerobot.datasets.storage import atomic, disk, layout
+from bhd_lerobot.datasets.storage.disk import Disk, RootLock
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.errors import DatasetError, DatasetExistsError, DatasetLockedError
+from tests.datasets import support
+from tests.datasets.edit_support import content, record
+from tests.datasets.sweeps.operations import leftovers
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return record(tmp_path / "d", [0, 1, 2])
+
+
+def names(root: Path) -> list[str]:
+    return sorted(path.relative_to(root).as_posix() for path in root.rglob("*"))
+
+
+# --- the place --------------------------------------------------------------------------------------------------------
+
+
+def test_what_others_put_into_a_dataset_stays_as_it_was(root: Path) -> None:
+    (root / "README.md").write_text("mine")
+    (root / "own/deep/empty").mkdir(parents=True)
+    (root / "own/secret").write_text("mine")
+    (root / "own/secret").chmod(0o600)
+    (root / "link").symlink_to("own/secret")
+    root.chmod(0o750)
+    inode = (root / "own/secret").stat().st_ino
+    delete(root, [1])
+    assert [one.task for one in content(root)] == [["task 0"], ["task 0"]]
+    assert (root / "README.md").read_text() == "mine"
+    assert (root / "own/deep/empty").is_dir()
+    assert ((root / "own/secret").stat().st_mode & 0o777, (root / "own/secret").stat().st_ino) == (0o600, inode)
+    assert os.readlink(root / "link") == "own/secret"
+    assert root.stat().st_mode & 0o777 == 0o750
+    assert leftovers(root.parent) == []
+
+
+def test_what_others_write_during_an_edit_stays(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anywhere below the dataset but in its own three folders; also by a rename, as editors save."""
+    (root / "own").mkdir()
+    (root / "own/notes").write_text("old")
+    inode = root.stat().st_ino
+    count = 0
+
+    def write(action: str, path: Path) -> None:
+        nonlocal count
+        count += 1
+        (root / f"own/{count}").touch()
+        (root / "own/next").write_text(str(count))
+        (root / "own/next").rename(root / "own/notes")
+        (root / "late.txt").write_text(str(count))
+
+    monkeypatch.setattr(disk, "_before_step", write)
+    delete(root, [1])
+    assert len(list((root / "own").iterdir())) == count + 1
+    assert (root / "own/notes").read_text() == (root / "late.txt").read_text() == str(count)
+    assert root.stat().st_ino == inode, "who stands in it, or has mounted it, sees the new content"
+
+
+def test_nobody_ever_takes_a_mixture_for_the_dataset(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between any two changes of the disk a stock LeRobot finds the old dataset or the new one, or is refused."""
+    old = content(root)
+    new = [old[0], old[2]]
+    seen: list[int] = []
+
+    def look(action: str, path: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(disk, "_before_step", lambda *_: None)
+            if json.loads((root / "meta/info.json").read_text())["codebase_version"].startswith("v3."):
+                found = content(root)
+                assert found in (old, new)
+                seen.append(len(found))
+            else:
+                with pytest.raises(Exception, match="bhd-data repair"):
+                    LeRobotDatasetMetadata("t/t", root=root)
+                seen.append(0)
+
+    monkeypatch.setattr(disk, "_before_step", look)
+    delete(root, [1])
+    assert list(dict.fromkeys(seen)) == [3, 0, 2]
+
+
+def test_the_current_folder_is_not_put_aside(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(root)
+    inode = root.stat().st_ino
+    assert main.main(["delete", ".", "--episodes=1"]) == 0
+    assert (root.stat().st_ino, Path.cwd(), len(content(root))) == (inode, root, 2)
+    assert leftovers(root.parent) == []
+
+
+def test_a_link_to_an_empty_folder_and_one_to_a_dataset_stay_links(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "link").symlink_to("disk")
+    keep(root, [0, 2], tmp_path / "link")
+    assert (tmp_path / "link").is_symlink()
+    assert len(content(tmp_path / "disk")) == 2
+    delete(tmp_path / "link", [0])
+    assert (tmp_path / "link").is_symlink()
+    assert content(tmp_path / "disk") == [content(root)[2]]
+    (tmp_path / "new").mkdir()
+    (tmp_path / "to_new").symlink_to("new")
+    with support.create(tmp_path / "to_new") as recorder:
+        support.record(recorder)
+    assert support.read_back(tmp_path / "new") == 1
+    (tmp_path / "dangling").symlink_to("nowhere")
+    with pytest.raises(DatasetExistsError, match="link to nothing"):
+        keep(root, [0], tmp_path / "dangling")
+
+
+def test_a_mount_point_is_a_place_like_any_other(root: Path, tmp_path: Path) -> None:
+    """Of a container, for example, whose volume is the dataset."""
+    folder = Path(__file__).parents[3]
+    program = f"""
+import os, sys
+from pathlib import Path
+sys.path[:0] = [{str(folder)!r}]
+from tests.datasets import support
+from bhd_lerobot.datasets.edit.edits import delete, keep, split
+from bhd_lerobot.cli.data import main as data
+root, place = Path({str(root)!r}), Path({str(tmp_path / "volume")!r})
+def empty():
+    os.system(f"umount --lazy {{place}} 2>/dev/null")
+    assert os.system(f"mount -t tmpfs tmpfs {{place}}") == 0
+    (place / "lost+found").mkdir()
+    return place
+with support.create(empty()) as recorder:
+    support.record(recorder), support.record(recorder)
+with support.resume(place) as recorder:
+    support.record(recorder)
+assert support.read_back(place) == 3
+delete(place, [1])
+assert sorted(os.listdir(place)) == ["data", "lost+found", "meta"], os.listdir(place)
+keep(root, [0, 2], empty())
+assert data.main(["mark", str(place), "--episodes=0", "--outcome=failure"]) == 0
+split(root, {{"a": [0], "b": [1]}}, empty())
+assert sorted(os.listdir(place)) == ["a", "b", "lost+found"]
+assert data.main(["export", str(root), "--output", str(empty())]) == 0
+assert data.main(["import", str(place), "--repo_id=t/t", "--root", str(root.parent / "again")]) == 0
+assert data.main(["pull", f"file://{{root}}", "--root", str(empty())]) == 0
+delete(place, [0])
+assert data.main(["pull", f"file://{{root}}", "--root", str(place), "--replace", "--verify"]) == 0
+assert support.read_back(place) == 3
+assert sorted(os.listdir(place)) == ["data", "lost+found", "meta"], os.listdir(place)
+assert os.system(f"umount --lazy {{place}} && mount --bind {{root.parent / 'again'}} {{place}}") == 0
+delete(place, [1])
+assert support.read_back(root) == 3 and len(os.listdir(place / "meta")) > 3
+other = root.parent / "bound"
+other.mkdir()
+assert os.system(f"mount --bind {{root}} {{other}}") == 0
+delete(root, [2])  # from outside of the container
+assert support.read_back(other) == 2
+assert os.system(f"umount --lazy {{other}} && mkdir {{root}}/kept && mount -t tmpfs tmpfs {{root}}/kept") == 0
+assert os.system(f"mount --bind {{root}}/data {{root}}/data") == 0
+before = sorted(os.listdir(root / "data/chunk-000"))
+assert data.main(["delete", str(root), "--episodes=0"]) == 2
+assert sorted(os.listdir(root / "data/chunk-000")) == before and not (root / ".bhd").exists()
+assert support.read_back(root) == 2
+print("all of it")
+"""
+    (tmp_path / "volume").mkdir()
+    for options in (["--mount"], ["--mount", "--map-root-user"]):
+        if subprocess.run(["unshare", *options, "true"], capture_output=True, check=False).returncode == 0:
+            break
+    else:
+        pytest.skip("this system permits no mounts")
+    done = subprocess.run(
+        ["unshare", *options, sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(folder.parents[1])},
+    )
+    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["all of it"]), done.stderr
+
+
+def test_where_names_cannot_be_exchanged_the_content_is_moved_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(22, "Invalid argument")
+
+    monkeypatch.setattr(Disk, "swap", refuse)
+    delete(root, [1])
+    assert len(content(root)) == 2
+    assert leftovers(root.parent) == []
+
+
+def test_odd_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(DatasetExistsError, match="link to nothing"):
+        keep(root, [0], tmp_path / "loop")
+    long = tmp_path / ("x" * 250)  # too long for a hidden folder beside it
+    shutil.copytree(root, long)
+    delete(long, [1])
+    assert len(content(long)) == 2
+    line = record(tmp_path / "two\nlines", [0, 1])
+    delete(line, [0])
+    assert len(content(line)) == 1
+    monkeypatch.chdir(tmp_path / "two\nlines")
+    shutil.rmtree(tmp_path / "two\nlines")
+    delete(long, [0])  # from a current folder that is gone
+    assert len(content(long)) == 1
+    (tmp_path / "left/.bhd/compact/build").mkdir(parents=True)  # of an attempt that was killed
+    with support.create(tmp_path / "left") as recorder:
+        support.record(recorder)
+        with pytest.raises(DatasetLockedError):
+            RootLock(tmp_path / "left")
+    assert support.read_back(tmp_path / "left") == 1
+
+
+# --- who else is there ------------------------------------------------------------------------------------------------
+
+
+def test_what_somebody_else_makes_at_the_same_place_stays(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    move = Disk.move
+    places = (tmp_path / "new", tmp_path / "empty", tmp_path / "fixed")
+    for place in places:
+        if place.name != "new":
+            place.mkdir()
+
+        def late(self: Disk, source: Path, target: Path, place: Path = place) -> None:
+            if target in (place, place / atomic.WORK / "new"):
+                (place / "meta").mkdir(parents=True)
+                (place / "meta/theirs").touch()
+            move(self, source, target)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Disk, "move", late)
+            if place.name == "fixed":
+                patch.setattr(atomic, "is_fixed", lambda path: path.name == "fixed")
+            with pytest.raises(DatasetError):
+                keep(root, [0], place)
+        assert (place / "meta/theirs").exists()
+        assert not (place / "meta/info.json").exists()
+
+
+def test_workspaces_of_killed_processes_are_removed_and_those_of_living_ones_stay(root: Path) -> None:
+    (root.parent / ".d.bhd-0a1b2c3_/d/data").mkdir(parents=True)
+    (root.parent / ".d.bhd-notes").mkdir()  # of somebody else
+    living = root.parent / ".d.bhd-00000000"
+    living.mkdir()
+    lock = RootLock(living)
+    delete(root, [1])
+    assert leftovers(root.parent) == [".d.bhd-00000000", ".d.bhd-notes"]
+    lock.release()
+    assert not repair(root)
+    assert leftovers(root.parent) == [".d.bhd-notes"]
+
+
+def test_two_that_move_into_one_folder_do_not_meet(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = root.with_name("parts")
+    (folder / "mine").mkdir(parents=True)
+    write = Disk.write
+
+    def meanwhile(self: Disk, path: Path, content: bytes) -> None:
+        if path.name == "info.json" and "/a/" in str(path):
+            with pytest.raises(DatasetLockedError):
+                split(root.with_name("e"), {"c": [0], "d": [1]}, folder)
+        write(self, path, content)
+
+    record(root.with_name("e"), [4, 5])
+    monkeypatch.setattr(Disk, "write", meanwhile)
+    split(root, {"a": [0], "b": [1]}, folder)
+    assert sorted(os.listdir(folder)) == ["a", "b", "mine"]
+
+
+# --- a move that was decided ------------------------------------------------------------------------------------------
+
+
+def half_moved(root: Path) -> None:
+    """Leave a dataset as a process does that is killed between the renames of an edit."""
+    new = root / atomic.WORK / "new"
+    other = root.with_name("other")
+    shutil.copytree(root, other)
+    delete(other, [1])
+    shutil.copytree(other / "meta", new / "meta")
+    shutil.copytree(other / "data", new / "data")
+    shutil.rmtree(other)
+    (root / atomic.WORK / "old").mkdir()
+    (root / "data").rename(root / atomic.WORK / "old/data")
+    (root / atomic.WORK / "ready").touch()
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        dataset_info,
+        check_dataset,
+        open_metadata,
+        lambda root: merge([root, record(root.with_name("e"), [5])], root.with_name("all")),
+        lambda root: split(root, {"a": [0], "b": [1]}, root.with_name("parts")),
+        lambda root: main.main(["info", str(root)]),
+        lambda root: main.main(["export", str(root), "--output", str(root.with_name("bags"))]),
+        lambda root: main.main(["repair", str(root)]),
+    ],
+    ids=["info", "check", "loader", "merge", "split", "bhd-data info", "export", "repair"],
+)
+def test_whoever_comes_next_completes_it_and_says_so(root: Path, read, caplog, capsys) -> None:
+    half_moved(root)
+    with caplog.at_level(logging.WARNING):
+        read(root)
+    assert len(content(root)) == 2
+    assert "completed" in caplog.text + capsys.readouterr().out
+    assert leftovers(root.parent) == []
+
+
+def test_while_its_process_lives_it_is_waited_for(root: Path) -> None:
+    half_moved(root)
+    lock = RootLock(root)
+    with pytest.raises(DatasetLockedError, match="Wait until it ends"):
+        dataset_info(root)
+    lock.release()
+
+
+@pytest.mark.parametrize("how", ["of another folder", "a path", "a link", "a link to the staging folder", "no JSON"])
+def test_a_marker_that_came_with_a_dataset_of_somebody_else_moves_nothing(root: Path, how: str) -> None:
+    victim = root.parent / "victim"
+    (victim / "meta").mkdir(parents=True)
+    half_moved(root)
+    (root / atomic.WORK / "old/data").rename(root / "data")
+    plan = {"root": root.stat().st_ino, "new": {}, "goes": [], "is_new": False}
+    if how == "of another folder":
+        plan |= {"root": 1, "goes": ["data"]}
+    elif how == "a path":
+        plan |= {"goes": ["../victim"]}
+    elif how == "a link":
+        shutil.rmtree(root / atomic.WORK / "new")
+        (root / atomic.WORK / "new").symlink_to(victim)
+    elif how == "a link to the staging folder":
+        (root / ".bhd").rename(root / "elsewhere")
+        (root / ".bhd").symlink_to("elsewhere")
+    (root / atomic.WORK / "ready").write_text("{" if how == "no JSON" else json.dumps(plan))
+    before = names(root.parent)
+    for command in ("info", "check", "repair"):
+        assert main.main([command, str(root)]) == 2
+    assert main.main(["delete", str(root), "--episodes=0"]) == 2
+    assert names(root.parent) == before
+
+
+# --- an edit that nobody was told of ----------------------------------------------------------------------------------
+
+
+class KilledError(Exception):
+    pass
+
+
+def killed(report: object) -> None:
+    raise KilledError
+
+
+def test_an_edit_that_nobody_was_told_of_is_recognised(root: Path, tmp_path: Path, capsys) -> None:
+    """With the numbers of another state, the next one would delete a good episode."""
+    first, _, last = content(root)
+    with pytest.raises(KilledError):
+        delete(root, [1], killed)
+    assert main.main(["delete", str(root), "--episodes=1"]) == 0
+    assert "interrupted before, after it had been completed: nothing was changed now" in capsys.readouterr().out
+    assert content(root) == [first, last]
+    assert main.main(["delete", str(root), "--episodes=1"]) == 0  # now it is meant
+    assert content(root) == [first]
+
+    with pytest.raises(KilledError):
+        delete(record(tmp_path / "e", [0, 1, 2]), [1], killed)
+    told = json.loads((tmp_path / "e" / layout.UNREPORTED).read_text())
+    (root / layout.UNREPORTED).write_text(json.dumps({**told, "time": "2001"}))  # it is not about this content
+    mark(root, [0], outcome="success")
+
+    with pytest.raises(KilledError):
+        mark(root, [0], outcome="failure", note="why", tell=killed)
+    assert mark(root, [0], outcome="failure", note="why").is_repeated
+    assert not mark(root, [0], outcome="failure", note="why").is_repeated
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda root: delete(root, [0]),
+        lambda root: mark(root, [0], outcome="failure"),
+        lambda root: keep(root, [0], root.with_name("kept")),
+        lambda root: split(root, {"a": [0], "b": [1]}, root.with_name("parts")),
+    ],
+    ids=["delete", "mark", "filter", "split"],
+)
+def test_other_numbers_of_episodes_are_refused_once_after_it(root: Path, other) -> None:
+    with pytest.raises(KilledError):
+        delete(root, [1], killed)
+    before = names(root)
+    with pytest.raises(DatasetError, match="had been completed"):
+        other(root)
+    assert names(root) == [name for name in before if name != layout.UNREPORTED]
+    assert len(content(root)) == 2
+    other(root)
+
+
+# --- signals ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_wait_until_it_is_done(root: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals) -> None:
+    seen: list[int] = []
+    former = signal.signal(number, lambda got, frame: seen.append(len(content(root))))
+    swap = Disk.swap
+
+    def disturbed(self: Disk, one: Path, other: Path) -> None:
+        signal.raise_signal(number)
+        assert seen == []
+        swap(self, one, other)
+        signal.raise_signal(number)
+        assert seen == []
+
+    try:
+        monkeypatch.setattr(Disk, "swap", disturbed)
+        delete(root, [1])
+    finally:
+        signal.signal(number, former)
+    assert seen == [2]
+
+
+def test_ctrl_c_at_the_end_of_an_edit_says_that_it_was_made(root: Path, monkeypatch, capsys) -> None:
+    swap = Disk.swap
+
+    def disturbed(self: Disk, one: Path, other: Path) -> None:
+        swap(self, one, other)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Disk, "swap", disturbed)
+    assert main.main(["delete", str(root), "--episodes=1"]) == 130
+    said = capsys.readouterr().err
+    assert "had been completed" in said
+    assert "nothing was changed" not in said
+    assert len(content(root)) == 2
+
+
+def test_an_error_and_ctrl_c_at_once_do_not_say_that_nothing_was_changed(root: Path, monkeypatch, capsys) -> None:
+    def refuse(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Disk, "swap", refuse)
+        assert main.main(["delete", str(root), "--episodes=1"]) == 2
+    said = capsys.readouterr().err
+    assert "The change is decided, and the next command completes it." in said
+    assert "nothing was changed" not in said
+    assert main.main(["info", str(root), "--short"]) == 0
+    assert len(content(root)) == 2
+
+
+def test_in_another_thread_signals_are_somebody_elses(root: Path) -> None:
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            delete(root, [1])
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert failed == []
+    assert len(content(root)) == 2

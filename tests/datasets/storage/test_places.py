@@ -1,0 +1,242 @@
+"""A dataset names no file outside of it: neither by a link nor by a name that becomes a path."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.datasets.edit.edits import keep, merge, split
+from bhd_lerobot.datasets.format.state import load_state
+from bhd_lerobot.datasets.loader.source import local_metadata
+from bhd_lerobot.datasets.loader.table import open_metadata
+from bhd_lerobot.datasets.recovery.columns import read_info
+from bhd_lerobot.datasets.recovery.repair import repair
+from bhd_lerobot.datasets.remote.info import parse_info
+from bhd_lerobot.datasets.remote.listing import RemoteFile
+from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.places import (
+    LINKED_FOLDERS,
+    check_inside,
+    check_links,
+    wrong_info,
+    wrong_name,
+    wrong_path,
+)
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.errors import BhdError, DatasetError
+from bhd_lerobot.rosbag.importer.restore import _create
+from tests.datasets import support
+from tests.datasets.edit_support import content, record
+
+ESCAPES = ("../../../../x", "..", ".", "", "/x", "a/b", "a\\b", "a\0b", "a\nb", "\ud800", "x" * 300)
+PARTS = st.sampled_from(["..", ".", "/", "\\", "a", "videos", "\0", "\n", "", "ä", " ", "~", "$HOME", "{", "\ud800"])
+NAMES = st.lists(PARTS, max_size=6).map("".join) | st.text(max_size=8)
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("places") / "d", [0, 1, 2], video=True)
+
+
+@pytest.fixture
+def root(filmed: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(filmed, tmp_path / "d"))
+
+
+@given(NAMES)
+def test_a_name_that_is_taken_is_one_part_of_a_path(name: str) -> None:
+    whole = Path("/d/videos")
+    if not wrong_name(name):
+        name.encode()
+        assert os.path.normpath(whole / name) == f"{whole}/{name}"
+        assert wrong_path(f"videos/{name}/file") == ""
+        assert wrong_info({"features": {name: {}}}) == ""
+    else:
+        assert wrong_path(f"videos/{name}/file") or "/" in name
+        assert name in ("", ".", "..") or not name.isprintable() or "/" in name or "\\" in name
+        assert wrong_info({"features": {name: {}}})
+
+
+@given(st.lists(PARTS | st.sampled_from(["{chunk_index:03d}", "{file_index}", "{x.y}", "{x[0]}", "{}"])).map("/".join))
+def test_a_template_that_is_taken_stays_inside(template: str) -> None:
+    if not wrong_info({"data_path": template}):
+        path = template.format(chunk_index=1, file_index=2)
+        assert os.path.normpath(Path("/d") / path).startswith("/d/")
+
+
+def test_names_are_refused_by_all_who_read_them(root: Path, tmp_path: Path) -> None:
+    camera = support.CAMERA
+    outside = tmp_path / "victim"
+    outside.mkdir()
+    info = json.loads((root / layout.INFO).read_text())
+    readers: list[Callable[[], Any]] = [
+        lambda: load_state(root),
+        lambda: keep(root, [0], tmp_path / "work" / "kept"),
+        lambda: split(root, {"a": [0]}, tmp_path / "work" / "parts"),
+        lambda: merge([root, root], tmp_path / "work" / "merged"),
+        lambda: repair(root),
+        lambda: check_dataset(root),
+        lambda: open_metadata(root),
+        lambda: local_metadata("t/t", root),
+        lambda: read_info(root / layout.INFO),
+        lambda: parse_info((root / layout.INFO).read_bytes(), "there"),
+    ]
+    before = {path for path in tmp_path.rglob("*") if root not in path.parents}
+    for name in ESCAPES:
+        features = {name if key == camera else key: one for key, one in info["features"].items()}
+        changed: list[dict[str, Any]] = [{**info, "features": features}]
+        if name and "/" in name:
+            changed += [{**info, "data_path": f"data/{name}/{{file_index}}.parquet"}] * (".." in name)
+            changed.append({**info, "video_path": f"/{name}"})
+        for one in changed:
+            (root / layout.INFO).write_text(json.dumps(one))
+            for reader in readers:
+                with pytest.raises(BhdError):
+                    reader()
+            assert {path for path in tmp_path.rglob("*") if root not in path.parents} <= before | {tmp_path / "work"}
+        episode = {"features": features, "fps": 10, "robot_type": "t", "recording": {}, "video": None}
+        with pytest.raises(BhdError, match="name"):  # as a bag says it
+            _create(episode, tmp_path / "new", "t/t")
+
+
+def test_filter_writes_to_its_output_only(root: Path, tmp_path: Path) -> None:
+    evil = "../../../far"  # from <output>/videos: beside the folder that the output lies in
+    info = json.loads((root / layout.INFO).read_text())
+    info["features"][evil] = info["features"].pop(support.CAMERA)
+    (root / layout.INFO).write_text(json.dumps(info))
+    for path in (root / "meta/episodes").glob("*/*.parquet"):
+        table = pq.read_table(path)
+        pq.write_table(table.rename_columns([name.replace(support.CAMERA, evil) for name in table.column_names]), path)
+    (root / "videos" / support.CAMERA).rename((root / "videos" / evil).resolve())
+    output = tmp_path / "a" / "b" / "c" / "kept"
+    with pytest.raises(DatasetError, match=r"'\.\./\.\./\.\./far' would lead to another folder"):
+        keep(root, [0, 1], output)
+    assert not (tmp_path / "a").exists()
+
+
+class Listing:
+    """A remote place that lists what a stranger wants."""
+
+    name, folder = "there", None
+
+    def __init__(self, paths: list[str]) -> None:
+        self._paths = paths
+
+    def files(self) -> dict[str, RemoteFile]:
+        return {path: RemoteFile(1, None) for path in (layout.INFO, *self._paths)}
+
+
+def test_files_that_a_remote_place_lists(tmp_path: Path) -> None:
+    for path in ("/etc/x", "../x", "data/../../x", "data//x", "a\\..\\x", "data/\0", "./x", "data/."):
+        with pytest.raises(BhdError, match="no path within the dataset"):
+            pull(Listing([path]), tmp_path / "d")  # type: ignore[arg-type]
+        assert not any(tmp_path.iterdir())
+
+
+def test_a_pull_does_not_come_together_in_a_folder_of_somebody_else(tmp_path: Path) -> None:
+    """In a folder that is everybody's, as /tmp, its name can be foreseen, and what is in it could change later."""
+    staging = tmp_path / ".d.pull"
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / ".bhd-pull").touch()
+    staging.symlink_to("elsewhere")
+    with pytest.raises(DatasetError, match=r"\.d\.pull is in the way"):
+        pull(Listing([]), tmp_path / "d")  # type: ignore[arg-type]
+    staging.unlink()
+    if not os.geteuid():
+        (tmp_path / "elsewhere").rename(staging)
+        os.chown(staging, 65534, -1)
+        with pytest.raises(DatasetError, match=r"\.d\.pull is in the way"):
+            pull(Listing([]), tmp_path / "d")  # type: ignore[arg-type]
+
+
+def test_no_command_follows_a_link_out_of_the_dataset(root: Path, tmp_path: Path) -> None:
+    data, film = "data/chunk-000/file-000.parquet", layout.video_file(support.CAMERA, (0, 0))
+    episodes = "meta/episodes/chunk-000/file-000.parquet"
+    others = ("images", "tmp123", "meta/notes.txt", "videos/x", "data/chunk-000/.hidden")
+    for name in (data, film, episodes, layout.INFO, layout.TASKS, layout.STATS, "videos", "data/chunk-000", *others):
+        place, secret = root / name, tmp_path / "secret"
+        if place.exists():
+            place.rename(secret)
+        else:
+            secret.write_text("password")
+        (root / ".step").symlink_to(secret)
+        place.symlink_to(root / ".step")  # by way of a link that stays inside
+        calls: list[Callable[[], Any]] = [
+            lambda: load_state(root),
+            lambda: load_state(root, films=False),
+            lambda: keep(root, [0], tmp_path / "kept"),
+            lambda: repair(root),
+        ]
+        for call in calls:
+            with pytest.raises(DatasetError, match=r"is a link to .*secret, outside of the dataset.*cp -rL") as caught:
+                call()
+            assert str(place) in str(caught.value)
+            assert LINKED_FOLDERS in str(caught.value)
+        assert not (tmp_path / "kept").exists()
+        if name not in (layout.INFO, "data/chunk-000"):
+            found = [str(one) for one in check_dataset(root).findings]
+            assert any("link leads out of the dataset" in one for one in found)
+        place.unlink()
+        (root / ".step").unlink()
+        if name in others:
+            secret.unlink()
+        else:
+            secret.rename(place)
+    load_state(root)
+
+
+def test_links_within_and_to_declared_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = content(root)
+    (root / "videos").rename(root / "films")
+    (root / "videos").symlink_to("films")
+    (root / "data" / "again").symlink_to("..")  # a circle
+    (root / "meta" / "itself").symlink_to("itself")
+    load_state(root)
+    (root / "films").rename(tmp_path / "big")
+    (root / "videos").unlink()
+    (root / "videos").symlink_to(tmp_path / "big")
+    with pytest.raises(DatasetError, match="outside of the dataset"):
+        load_state(root)
+    monkeypatch.setenv(LINKED_FOLDERS, f"/nowhere:{tmp_path / 'big'}")
+    load_state(root)
+    (root / "data" / "again").unlink()
+    (root / "meta" / "itself").unlink()
+    assert content(root) == wanted
+    link = tmp_path / "link"
+    link.symlink_to(root)  # the folder itself may be one
+    load_state(link)
+
+
+def test_a_cache_that_is_none(root: Path, tmp_path: Path) -> None:
+    """Folders named as the Hub's cache lead nowhere else by a link of their own."""
+    repository = tmp_path / "datasets--me--d"
+    snapshot = repository / "snapshots" / "abc"
+    snapshot.parent.mkdir(parents=True)
+    root.rename(snapshot)
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "key").write_text("password")
+    (repository / "blobs").symlink_to(tmp_path / "home")
+    (snapshot / "meta" / "x").symlink_to("../../../blobs/key")
+    with pytest.raises(DatasetError, match=r"is a link to .*home/key"):
+        check_links(snapshot)
+    (repository / "blobs").unlink()
+    (repository / "blobs").mkdir()
+    (repository / "blobs" / "key").write_text("of the dataset")
+    check_links(snapshot)
+
+
+def test_pictures_beside_the_data_are_within(root: Path) -> None:
+    for path in ("/etc/passwd", "../x", "images/../../x"):
+        with pytest.raises(DatasetError, match="outside of the dataset"):
+            check_inside(root, root / path)
+    with pytest.raises(DatasetError, match="no file can be called"):
+        check_inside(root, root / "a\0b")
+    assert check_inside(root, root / "images/x.png") == root.resolve() / "images/x.png"

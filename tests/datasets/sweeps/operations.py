@@ -1,0 +1,233 @@
+"""What the sweeps do to datasets, and what is at a place before and after."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from bhd_lerobot.datasets.storage.atomic import UNFINISHED_VERSION
+from bhd_lerobot.rosbag.exporter.export import ExportOptions, export_bags
+from bhd_lerobot.rosbag.messages.views import RobotView
+from tests.datasets import support
+from tests.datasets.edit_support import record
+
+NOTES = "notes.txt"  # what somebody else put there; it must stay
+
+
+@dataclass(frozen=True)
+class Operation:
+    """A command, by the folder in which it works.
+
+    Attributes:
+        name: for the report.
+        prepare: puts into a folder what the command needs; called once, and copied for each run.
+        argv: the command line, in that folder.
+        target: what the command makes or changes.
+        is_new: whether nothing is there before.
+        places: "no exchange" of names by the file system, or a "fixed" folder, such as a mount point.
+        repeated: exit status of the same command again, when it had been completed.
+        says: what it says of that.
+    """
+
+    name: str
+    prepare: Callable[[Path], object]
+    argv: Callable[[Path], list[str]]
+    target: str
+    is_new: bool = False
+    places: tuple[str, ...] = ("plain",)
+    repeated: int = 0
+    says: str = ""
+
+
+def dataset(folder: Path, name: str = "d 1", episodes: int = 4) -> Path:
+    """Make a dataset with notes of somebody else in it; its name has a space."""
+    root = record(folder / name, list(range(episodes)))
+    for place in (root, root / "meta", root / "own"):
+        place.mkdir(exist_ok=True)
+        (place / NOTES).write_text("mine", encoding="utf-8")
+    return root
+
+
+def _two(folder: Path) -> None:
+    dataset(folder, "a", 2)
+    record(folder / "b", [2, 3])
+
+
+def _without_stats(folder: Path) -> None:
+    (dataset(folder) / "meta/stats.json").unlink()
+
+
+def _into(folder: Path) -> None:
+    dataset(folder)
+    (folder / "parts").mkdir()
+    (folder / "parts" / NOTES).write_text("mine", encoding="utf-8")
+
+
+def _bags(folder: Path) -> None:
+    export_bags(record(folder / "d", [0, 1]), folder / "bags", view=RobotView(), options=ExportOptions())
+
+
+def _afar(folder: Path) -> None:
+    shutil.copytree(record(folder / "made", [0, 1, 2]), folder / "afar")
+
+
+def _afar_and_here(folder: Path) -> None:
+    _afar(folder)
+    dataset(folder)
+
+
+def _killed(folder: Path) -> None:
+    """Leave a recording as after a kill: episodes in files of their own, an unfinished one, no statistics."""
+    recorder = support.create(folder / "d 1")
+    for _ in range(3):
+        support.record(recorder)
+    support.fill(recorder.begin_episode(), 3)
+    (folder / "d 1/.bhd/episode-3").mkdir(parents=True)
+    recorder._lock.release()
+
+
+def _edit(*words: str) -> Callable[[Path], list[str]]:
+    return lambda folder: [words[0], str(folder / "d 1"), *words[1:]]
+
+
+ANYWHERE = ("plain", "no exchange")
+NEW_ANYWHERE = ("plain", "fixed")
+EXISTS = {"is_new": True, "repeated": 2, "says": "exists already", "places": NEW_ANYWHERE}
+OPERATIONS = (
+    Operation(
+        "delete", dataset, _edit("delete", "--episodes=1"), "d 1", places=ANYWHERE, says="nothing was changed now"
+    ),
+    Operation("mark", dataset, _edit("mark", "--episodes=1", "--outcome=failure"), "d 1", says="changed now"),
+    Operation("fix", _without_stats, _edit("check", "--fix"), "d 1"),
+    Operation("repair", _killed, _edit("repair"), "d 1", places=ANYWHERE),
+    Operation("resume", _killed, lambda folder: ["record", str(folder / "d 1"), "5"], "d 1"),
+    Operation(
+        "record",
+        lambda folder: None,
+        lambda folder: ["record", str(folder / "d 1"), "2"],
+        "d 1",
+        is_new=True,
+        places=NEW_ANYWHERE,
+    ),
+    Operation(
+        "merge",
+        _two,
+        lambda folder: ["merge", str(folder / "a"), str(folder / "b"), "--output", str(folder / "all")],
+        "all",
+        **EXISTS,
+    ),
+    Operation(
+        "filter",
+        dataset,
+        lambda folder: ["filter", str(folder / "d 1"), "--episodes=0,2", "--output", str(folder / "some")],
+        "some",
+        **EXISTS,
+    ),
+    Operation(
+        "split",
+        dataset,
+        lambda folder: ["split", str(folder / "d 1"), "--parts=x=0.5,y=0.5", "--output", str(folder / "parts")],
+        "parts",
+        **EXISTS,
+    ),
+    Operation(
+        "split into a folder",
+        _into,
+        lambda folder: ["split", str(folder / "d 1"), "--parts=x=0.5,y=0.5", "--output", str(folder / "parts")],
+        "parts",
+        repeated=2,
+        says="exists already",
+    ),
+    Operation(
+        "export",
+        lambda folder: record(folder / "d", [0, 1]),
+        lambda folder: ["export", str(folder / "d"), "--output", str(folder / "bags")],
+        "bags",
+        **EXISTS,
+    ),
+    Operation(
+        "import",
+        _bags,
+        lambda folder: ["import", str(folder / "bags"), "--repo_id=t/t", "--root", str(folder / "new")],
+        "new",
+        **EXISTS,
+    ),
+    Operation(
+        "pull",
+        _afar,
+        lambda folder: ["pull", f"file://{folder}/afar", "--root", str(folder / "new")],
+        "new",
+        is_new=True,
+        places=NEW_ANYWHERE,
+    ),
+    Operation(
+        "pull in the place of another",
+        _afar_and_here,
+        lambda folder: ["pull", f"file://{folder}/afar", "--root", str(folder / "d 1"), "--replace", "--verify"],
+        "d 1",
+        places=(*ANYWHERE, "fixed"),
+    ),
+)
+
+
+REFUSED = "refused by LeRobot"
+
+
+class RefusedError(Exception):
+    """LeRobot would not load it."""
+
+
+def content(place: Path) -> str:
+    """Return a digest of all datasets at a place, or of the bags there; "nothing", or "broken", if there are none.
+
+    Read without the code that is tested: as a stock LeRobot would find it.
+    """
+    try:
+        found = sorted([*place.rglob("meta/info.json"), *place.rglob("*.mcap")])
+        hidden = [path for path in found if any(part.startswith(".") for part in path.relative_to(place).parts)]
+        if any(path.name == NOTES for path in place.glob("*")):
+            found.append(place / NOTES)
+        return _digest([path for path in found if path not in hidden]) if found else "nothing"
+    except RefusedError:
+        return REFUSED
+    except (OSError, KeyError, ValueError, pa.ArrowException) as error:
+        return f"broken: {error!r}"
+
+
+def _digest(found: list[Path]) -> str:
+    digest = hashlib.sha256()
+    for path in found:
+        if path.name != "info.json":
+            digest.update(path.read_bytes())
+            continue
+        root = path.parents[1]
+        info = json.loads(path.read_text(encoding="utf-8"))
+        if info["codebase_version"] == UNFINISHED_VERSION:
+            raise RefusedError
+        rows = pa.concat_tables([_light(one) for one in sorted(root.glob("meta/episodes/*/*.parquet"))]).to_pylist()
+        rows = [row for row in rows if row["episode_index"] < info["total_episodes"]]
+        data = pa.concat_tables([pq.read_table(one) for one in sorted(root.glob("data/*/*.parquet"))])
+        if [row["episode_index"] for row in rows] != list(range(info["total_episodes"])):
+            raise ValueError("episodes are missing")
+        if data.num_rows < info["total_frames"]:
+            raise ValueError("frames are missing")
+        told = [data.slice(0, info["total_frames"]).to_pydict(), rows, info["total_episodes"], info["features"]]
+        digest.update(json.dumps([root.name, told], default=str).encode())
+    return digest.hexdigest()
+
+
+def _light(path: Path) -> pa.Table:
+    """Return episodes without statistics and the places of their files, which change with every merge of files."""
+    table = pq.read_table(path)
+    names = [name for name in table.column_names if not name.startswith(("stats/", "data/", "meta/"))]
+    return table.select(names)
+
+
+def leftovers(folder: Path) -> list[str]:
+    """Return what is hidden in a folder, which nobody wants there after a command."""
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob(".*") if path.name != ".cache")

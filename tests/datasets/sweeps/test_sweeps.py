@@ -1,0 +1,189 @@
+"""Whatever happens to a command, and whenever: nothing is lost, and what it said of that is true.
+
+Every command that writes a dataset or a bag is killed, interrupted, or meets a full disk, before each of its changes of
+the file system. Here some of them are tried; ``make sweep`` tries all.
+"""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.datasets.sweeps.operations import NOTES, OPERATIONS, REFUSED, Operation, content, leftovers
+
+ROOT = Path(__file__).parents[3]
+IS_FULL = os.environ.get("BHD_SWEEP") == "full"
+FAULTS = ("kill", "interrupt", "full")
+
+# What messages say of the state in which a command leaves what it works on.
+OLD = re.compile(
+    r"(nothing was changed|is as it was|are as they were|was not touched|no part was written|no dataset was made|"
+    r"no bag was (written|left)|nothing was written there)(?! now)",
+    re.IGNORECASE,
+)
+NEW = re.compile(r"had been (completed|made|pulled|merged)|are gone, and those behind|changed now")
+DECIDED = "next command completes it"
+
+
+class Runner:
+    """The process that runs the commands."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("server.py"))],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+
+    def run(
+        self,
+        argv: list[str],
+        watched: Path,
+        *,
+        place: str = "plain",
+        target: Path = Path(),
+        fault: str = "none",
+        step: int = -1,
+    ) -> tuple[int, str, int]:
+        """Return exit status, output, and how many changes were seen, if it came to an end."""
+        output = self.folder / "output"
+        counted = Path(f"{output}.steps")
+        counted.unlink(missing_ok=True)
+        job = {"argv": argv, "cwd": str(ROOT), "watched": str(watched), "target": str(target), "output": str(output)}
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps({**job, "place": place, "fault": fault, "step": step}) + "\n")
+        self.process.stdin.flush()
+        status = int(self.process.stdout.readline())
+        steps = int(counted.read_text()) if counted.exists() else 0
+        return status, output.read_text(encoding="utf-8", errors="replace"), steps
+
+    def close(self) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        self.process.wait()
+
+
+@pytest.fixture(scope="module")
+def runner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runner]:
+    runner = Runner(tmp_path_factory.mktemp("runner"))
+    yield runner
+    runner.close()
+
+
+def chosen(steps: int, offset: int) -> list[int]:
+    """Return the changes before which something happens: all, or one early and some of the last, which decide."""
+    if IS_FULL:
+        return list(range(1, steps + 1))
+    return sorted({1 + (steps * (offset + 1)) // 5, *range(max(1, steps - 8 + offset), steps + 1, 4)})
+
+
+CASES = [
+    (operation, place)
+    for operation in OPERATIONS
+    for place in operation.places
+    if IS_FULL or place == "plain" or operation.name in ("delete", "merge")
+]
+
+
+@pytest.mark.parametrize(("operation", "place"), CASES, ids=[f"{one.name}, {place}" for one, place in CASES])
+def test_nothing_is_lost_and_what_is_said_is_true(
+    runner: Runner, tmp_path: Path, operation: Operation, place: str
+) -> None:
+    origin = tmp_path / "origin"
+    origin.mkdir()
+    operation.prepare(origin)
+    folder = tmp_path / "f"
+
+    def fresh() -> Path:
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(origin, folder)
+        return folder / operation.target
+
+    target, argv = fresh(), operation.argv(folder)
+    before = content(target)
+    status, said, steps = runner.run(argv, folder, place=place, target=target)
+    assert status == 0, said
+    after = content(target)
+    assert after not in ("nothing", "broken")
+    assert leftovers(folder) == []
+    assert steps > 5
+    for number, fault in enumerate(FAULTS):
+        for step in chosen(steps, number):
+            target = fresh()
+            status, said, _ = runner.run(argv, folder, place=place, target=target, fault=fault, step=step)
+            where = f"{fault} before change {step} of {steps}: status {status}, {said!r}"
+            assert "Traceback" not in said, where
+            check_state(Outcome(operation, place, target, status, said), before, after, where)
+            was_told = status == 0 or bool(NEW.search(said))
+            finish(runner, Outcome(operation, place, target, status, said), was_told, after, where)
+            for path in origin.rglob(NOTES):
+                assert (folder / path.relative_to(origin)).read_text(encoding="utf-8") == "mine", where
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a command: its target, exit status, and what it printed."""
+
+    operation: Operation
+    place: str
+    target: Path
+    status: int
+    said: str
+
+
+def check_state(outcome: Outcome, before: str, after: str, where: str) -> None:
+    """Check that the old or the new content is there, and that it is the one that the command speaks of."""
+    name, said, found = outcome.operation.name, outcome.said, content(outcome.target)
+    if outcome.status < 0 or DECIDED in said:  # whoever comes next completes it; until then LeRobot mixes nothing
+        if outcome.place == "no exchange" or name == "split into a folder" or outcome.place == "fixed":
+            return
+        assert found in (before, after, REFUSED) or name in ("record", "resume", "repair"), where
+        return
+    if name in ("record", "resume", "repair"):
+        printed = len(re.findall(r"^saved \d+", said, re.MULTILINE))
+        assert printed + 3 * (name != "record") <= saved_in(outcome.target), where
+        return
+    assert found in (before, after), where
+    if OLD.search(said):
+        assert found == before, where
+    if NEW.search(said) or outcome.status == 0:
+        assert found == after, where
+    if outcome.status not in (0, -signal.SIGKILL):
+        assert OLD.search(said) or NEW.search(said) or "kept beside it" in said or "exists already" in said, where
+
+
+def saved_in(root: Path) -> int:
+    info = root / "meta/info.json"
+    return json.loads(info.read_text(encoding="utf-8"))["total_episodes"] if info.exists() else 0
+
+
+def finish(runner: Runner, outcome: Outcome, was_told: bool, after: str, where: str) -> None:
+    """Check that the same command again leads to the new content, once, and leaves nothing behind."""
+    operation, target = outcome.operation, outcome.target
+    folder = target.parent
+    if not operation.is_new and operation.name != "split into a folder" and content(target) != after:
+        status, said, _ = runner.run(["info", str(target)], folder)
+        assert status == 0, (where, said)
+    was_done = content(target) == after
+    if not was_told or operation.is_new:
+        status, said, _ = runner.run(operation.argv(folder), folder, place=outcome.place, target=target)
+        if "completed a change" in said or "nothing was changed now" in said:
+            assert status in (0, operation.repeated), (where, said)  # completed now, as what it had been
+        elif was_done and operation.repeated:
+            assert (status, operation.says in said) == (operation.repeated, True), (where, said)
+        else:
+            assert status == 0, (where, said)
+        assert leftovers(folder) == [], where
+    assert content(target) == after, where

@@ -1,0 +1,473 @@
+"""A sound dataset has no finding; each kind of damage has one, which names the place."""
+
+import contextlib
+import json
+import math
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Finding, Severity, check_dataset
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import DatasetError
+from tests.datasets.loader import support as loader_support
+
+FPS, EPISODES, CAMERA = 10, 6, "observation.images.front"
+STATE = ["a.pos", "b.pos", "tool_qw.pos", "tool_qx.pos", "tool_qy.pos", "tool_qz.pos"]
+FEATURES: dict[str, dict[str, Any]] = {
+    "observation.state": {"dtype": "float32", "shape": (6,), "names": STATE},
+    "action": {"dtype": "float32", "shape": (2,), "names": ["a.pos", "grip.pos"]},
+    "control.late": {"dtype": "bool", "shape": (1,), "names": None},
+    "control.age": {"dtype": "float32", "shape": (1,), "names": None},
+    "note": {"dtype": "string", "shape": (1,), "names": None},
+}
+VIDEO = {CAMERA: {"dtype": "video", "shape": (32, 48, 3), "names": ["height", "width", "channels"]}}
+
+
+def limits(robot_type: str | None) -> dict[str, dict[str, tuple[float, float]]]:
+    assert robot_type == "toy"
+    return {"observation.state": {"a.pos": (-2.0, 2.0), "nothing.pos": (0.0, 1.0)}}
+
+
+def length(episode: int) -> int:
+    return 20 + episode
+
+
+def columns(episode: int) -> dict[str, np.ndarray]:
+    """An arm that turns its tool by a third of a turn, and closes its gripper once."""
+    rng = np.random.default_rng(episode)
+    time = np.arange(length(episode)) / FPS
+    half = 0.5 * (time + episode)
+    quaternion = np.stack([np.cos(half), np.sin(half), 0 * half, 0 * half], axis=1)
+    quaternion *= np.sign(quaternion @ [0.6, 0.8, 0, 0])[:1, None]
+    position = np.stack([np.sin(time + episode), np.cos(time)], axis=1) + rng.normal(0, 0.01, (len(time), 2))
+    return {
+        "observation.state": np.concatenate([position, quaternion], axis=1).astype(np.float32),
+        "action": np.stack([np.sin(time + episode + 0.1), time > 1.0], axis=1).astype(np.float32),
+        "control.late": np.zeros(len(time), np.bool_),
+        "control.age": rng.uniform(0, 0.01, len(time)).astype(np.float32),
+        "note": np.array([f"{frame}" for frame in range(len(time))], object),
+    }
+
+
+def record(root: Path, *, finalize: bool = True, video: bool = False, outcome: str = "success") -> Path:
+    features = {**FEATURES, **(VIDEO if video else {})}
+    recorder = DatasetRecorder.create("t/t", FPS, features, robot_type="toy", root=root, recording={"seed": 1})
+    for episode in range(EPISODES):
+        writer = recorder.begin_episode()
+        writer.set_columns(columns(episode))
+        if video:
+            for frame in range(length(episode)):
+                writer.add_image(CAMERA, np.full((32, 48, 3), 20 + 5 * frame, np.uint8))
+        recorder.save(writer, task=f"task {episode % 2}", metadata={"outcome": outcome})
+    if finalize:
+        recorder.finalize()
+    return root
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory) -> Path:
+    return record(tmp_path_factory.mktemp("check") / "d")
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory) -> Path:
+    return record(tmp_path_factory.mktemp("check") / "v", video=True)
+
+
+def copy(root: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(root, tmp_path / "copy"))
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def data_file(root: Path) -> Path:
+    return next((root / "data").rglob("*.parquet"))
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Change columns of a Parquet file: dictionaries of lists."""
+    table = pq.read_table(path)
+    rows = table.to_pydict()
+    change(rows)
+    fields = [field for field in table.schema if field.name in rows]
+    pq.write_table(pa.table(rows, schema=pa.schema(fields)), path)
+
+
+def edit_json(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    values = json.loads(path.read_text())
+    change(values)
+    path.write_text(json.dumps(values))
+
+
+def bad(found: DatasetCheck) -> list[Finding]:
+    return [one for one in found.findings if one.severity > Severity.NOTE]
+
+
+# --- sound -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_sound_dataset_has_no_finding_and_is_left_alone(sound: Path) -> None:
+    before = contents(sound)
+    found = check_dataset(sound, limits)
+    assert bad(found) == []
+    assert (found.episodes, found.frames) == (EPISODES, sum(map(length, range(EPISODES))))
+    assert [one.what for one in found.findings if one.check == "outcome"] == ["success 6"]
+    assert contents(sound) == before
+
+
+def test_films_are_counted(filmed: Path) -> None:
+    assert bad(check_dataset(filmed, limits)) == []
+
+
+def test_a_dataset_of_stock_lerobot_is_sound(tmp_path: Path) -> None:
+    root = loader_support.record_stock(tmp_path / "stock", cameras=True)
+    assert [one for one in check_dataset(root).findings if one.severity == Severity.ERROR] == []
+
+
+def test_every_finding_belongs_to_a_check_that_is_described(sound: Path, tmp_path: Path) -> None:
+    root = copy(sound, tmp_path)
+    (root / "meta/stats.json").unlink()
+    assert {one.check for one in check_dataset(root).findings} <= set(CHECKS)
+
+
+# --- damage ----------------------------------------------------------------------------------------------------------
+
+
+def nan(rows: dict[str, Any]) -> None:
+    rows["observation.state"][length(0) + 4][1] = float("nan")
+    rows["observation.state"][length(0) + 9][1] = float("inf")
+
+
+def age(rows: dict[str, Any]) -> None:
+    rows["control.age"][3] = float("nan")
+
+
+def frozen_sensor(rows: dict[str, Any]) -> None:
+    for row in range(length(0), length(0) + length(1)):
+        rows["observation.state"][row][0] = 0.25
+
+
+def frozen_episode(rows: dict[str, Any]) -> None:
+    for row in range(length(0), length(0) + length(1)):
+        rows["observation.state"][row] = rows["observation.state"][length(0)]
+
+
+def flipped(rows: dict[str, Any]) -> None:
+    for row in range(length(0) + 7, length(0) + 12):
+        rows["observation.state"][row][2:] = [-x for x in rows["observation.state"][row][2:]]
+
+
+def jump(rows: dict[str, Any]) -> None:
+    rows["action"][length(0) + 6][0] = -1.9
+
+
+def beyond(rows: dict[str, Any]) -> None:
+    rows["observation.state"][5][0] = 2.5
+
+
+def late(rows: dict[str, Any]) -> None:
+    for row in range(10):
+        rows["control.late"][row] = True
+
+
+def shifted(rows: dict[str, Any]) -> None:
+    rows["timestamp"][length(0) + 3] += 0.01
+
+
+def swapped(rows: dict[str, Any]) -> None:
+    rows["frame_index"][2], rows["frame_index"][3] = 3, 2
+
+
+def no_task(rows: dict[str, Any]) -> None:
+    rows["task_index"][8] = 2
+
+
+def no_column(rows: dict[str, Any]) -> None:
+    del rows["control.age"]
+
+
+def lost_row(rows: dict[str, Any]) -> None:
+    for values in rows.values():
+        values.pop()
+
+
+ERROR, WARNING = Severity.ERROR, Severity.WARNING
+
+
+@pytest.mark.parametrize(
+    ("damage", "expected"),
+    [
+        (nan, (ERROR, "finite", "observation.state", "2 frames .* first in episode 1, frame 4: b.pos is nan")),
+        (frozen_sensor, (WARNING, "frozen", "observation.state: a.pos", "does not change in episode 1,")),
+        (frozen_episode, (WARNING, "frozen", "observation.state", "nothing changes in episode 1")),
+        (flipped, (WARNING, "jumps", "observation.state: tool", "2 times in 1 episodes, first in episode 1, frame 7")),
+        (jump, (WARNING, "jumps", "action: a.pos", "2 times in 1 episodes, first in episode 1, frame 6")),
+        (beyond, (WARNING, "limits", "observation.state: a.pos", "to 2.5; the robot's limits are -2 and 2")),
+        (late, (WARNING, "timing", "control.late", "10 of 135 frames were late")),
+        (shifted, (ERROR, "timing", "file-000", "1 timestamps .* the first in episode 1, frame 3: 0.31 s")),
+        (swapped, (ERROR, "counts", "file-000", "frame_index is 3 in row 2, where meta/episodes has 2")),
+        (no_task, (ERROR, "counts", "file-000", "task_index is 2; there are 2 instructions")),
+        (no_column, (ERROR, "schema", "file-000", "no column control.age")),
+        (lost_row, (ERROR, "counts", "file-000", "134 frames; its episodes have 135")),
+    ],
+)
+def test_damaged_numbers_are_found(sound: Path, tmp_path: Path, damage, expected) -> None:
+    root = copy(sound, tmp_path)
+    edit(data_file(root), damage)
+    found = check_dataset(root, limits)
+    severity, check, where, what = expected
+    matching = [one for one in bad(found) if (one.severity, one.check) == (severity, check)]
+    assert any(where in one.where and re.search(what, one.what) for one in matching), found.findings
+    assert all(one.remedy for one in matching)
+    # What was changed changed the statistics, too; nothing else is found.
+    assert {one.check for one in bad(found)} <= {check, "stats", "limits"}
+
+
+def test_a_nan_that_no_policy_learns_from_is_a_note(sound: Path, tmp_path: Path) -> None:
+    root = copy(sound, tmp_path)
+    edit(data_file(root), age)
+    found = check_dataset(root)
+    assert bad(found) == []
+    (note,) = [one for one in found.findings if one.check == "finite"]
+    assert "episode 0, frame 3" in note.what
+
+
+def test_a_column_with_gaps_is_found_and_the_rest_is_checked(sound: Path, tmp_path: Path) -> None:
+    def gap(rows: dict[str, Any]) -> None:
+        rows["observation.state"][3] = None
+        frozen_episode({"observation.state": rows["observation.state"]})
+        jump(rows)
+
+    root = copy(sound, tmp_path)
+    edit(data_file(root), gap)
+    found = bad(check_dataset(root))
+    assert [one.what for one in found if one.check == "finite"] == ["1 frames hold nothing"]
+    assert [one.where for one in found if one.check == "jumps"] == ["action: a.pos"]
+
+
+def test_a_gripper_that_closes_once_in_every_episode_does_not_jump(sound: Path) -> None:
+    assert not [one for one in check_dataset(sound).findings if one.check == "jumps"]
+
+
+def episodes_file(root: Path) -> Path:
+    return next((root / "meta/episodes").rglob("*.parquet"))
+
+
+def cut_footer(root: Path) -> None:
+    path = data_file(root)
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def flip_a_byte(root: Path) -> None:
+    path = data_file(root)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 4] ^= 0xFF
+    path.write_bytes(content)
+
+
+def info(**values: Any) -> Callable[[Path], None]:
+    return lambda root: edit_json(root / "meta/info.json", lambda content: content.update(values))
+
+
+def stats(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
+    return lambda root: edit_json(root / "meta/stats.json", change)
+
+
+def row(name: str, value: int | None) -> Callable[[Path], None]:
+    return lambda root: edit(episodes_file(root), lambda rows: rows[name].__setitem__(2, value))
+
+
+def no_shape(root: Path) -> None:
+    edit_json(root / "meta/info.json", lambda content: content["features"]["action"].pop("shape"))
+
+
+def one_name(root: Path) -> None:
+    edit_json(root / "meta/info.json", lambda content: content["features"]["action"].update(names=["a"]))
+
+
+FILE = "data/chunk-000/file-000.parquet"
+DAMAGE: dict[str, tuple[Callable[[Path], Any], str, str, str]] = {
+    "footer": (cut_footer, "files", FILE, "cannot be read"),
+    "byte": (flip_a_byte, "files", FILE, "cannot be read"),
+    "no data": (lambda root: data_file(root).unlink(), "files", FILE, "missing"),
+    "tasks": (lambda root: (root / "meta/tasks.parquet").write_bytes(b"PAR1"), "files", "tasks", "cannot be read"),
+    "no stats": (lambda root: (root / "meta/stats.json").unlink(), "stats", "meta/stats.json", "missing"),
+    "half stats": (lambda root: (root / "meta/stats.json").write_text("{"), "stats", "stats.json", "cannot be read"),
+    "mean": (stats(lambda all_: all_["action"]["mean"].reverse()), "stats", "action", "mean is not that of the data"),
+    "stats of": (stats(lambda all_: all_.pop("action")), "stats", "meta/stats.json: action", "no min"),
+    "frames": (info(total_frames=134), "counts", "info.json", "counts 134 frames; the episodes have 135"),
+    "episodes": (info(total_episodes=7), "counts", "meta/episodes", "1 episodes are not described, 6 first"),
+    "names": (one_name, "schema", "meta/info.json: action", "1 names for 2 numbers"),
+    "shape": (no_shape, "schema", "meta/info.json: action", "it has the shape None"),
+    "start": (row("dataset_from_index", 40), "counts", "meta/episodes", "episode 2 "),
+    "no place": (row("data/file_index", None), "schema", "meta/episodes", "it lacks data/file_index"),
+    "no frame": (row("length", 0), "counts", "meta/episodes", "episode 2 has 0 frames"),
+    "twice": (row("episode_index", 1), "counts", "meta/episodes", "episode 1 is described twice"),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_damaged_files_are_found(sound: Path, tmp_path: Path, case: str) -> None:
+    root = copy(sound, tmp_path)
+    damage, check, where, what = DAMAGE[case]
+    damage(root)
+    found = check_dataset(root)
+    matching = [one for one in found.findings if (one.severity, one.check) == (Severity.ERROR, check)]
+    assert any(where in one.where and what in one.what for one in matching), found.findings
+    assert found.worst == Severity.ERROR
+
+
+def test_an_unfinished_recording_is_told_with_the_command_that_finishes_it(tmp_path: Path) -> None:
+    root = record(tmp_path / "d", finalize=False)
+    (root / "data/chunk-000/file-042.parquet").write_bytes(b"half")
+    found = bad(check_dataset(root))
+    assert any("file-042" in one.where and one.severity == Severity.WARNING for one in found)
+    assert all("bhd-data repair" in one.remedy for one in found)
+
+
+def test_a_film_that_is_too_short_is_found(filmed: Path, tmp_path: Path) -> None:
+    root = copy(filmed, tmp_path)
+    film, other = next((root / "videos").rglob("*.mp4")), tmp_path / "other"
+    record(other, video=True, finalize=False)
+    short = min((other / "videos").rglob("*.mp4"))
+    shutil.copy(short, film)
+    (one,) = bad(check_dataset(root))
+    assert (one.check, one.what) == ("video", "it has 20 frames; its episodes have 135")
+    assert bad(check_dataset(root, videos=False)) == []
+
+
+def test_a_film_that_cannot_be_read_is_found(filmed: Path, tmp_path: Path) -> None:
+    root = copy(filmed, tmp_path)
+    next((root / "videos").rglob("*.mp4")).write_bytes(b"no film")
+    (one,) = bad(check_dataset(root))
+    assert (one.check, one.severity) == ("video", Severity.ERROR)
+
+
+def test_a_dataset_without_a_success_is_warned_of(tmp_path: Path) -> None:
+    (one,) = bad(check_dataset(record(tmp_path / "d", outcome="collision")))
+    assert (one.check, one.what) == ("outcome", "none succeeded: collision 6")
+
+
+def test_what_cannot_be_checked_is_an_error(sound: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="does not exist"):
+        check_dataset(tmp_path / "none")
+    root = copy(sound, tmp_path)
+    (root / "meta/info.json").write_text("{")
+    with pytest.raises(DatasetError, match="cannot be used"):
+        check_dataset(root)
+    (root / "meta/info.json").write_text("{}")
+    with pytest.raises(DatasetError, match="has no 'codebase_version'"):
+        check_dataset(root)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_whatever_happened_to_a_file_is_a_finding_or_a_clear_error(filmed: Path, tmp_path: Path, seed: int) -> None:
+    root, rng = copy(filmed, tmp_path), np.random.default_rng(seed)
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    path = files[rng.integers(len(files))]
+    content = bytearray(path.read_bytes())
+    where = int(rng.integers(len(content)))
+    if seed % 4 == 0:
+        path.unlink()
+    elif seed % 4 == 1:
+        path.write_bytes(content[:where])
+    elif seed % 4 == 2:
+        path.write_bytes(content[:where] + bytes(7) + content[where:])
+    else:
+        content[where] ^= 1 << int(rng.integers(8))
+        path.write_bytes(content)
+    try:
+        worst = check_dataset(root).worst
+    except DatasetError:  # of meta/info.json
+        worst = Severity.ERROR
+    # Films are not decoded, and of a Parquet file the footer has no checksum: a flipped bit may be in a comment.
+    assert worst == Severity.ERROR or path.suffix in {".mp4", ".json"} or seed % 4 == 3
+
+
+def nodes(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    yield path
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, one in inside:
+        yield from nodes(one, (*path, key))
+
+
+@pytest.mark.parametrize("name", ["meta/info.json", "meta/stats.json"])
+@pytest.mark.parametrize("wrong", [None, "x", -1, 0, True, [], {}, ["a"], math.nan, 10**20, [[1]]])
+def test_a_value_of_any_other_kind_is_a_finding_or_a_clear_error(sound: Path, tmp_path: Path, name, wrong) -> None:
+    root = copy(sound, tmp_path)
+    whole = json.loads((root / name).read_text())
+    for path in [one for one in nodes(whole) if len(one) <= 2][:12]:  # one after the other
+        value = wrong if not path else json.loads(json.dumps(whole))
+        if path:
+            inside = value
+            for key in path[:-1]:
+                inside = inside[key]
+            inside[path[-1]] = wrong
+        (root / name).write_text(json.dumps(value))
+        with contextlib.suppress(DatasetError):
+            assert check_dataset(root).frames in {0, 135}
+
+
+# --- edits by LeRobot ------------------------------------------------------------------------------------------------
+
+
+def record_with_lerobot(root: Path) -> Path:
+    features = {key: {**FEATURES[key], "names": None} for key in ("observation.state", "action")}
+    dataset = LeRobotDataset.create("t/stock", FPS, features, root=root, use_videos=False)
+    for episode in range(EPISODES):
+        values = columns(episode)
+        for frame in range(length(episode)):
+            dataset.add_frame({**{key: values[key][frame] for key in features}, "task": f"task {episode % 2}"})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+@pytest.mark.parametrize("source", ["ours", "stock"])
+def test_what_lerobot_edited_has_warnings_of_statistics_that_no_policy_reads(
+    sound, tmp_path, source, capsys, monkeypatch
+) -> None:
+    root = copy(sound, tmp_path) if source == "ours" else record_with_lerobot(tmp_path / "stock")
+    monkeypatch.setenv("COLUMNS", "200")
+    dataset, again = loader_support.stock(root), loader_support.stock(root)
+    folder = tmp_path / "edited"
+    delete_episodes(dataset, [1], output_dir=folder / "deleted", repo_id="t/deleted")
+    merge_datasets([dataset, again], output_repo_id="t/merged", output_dir=folder / "merged")
+    split_dataset(dataset, {"first": [0, 1], "last": [3, 5]}, output_dir=folder)
+    stale = set()
+    for name in ("deleted", "merged", "first", "last"):
+        found = [one for one in bad(check_dataset(folder / name)) if one.check == "stats"]
+        assert {one.severity for one in found} <= {Severity.WARNING}, (name, found)
+        assert main.main(["check", str(folder / name)]) == 0
+        assert all(one.where in capsys.readouterr().out.replace("\n", "") for one in found[:1])
+        stale |= {one.where.removeprefix("meta/stats.json: ") for one in found}
+    assert {"index", "episode_index"} <= stale <= {"index", "episode_index", "task_index"}
+    # What a policy is normalised with stays an error there, too.
+    edit_json(folder / "merged/meta/stats.json", lambda all_: all_["action"]["mean"].reverse())
+    assert [one.where for one in check_dataset(folder / "merged").findings if one.severity == Severity.ERROR] == [
+        "meta/stats.json: action"
+    ]
+
+
+def test_a_dataset_without_episodes_is_an_error_with_what_to_do(tmp_path: Path) -> None:
+    ours = DatasetRecorder.create("t/t", FPS, FEATURES, robot_type="toy", root=tmp_path / "ours", recording={})
+    ours.finalize()
+    LeRobotDataset.create("t/t", FPS, {"action": FEATURES["action"]}, root=tmp_path / "stock", use_videos=False)
+    for name in ("ours", "stock"):
+        (one,) = bad(check_dataset(tmp_path / name))
+        assert (one.severity, one.check, one.where) == (Severity.ERROR, "counts", "meta/info.json")
+        assert "no episodes" in one.what
+        assert "--resume=true" in one.remedy

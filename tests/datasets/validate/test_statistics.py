@@ -1,0 +1,129 @@
+"""Statistics of stock LeRobot are those of its data, as far as float32 goes; those of other data are not."""
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.validate.findings import Severity
+from bhd_lerobot.datasets.validate.statistics import Moments, wrong_statistic
+
+NAMES = ["wrist_2.pos", "offset.pos", "swing.pos", "zero.pos", "steady.pos"]
+FEATURES = {"observation.state": {"dtype": "float32", "shape": (5,), "names": NAMES}}
+LENGTHS = (60, 240, 600)  # rounding depends on it: it may be up or down, and cancel
+
+
+def columns(rng: np.random.Generator, episode: int, n: int) -> np.ndarray:
+    """Return what a joint that rests, one far from zero, one that swings, a dead one, and an encoder tell, (n, 5)."""
+    time = np.arange(n) / 30
+    swing = np.sin(2 * time + episode) + 0.3 * episode
+    values = [np.full(n, 1.57), 1000 + swing, swing, np.zeros(n), 1e4 + 0.1 * rng.normal(size=n)]
+    return np.stack(values, axis=1).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def stock(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("stock") / "d"
+    dataset = LeRobotDataset.create("t/t", fps=30, root=root, robot_type="toy", use_videos=False, features=FEATURES)
+    rng = np.random.default_rng(0)
+    for episode, n in enumerate(LENGTHS):
+        for row in columns(rng, episode, n):
+            dataset.add_frame({"observation.state": row, "task": "t"})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def stats_errors(root: Path) -> list[str]:
+    found = check_dataset(root).findings
+    return [f"{one.where}: {one.what}" for one in found if (one.severity, one.check) == (Severity.ERROR, "stats")]
+
+
+def test_a_stock_dataset_is_sound_though_its_statistics_are_rounded(stock: Path) -> None:
+    told = json.loads((stock / "meta/stats.json").read_text())["observation.state"]
+    assert abs(told["mean"][0] - np.float32(1.57)) > 1e-6, "the case that is to pass"
+    assert told["std"][0] > 1e-5
+    assert abs(told["mean"][1] - 1000.3) > 1e-6
+    assert stats_errors(stock) == []
+    assert check_dataset(stock).worst < Severity.WARNING
+
+
+def swap(told: dict[str, Any], name: str) -> None:
+    told[name][2], told[name][3] = told[name][3], told[name][2]
+
+
+def move(told: dict[str, Any], name: str, number: int, by: float) -> None:
+    told[name][number] += by
+
+
+WRONG: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "min of another": (lambda told: swap(told, "min"), "min"),
+    "max of another": (lambda told: swap(told, "max"), "max"),
+    "mean of another": (lambda told: swap(told, "mean"), "mean"),
+    "std of another": (lambda told: swap(told, "std"), "std"),
+    "a resting joint elsewhere": (lambda told: move(told, "mean", 0, 1e-3), "mean"),
+    "a resting joint that moves": (lambda told: move(told, "std", 0, 0.02), "std"),
+    "a dead joint that moves": (lambda told: move(told, "std", 3, 1e-3), "std"),
+    "an offset": (lambda told: move(told, "max", 1, 0.01), "max"),
+    "a mean far from zero": (lambda told: move(told, "mean", 1, 0.1), "mean"),
+    "no number": (lambda told: move(told, "mean", 2, float("nan")), "mean"),
+    "too few": (lambda told: told["std"].pop(), "std"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_statistics_are_found(stock: Path, case: str) -> None:
+    change, name = WRONG[case]
+    path = stock / "meta/stats.json"
+    before = path.read_text()
+    stats = json.loads(before)
+    change(stats["observation.state"])
+    path.write_text(json.dumps(stats))
+    try:
+        assert stats_errors(stock) == [f"meta/stats.json: observation.state: {name} is not that of the data"]
+    finally:
+        path.write_text(before)
+
+
+@pytest.mark.parametrize("missing", range(len(LENGTHS)))
+def test_statistics_without_an_episode_are_found(stock: Path, missing: int) -> None:
+    """Also where the number of frames was made to fit."""
+    from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
+
+    rng = np.random.default_rng(0)
+    parts = [columns(rng, episode, n) for episode, n in enumerate(LENGTHS)]
+    frames = sum(map(len, parts))
+    each = [compute_episode_stats({"observation.state": part}, FEATURES) for part in parts]
+    found = Moments.of(parts[0])
+    for part in parts[1:]:
+        found.add(Moments.of(part))
+
+    def judged(chosen: list[Any]) -> str | None:
+        told = {name: np.asarray(value, np.float64) for name, value in chosen[0]["observation.state"].items()}
+        return wrong_statistic(told, found, frames, max(map(len, parts)))
+
+    assert judged([aggregate_stats(copy.deepcopy(each))]) is None
+    assert judged([aggregate_stats(copy.deepcopy(each[:missing] + each[missing + 1 :]))]) is not None
+
+
+@pytest.mark.parametrize("n", [2, 30, 700, 5000, 60_000])
+@pytest.mark.parametrize("value", [1e-7, 0.1, 1.57, -3.14159, 1000.1, 123456.7])
+def test_no_length_of_an_episode_is_rounded_too_much(n: int, value: float) -> None:
+    from lerobot.datasets.compute_stats import compute_episode_stats
+
+    rng = np.random.default_rng(1)
+    kinds = [
+        np.full(n, value),
+        value + rng.normal(size=n),
+        value * np.linspace(0.5, 1, n),
+        value * (1 + 1e-4 * rng.normal(size=n)),
+    ]
+    values = np.stack(kinds, axis=1).astype(np.float32)
+    told = compute_episode_stats({"observation.state": values}, FEATURES)["observation.state"]
+    assert wrong_statistic(told, Moments.of(values), n, n) is None

@@ -1,0 +1,106 @@
+"""What `bhd-eval` takes and refuses, and what is in the configurations that we ship."""
+
+from pathlib import Path
+
+import pytest
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
+from bhd_lerobot.rollout.configuration import describe, encode, parse
+
+SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "eval").glob("*.yaml"))
+BASE = ["--robot.type=turtlebot3", "--task.type=avoid"]
+TWO = [*BASE, "--brains.old.type=avoidance", "--brains.new.type=gap_follower"]
+
+
+def test_brains_keep_their_names_parameters_and_order():
+    config = parse(EvalConfig, [*TWO, "--brains.old.forward_speed=0.1"])
+    assert list(config.brains) == ["old", "new"]
+    assert isinstance(config.brains["old"], AvoidanceConfig)
+    assert config.brains["old"].forward_speed == 0.1
+    assert isinstance(config.brains["new"], GapFollowerConfig)
+    assert config.reference == "old"
+    assert config.split == "held_out"
+
+
+def test_what_is_written_reads_back(tmp_path):
+    import yaml
+
+    config = parse(EvalConfig, [*TWO, "--episodes=[4,2]", "--baseline=new"])
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(encode(config), sort_keys=False))
+    assert parse(EvalConfig, [f"--config_path={path}"]) == config
+    assert config.indices == [2, 4]
+
+
+def test_a_command_line_adds_takes_out_and_chooses_brains(tmp_path):
+    path = tmp_path / "eval.yaml"
+    path.write_text(
+        "robot: {type: turtlebot3}\ntask: {type: avoid}\nbrains:\n  a: {type: avoidance}\n  b: {type: avoidance}\n"
+    )
+    at = f"--config_path={path}"
+    assert list(parse(EvalConfig, [at, "--brains.c.type=gap_follower"]).brains) == ["a", "b", "c"]
+    assert list(parse(EvalConfig, [at, "--brains.a=null"]).brains) == ["b"]
+    chosen = parse(EvalConfig, [at, "--baseline=a", "--only=[b]"])
+    assert list(chosen.chosen) == ["b"]
+    assert chosen.reference == "b"
+
+
+def test_one_brain_has_a_short_form():
+    config = parse(EvalConfig, [*BASE, "--brain.type=gap_follower", "--brain.margin_m=0.1"])
+    assert list(config.brains) == ["gap_follower"]
+    assert config.brains["gap_follower"].margin_m == 0.1
+    assert config.brain is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (BASE, "no brain to evaluate"),
+        ([*BASE, "--brains.a.type=avoidence"], "Did you mean 'avoidance'"),
+        ([*BASE, "--brains.a.type=avoidance", "--brains.a.speed=1"], "brains.a.speed"),
+        ([*BASE, "--brains.a.forward_speed=1"], "brains.a.type is missing"),
+        ([*BASE, "--brains.a=avoidance"], "such as brains.a.type"),
+        ([*BASE, "--brains=avoidance"], "such as brains.NAME.type"),
+        ([*BASE, "--brains.my-brain.type=avoidance"], "'my-brain' is no name"),
+        ([*BASE, "--brains.a.type=reach"], "brains.a.type is 'reach', which drives a ur5"),
+        (["--robot.type=ur5", "--task.type=avoid", "--brains.a.type=avoidance"], "which is for robot.type"),
+        ([*TWO, "--baseline=older"], "Did you mean 'old'"),
+        ([*TWO, "--only=[never]"], "Unknown brain in only 'never'"),
+        ([*TWO, "--only=[]"], "only is empty"),
+        ([*TWO, "--only=old"], "only is 'old'; it must be a list of str"),
+        ([*TWO, "--episodes=3"], "episodes is 3; it must be a list of int"),
+        ([*TWO, "--episodes=[a]"], "must be int"),
+        ([*TWO, "--episodes=[1.5]"], "is 1.5; it must be int"),
+        ([*TWO, "--n_episodes=0"], "n_episodes is 0"),
+        ([*TWO, "--n_envs=0"], "n_envs is 0"),
+        ([*TWO, "--threads=0"], "threads is 0"),
+        ([*TWO, "--seed=-1"], "seed holds -1"),
+        ([*TWO, "--videos=-1"], "videos holds -1"),
+        ([*TWO, "--episodes=[]"], "at least one episode"),
+        ([*TWO, "--episodes=[1,1]"], "none twice"),
+        ([*TWO, "--episodes=[-3]"], "episodes holds -3"),
+        ([*TWO, "--split=test"], "Valid: train, held_out"),
+        ([*TWO, "--fail_below=90"], "success rate, from 0 to 1"),
+        ([*TWO, "--record.root=somewhere"], "record.repo_id is not"),
+        ([*TWO, "--brain.type=avoidance", "--brains.avoidance.type=avoidance"], "two brains of the name 'avoidance'"),
+    ],
+)
+def test_what_cannot_be_honoured_is_refused_by_name(arguments, message):
+    with pytest.raises(ConfigError) as caught:
+        parse(EvalConfig, arguments)
+    assert message in str(caught.value)
+
+
+def test_help_names_how_brains_are_given():
+    assert "--brains.NAME.type" in describe(EvalConfig)
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_configurations_are_valid_and_compare_held_out_seeds(path):
+    config = parse(EvalConfig, [f"--config_path={path}"])
+    assert len(config.brains) > 1
+    assert config.split == "held_out"
+    assert config.reference in config.brains

@@ -1,0 +1,262 @@
+"""bhd-eval: the same bytes for any number of simulations and twice, the same episodes for every brain, and its ends."""
+
+import io
+import json
+import os
+import shlex
+import signal
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.evaluation import evaluate as evaluate_module
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate, main
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.tasks.task import episode_seed
+from tests.recording.support import run_record
+
+
+def options(folder, **overrides) -> list[str]:
+    values = {
+        "robot.type": "turtlebot3",
+        "robot.beams": 36,
+        "task.type": "avoid",
+        "task.duration_s": 3,
+        "task.min_path_m": 0.3,
+        "brains.old.type": "avoidance",
+        "brains.new.type": "gap_follower",
+        "n_episodes": 5,
+        "n_envs": 3,
+        "videos": 0,
+        "output_dir": folder,
+        **{key.replace("__", "."): value for key, value in overrides.items()},
+    }
+    return [f"--{key}={value}" for key, value in values.items() if value is not None]
+
+
+def run_eval(folder, **overrides) -> tuple[EvalResult, str]:
+    console = Console(file=io.StringIO(), width=160)
+    result = evaluate(parse(EvalConfig, options(folder, **overrides)), console)
+    return result, console.file.getvalue()
+
+
+def results(folder) -> dict:
+    return json.loads((folder / "results.json").read_text())
+
+
+# What a success needs is set so that some of these short episodes fail: 0.3 m in 3 s from a standing start.
+FAILING = {"task__min_path_m": 0.55}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("eval") / "whole"
+    result, printed = run_eval(folder, n_episodes=9, n_envs=1, threads=1, **FAILING)
+    return folder, result, printed
+
+
+@pytest.mark.parametrize(("n_envs", "threads"), [(1, 1), (4, 2), (16, 2)])
+def test_the_same_bytes_twice_and_for_any_number_of_simulations(whole, tmp_path, n_envs, threads):
+    run_eval(tmp_path, n_episodes=9, n_envs=n_envs, threads=threads, **FAILING)
+    assert (tmp_path / "results.json").read_bytes() == (whole[0] / "results.json").read_bytes()
+    with np.load(whole[0] / "initial_states.npz") as one, np.load(tmp_path / "initial_states.npz") as other:
+        assert set(one.files) == {"state_old", "episode_old", "state_new", "episode_new"}
+        assert all(np.array_equal(one[name], other[name]) for name in one.files)
+
+
+def test_brains_get_the_same_episodes_which_are_held_out(whole):
+    folder, result, _ = whole
+    by_brain = {label: [e for e in result.results.episodes if e.brain == label] for label in ("old", "new")}
+    for old, new in zip(*by_brain.values(), strict=True):
+        assert (old.episode, old.seed, old.initial_state) == (new.episode, new.seed, new.initial_state)
+        assert old.digest != new.digest  # what they did with it is their own
+        assert old.seed == episode_seed(0, old.episode, "held_out")
+    assert len({one.initial_state for one in by_brain["old"]}) == 9
+    with np.load(folder / "initial_states.npz") as states:
+        assert np.array_equal(states["state_old"], states["state_new"])
+        assert states["episode_new"].tolist() == list(range(9))
+
+
+def test_other_brains_and_episodes_beside_it_change_nothing(whole, tmp_path):
+    result, _ = run_eval(tmp_path, only="[new]", episodes="[7,2]", n_episodes=9, **FAILING)
+    alone = {one.episode: one for one in result.results.episodes}
+    assert sorted(alone) == [2, 7]
+    for one in whole[1].results.episodes:
+        if one.brain == "new" and one.episode in alone:
+            assert one == alone[one.episode]
+
+
+def test_another_seed_and_split_are_other_episodes(whole, tmp_path):
+    seen = {one.seed for one in whole[1].results.episodes}
+    for name, overrides in (("a", {"seed": 1}), ("b", {"split": "train"})):
+        result, _ = run_eval(tmp_path / name, only="[old]", **overrides)
+        assert not seen & {one.seed for one in result.results.episodes}
+
+
+def test_counts_and_files_agree(whole):
+    folder, _, printed = whole
+    said = results(folder)
+    rows = pq.read_table(folder / "episodes.parquet").to_pylist()
+    assert len(said["episodes"]) == len(rows) == 18
+    assert said["partial"] is False
+    for label, one in said["brains"].items():
+        mine = [row for row in rows if row["brain"] == label]
+        assert one["episodes"] == len(mine) == 9
+        assert one["successes"] == sum(row["success"] for row in mine)
+        assert sum(one["outcomes"].values()) == 9
+        assert one["success"]["low"] <= one["success"]["value"] <= one["success"]["high"]
+        assert one["means"]["score"]["value"] == pytest.approx(np.mean([row["score"] for row in mine]))
+        assert one["frames"] == sum(row["frames"] for row in mine)
+        assert one["limits"]["acceleration"] == sum(row["limits.acceleration"] for row in mine) > 0
+        for row in mine:
+            assert row["path_m"] == pytest.approx(row["details.path_m"], abs=0.05)  # the task's own count
+            assert row["length_s"] == row["frames"] / 10
+    pair = said["paired"]["new"]
+    assert pair["baseline"] == "old"
+    difference = said["brains"]["new"]["means"]["score"]["value"] - said["brains"]["old"]["means"]["score"]["value"]
+    assert pair["score"]["value"] == pytest.approx(difference)
+    assert set(said["brains"]["old"]["outcomes"]) | set(said["brains"]["new"]["outcomes"]) > {"success"}
+    assert "9 held_out episodes" in printed
+    timing = json.loads((folder / "timing.json").read_text())
+    assert timing["brains"]["old"]["act"]["calls"] >= 9 * 20
+    assert 0 < timing["brains"]["old"]["act"]["p50_s"] <= timing["brains"]["old"]["act"]["p99_s"]
+
+
+def test_nothing_of_the_wall_clock_is_in_the_results(whole):
+    text = (whole[0] / "results.json").read_text()
+    for word in ("wall", "per_s", "n_envs", "threads", "output_dir", str(whole[0])):
+        assert word not in text
+
+
+def test_an_episode_equals_the_one_that_is_recorded(whole, tmp_path):
+    """bhd-record with the same seed and split has the same episodes."""
+    run_record(tmp_path / "d", split="held_out", task__min_path_m=FAILING["task__min_path_m"], dataset__num_episodes=9)
+    recorded = [row.metadata for row in dataset_info(tmp_path / "d").episodes]
+    old = [one for one in whole[1].results.episodes if one.brain == "old"]
+    assert [(r["seed"], r["score"], r["outcome"]) for r in recorded] == [(str(o.seed), o.score, o.outcome) for o in old]
+
+
+def test_runs_are_recorded_as_a_dataset_for_each_brain(whole, tmp_path):
+    run_eval(tmp_path / "e", n_episodes=9, record__repo_id="me/eval", record__root=tmp_path / "data", **FAILING)
+    for label in ("old", "new"):
+        info = dataset_info(tmp_path / "data" / label)
+        mine = [one for one in whole[1].results.episodes if one.brain == label]
+        assert [row.metadata["score"] for row in info.episodes] == [one.score for one in mine]
+        assert [row.frames for row in info.episodes] == [one.frames for one in mine]
+    assert (tmp_path / "e" / "results.json").read_bytes() == (whole[0] / "results.json").read_bytes()
+
+
+def test_a_failed_episode_is_run_again_by_the_command_in_the_report(whole, tmp_path):
+    from bhd_lerobot.evaluation.report import replay_command
+
+    config = parse(EvalConfig, [f"--config_path={whole[0] / 'config.yaml'}"])
+    failed = next(one for one in whole[1].results.episodes if not one.success)
+    words = shlex.split(replay_command(config, whole[0], failed))
+    assert words[0] == "bhd-eval"
+    assert main(words[1:]) == 0
+    (again,) = results(whole[0] / f"{failed.brain}_{failed.episode:04d}")["episodes"]
+    assert again == failed.plain()
+
+
+def test_a_brain_that_does_not_fit_fails_before_any_episode_and_is_named(tmp_path, monkeypatch):
+    def bind(self, *arguments):
+        raise ConfigError("The brain 'gap_follower' needs the observation feature(s) sonar.pos.")
+
+    monkeypatch.setattr(GapFollowerBrain, "bind", bind)
+    monkeypatch.setattr(AvoidanceBrain, "act", lambda self, seen: pytest.fail("an episode was begun"))
+    with pytest.raises(ConfigError, match=r"^brains\.new: The brain 'gap_follower' needs .* sonar\.pos"):
+        run_eval(tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_keeps_what_is_finished_and_says_that_it_is_partial(whole, tmp_path, monkeypatch, number):
+    calls = 0
+    act = GapFollowerBrain.act
+
+    def acting(self, seen):
+        nonlocal calls
+        calls += 1
+        if calls == 45:  # in the second brain's second episode: 30 frames each
+            os.kill(os.getpid(), number)
+        return act(self, seen)
+
+    monkeypatch.setattr(GapFollowerBrain, "act", acting)
+    result, printed = run_eval(tmp_path, n_episodes=9, n_envs=1, **FAILING)
+    assert result.exit_status == 128 + number
+    said = results(tmp_path)
+    assert said["partial"] is True
+    assert said["brains"]["old"]["episodes"] == 9
+    finished = said["brains"]["new"]["episodes"]
+    assert 1 <= finished < 9
+    reference = {(one["brain"], one["episode"]): one for one in results(whole[0])["episodes"]}
+    assert all(reference[one["brain"], one["episode"]] == one for one in said["episodes"])
+    assert said["paired"]["new"]["episodes"] == finished
+    assert "partial" in printed
+    assert "Partial:" in (tmp_path / "report.html").read_text()
+
+
+def test_a_signal_before_anything_is_finished_still_ends_in_a_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        AvoidanceBrain, "act", lambda self, seen: (os.kill(os.getpid(), signal.SIGINT), np.zeros((3, 2)))[1]
+    )
+    result, _ = run_eval(tmp_path)
+    assert result.exit_status == 130
+    assert results(tmp_path)["episodes"] == []
+    assert "ran no episode" in (tmp_path / "report.html").read_text()
+
+
+def test_fail_below_is_about_the_lower_end_of_the_interval(tmp_path):
+    result, printed = run_eval(tmp_path / "a", fail_below=0.9)
+    assert all(one.success.value == 1 for one in result.results.brains.values())
+    assert result.exit_status == 1  # 5 of 5 is not yet 90 %
+    assert result.missed == ["old", "new"]
+    assert "old missed fail_below" in printed
+    assert run_eval(tmp_path / "b", fail_below=0.5)[0].exit_status == 0
+
+
+def test_main_gives_the_exit_status_and_says_what_is_wrong(tmp_path, capsys):
+    assert main(options(tmp_path / "a", fail_below=0.99, n_episodes=1)) == 1
+    assert main(options(tmp_path / "b", split="tset")) == 2
+    assert "split is 'tset'" in capsys.readouterr().err
+
+
+def test_a_path_alone_is_a_checkpoint(monkeypatch):
+    seen = []
+    monkeypatch.setattr(evaluate_module, "run", lambda main, kind, arguments: seen.append(arguments) or 0)
+    main(["--brain.path=outputs/x"])
+    main(["--brain.path", "outputs/x", "--brain.type=other"])
+    assert seen[0] == ["--brain.path=outputs/x", "--brain.type=learned"]
+    assert "--brain.type=learned" not in seen[1]
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot be written"):
+        run_eval(tmp_path / "file" / "run")
+
+
+def test_results_that_are_there_are_not_overwritten(whole):
+    folder = whole[0]
+    before = (folder / "results.json").read_bytes()
+    with pytest.raises(ConfigError, match=r"holds the results of an evaluation.*--output_dir"):
+        run_eval(folder, n_episodes=1)
+    assert (folder / "results.json").read_bytes() == before
+
+
+def test_a_full_disk_still_shows_the_numbers(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(evaluate_module, "write_json", full)
+    console = Console(file=io.StringIO(), width=160)
+    with pytest.raises(BhdError, match=r"No space left on device.*run it again"):
+        evaluate(parse(EvalConfig, options(tmp_path, only="[old]", n_episodes=1)), console)
+    assert "old" in console.file.getvalue()

@@ -1,0 +1,381 @@
+"""The corrected brain: who drives when, what learner and expert see, and how an expert that gives goals begins."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.control.commands import CommandResult, ResultCode
+from bhd_lerobot.errors import ActionError, ConfigError
+from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomConfig
+from bhd_lerobot.policies.brain import Chunk, Mixed, Observation
+from bhd_lerobot.policies.dagger.brain import LEARNER_DRIVES, CorrectedBrain, CorrectedConfig
+from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
+from bhd_lerobot.policies.dagger.takeover import (
+    ArmCollisionWatch,
+    BaseCollisionWatch,
+    DisagreementWatch,
+    StallWatch,
+    collision_watch,
+)
+from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
+from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
+from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
+from bhd_lerobot.rollout.registry import make_brain, robot_of_brain
+from bhd_lerobot.tasks.pick import ENVIRONMENT
+from tests.policies.arm_desk import BOX, CUP, Desk, scene
+
+BASE = ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36)))
+TWIST = ("x.vel", "theta.vel")
+JOINTS = tuple(ur5().limits.names)
+ARM = (*JOINTS, *(name.replace(".pos", ".vel") for name in JOINTS))
+HOME = np.array(ur5().home)
+
+
+class Fake:
+    """Always wants the same, and remembers what it was shown."""
+
+    robot_type, uses_images, has_plan = "any", False, False
+
+    def __init__(self, name: str, value: float) -> None:
+        self.name, self.value = name, value
+        self.seen: list[np.ndarray] = []
+        self.seeds: list[int] = []
+
+    def bind(self, *_: Any) -> None: ...
+
+    def reset(self, ids: np.ndarray, seeds: list[int], n: int, instructions: Any = ()) -> None:
+        self.seeds += seeds
+
+    def act(self, observation: Observation) -> Any:
+        assert observation.running is not None
+        self.seen.append(observation.running.copy())
+        return np.full((len(observation.state), 2), self.value)
+
+    def parameters(self) -> dict[str, Any]:
+        return {"type": self.name, "value": self.value}
+
+
+def config(**values: Any) -> CorrectedConfig:
+    nothing = {"collision_s": None, "stall_s": None}
+    return CorrectedConfig(NoopConfig(), GapFollowerConfig(), **{**nothing, **values})
+
+
+def base(n: int = 1, speed: float = 0.0, ranges: float = 3.5) -> Observation:
+    state = np.full((n, len(BASE)), ranges)
+    state[:, 0], state[:, 1] = speed, 0.0
+    return Observation(BASE, state, running=np.ones(n, np.bool_))
+
+
+def arm(q: np.ndarray, velocity: float | np.ndarray = 0.0) -> Observation:
+    return Observation(ARM, np.concatenate([q, np.zeros(7) + velocity])[None], running=np.ones(1, np.bool_))
+
+
+def made(n: int = 1, **values: Any) -> tuple[CorrectedBrain, Fake, Fake]:
+    learner, expert = Fake("learner", 0.1), Fake("expert", 0.2)
+    brain = CorrectedBrain(config(**values), learner, expert)
+    brain.bind(BASE, TWIST, 10)
+    brain.reset(np.arange(n), list(range(n)), n)
+    return brain, learner, expert
+
+
+# --- turns -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_expert_drives_to_the_end_and_the_learner_is_not_asked_any_more() -> None:
+    brain, learner, expert = made(patience_s=0.5)
+    actions, taken = [], []
+    for _ in range(9):
+        actions.append(brain.act(base())[0, 0])
+        taken.append(bool(brain.interventions()[0]))
+    assert taken == [False] * 5 + [True] * 4
+    assert actions == [0.1] * 5 + [0.2] * 4
+    assert brain.causes() == ("time is up",)
+    assert len(learner.seen) == 6  # the sixth time it was asked in vain
+    assert len(expert.seen) == 9  # what it has to remember, it has seen
+
+
+def test_after_hold_s_the_learner_has_another_turn_and_has_seen_everything() -> None:
+    brain, learner, expert = made(patience_s=0.3, hold_s=0.2)
+    taken = []
+    for _ in range(12):
+        brain.act(base())
+        taken.append(int(brain.interventions()[0]))
+    assert taken == [0, 0, 0, 1, 1, 0, 0, 0, 1, 1, 0, 0]
+    assert len(learner.seen) == len(expert.seen) == 12
+
+
+def test_simulations_have_turns_of_their_own_and_a_new_episode_begins_with_the_learner() -> None:
+    brain, _, _ = made(n=2, patience_s=0.2)
+    for _ in range(3):
+        brain.act(base(2))
+    assert brain.interventions().tolist() == [True, True]
+    brain.reset(np.array([1]), [7], 2)
+    wanted = brain.act(base(2))
+    assert brain.interventions().tolist() == [True, False]
+    assert wanted[:, 0].tolist() == [0.2, 0.1]
+    assert brain.causes()[1] == ""
+
+
+def test_the_learner_gets_the_seed_that_it_would_have_alone_and_the_expert_another() -> None:
+    _, learner, expert = made(n=2)
+    assert learner.seeds == [0, 1]
+    assert not set(expert.seeds) & {0, 1}
+
+
+def test_a_simulation_that_is_not_running_is_not_flagged() -> None:
+    brain, _, _ = made(n=2, patience_s=0.1)
+    seen = base(2)
+    seen.running[1] = False  # type: ignore[index]
+    for _ in range(3):
+        brain.act(seen)
+    assert brain.interventions().tolist() == [True, False]
+
+
+# --- what is refused -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["collision_s", "stall_s", "disagreement", "disagreement_s", "patience_s", "hold_s"])
+@pytest.mark.parametrize("value", [0, -1.0, math.inf, math.nan])
+def test_times_and_shares_are_positive(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=rf"brain\.{name} is .*must be positive"):
+        config(**{name: value})
+
+
+def test_what_does_not_fit_together_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"brain\.learner\.type is 'corrected' itself"):
+        CorrectedConfig(config(), GapFollowerConfig())
+    with pytest.raises(ConfigError, match=r"brain\.learner\.stream is true"):
+        CorrectedConfig(LearnedBrainConfig("x", stream=True), GapFollowerConfig())
+    with pytest.raises(ConfigError, match="'reach', which gives goals; a learner gives setpoints"):
+        make_brain(CorrectedConfig(ReachBrainConfig(), PickBrainConfig()))
+    with pytest.raises(ConfigError, match="disagreement compares setpoints, and the expert 'pick' gives goals"):
+        make_brain(CorrectedConfig(NoopConfig(), PickBrainConfig(), disagreement=0.3))
+    with pytest.raises(ConfigError, match=r"brain\.learner drives a turtlebot3, but brain\.expert drives a ur5"):
+        robot_of_brain(CorrectedConfig(AvoidanceConfig(), PickBrainConfig()))
+    assert robot_of_brain(CorrectedConfig(NoopConfig(), PickBrainConfig())) == "ur5"
+
+
+def test_a_learner_that_gives_chunks_is_refused_by_name() -> None:
+    brain, learner, _ = made()
+    learner.act = lambda _: Chunk(np.zeros((2, 1, 2)))  # type: ignore[method-assign]
+    with pytest.raises(ActionError, match=r"brain\.learner is 'learner', which gave Chunk"):
+        brain.act(base())
+
+
+def test_a_robot_whose_collisions_it_cannot_foresee_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"not of a robot with the actions a\.pos.*--brain\.collision_s=null"):
+        collision_watch(0.5, ("a.pos",), ("a.pos",), 10)
+    with pytest.raises(ConfigError, match=r"not known of tool\.x"):
+        DisagreementWatch(0.1, 1, ("tool.x",))
+
+
+def test_the_parameters_name_both_and_are_plain() -> None:
+    brain = make_brain(CorrectedConfig(RandomConfig(scale=0.5), GapFollowerConfig(), hold_s=2.0))
+    parameters = json.loads(json.dumps(brain.parameters()))
+    assert parameters["type"] == "corrected"
+    assert parameters["hold_s"] == 2.0
+    assert parameters["learner"] == {"type": "random", "period_s": 1.0, "scale": 0.5}
+    assert parameters["expert"]["type"] == "gap_follower"
+
+
+# --- when ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_base_that_drives_at_a_wall_is_about_to_collide_and_one_that_stands_or_backs_off_is_not() -> None:
+    watch = BaseCollisionWatch(0.5, BASE, TWIST)
+    seen = base()
+    seen.state[0, 2] = 0.15  # straight ahead, 0.08 m before the robot's front
+    for speed, turn, expected in [(0.22, 0.0, True), (0.0, 0.0, False), (-0.1, 0.0, False), (0.05, 0.0, False)]:
+        assert watch.look(seen, np.array([[speed, turn]]), None).tolist() == [expected], (speed, turn)
+    assert not watch.look(base(), np.array([[0.22, 0.0]]), None).any()
+
+
+def test_an_arm_that_falls_to_the_table_is_about_to_collide_and_one_that_rises_is_not() -> None:
+    watch = ArmCollisionWatch(ARM, JOINTS, 25)
+    down = np.zeros(7)
+    down[1] = 1.0  # the shoulder leans forward
+    low = HOME + np.array([0, 0.40, 0, 0, 0, 0, 0])
+    assert not watch.look(arm(HOME), HOME[None], None).any()
+    # The same posture: what counts is where it can come to rest.
+    fast, slow = 2.5 * down, 0.02 * down
+    assert watch.look(arm(low, fast), low[None] + 0.1 * down, None).all()
+    assert not watch.look(arm(low, slow), low[None] + 0.0008 * down, None).any()
+    assert not watch.look(arm(low, -fast), low[None] - 0.1 * down, None).any()
+
+
+@pytest.mark.parametrize(("speed", "stalls"), [(0.0, True), (0.005, True), (0.2, False)])
+def test_a_base_that_gets_nowhere_stalls(speed: float, stalls: bool) -> None:
+    watch = StallWatch(20, BASE, 10)
+    watch.restart(np.arange(1), 1)
+    looks = [bool(watch.look(base(speed=speed), np.zeros((1, 2)), None)[0]) for _ in range(30)]
+    assert not any(looks[:20])
+    assert looks[20] == stalls
+    watch.restart(np.arange(1), 1)
+    assert not watch.look(base(speed=speed), np.zeros((1, 2)), None)[0]
+
+
+def test_an_arm_that_turns_one_joint_does_not_stall() -> None:
+    watch = StallWatch(10, ARM, 25)
+    for turning, stalls in [(0.02, False), (0.0, True)]:
+        watch.restart(np.arange(1), 1)
+        looks = [watch.look(arm(HOME + turning * k), HOME[None], None)[0] for k in range(12)]
+        assert bool(looks[-1]) == stalls
+
+
+def test_disagreement_counts_only_if_it_lasts() -> None:
+    watch = DisagreementWatch(0.25, 3, TWIST)
+    watch.restart(np.arange(1), 1)
+    wide = 2 * 2.84 * 0.3  # rad/s, 0.3 of the range of the yaw rate
+    looks = []
+    for turn in (wide, wide, 0.0, wide, wide, wide, wide):
+        looks.append(bool(watch.look(base(), np.zeros((1, 2)), np.array([[0.0, turn]]))[0]))
+    assert looks == [False, False, False, False, False, True, True]
+
+
+# --- an expert that gives goals ---------------------------------------------------------------------------------------
+
+
+class Table(Desk):
+    """A desk with an arm of all joints."""
+
+    def __init__(self, q: np.ndarray = HOME, patience_s: float = 0.04) -> None:
+        self.n = 1
+        expert = PickBrain()
+        settings = CorrectedConfig(
+            NoopConfig(), PickBrainConfig(), collision_s=None, stall_s=None, patience_s=patience_s, hold_s=None
+        )
+        self.corrected = CorrectedBrain(settings, NoopBrain(), expert)
+        super().__init__(expert, [scene(CUP, BOX)])
+        self.state = np.concatenate([q, np.zeros(7)])[None]
+        self.corrected.bind(ARM, JOINTS, 25, ENVIRONMENT)
+        self.corrected.reset(np.arange(1), [0], 1, [""])
+
+    def look(self, results: Any = None, running: Any = None) -> dict[int, Any]:
+        environment = self.table.reshape(1, -1)
+        mixed = self.corrected.act(Observation(ARM, self.state, {}, environment, results or {}, np.ones(1, np.bool_)))
+        assert isinstance(mixed, Mixed)
+        for sim, commands in mixed.commands.items():
+            assert mixed.by_goals[sim]
+            assert len(commands) == 1
+            assert commands[0].task_id not in [one.task_id for one in self.given[sim]]
+            self.given[sim] += commands
+        return {sim: commands[0] for sim, commands in mixed.commands.items()}
+
+    def steps(self, sim: int = 0) -> list[str]:
+        return [one.task_id.rsplit("-", 1)[1] for one in self.given[sim]]
+
+
+def taken_over(q: np.ndarray = HOME, **changes: Any) -> Table:
+    """Return a desk in which the expert has just taken over."""
+    table = Table(q)
+    for name, value in changes.items():
+        getattr(table, name)(**value)
+    assert table.look() == {}
+    assert table.corrected.subtasks() == [LEARNER_DRIVES]
+    table.look()
+    assert table.corrected.interventions().all()
+    return table
+
+
+def test_from_home_the_expert_begins_at_once() -> None:
+    table = taken_over()
+    assert table.steps() == ["above"]
+    assert table.corrected.subtasks() == ["move the gripper to the red cup"]
+    for _ in range(2):
+        table.end()
+    assert table.steps() == ["above", "down", "close"]
+
+
+def low_posture() -> np.ndarray:
+    """Return a posture with the finger tips among the objects."""
+    return HOME + np.array([0, 0.35, 0.1, -0.45, 0, 0, 0])
+
+
+def test_an_arm_that_is_low_opens_and_rises_first() -> None:
+    table = taken_over(low_posture())
+    assert table.given[0][0].gripper == MAX_OPENING
+    up = table.end()
+    assert up is not None
+    assert up.motion == "line"
+    assert up.gripper is None
+    kinematics = GoalExpert(PickBrain())._kinematics
+    start = kinematics.tool(low_posture()[:6])[:3, 3]
+    assert up.target_pose.position[:2] == pytest.approx(start[:2])
+    assert up.target_pose.position[2] > start[2] + 0.05
+    table.state[0, :6] = HOME[:6]
+    table.end()
+    assert table.steps() == ["open", "up", "above"]
+
+
+def test_what_the_task_is_about_and_what_is_held_already_is_raised_and_not_let_go_of() -> None:
+    q = low_posture()
+    tip = GoalExpert(PickBrain())._kinematics.tool(q[:6])[:3, 3]
+    table = Table(q)
+    table.table[0, 0, 3:6] = tip + np.array([0, 0, 0.01])
+    table.look()
+    table.look()
+    assert table.steps() == ["raise"]
+    assert table.given[0][0].gripper is None
+    assert table.end() is None  # it holds, and waits for that to be enough
+    for _ in range(60):
+        assert table.look() == {}
+    assert table.corrected.subtasks() == ["raise what is held"]
+
+
+def test_from_an_odd_posture_and_where_there_is_no_way_the_arm_goes_home_first() -> None:
+    table = taken_over(HOME - np.array([0, 0, 1.2, 0, 0, 0, 0]))
+    assert table.steps() == ["upright"]
+    table.end(success=False)
+    assert table.steps() == ["upright", "home"]
+    assert table.given[0][1].joint_target == pytest.approx(HOME[:6])
+    table.end(success=False)  # no more can be done than to try
+    assert table.steps()[-1] == "above"
+    table = taken_over()
+    table.end(success=False, message="no way")
+    table.end()
+    table.end()
+    assert table.steps() == ["above", "upright", "home", "above"]
+
+
+def test_home_is_the_nearest_full_turn() -> None:
+    expert = GoalExpert(PickBrain())
+    turned = HOME[:6] + np.array([0, 0, 0, 2 * np.pi, 0, -2 * np.pi])
+    np.testing.assert_allclose(expert._home_near(turned), turned)
+    beyond = HOME[:6] + np.array([2 * np.pi, 0, 0, 0, 0, 0])  # out of the shoulder's range
+    np.testing.assert_allclose(expert._home_near(beyond), HOME[:6])
+
+
+def test_an_expert_that_gave_up_begins_again() -> None:
+    table = taken_over()
+    while not table.corrected.subtasks()[0].startswith("cannot"):
+        table.end(success=len(table.given[0]) % 3 != 2, message="blocked")
+    before = len(table.given[0])
+    for _ in range(70):
+        table.look()
+    assert table.steps()[before:] == ["upright"]
+
+
+def test_results_of_goals_of_an_earlier_turn_are_not_taken_for_those_of_this_one() -> None:
+    table = taken_over()
+    stray = CommandResult("0.0.1-above", True, ResultCode.SUCCEEDED, "")
+    assert table.look({0: [stray]}) == {}
+    assert table.steps() == ["above"]
+
+
+def test_an_arm_that_is_fast_comes_to_rest_first() -> None:
+    table = Table()
+    table.state[0, 7:13] = 1.0
+    table.look()
+    table.look()
+    assert table.steps() == ["stop"]
+    assert table.given[0][0].target_pose is table.given[0][0].joint_target is None
+    assert table.given[0][0].gripper == pytest.approx(HOME[6])  # nothing is let go of
+    table.state[0, 7:] = 0.0
+    table.end()
+    assert table.steps() == ["stop", "above"]

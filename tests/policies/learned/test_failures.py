@@ -1,0 +1,226 @@
+"""Checkpoints that cannot be used and robots that do not fit: refused, and the message says what to do."""
+
+import json
+import logging
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from bhd_lerobot.errors import ActionError, ConfigError
+from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
+from bhd_lerobot.policies.learned.contract import CONTRACT_FILE, PolicyContract
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.rollout.registry import action_names_of, brains_for, make_brain, robot_of_brain
+from tests.policies.learned import rig
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rig.save_policy(tmp_path_factory.mktemp("policies") / "mlp")
+
+
+@pytest.fixture
+def folder(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "policy"))
+
+
+def refused(path: Path, **options: Any) -> str:
+    with pytest.raises(ConfigError) as error:
+        rig.make_brain(path, **options)
+    return str(error.value)
+
+
+def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+    assert "the folder does not exist" in refused(tmp_path / "none")
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+def test_a_file_is_missing(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    assert name in refused(folder)
+
+
+@pytest.mark.parametrize("name", ["policy_preprocessor", "policy_postprocessor"])
+def test_a_processor_is_missing(folder: Path, name: str) -> None:
+    (folder / f"{name}.json").unlink()
+    assert f"no {name}.json" in refused(folder)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "model.safetensors",
+        "config.json",
+        "policy_preprocessor.json",
+        "policy_preprocessor_step_3_normalizer_processor.safetensors",
+    ],
+)
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_file_is_half_written(folder: Path, name: str, share: float) -> None:
+    data = (folder / name).read_bytes()
+    (folder / name).write_bytes(data[: int(share * len(data))])
+    message = refused(folder)
+    assert "opy" in message  # copy it again
+    assert str(folder) in message
+
+
+def test_weights_that_are_not_there_are_not_made_up(folder: Path) -> None:
+    weights = load_file(folder / "model.safetensors")
+    name = next(iter(weights))
+    del weights[name]
+    save_file(weights, folder / "model.safetensors")
+    assert name in refused(folder)
+
+
+def test_a_policy_type_that_is_not_installed(folder: Path) -> None:
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "type": "telepathy"}))
+    message = refused(folder)
+    assert "'telepathy', which is not installed" in message
+    assert "bhd_mlp" in message
+
+
+def test_an_adapter_without_its_base(folder: Path) -> None:
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "use_peft": True}))
+    assert "Merge it into its base model" in refused(folder)
+
+
+@pytest.mark.parametrize("device", ["cuda:7", "abacus"])
+def test_a_device_that_is_not_there(folder: Path, device: str) -> None:
+    message = refused(folder, device=device)
+    assert device in message
+    assert "--brain.device=cpu" in message
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n_action_steps": 7}, "brain.n_action_steps is 7; this 'bhd_mlp' predicts chunks of 6"),
+        ({"n_action_steps": 0}, "brain.n_action_steps is 0; it must be at least 1"),
+        ({"threads": 0}, "brain.threads is 0"),
+        ({"sample": True}, "brain.sample is true, but this policy has no distribution"),
+        ({"stream": True, "n_action_steps": 1}, "brain.stream is true"),
+    ],
+)
+def test_options_that_cannot_be_honoured(folder: Path, options: dict[str, Any], message: str) -> None:
+    assert message in refused(folder, **options)
+
+
+def test_an_average_over_chunks_looks_at_every_frame(tmp_path: Path) -> None:
+    folder = rig.save_policy(tmp_path / "act", "act_average")
+    assert "temporal_ensemble_coeff" in refused(folder, n_action_steps=2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ((rig.STATE[::-1], rig.ACTIONS, 10, rig.ENVIRONMENT), ("observation", "another order")),
+        ((rig.STATE[:-1], rig.ACTIONS, 10, rig.ENVIRONMENT), ("observation", "14 there and 13 here")),
+        ((rig.STATE, rig.ACTIONS[::-1], 10, rig.ENVIRONMENT), ("action", "another order")),
+        ((rig.STATE, rig.ACTIONS, 25, rig.ENVIRONMENT), ("10 frames a second", "at 25")),
+        ((rig.STATE, rig.ACTIONS, 10, ()), ("environment", "goal_x, goal_y", "the same task")),
+    ],
+)
+def test_a_robot_or_a_task_that_does_not_fit(folder: Path, arguments: Any, parts: tuple[str, ...]) -> None:
+    brain = LearnedBrain(LearnedBrainConfig(str(folder)))
+    with pytest.raises(ConfigError) as error:
+        brain.bind(*arguments)
+    assert [part for part in (str(folder), *parts) if part not in str(error.value)] == []
+
+
+def test_without_a_contract_the_shapes_are_checked_and_it_says_so(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (folder / CONTRACT_FILE).unlink()
+    with caplog.at_level(logging.WARNING):
+        rig.make_brain(folder)
+    assert "only the number of its inputs is checked" in caplog.text
+    brain = LearnedBrain(LearnedBrainConfig(str(folder)))
+    assert brain.robot_type == "any"
+    for arguments, what in (
+        ((rig.STATE[1:], rig.ACTIONS, 10, rig.ENVIRONMENT), "14 numbers in 'observation.state'"),
+        ((rig.STATE, ("a",), 10, rig.ENVIRONMENT), "2 numbers in 'action'"),
+        ((rig.STATE, rig.ACTIONS, 10, ()), "2 numbers in 'observation.environment_state'"),
+    ):
+        with pytest.raises(ConfigError, match=what):
+            brain.bind(*arguments)
+
+
+def test_a_camera_that_the_robot_does_not_have(tmp_path: Path) -> None:
+    brain = rig.make_brain(rig.save_policy(tmp_path / "act", "act_image"))
+    brain.reset(np.arange(1), [0], 1)
+    seen = next(rig.observations(1, 1))
+    with pytest.raises(ConfigError, match=r"camera 'front'.*There is: none.*--robot.camera=true.*camera_width=48"):
+        brain.act(Observation(seen.names, seen.state, {}, seen.environment_state))
+    small = {"front": seen.images["front"][:, ::2, ::2]}
+    with pytest.raises(ConfigError, match=r"48 x 32 px.*24 x 16 px"):
+        brain.act(Observation(seen.names, seen.state, small, seen.environment_state))
+
+
+@pytest.mark.parametrize("blind", [False, True])
+def test_an_action_that_is_not_finite_names_where_and_when(folder: Path, blind: bool) -> None:
+    brain = rig.make_brain(folder)
+    brain.reset(np.arange(2), [0, 1], 2)
+    seen = list(rig.observations(2, 4))
+    for one in seen[:3]:
+        brain.act(one)
+    if blind:
+        seen[3].state[1, 4] = np.nan
+    else:
+        with torch.no_grad():
+            brain.loaded.policy.net[-1].bias[3] = torch.inf  # the second action of the second frame
+    with pytest.raises(ActionError) as error:
+        brain.act(seen[3])
+    parts = ["in frame 3 of the episode"]
+    parts += ["simulation 1", "'observation.state' is not finite"] if blind else ["inf for 'theta.vel', 1 frames ahead"]
+    assert [part for part in parts if part not in str(error.value)] == []
+
+
+def test_an_empty_path() -> None:
+    with pytest.raises(ConfigError, match=r"brain\.path is empty"):
+        LearnedBrainConfig("")
+
+
+def options(root: Path, brain: str, robot: str = "turtlebot3", task: str = "avoid") -> list[str]:
+    return [
+        f"--robot.type={robot}",
+        f"--task.type={task}",
+        "--dataset.repo_id=a/b",
+        f"--dataset.root={root / 'data'}",
+        "--brain.type=learned",
+        f"--brain.path={brain}",
+    ]
+
+
+def test_the_registry_asks_the_checkpoint_which_robot_it_drives(folder: Path, tmp_path: Path) -> None:
+    config = LearnedBrainConfig(str(folder))
+    assert robot_of_brain(config) == "turtlebot3"
+    assert action_names_of(config) == ("x.vel", "theta.vel")
+    assert isinstance(make_brain(config), LearnedBrain)
+    assert "learned" in brains_for("turtlebot3")
+    assert "learned" in brains_for("ur5")
+    assert parse(RecordConfig, options(tmp_path, str(folder))).brain == config
+    with pytest.raises(ConfigError, match=r"drives a turtlebot3; robot\.type is 'ur5'"):
+        parse(RecordConfig, options(tmp_path, str(folder), "ur5", "reach"))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="There is no policy in"):
+        parse(RecordConfig, options(tmp_path, str(tmp_path / "empty")))
+    replace(PolicyContract.load(folder), robot_type=None).save(folder)
+    assert robot_of_brain(config) == ""
+    assert action_names_of(config) == ()
+
+
+def test_a_configuration_is_read_before_its_policy_is_trained(tmp_path: Path) -> None:
+    later = parse(RecordConfig, options(tmp_path, str(tmp_path / "later")))
+    assert robot_of_brain(later.brain) == ""
+    with pytest.raises(ConfigError, match="the folder does not exist"):
+        make_brain(later.brain)

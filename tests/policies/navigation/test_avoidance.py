@@ -1,0 +1,132 @@
+"""The rule of the articles, decision by decision."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain, AvoidanceConfig
+
+ACTIONS = ("x.vel", "theta.vel")
+NAMES = tuple(f"scan_{beam:03d}.pos" for beam in range(360))
+AHEAD, LEFT, STOP = (0.2, 0.0), (0.0, 0.5), (0.0, 0.0)
+
+
+def decide(scan: np.ndarray, config: AvoidanceConfig | None = None) -> np.ndarray:
+    scan = np.atleast_2d(scan)
+    names = tuple(f"scan_{beam:03d}.pos" for beam in range(scan.shape[1]))
+    brain = AvoidanceBrain(config)
+    brain.bind(names, ACTIONS, 10)
+    brain.reset(np.arange(len(scan)), [0] * len(scan), len(scan))
+    return brain.act(Observation(names, scan))
+
+
+def one_reading(degrees: int, distance: float, elsewhere: float = 3.5) -> np.ndarray:
+    scan = np.full(360, elsewhere)
+    scan[degrees % 360] = distance
+    return scan
+
+
+def test_defaults_are_those_of_the_articles() -> None:
+    config = AvoidanceConfig()
+    assert (config.front_sector_deg, config.safe_distance_m) == (30.0, 0.5)
+    assert (config.forward_speed, config.turn_speed) == (0.2, 0.5)
+
+
+@pytest.mark.parametrize("degrees", range(-180, 180, 5))
+def test_only_the_front_sector_counts(degrees: int) -> None:
+    expected = LEFT if abs(degrees) <= 30 else AHEAD
+    assert tuple(decide(one_reading(degrees, 0.3))[0]) == expected
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(-31, AHEAD), (-30, LEFT), (30, LEFT), (31, AHEAD)])
+def test_the_edges_belong_to_the_sector(degrees: int, expected: tuple[float, float]) -> None:
+    assert tuple(decide(one_reading(degrees, 0.49))[0]) == expected
+
+
+@pytest.mark.parametrize(
+    ("distance", "expected"),
+    [
+        (np.nextafter(0.5, 0), LEFT),
+        (0.5, AHEAD),
+        (np.nextafter(0.5, 1), AHEAD),
+        (0.12, LEFT),
+        (0.1199, AHEAD),  # not valid, so not there
+        (0.0, AHEAD),
+        (-1.0, AHEAD),
+        (3.5, AHEAD),
+        (np.nextafter(3.5, 4), AHEAD),
+        (np.nan, AHEAD),
+        (np.inf, AHEAD),
+    ],
+)
+def test_exactly_the_safe_distance_is_free_and_invalid_readings_are_not_there(
+    distance: float, expected: tuple[float, float]
+) -> None:
+    assert tuple(decide(one_reading(0, distance))[0]) == expected
+
+
+@pytest.mark.parametrize("blind", [np.nan, np.inf, -np.inf, 0.0, 0.11, 3.6])
+def test_without_a_valid_reading_in_front_it_stops(blind: float) -> None:
+    scan = np.full(360, blind)
+    assert tuple(decide(scan)[0]) == STOP
+    scan[31:330] = 1.0  # what is behind does not help
+    assert tuple(decide(scan)[0]) == STOP
+    scan[330] = 1.0  # one valid reading in front is enough
+    assert tuple(decide(scan)[0]) == AHEAD
+
+
+@pytest.mark.parametrize("beams", [1, 4, 12, 36, 90, 360])
+def test_any_number_of_beams(beams: int) -> None:
+    scan = np.full(beams, 3.5)
+    assert tuple(decide(scan)[0]) == AHEAD
+    scan[0] = 0.2
+    assert tuple(decide(scan)[0]) == LEFT
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 9))
+def test_many_robots_decide_like_each_alone(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    scan = rng.choice(
+        [np.nan, 0.0, 0.12, 0.4, 0.5, 1.0, 3.5, 9.0], (n, 360), p=[0.1, 0.1, 0.01, 0.01, 0.1, 0.3, 0.3, 0.08]
+    )
+    together = decide(scan)
+    assert np.array_equal(together, np.vstack([decide(row) for row in scan]))
+    # Left and right count the same: a mirrored scan gives the same decision.
+    assert np.array_equal(together, decide(np.roll(scan[:, ::-1], 1, axis=1)))
+
+
+def test_the_observation_is_left_alone_and_nothing_is_remembered() -> None:
+    scan = np.random.default_rng(1).uniform(0.3, 1.0, (3, 360))
+    scan.flags.writeable = False
+    brain = AvoidanceBrain()
+    brain.bind(NAMES, ACTIONS, 10)
+    first = brain.act(Observation(NAMES, scan))
+    for _ in range(3):
+        assert np.array_equal(brain.act(Observation(NAMES, scan)), first)
+
+
+def test_parameters_are_used() -> None:
+    config = AvoidanceConfig(front_sector_deg=90, safe_distance_m=1.0, forward_speed=0.1, turn_speed=-0.7)
+    assert tuple(decide(one_reading(90, 0.9), config)[0]) == (0.0, -0.7)
+    assert tuple(decide(one_reading(91, 0.9), config)[0]) == (0.1, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("front_sector_deg", 0.0), ("front_sector_deg", 181.0), ("turn_speed", np.nan), ("safe_distance_m", np.inf)],
+)
+def test_impossible_parameters_are_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=f"brain.{name} is {value}"):
+        AvoidanceConfig(**{name: value})
+
+
+def test_readings_at_the_limits_are_valid_in_single_precision_too() -> None:
+    brain = AvoidanceBrain()
+    names = ["x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36))]
+    brain.bind(names, ["x.vel", "theta.vel"], 10)
+    for reading, expected in ((0.12, [0.0, 0.5]), (3.5, [0.2, 0.0])):
+        state = np.full((1, 38), reading, np.float32).astype(np.float64)
+        assert brain.act(Observation(tuple(names), state)).tolist() == [expected]

@@ -1,0 +1,329 @@
+"""Laws of the gap follower: limits, symmetry, sides, memory, independence of n, and what it achieves."""
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
+from bhd_lerobot.policies.navigation.clearance import LIDAR_X, QUANTUM, ClearanceTable, Level, make_paths
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import EpisodeSpec
+from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
+from bhd_lerobot.tasks.task import Outcome, episode_seed
+
+ACTIONS = ("x.vel", "theta.vel")
+BEAMS = (36, 40, 45, 60, 72, 90, 120, 180, 360)
+
+
+def names_of(beams: int) -> tuple[str, ...]:
+    return ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(beams)))
+
+
+def bound(beams: int, n: int, config: GapFollowerConfig | None = None) -> GapFollowerBrain:
+    brain = GapFollowerBrain(config)
+    brain.bind(names_of(beams), ACTIONS, 10)
+    brain.reset(np.arange(n), [0] * n, n)
+    return brain
+
+
+def see(brain: GapFollowerBrain, scan: np.ndarray, twist: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    scan = np.atleast_2d(scan)
+    state = np.hstack([np.tile(twist, (len(scan), 1)), scan])
+    return brain.act(Observation(names_of(scan.shape[1]), state))
+
+
+def decide(scan: np.ndarray) -> np.ndarray:
+    scan = np.atleast_2d(scan)
+    return see(bound(scan.shape[1], len(scan)), scan)
+
+
+def inside_box(beams: int, front: float, back: float, left: float, right: float) -> np.ndarray:
+    """Return the scan of a robot in a rectangle, distances from the range finder."""
+    angle = 2 * np.pi * np.arange(beams) / beams
+    with np.errstate(divide="ignore"):
+        x = np.where(np.cos(angle) > 0, front, back) / np.abs(np.cos(angle))
+        y = np.where(np.sin(angle) > 0, left, right) / np.abs(np.sin(angle))
+    return np.clip(np.minimum(x, y), 0.12, 3.5)
+
+
+def random_scans(n: int, beams: int = 360, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    scale = rng.choice([0.3, 1.0, 3.5], (n, 1))
+    smooth = np.cumsum(rng.normal(0, 0.1, (n, beams)), axis=1)
+    return np.clip(scale * (0.6 + smooth / 2), 0.12, 3.5)
+
+
+# --- decisions -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("beams", BEAMS)
+def test_it_drives_straight_in_the_open(beams: int) -> None:
+    assert tuple(decide(np.full(beams, 3.5))[0]) == (0.22, 0.0)
+
+
+@pytest.mark.parametrize("beams", BEAMS)
+def test_it_turns_to_the_free_side(beams: int) -> None:
+    open_left = inside_box(beams, front=0.4, back=3.0, left=3.0, right=0.3)
+    open_right = inside_box(beams, front=0.4, back=3.0, left=0.3, right=3.0)
+    assert decide(open_left)[0, 1] > 0.3
+    assert decide(open_right)[0, 1] < -0.3
+
+
+def test_it_never_asks_for_more_than_the_robot_can() -> None:
+    scan = np.vstack([random_scans(1000, seed=1), np.full((1, 360), 0.12), np.full((1, 360), 3.5)])
+    brain = bound(360, len(scan))
+    rim = MAX_ANGULAR * WHEEL_SEPARATION / 2
+    for step in range(5):
+        action = see(brain, np.roll(scan, 40 * step, axis=1), (0.2, 0.3))
+        assert np.isfinite(action).all()
+        assert (np.abs(action[:, 0]) <= MAX_LINEAR).all()
+        assert (np.abs(action[:, 1]) <= MAX_ANGULAR).all()
+        assert (np.abs(action[:, 0]) + np.abs(action[:, 1]) * WHEEL_SEPARATION / 2 <= rim + 1e-9).all()
+
+
+@pytest.mark.parametrize("beams", [36, 360])
+@pytest.mark.parametrize("distance", [0.12, 0.2])
+def test_it_does_not_drive_into_a_wall(beams: int, distance: float) -> None:
+    assert decide(inside_box(beams, front=distance, back=3.0, left=1.0, right=1.0))[0, 0] <= 0
+    assert decide(inside_box(beams, front=distance, back=distance, left=distance, right=distance))[0, 0] <= 0
+
+
+def test_wedged_in_a_slot_it_backs_off() -> None:
+    forward, turn = decide(inside_box(360, front=0.125, back=2.0, left=0.12, right=0.12))[0]
+    assert forward < 0
+    assert turn == 0
+
+
+@pytest.mark.parametrize("blind", [np.nan, np.inf, -np.inf, 0.0, 0.11, 3.6])
+def test_blind_it_stops_and_sees_again(blind: float) -> None:
+    brain = bound(90, 2)
+    scan = np.full((2, 90), 3.5)
+    scan[0] = blind
+    assert see(brain, scan).tolist() == [[0, 0], [0.22, 0]]
+    scan[0] = 3.5
+    assert see(brain, scan).tolist() == [[0.22, 0]] * 2
+
+
+@pytest.mark.parametrize("beams", [36, 90, 360])
+def test_one_lost_beam_does_not_matter_a_lost_quarter_does(beams: int) -> None:
+    scan = np.full((2, beams), 3.5)
+    scan[0, beams // 4] = np.nan
+    scan[1, : beams // 4] = np.nan
+    assert decide(scan).tolist() == [[0.22, 0], [0, 0]]
+
+
+def test_readings_at_the_limits_survive_single_precision() -> None:
+    scan = inside_box(360, front=0.12, back=3.5, left=3.5, right=3.5)
+    assert np.array_equal(decide(scan), decide(scan.astype(np.float32).astype(np.float64)))
+
+
+def test_a_measured_twist_that_is_no_number_does_no_lasting_harm() -> None:
+    brain, other = bound(90, 1), bound(90, 1)
+    scan = random_scans(1, 90, seed=3)
+    for twist in ((0.1, 0.2), (np.nan, np.inf), (0.1, 0.2)):
+        assert np.isfinite(see(brain, scan, twist)).all()
+        see(other, scan, tuple(np.nan_to_num(twist, posinf=0.0)))
+    assert np.array_equal(see(brain, scan), see(other, scan))
+
+
+# --- memory ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_new_ground_attracts(side: int) -> None:
+    """Two ways are equally free; the robot takes the one that it did not come from."""
+    brain = bound(120, 1, GapFollowerConfig(commit_weight=0.0))
+    for _ in range(100):  # 2 m along a way
+        see(brain, np.full(120, 3.5), (0.2, 0.0))
+    for _ in range(10):  # a quarter turn: the way driven now lies on the side that the robot turned to
+        see(brain, np.full(120, 3.5), (0.0, side * np.pi / 2))
+    junction = inside_box(120, front=0.45, back=0.5, left=2.5, right=2.5)
+    assert see(brain, junction)[0, 1] * side < -0.3
+
+
+def test_reset_forgets_and_only_where_it_is_asked_to() -> None:
+    scans = random_scans(3, 120, seed=5)
+    brain = bound(120, 3)
+    for step in range(50):
+        see(brain, np.roll(scans, step, axis=1), (0.2, 0.5))
+    untouched = bound(120, 3)
+    for step in range(50):
+        see(untouched, np.roll(scans, step, axis=1), (0.2, 0.5))
+    brain.reset(np.array([1]), [7], 3)
+    after, before, fresh = see(brain, scans), see(untouched, scans), decide(scans)
+    assert np.array_equal(after[[0, 2]], before[[0, 2]])
+    assert np.array_equal(after[1], fresh[1])
+    brain.reset(np.arange(2), [0, 0], 2)  # another number of robots: everything is new
+    assert np.array_equal(see(brain, scans[:2]), fresh[:2])
+
+
+def test_an_unexpected_number_of_robots_is_refused() -> None:
+    with pytest.raises(ConfigError, match="was reset for 2 robots and sees 3"):
+        see(bound(90, 2), np.full((3, 90), 1.0))
+
+
+# --- configuration ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("beams", [1, 12, 30])
+def test_too_few_beams_are_refused(beams: int) -> None:
+    with pytest.raises(ConfigError, match=f"needs at least 36 beams; this robot has {beams}"):
+        bound(beams, 1)
+
+
+def test_the_measured_twist_is_needed() -> None:
+    with pytest.raises(ConfigError, match=r"'gap_follower' needs the observation feature\(s\) theta\.vel"):
+        GapFollowerBrain().bind(("x.vel", *names_of(90)[2:]), ACTIONS, 10)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("forward_speed", 0),
+        ("settle_s", 0),
+        ("forward_speed", 0.3),  # faster than the wheels
+        ("turn_speed", -1.0),
+        ("margin_m", np.nan),
+        ("horizon_m", 9.0),
+        ("horizon_m", 0.1),
+        ("discount", 1.5),
+        ("stop_m", 2.0),
+        ("memory_s", np.inf),
+        ("range_min_m", 4.0),
+    ],
+)
+def test_impossible_parameters_are_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=rf"brain\.{name} is {value}"):
+        GapFollowerConfig(**{name: value})
+
+
+# --- the table -------------------------------------------------------------------------------------------------------
+
+
+def test_straight_ahead_the_table_is_plain_geometry() -> None:
+    paths = make_paths(0.22, 0.2272)
+    straight = int(np.flatnonzero(paths.heading == 0)[0])
+    table = ClearanceTable(paths, 360, 0.0, (Level(0.05, 0.005),), 3.5)
+    for distance in (0.3, 0.7, 1.5, 3.0):
+        scan = np.full((1, 360), 3.5)
+        scan[0, 0] = distance
+        free = table.clear(table.rows(scan), 0)[0, straight] * QUANTUM
+        assert free == pytest.approx(LIDAR_X + distance - 0.038 - 0.05, abs=2 * QUANTUM)
+
+
+def test_more_margin_never_gives_more_room() -> None:
+    paths = make_paths(0.22, 0.2272)
+    table = ClearanceTable(paths, 120, 0.01, (Level(0.1, 0.0), Level(0.05, 0.0), Level(0.0, 0.0)), 3.5)
+    rows = table.rows(random_scans(50, 120, seed=2))
+    wide, usual, tight = (table.clear(rows, level) for level in range(3))
+    assert (wide <= usual).all()
+    assert (usual <= tight).all()
+    assert (wide < tight).any()
+
+
+@pytest.mark.parametrize("sectors", [36, 120])
+def test_a_mirrored_scan_mirrors_the_room(sectors: int) -> None:
+    paths = make_paths(0.22, 0.2272)
+    table = ClearanceTable(paths, sectors, 0.01, (Level(0.05, 0.005),), 3.5)
+    scan = random_scans(100, sectors, seed=6)
+    room = table.clear(table.rows(scan), 0)
+    mirrored = table.clear(table.rows(np.roll(scan[:, ::-1], 1, axis=1)), 0)
+    two_sided = np.abs(paths.heading) < np.pi - 1e-9  # half a turn is made to the left only
+    assert np.array_equal(paths.heading[paths.mirror[two_sided]], -paths.heading[two_sided])
+    assert np.array_equal(room[:, two_sided], mirrored[:, paths.mirror[two_sided]])
+
+
+def test_an_obstacle_on_a_path_is_met_where_the_path_comes_to_it() -> None:
+    """Whatever is put on the robot's centre line at some length, no path may go on past it."""
+    paths = make_paths(0.22, 0.2272)
+    table = ClearanceTable(paths, 360, 0.01, (Level(0.05, 0.005),), 3.5)
+    lengths = np.array([0.6, 1.0, 2.0])
+    for length, x, y in zip(lengths, *paths.points(lengths), strict=True):
+        for path in np.flatnonzero((np.hypot(x - LIDAR_X, y) > 0.3) & (np.hypot(x - LIDAR_X, y) < 3.4)):
+            angle = np.arctan2(y[path], x[path] - LIDAR_X)
+            scan = np.full((1, 360), 3.5)
+            scan[0, round(np.degrees(angle)) % 360] = np.hypot(x[path] - LIDAR_X, y[path])
+            assert table.clear(table.rows(scan), 0)[0, path] * QUANTUM <= length
+
+
+# --- n ---------------------------------------------------------------------------------------------------------------
+
+
+def test_many_robots_decide_like_each_alone_to_the_last_bit() -> None:
+    n, steps = 7, 60
+    rng = np.random.default_rng(4)
+    scans = np.array([random_scans(n, seed=10 + step // 5) for step in range(steps)])
+    scans[20:25, 2] = np.nan
+    twists = rng.uniform((-0.2, -2), (0.2, 2), (steps, n, 2))
+
+    def drive(ids: list[int]) -> np.ndarray:
+        brain, actions = bound(360, len(ids)), []
+        for scan, twist in zip(scans, twists, strict=True):
+            actions.append(brain.act(Observation(names_of(360), np.hstack([twist, scan])[ids])))
+        return np.array(actions)
+
+    together = drive(list(range(n)))
+    for sim in range(n):
+        assert drive([sim])[:, 0].tobytes() == together[:, sim].tobytes()
+
+
+def run(brain: Brain, seeds: list[int], n: int, beams: int = 120, seconds: float = 60.0) -> list[Outcome]:
+    simulation = TurtleBot3Simulation(TurtleBot3Config(beams=beams), n)
+    loop = EpisodeLoop(simulation, AvoidTask(AvoidConfig(duration_s=seconds, min_path_m=0.0), n, 10), brain)
+    return [e.outcome for e in loop.run([EpisodeSpec(index, seed) for index, seed in enumerate(seeds)])]
+
+
+def test_episodes_do_not_depend_on_how_many_run() -> None:
+    seeds = [episode_seed(3, episode, "train") for episode in range(7)]
+    together = run(GapFollowerBrain(), seeds, 7, seconds=6)
+    assert run(GapFollowerBrain(), seeds[:3], 1, seconds=6) == together[:3]
+
+
+# --- in simulation ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("beams", [36, 360])
+def test_it_gets_out_of_a_dead_end(beams: int) -> None:
+    """A corridor 0.7 m wide and 1.2 m deep, closed behind the robot's nose."""
+    walls = (
+        Shape("box", 1.6, 0.0, 0.0, 0.03, 0.41),
+        Shape("box", 1.0, 0.38, 0.0, 0.6, 0.03),
+        Shape("box", 1.0, -0.38, 0.0, 0.6, 0.03),
+        *(Shape("box", side * 2.05, 0.0, 0.0, 0.05, 2.1) for side in (-1, 1)),
+        *(Shape("box", 0.0, side * 2.05, 0.0, 2.1, 0.05) for side in (-1, 1)),
+    )
+    starts = [(1.3, 0.0, 0.0), (1.1, 0.1, 0.3), (1.1, -0.12, -0.5)]
+    arenas = [Arena("dead end", walls, (-2.0, 2.0, -2.0, 2.0), start) for start in starts]
+    ids = np.arange(len(starts))
+    simulation = TurtleBot3Simulation(TurtleBot3Config(beams=beams), len(ids))
+    brain = GapFollowerBrain()
+    brain.bind(simulation.observation_names, simulation.action_names, 10)
+    simulation.reset(ids, arenas, [1, 2, 3])
+    brain.reset(ids, [1, 2, 3], len(ids))
+    outside = np.zeros(len(ids), np.bool_)
+    for _ in range(200):
+        simulation.act(brain.act(Observation(simulation.observation_names, simulation.observe().state)))
+        assert not simulation.truth().touched.any()
+        outside |= simulation.world.base_pose[:, 0] < 0.2
+    assert outside.all()
+
+
+@pytest.mark.parametrize("beams", [36, 60, 180])
+def test_it_roams_without_contact_with_any_scanner(beams: int) -> None:
+    outcomes = run(GapFollowerBrain(), [episode_seed(5, e, "train") for e in range(4)], 4, beams, seconds=25)
+    assert all(outcome.success for outcome in outcomes)
+    assert all(outcome.details["path_m"] > 4 for outcome in outcomes)
+
+
+def test_it_sees_more_than_avoidance_and_fails_no_more() -> None:
+    seeds = [episode_seed(7, episode, "train") for episode in range(16)]
+    old, new = run(AvoidanceBrain(), seeds, 16), run(GapFollowerBrain(), seeds, 16)
+    assert sum(not outcome.success for outcome in new) <= sum(not outcome.success for outcome in old)
+    assert np.mean([outcome.score for outcome in new]) > 1.2 * np.mean([outcome.score for outcome in old])

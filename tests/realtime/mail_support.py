@@ -1,0 +1,80 @@
+"""Records for mailboxes, and the processes at the other end of them."""
+
+import mmap
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bhd_lerobot.control.commands import BrainCommand, ResultCode
+from bhd_lerobot.control.motion.planner import Plan
+from bhd_lerobot.control.motion.trajectory import PlanFailure, Trajectory
+from bhd_lerobot.realtime.mailbox import Mailbox
+from bhd_lerobot.realtime.plan_link import PlanServer
+
+RECORD = np.dtype([("number", np.int64), ("flag", np.bool_), ("copies", np.int64, (100,))])  # 809 bytes: not aligned
+CAPACITY = 4
+DURATION_S = 1.0
+
+
+def shared_block(path: Path, size: int = 0) -> mmap.mmap:
+    """Return memory that processes share through a file: a new zeroed block, or what is there if the size is 0."""
+    if size:
+        path.write_bytes(bytes(size))
+    with path.open("r+b") as file:
+        return mmap.mmap(file.fileno(), 0)
+
+
+def record(number: int) -> np.void:
+    value = np.zeros(1, RECORD)[0]
+    value["number"], value["flag"], value["copies"] = number, number % 2, number
+    return value
+
+
+class RampPlanner:
+    """Plans as many ticks as the goal's `timeout_s` says, whose rows are the start and what its `gripper` adds."""
+
+    def __init__(self, dof: int = 6, hz: int = 100) -> None:
+        self.dof, self.hz = dof, hz
+        self.planned: list[BrainCommand] = []
+
+    def plan(
+        self, command: BrainCommand, position: Any, velocity: Any, acceleration: Any, *, opening: float | None = None
+    ) -> Plan | PlanFailure:
+        self.planned.append(command)
+        if command.max_velocity is not None:
+            return PlanFailure(ResultCode.UNREACHABLE, f"{command.max_velocity} is what was asked for. " + "é" * 300)
+        if command.max_acceleration is not None:
+            raise ZeroDivisionError("no planner plans this")
+        steps = (command.gripper or 0.0) * np.arange(1, int(command.timeout_s) + 1)[:, None]
+        trajectory = Trajectory(position + steps, velocity + steps, acceleration + steps)
+        return Plan(trajectory, np.full(self.dof + 1, -1.0 if opening is None else opening))
+
+
+def start(job: str, path: Path, count: int) -> subprocess.Popen:
+    """Run one of the functions below in a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    return subprocess.Popen([sys.executable, __file__, job, str(path), str(count)], env=environment)
+
+
+def post_numbers(path: Path, count: int) -> None:
+    """Post as fast as the reader makes room."""
+    mailbox = Mailbox(RECORD, CAPACITY, shared_block(path))
+    for number in range(count):
+        while not mailbox.post(record(number)):
+            pass
+
+
+def serve_plans(path: Path, count: int) -> None:
+    """Answer so many requests."""
+    planner = RampPlanner()
+    server = PlanServer(shared_block(path), planner, duration_s=DURATION_S)  # type: ignore[arg-type]
+    server.serve(lambda: len(planner.planned) == count, lambda: time.sleep(1e-4))
+
+
+if __name__ == "__main__":
+    globals()[sys.argv[1]](Path(sys.argv[2]), int(sys.argv[3]))

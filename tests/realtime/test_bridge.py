@@ -1,0 +1,225 @@
+"""The bridge over shared memory, with both of its ends in one process and on a virtual clock."""
+
+import os
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.body import Rates
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.fifo import StateRing
+from bhd_lerobot.control.messages import Mode, Reason
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Phase, Word
+from bhd_lerobot.realtime.bridge import LiveBridge
+from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
+from bhd_lerobot.realtime.mailbox import Mailbox
+from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestServer, request_dtype
+from tests.control.support import BODY, PerfectPlant
+
+HZ, FPS = 200, 10
+TICK = 1_000_000_000 // HZ
+F = HZ // FPS
+STATE = Cerebellum.state_dtype(1)
+
+
+class Rig:
+    """A base's cerebellum behind a block; time goes on when the rig says so."""
+
+    def __init__(self) -> None:
+        self.now = 5 * 10**12
+        sizes = {
+            "requests": Mailbox.nbytes(request_dtype(0)),
+            "events": Mailbox.nbytes(EVENT_DTYPE),
+        }
+        extended = np.dtype([*[(name, STATE[name].base, STATE[name].shape) for name in STATE.names or ()],
+                             ("tick", np.int64), ("due_ns", np.int64)])  # fmt: skip
+        layout = LiveLayout(2, extended, 16, 64, sizes)
+        self.block = layout.create(f"test-bridge-{os.getpid()}", {})
+        other = LiveBlock.attach(self.block.name)
+        self.other = other
+        self.cerebellum = Cerebellum(BODY, PerfectPlant(1), HZ, fifo=other.fifo, estop_word=other.estop_word)
+        requests, events = (Mailbox(request_dtype(0), buffer=other.section("requests")),
+                            Mailbox(EVENT_DTYPE, buffer=other.section("events")))  # fmt: skip
+        server = RequestServer(self.cerebellum, requests, events)
+        self.ring: StateRing = other.ring
+        self.record = np.zeros((), extended)
+        self.start = self.now
+        self.ticks = 0
+        other.words[Word.START] = self.start
+        self.loop = RealtimeLoop(
+            self.cerebellum,
+            other.words,
+            LoopLimits(),
+            serve=lambda now: server.serve(self.now),
+            advance=lambda ticks: None,
+            publish=self.publish,
+            count=lambda *numbers: None,
+            clock=self.clock,
+            sleep=self.sleep,
+        )
+        client = RequestClient(
+            Mailbox(request_dtype(0), buffer=self.block.section("requests")),
+            Mailbox(EVENT_DTYPE, buffer=self.block.section("events")),
+            self.tick,
+            clock_ns=self.clock,
+        )
+        self.bridge = LiveBridge(self.block, Rates(HZ, HZ, FPS), client, self.tick, self.clock)
+        self.until = 0
+
+    def clock(self) -> int:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += round(seconds * 1e9)
+
+    def publish(self, slot, started, ended, grid) -> None:
+        state = self.cerebellum.state(slot.due_ns - grid.start_ns)
+        for name in STATE.names or ():
+            self.record[name] = getattr(state, name)
+        self.record["tick"], self.record["due_ns"] = self.ticks, slot.due_ns
+        self.ring.publish(self.record)
+        self.ticks += 1
+        if self.ticks >= self.until:
+            self.other.words[Word.PAUSE] = 1
+
+    def tick(self, count: int = 1) -> None:
+        """Run some ticks, each stretch of which goes on with the time of the one before."""
+        self.until = self.ticks + count
+        words = self.other.words
+        words[Word.PAUSE] = 0
+        # The grid goes on: a stretch that starts anew at the next point of the same grid.
+        next_due = self.start + self.ticks * TICK
+        self.now = max(self.now, next_due - TICK // 2)
+        self.cerebellum_time(next_due)
+
+    def cerebellum_time(self, next_due: int) -> None:
+        """Run the loop from a point of the grid on; times stay those since the first start."""
+        first = self.start
+        plain = self.cerebellum.tick
+        offset = next_due - first
+        self.cerebellum.tick = lambda now, ticks=1: plain(now + offset, ticks)  # type: ignore[method-assign]
+        try:
+            self.loop.run(next_due)
+        finally:
+            self.cerebellum.tick = plain  # type: ignore[method-assign]
+            self.other.words[Word.START] = first
+
+    def close(self) -> None:
+        self.block.close()
+        self.other.close()
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    rig = Rig()
+    try:
+        rig.tick()
+        rig.bridge.configure()
+        rig.bridge.activate()
+        yield rig
+    finally:
+        rig.close()
+
+
+def drive(value: float) -> np.ndarray:
+    return np.array([[value, 0.0]])
+
+
+def test_modes_are_asked_for_and_setpoints_move_the_robot(rig: Rig) -> None:
+    assert rig.bridge.state().mode.tolist() == [Mode.HOLD]
+    assert rig.bridge.send(drive(0.1)).accepted.all()
+    rig.tick(30)
+    state = rig.bridge.state()
+    assert state.mode.tolist() == [Mode.TRACKING]
+    assert state.command[0, 0] == pytest.approx(0.1)
+    assert Phase(int(rig.block.words[Word.PHASE])) == Phase.STANDING
+
+
+def test_what_cannot_be_accepted_is_refused_at_once_and_with_the_reason(rig: Rig) -> None:
+    bridge = rig.bridge
+
+    def reason(values: np.ndarray, due: int | None = None) -> Reason:
+        return Reason(int(bridge.send(values, due_ns=due).reasons[0]))
+
+    assert reason(np.zeros((1, 3))) == Reason.WRONG_WIDTH
+    assert reason(np.array([["a", "b"]])) == Reason.WRONG_WIDTH
+    assert reason(np.array([[np.nan, 0.0]])) == Reason.NON_FINITE
+    assert reason(drive(0.1), bridge.now_ns + 10 * TICK) == Reason.ACCEPTED
+    assert reason(drive(0.1), bridge.now_ns + 5 * TICK) == Reason.OUT_OF_ORDER
+    for _ in range(15):
+        assert reason(drive(0.1), bridge.now_ns + 10 * TICK) == Reason.ACCEPTED
+    assert reason(drive(0.1), bridge.now_ns + 10 * TICK) == Reason.FIFO_FULL
+    bridge.estop()
+    assert reason(drive(0.1), bridge.now_ns + 11 * TICK) == Reason.ESTOP
+
+
+def test_an_emergency_stop_latches_and_motion_needs_reset_and_activate(rig: Rig) -> None:
+    bridge = rig.bridge
+    bridge.send(drive(0.2))
+    rig.tick(40)
+    bridge.estop()
+    assert bridge.estop_pressed
+    rig.tick()
+    assert bridge.state().mode.tolist() == [Mode.ESTOP]
+    assert bridge.reset().reasons.tolist() == [Reason.NOT_AT_REST]
+    rig.tick(100)
+    assert np.abs(bridge.state().command).max() < 1e-9
+    assert bridge.activate().reasons.tolist() == [Reason.ESTOP]
+    assert bridge.reset().accepted.all()
+    assert not bridge.estop_pressed
+    assert bridge.send(drive(0.1)).reasons.tolist() == [Reason.NOT_ACTIVE]
+    assert bridge.activate().accepted.all()
+    assert bridge.send(drive(0.1)).accepted.all()
+    rig.tick(20)
+    assert bridge.state().mode.tolist() == [Mode.TRACKING]
+
+
+def test_a_chunk_takes_effect_frame_by_frame_and_its_end_means_hold(rig: Rig) -> None:
+    bridge = rig.bridge
+    rows = [0.10, 0.05, 0.15]
+    assert all(one.accepted.all() for one in bridge.send_chunk(np.array([drive(row) for row in rows])))
+    reached = []
+    for number in range(len(rows)):
+        rig.tick(F if number else F - 1)  # the chunk was sent at a tick, so that its frames end just before one
+        reached.append(float(bridge.state().command[0, 0]))
+    assert reached == pytest.approx(rows)
+    rig.tick(round(BODY.limits.command_timeout_s * HZ))
+    assert bridge.state().mode.tolist() in ([Mode.STOPPING], [Mode.HOLD])
+    rig.tick(60)
+    assert bridge.state().mode.tolist() == [Mode.HOLD]
+    assert np.abs(bridge.state().command).max() < 1e-9
+
+
+def test_a_new_chunk_takes_the_place_of_what_is_left_of_the_last(rig: Rig) -> None:
+    bridge = rig.bridge
+    bridge.send_chunk(np.array([drive(0.2)] * 10))
+    rig.tick(2 * F)
+    bridge.send_chunk(np.array([drive(0.05)] * 2))
+    rig.tick(2 * F)
+    assert bridge.state().command[0, 0] == pytest.approx(0.05)
+    assert len(rig.block.fifo) == 0
+
+
+def test_a_late_brain_neither_jumps_nor_makes_the_robot_hurry(rig: Rig) -> None:
+    bridge = rig.bridge
+    began = bridge.now_ns  # the observation that the brain looked at
+    bridge.send(drive(0.10))
+    rig.tick(2 * F + 5)  # it took more than two frames
+    rows = [0.22, 0.22, 0.08, 0.12]
+    sent = bridge.send_chunk(np.array([drive(row) for row in rows]), began)
+    assert len(sent) == 2  # the first two were for frames that have gone by
+    commands = []
+    for _ in range(2 * F):
+        rig.tick()
+        commands.append(float(bridge.state().command[0, 0]))
+    assert max(commands) <= 0.12 + 1e-9
+    assert commands[-1] == pytest.approx(0.12)
+    change = BODY.limits.acceleration[0] / HZ
+    assert np.abs(np.diff([0.10, *commands])).max() <= change + 1e-9
+
+
+def test_there_is_one_robot(rig: Rig) -> None:
+    with pytest.raises(ConfigError, match="number 0"):
+        rig.bridge.take_results(1)

@@ -1,0 +1,333 @@
+"""The loop on a virtual clock: the grid, overruns, watchdogs and words. Time is a number here; nothing waits."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, Request, Watchdog
+from bhd_lerobot.realtime.block import WORDS, Phase, Word
+from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
+from tests.control.support import TICK_NS, Rig
+
+MS = 1_000_000
+STOPPING_TICKS = 80  # more than a base at this speed needs to come to rest
+
+
+class VirtualLoop:
+    """A loop around a cerebellum with perfect wheels, and the clock that it sleeps on.
+
+    What happens at which tick is written into `script`: executed tick -> what is done before it. Delays and work are in
+    nanoseconds, one for each executed tick; the tick after the last of them is punctual and takes no time.
+    """
+
+    def __init__(
+        self,
+        limits: LoopLimits | None = None,
+        delays: tuple[int, ...] = (),
+        work: tuple[int, ...] = (),
+        alive: tuple[Word, ...] = (),
+    ) -> None:
+        self.now = self.begin = 10**15
+        self.rig = Rig()
+        self.words = np.zeros(WORDS, np.int64)
+        self.rig.cerebellum.estop_word = self.words[Word.ESTOP : Word.ESTOP + 1]
+        self.delays, self.work, self.alive = delays, work, set(alive)
+        self.script: dict[int, Callable[[], object]] = {}
+        self.until = 0  # executed ticks after which the loop is told to pause
+        self.slots: list[Slot] = []
+        self.starts: list[int] = []
+        self.counted: list[tuple[int, int, int, int]] = []
+        self.served: list[int] = []
+        self.given: list[tuple[int, int]] = []  # what the cerebellum was told: its time, and periods that passed
+        self.advanced = 0
+        self.modes: list[int] = []
+        self.speeds: list[float] = []
+        self.watchdogs: list[int] = []
+        tick = self.rig.cerebellum.tick
+
+        def spy(now_ns: int, ticks: int = 1) -> None:
+            self.given.append((now_ns, ticks))
+            tick(now_ns, ticks)
+
+        self.rig.cerebellum.tick = spy  # type: ignore[method-assign]
+        self.loop = RealtimeLoop(
+            self.rig.cerebellum,
+            self.words,
+            limits or LoopLimits(most_misses=10**6),
+            serve=self._serve,
+            advance=self._advance,
+            publish=self._publish,
+            count=lambda *timing: self.counted.append(timing),
+            clock=lambda: self.now,
+            sleep=self._sleep,
+        )
+
+    def _sleep(self, seconds: float) -> None:
+        assert seconds > 0
+        self._live()
+        self.now += round(seconds * NANOSECONDS)
+        self._live()
+
+    def _live(self) -> None:
+        for word in self.alive:
+            self.words[word] = self.now
+
+    def _serve(self, now_ns: int) -> None:
+        self.served.append(now_ns)
+
+    def _advance(self, ticks: int) -> None:
+        self.advanced += ticks
+
+    def _publish(self, slot: Slot, started_ns: int, ended_ns: int, grid: TickGrid) -> None:
+        tick = len(self.slots)
+        self.slots.append(slot)
+        self.starts.append(started_ns)
+        self.modes.append(self.rig.mode)
+        self.speeds.append(self.rig.command[0])
+        self.watchdogs.append(int(self.rig.cerebellum.take_flags()[1][0]))
+        # A real loop wakes up late, and its tick takes time; the sum is what makes it late.
+        self.now += self.work[tick] if tick < len(self.work) else 0
+        self.now += self.delays[tick] if tick < len(self.delays) else 0
+        self._live()
+        self.script.get(tick + 1, lambda: None)()
+        if tick + 1 >= self.until:
+            self.words[Word.PAUSE] = 1
+
+    def run(self, ticks: int) -> TickGrid:
+        self.until = len(self.slots) + ticks
+        self.words[Word.PAUSE] = 0
+        self.begin = self.now
+        self.script.get(0, lambda: None)()
+        return self.loop.run(self.now)
+
+    def drive(self, first: int, last: int, speed: float = 0.2) -> None:
+        """Send a setpoint before each of these ticks, as a brain that never tires."""
+        for tick in range(first, last):
+            former = self.script.get(tick, lambda: None)
+
+            def step(former: Callable[[], object] = former) -> None:
+                former()
+                self.rig.now = max(0, self.now - self.begin)
+                self.rig.send(speed)
+
+            self.script[tick] = step
+
+
+LATE = st.lists(st.integers(0, 5 * TICK_NS), min_size=1, max_size=40).map(tuple)
+
+
+@given(delays=LATE, work=LATE, catch_up=st.integers(1, 4))
+def test_the_grid_is_absolute_and_every_period_is_accounted_for(delays, work, catch_up):
+    loop = VirtualLoop(LoopLimits(most_misses=10**6, most_catch_up=catch_up), delays, work)
+    start = loop.now
+    ticks = max(len(delays), len(work)) + 2
+    grid = loop.run(ticks)
+    last = -1
+    for slot, started, (due, counted_start, ended, skipped), (now, periods) in zip(
+        loop.slots, loop.starts, loop.counted, loop.given, strict=True
+    ):
+        assert due == slot.due_ns == start + slot.index * TICK_NS  # never re-anchored
+        assert 0 <= started - due < TICK_NS
+        assert counted_start == started <= ended
+        assert skipped == slot.skipped == slot.index - last - 1
+        assert now == due - start  # the cerebellum's time is that of the grid, not of the wake-up
+        assert periods == 1 + min(skipped, catch_up)
+        last = slot.index
+    words = loop.words
+    assert words[Word.EXECUTED] == grid.executed == ticks
+    assert words[Word.EXECUTED] + words[Word.SKIPPED] == last + 1  # the periods that passed
+    assert loop.advanced == sum(periods for _, periods in loop.given)
+    assert words[Word.CATCH_UP_LOST] == last + 1 - loop.advanced
+    assert words[Word.CEREBELLUM_ALIVE] == loop.counted[-1][2]
+
+
+def test_a_punctual_loop_skips_and_loses_nothing():
+    loop = VirtualLoop()
+    loop.run(1000)
+    assert [loop.words[word] for word in (Word.EXECUTED, Word.SKIPPED, Word.OVERRUNS, Word.CATCH_UP_LOST)] == [
+        1000,
+        0,
+        0,
+        0,
+    ]
+    assert loop.served == [k * TICK_NS for k in range(1000)]
+
+
+def test_what_is_beyond_the_catch_up_is_lost_and_counted():
+    loop = VirtualLoop(LoopLimits(most_misses=10, most_catch_up=3), work=(0, 8 * TICK_NS + 1))
+    loop.run(4)
+    assert [slot.skipped for slot in loop.slots] == [0, 0, 7, 0]
+    assert [periods for _, periods in loop.given] == [1, 1, 4, 1]
+    assert loop.words[Word.CATCH_UP_LOST] == 4
+    assert loop.words[Word.OVERRUNS] == 1
+
+
+@given(misses=st.integers(1, 8))
+def test_so_many_misses_in_a_row_are_a_fault_and_one_less_is_not(misses):
+    late = 2 * TICK_NS
+    for count, expected in ((misses - 1, Mode.HOLD), (misses, Mode.FAULT)):
+        loop = VirtualLoop(LoopLimits(most_misses=misses), delays=(0, *[late] * count))
+        loop.run(misses + 5)
+        assert loop.modes[-1] == expected
+        raised = [tick for tick, flags in enumerate(loop.watchdogs) if flags & Watchdog.MISSES]
+        assert raised == ([] if expected == Mode.HOLD else [misses + 1])  # once: it latches
+        assert loop.modes[: misses + 1] == [Mode.HOLD] * (misses + 1)
+
+
+def test_a_fault_of_misses_stops_a_moving_robot_and_latches():
+    loop = VirtualLoop(LoopLimits(most_misses=3), delays=tuple([0] * 50 + [2 * TICK_NS] * 3))
+    loop.drive(0, 300)
+    loop.run(300)
+    assert loop.modes[49] == Mode.TRACKING
+    assert loop.speeds[49] == pytest.approx(0.2)
+    assert loop.modes[53] == Mode.FAULT
+    assert loop.modes[-1] == Mode.FAULT
+    assert loop.speeds[-1] == 0.0
+    assert loop.rig.refused(Reason.FAULT) > 0
+
+
+@pytest.mark.parametrize(
+    ("word", "watchdog"), [(Word.BRAIN_ALIVE, Watchdog.BRAIN), (Word.RECORDER_ALIVE, Watchdog.RECORDER)]
+)
+@settings(max_examples=30)
+@given(timeout_ms=st.integers(1, 400), dies=st.integers(1, 60), phase=st.integers(0, TICK_NS - 1))
+def test_silence_stops_the_robot_at_its_time_out(word, watchdog, timeout_ms, dies, phase):
+    """Counted in ticks: the first that starts more than the time-out after the last sign of life, and no other."""
+    other = Word.RECORDER_ALIVE if word == Word.BRAIN_ALIVE else Word.BRAIN_ALIVE
+    loop = VirtualLoop(LoopLimits(**{f"{watchdog.name.lower()}_timeout_s": timeout_ms / 1e3}), alive=(word, other))
+    ticks = dies + timeout_ms * MS // TICK_NS + STOPPING_TICKS
+    start = loop.now
+
+    def die() -> None:
+        loop.alive.discard(word)
+        loop.words[word] = start + (dies - 1) * TICK_NS + phase
+
+    loop.script[dies] = die
+    loop.drive(0, ticks)  # the brain's other half goes on sending: that must not move the robot again
+    loop.run(ticks)
+    last_life = (dies - 1) * TICK_NS + phase
+    stopped = loop.modes.index(Mode.STOPPING)
+    assert stopped * TICK_NS - last_life > timeout_ms * MS >= (stopped - 1) * TICK_NS - last_life
+    assert loop.modes[:stopped] == [Mode.TRACKING] * stopped
+    hold = loop.modes.index(Mode.HOLD)
+    assert loop.modes[stopped:] == [Mode.STOPPING] * (hold - stopped) + [Mode.HOLD] * (ticks - hold)
+    assert loop.speeds[hold:] == [0.0] * (ticks - hold)
+    assert np.all(np.diff(loop.speeds[stopped : hold + 1]) <= 0)
+    assert loop.watchdogs[stopped] == watchdog
+    assert not any(loop.watchdogs[:stopped])
+
+
+def test_a_sign_of_life_after_the_silence_and_a_new_setpoint_move_it_again():
+    loop = VirtualLoop(LoopLimits(brain_timeout_s=0.05), alive=(Word.BRAIN_ALIVE,))
+    loop.script[20] = loop.alive.clear
+    loop.script[300] = lambda: loop.alive.add(Word.BRAIN_ALIVE)
+    loop.drive(0, 20)
+    loop.drive(302, 320)
+    loop.run(320)
+    assert loop.modes[299] == loop.modes[301] == Mode.HOLD  # life alone moves nothing
+    assert loop.modes[-1] == Mode.TRACKING
+
+
+def test_what_does_not_watch_is_not_watched():
+    """A word that was never written belongs to a process that there is not."""
+    loop = VirtualLoop(LoopLimits(brain_timeout_s=0.01, recorder_timeout_s=0.01, plant_timeout_s=0.01))
+    loop.drive(0, 100)
+    loop.run(100)
+    assert set(loop.modes) == {Mode.TRACKING}
+
+
+@given(timeout_ms=st.integers(1, 100))
+def test_a_silent_plant_is_a_fault_at_its_time_out(timeout_ms):
+    loop = VirtualLoop(LoopLimits(plant_timeout_s=timeout_ms / 1e3), alive=(Word.PLANT_ALIVE,))
+    loop.script[10] = loop.alive.clear  # its last sign of life was when tick 9 ended
+    loop.run(60)
+    fault = loop.modes.index(Mode.FAULT)
+    assert (fault - 9) * TICK_NS > timeout_ms * MS >= (fault - 10) * TICK_NS
+    assert loop.watchdogs[fault] == Watchdog.PLANT
+    assert set(loop.modes[fault:]) == {Mode.FAULT}
+
+
+@settings(max_examples=40)
+@given(tick=st.integers(1, 60), delays=LATE)
+def test_the_stop_word_takes_effect_at_the_next_executed_tick(tick, delays):
+    loop = VirtualLoop(delays=delays)
+    loop.drive(0, 150)
+    driving = loop.script[tick]
+
+    def press() -> None:
+        driving()
+        loop.words[Word.ESTOP] = 1
+
+    loop.script[tick] = press
+    loop.run(150)
+    assert Mode.ESTOP not in loop.modes[:tick]
+    assert set(loop.modes[tick:]) == {Mode.ESTOP}
+    # The command is a braking one with that tick already, and stays so.
+    assert loop.speeds[tick] < loop.speeds[tick - 1] or loop.speeds[tick] == 0.0
+    assert np.all(np.diff(loop.speeds[tick - 1 :]) <= 0)
+    assert loop.speeds[-1] == 0.0
+    assert loop.words[Word.ESTOP] == 1  # nobody but a reset clears it
+
+
+def test_reset_and_activation_lead_out_of_an_emergency_stop_between_late_ticks():
+    """Requests are answered once a tick, also while ticks are late; a reset is refused until the robot is at rest."""
+    loop = VirtualLoop(delays=tuple([0] * 30 + [3 * TICK_NS] * 200))
+    answers: list[int] = []
+    wanted = [Request.RESET]
+
+    def serve(now_ns: int) -> None:
+        if len(loop.slots) > 31 and wanted:
+            reason = int(loop.rig.request(wanted[0]).reasons[0])
+            answers.append(reason)
+            if reason == Reason.ACCEPTED:
+                wanted[0:1] = [Request.ACTIVATE] if wanted[0] == Request.RESET else []
+
+    loop.loop._serve = serve
+    loop.drive(0, 30)
+    loop.script[31] = lambda: loop.words.__setitem__(int(Word.ESTOP), 1)
+    loop.run(100)
+    refusals = answers.count(Reason.NOT_AT_REST)
+    assert refusals > 0
+    assert answers == [Reason.NOT_AT_REST] * refusals + [Reason.ACCEPTED] * 2
+    assert loop.modes[-1] == Mode.HOLD
+    assert loop.words[Word.ESTOP] == 0
+
+
+def test_a_pause_ends_the_stretch_and_the_next_one_starts_at_tick_0():
+    loop = VirtualLoop(delays=(3 * TICK_NS,))
+    seen: list[int] = []
+    loop.script[0] = lambda: seen.append(int(loop.words[Word.PHASE]))
+    first = loop.run(5)
+    assert loop.words[Word.PHASE] == Phase.STANDING
+    assert (first.executed, first.skipped) == (5, 2)
+    loop.now += 12345 * MS
+    begin = loop.now
+    second = loop.run(7)
+    assert loop.words[Word.STRETCH] == 2
+    assert loop.words[Word.START] == begin
+    assert [slot.index for slot in loop.slots[5:]] == list(range(7))
+    assert loop.slots[5].due_ns == begin
+    assert (second.executed, loop.words[Word.EXECUTED], loop.words[Word.SKIPPED]) == (7, 7, 0)
+    assert loop.served[5:] == [k * TICK_NS for k in range(7)]
+    assert seen == [Phase.STARTING, Phase.STANDING]
+
+
+@pytest.mark.parametrize("word", [Word.PAUSE, Word.END])
+def test_a_word_that_is_set_already_runs_no_tick(word):
+    loop = VirtualLoop()
+    loop.words[word] = 1
+    grid = loop.loop.run()
+    assert (grid.executed, len(loop.slots)) == (0, 0)
+    assert loop.words[Word.PHASE] == Phase.STANDING
+
+
+def test_without_a_start_tick_0_is_a_period_away():
+    loop = VirtualLoop()
+    loop.until = 1
+    begin = loop.now
+    loop.loop.run()
+    assert loop.slots[0].due_ns == begin + TICK_NS == loop.words[Word.START]

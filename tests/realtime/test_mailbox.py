@@ -1,0 +1,80 @@
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.realtime.mailbox import Mailbox
+from tests.realtime.mail_support import CAPACITY, RECORD, record, shared_block, start
+
+
+def number_of(value: np.void | None) -> int | None:
+    if value is None:
+        return None
+    assert (value["copies"] == value["number"]).all()
+    assert value["flag"] == value["number"] % 2
+    return int(value["number"])
+
+
+@given(st.lists(st.booleans(), max_size=60), st.integers(1, 7))
+def test_it_behaves_like_a_bounded_queue(posts: list[bool], capacity: int) -> None:
+    mailbox, model = Mailbox(RECORD, capacity), deque[int]()
+    for number, is_post in enumerate(posts):
+        if is_post:
+            accepted = mailbox.post(record(number))
+            assert accepted == (len(model) < capacity)
+            if accepted:
+                model.append(number)
+        else:
+            assert number_of(mailbox.take()) == (model.popleft() if model else None)
+        assert len(mailbox) == len(model)
+        assert mailbox.full == (len(model) == capacity)
+
+
+def test_a_record_is_a_copy_on_both_ways() -> None:
+    mailbox, value = Mailbox(RECORD, 1), record(1)
+    assert mailbox.post(value)
+    value["copies"] = 9
+    taken = mailbox.take()
+    assert mailbox.post(record(2))
+    assert number_of(taken) == 1
+
+
+@pytest.mark.parametrize("capacity", [0, -1])
+def test_a_mailbox_has_room(capacity: int) -> None:
+    with pytest.raises(ConfigError, match=str(capacity)):
+        Mailbox(RECORD, capacity)
+
+
+def test_the_block_of_memory_has_the_stated_size() -> None:
+    size = Mailbox.nbytes(RECORD, 3)
+    assert size % 8 == 0  # whatever follows it is aligned
+    mailbox = Mailbox(RECORD, 3, bytearray(size))
+    assert [mailbox.post(record(number)) for number in range(4)] == [True] * 3 + [False]
+    with pytest.raises(ValueError, match="buffer"):
+        Mailbox(RECORD, 3, bytearray(size - 1))
+
+
+def test_two_objects_on_one_block_are_one_mailbox() -> None:
+    block = bytearray(Mailbox.nbytes(RECORD, CAPACITY))
+    writer, reader = Mailbox(RECORD, CAPACITY, block), Mailbox(RECORD, CAPACITY, block)
+    for number in range(20):
+        assert reader.take() is None
+        assert writer.post(record(number))
+        assert len(reader) == 1
+        assert number_of(reader.take()) == number
+
+
+def test_between_two_processes_nothing_is_lost_reordered_or_torn(tmp_path: Path) -> None:
+    count, path = 3000, tmp_path / "block"
+    mailbox = Mailbox(RECORD, CAPACITY, shared_block(path, Mailbox.nbytes(RECORD, CAPACITY)))
+    process = start("post_numbers", path, count)
+    for number in range(count):
+        while (taken := mailbox.take()) is None:
+            assert process.poll() is None or len(mailbox)
+        assert number_of(taken) == number
+    assert process.wait() == 0
+    assert mailbox.take() is None

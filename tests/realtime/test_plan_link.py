@@ -1,0 +1,400 @@
+"""Plans from another process: what is asked for is what is planned, and what is played is never overwritten."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bhd_lerobot.control.commands import BrainCommand, ResultCode
+from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
+from bhd_lerobot.control.motion.planning import MIN_LEAD
+from bhd_lerobot.control.motion.trajectory import PlanFailure, State
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
+from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, joints, moved
+from tests.control.motion.test_goal_properties import goals
+from tests.realtime.mail_support import DURATION_S, RampPlanner, shared_block, start
+
+PLANNER = GoalPlanner(ARM, HZ, KINEMATICS)
+STATE = State.of(*np.arange(21.0).reshape(3, 7))
+
+
+def ramp(ticks: int, step: float = 1.0, **fields: Any) -> BrainCommand:
+    return BrainCommand("x" * 200, gripper=step, timeout_s=float(ticks), **fields)  # a planner needs no name
+
+
+def linked(planner: Any = None) -> tuple[PlanLink, PlanServer, Any, bytearray]:
+    planner = planner or RampPlanner()
+    block = bytearray(PlanLink.nbytes(planner.dof, planner.hz, DURATION_S))
+    link = PlanLink(block, planner.dof, planner.hz, duration_s=DURATION_S)
+    return link, PlanServer(block, planner, duration_s=DURATION_S), planner, block
+
+
+def answer(link: PlanLink) -> Plan:
+    plan = link.poll(0)
+    assert isinstance(plan, Plan)
+    return plan
+
+
+# --- one request -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        BrainCommand("a", joint_target=joints(0.3)),
+        BrainCommand("b", target_pose=moved(0.05), motion="line", gripper=0.02),
+        BrainCommand("c", gripper=0.0),
+    ],
+)
+def test_a_plan_is_the_planners_bit_for_bit_and_lies_in_the_shared_memory(command: BrainCommand) -> None:
+    block = bytearray(PlanLink.nbytes(6, HZ))
+    link, server = PlanLink(block, 6, HZ), PlanServer(block, PLANNER)
+    state = State.at_rest(HOME)
+    assert not server.serve_once()
+    link.request(0, command, state, 0.05, 17)
+    assert link.poll(0) is None
+    assert server.serve_once()
+    plan = answer(link)
+    assert plan.rows is not None
+    assert np.shares_memory(plan.rows, np.frombuffer(block, np.uint8))
+    expected = PLANNER.plan(command, *np.array((state.position, state.velocity, state.acceleration)), opening=0.05)
+    assert isinstance(expected, Plan)
+    for name in ("position", "velocity", "acceleration"):
+        assert np.array_equal(getattr(plan.trajectory, name), getattr(expected.trajectory, name))
+        assert np.shares_memory(getattr(plan.trajectory, name), plan.rows)
+    assert np.array_equal(plan.target, expected.target)
+    assert not server.serve_once()
+    assert link.poll(0) is None  # once
+
+
+@pytest.mark.parametrize("opening", [None, 0.0, 0.04])
+def test_the_state_and_the_opening_arrive(opening: float | None) -> None:
+    link, server, _, _ = linked()
+    link.request(0, ramp(3, 0.5), STATE, opening, 0)
+    server.serve_once()
+    plan = answer(link)
+    for name in ("position", "velocity", "acceleration"):
+        expected = getattr(STATE, name) + 0.5 * np.arange(1, 4)[:, None]
+        assert np.array_equal(getattr(plan.trajectory, name), expected)
+    assert plan.target.tolist() == [-1.0 if opening is None else opening] * 7
+
+
+def test_a_failure_arrives_with_its_words() -> None:
+    link, server, _, _ = linked()
+    link.request(0, ramp(3, max_velocity=0.25), STATE, None, 0)
+    server.serve_once()
+    failure = link.poll(0)
+    assert isinstance(failure, PlanFailure)
+    assert failure.code == ResultCode.UNREACHABLE
+    assert failure.message.startswith("0.25 is what was asked for. éé")
+    assert failure.message.endswith("é…")
+
+
+def test_a_planner_that_raises_fails_one_goal_and_plans_the_next(caplog: pytest.LogCaptureFixture) -> None:
+    link, server, _, _ = linked()
+    link.request(0, ramp(3, max_acceleration=1.0), STATE, None, 0)
+    assert server.serve_once()
+    failure = link.poll(0)
+    assert isinstance(failure, PlanFailure)
+    assert failure.code == ResultCode.PLANNING_FAILED
+    assert "ZeroDivisionError: no planner plans this" in failure.message
+    assert "Traceback" in caplog.text
+    link.request(0, ramp(3), STATE, None, 0)
+    assert server.serve_once()
+    assert answer(link).trajectory.ticks == 3
+
+
+def test_a_trajectory_that_is_too_long_for_the_memory_is_a_failure() -> None:
+    link, server, _, _ = linked()
+    room = round((DURATION_S + 5) * 100)
+    for ticks, fits in ((room, True), (room + 1, False), (3, True)):
+        link.request(0, ramp(ticks), STATE, None, 0)
+        server.serve_once()
+        plan = link.poll(0)
+        assert isinstance(plan, Plan) == fits
+        if isinstance(plan, PlanFailure):
+            assert plan.code == ResultCode.PLANNING_FAILED
+            assert "there is room for 6 s" in plan.message
+
+
+# --- requests that are not wanted any more ---------------------------------------------------------------------------
+
+
+def test_what_is_dropped_is_not_planned() -> None:
+    link, server, planner, _ = linked()
+    link.request(0, ramp(3), STATE, None, 0)
+    link.drop(0)
+    assert server.serve_once()
+    assert planner.planned == []
+    assert link.poll(0) is None
+
+
+def test_an_answer_to_an_older_request_is_ignored() -> None:
+    link, server, planner, _ = linked()
+    plan = planner.plan
+
+    def interrupted(command: BrainCommand, *state: Any, **options: Any) -> Any:
+        planner.plan = plan
+        link.drop(0)
+        link.request(0, ramp(7), STATE, None, 0)
+        return plan(command, *state, **options)
+
+    planner.plan = interrupted
+    link.request(0, ramp(3), STATE, None, 0)
+    assert server.serve_once()
+    assert link.poll(0) is None
+    assert server.serve_once()
+    assert answer(link).trajectory.ticks == 7
+    assert len(planner.planned) == 2
+
+
+def test_a_newer_request_takes_the_place_of_one_that_was_not_dropped() -> None:
+    link, server, planner, _ = linked()
+    for ticks in (3, 5):
+        link.request(0, ramp(ticks), STATE, None, 0)
+    assert server.serve_once()
+    assert answer(link).trajectory.ticks == 5
+    assert len(planner.planned) == 1
+
+
+@given(st.lists(st.sampled_from(["ask", "serve", "poll", "begin", "drop"]), max_size=60))
+def test_the_rows_that_are_played_are_never_written_to(steps: list[str]) -> None:
+    link, server, _, _ = linked()
+    playing: tuple[np.ndarray, np.ndarray] | None = None
+    polled: Plan | None = None
+    asked = 0
+    for step in steps:
+        if step == "ask":
+            asked, polled = asked + 1, None
+            link.request(0, ramp(3, float(asked)), STATE, None, 0)
+        elif step == "serve":
+            server.serve_once()
+        elif step == "poll" and (plan := link.poll(0)) is not None:
+            polled = plan
+            assert isinstance(plan, Plan)
+            assert plan.trajectory.position[0, 0] == asked
+        elif step == "begin" and polled is not None:
+            link.begin(0)
+            assert polled.rows is not None
+            playing, polled = (polled.rows, polled.rows.copy()), None
+        elif step == "drop":
+            link.drop(0)
+            polled = None
+        if playing is not None:
+            assert np.array_equal(*playing)
+        if polled is not None:
+            assert polled.trajectory.position[0, 0] == asked
+
+
+# --- processes that end ----------------------------------------------------------------------------------------------
+
+
+def test_a_half_written_request_is_not_read() -> None:
+    link, server, planner, block = linked()
+    link.request(0, ramp(3), STATE, None, 0)
+    guard = np.frombuffer(block, np.int64, 1)
+    guard += 1
+    assert not server.serve_once()
+    # Whoever was killed while writing is followed by somebody who can write again.
+    again = PlanLink(block, 6, 100, duration_s=DURATION_S)
+    assert guard[0] % 2 == 0
+    again.request(0, ramp(4), STATE, None, 0)
+    assert server.serve_once()
+    assert answer(again).trajectory.ticks == 4
+    assert len(planner.planned) == 1
+
+
+def test_a_request_that_changes_while_it_is_read_is_read_again() -> None:
+    link, server, _, _ = linked()
+    link.request(0, ramp(3), STATE, None, 0)
+    header = server._header
+
+    class Interrupted:
+        def __getitem__(self, name: str) -> Any:
+            value = header[name].copy()
+            link.request(0, ramp(5), STATE, None, 0)
+            return value
+
+    server._header = Interrupted()
+    assert not server.serve_once()
+    server._header = header
+    assert server.serve_once()
+    assert answer(link).trajectory.ticks == 5
+
+
+def test_a_planner_that_is_started_anew_answers_what_was_not_answered_and_nothing_else() -> None:
+    link, server, planner, block = linked()
+    link.request(0, ramp(3), STATE, None, 0)
+    assert server.serve_once()
+    assert not PlanServer(block, planner, duration_s=DURATION_S).serve_once()
+    link.request(0, ramp(5), STATE, None, 0)
+    assert PlanServer(block, planner, duration_s=DURATION_S).serve_once()
+    assert answer(link).trajectory.ticks == 5
+
+
+def test_it_serves_until_it_is_told_to_stop() -> None:
+    link, server, planner, _ = linked()
+    sleeps = []
+
+    def sleep() -> None:
+        sleeps.append(len(planner.planned))
+        link.request(0, ramp(2), STATE, None, 0)
+
+    server.serve(lambda: len(planner.planned) == 3, sleep)
+    assert sleeps == [0, 1, 2]
+
+
+def test_another_process_plans(tmp_path: Path) -> None:
+    path, count = tmp_path / "block", 200
+    block = shared_block(path, PlanLink.nbytes(6, 100, DURATION_S))
+    link = PlanLink(block, 6, 100, duration_s=DURATION_S)
+    process = start("serve_plans", path, count)
+    kept: tuple[np.ndarray, np.ndarray] | None = None
+    for number in range(1, count + 1):
+        link.request(0, ramp(1 + number % 500, float(number)), STATE, 0.01 * number, 0)
+        while (plan := link.poll(0)) is None:
+            assert process.poll() is None or number == count
+        assert isinstance(plan, Plan)
+        assert plan.rows is not None
+        steps = number * np.arange(1, 2 + number % 500)
+        assert np.array_equal(plan.rows[:, 1, 2], STATE.velocity[2] + steps)
+        assert plan.target.tolist() == [0.01 * number] * 7
+        assert kept is None or np.array_equal(*kept)
+        if number % 3:
+            link.begin(0)
+            kept = plan.rows, plan.rows.copy()
+    assert process.wait() == 0
+
+
+# --- all together ----------------------------------------------------------------------------------------------------
+
+
+class Scribbler(PlanServer):
+    """A planner's side that takes its time, and leaves rubbish where it may write while the arm goes on."""
+
+    def __init__(self, world: "World", latencies: list[int]) -> None:
+        super().__init__(world.block, PLANNER, duration_s=world.duration_s)
+        self.world, self.latencies = world, iter(latencies)
+
+    def _plan(self, request: Any, capacity: int) -> Plan | PlanFailure:
+        rows = self._memory.rows[int(request["block"])]
+        rows[:] = np.nan
+        self.world.pass_ticks(next(self.latencies, 0))
+        rows[:] = np.nan
+        return super()._plan(request, capacity)
+
+
+class World:
+    """A rig whose planner runs when ticks have passed, and a script of what is done at which tick."""
+
+    duration_s = 6.0
+
+    def __init__(self, script: list, latencies: list[int], lead_s: float) -> None:
+        self.block = bytearray(PlanLink.nbytes(6, HZ, self.duration_s))
+        self.link = PlanLink(self.block, 6, HZ, lead_s=lead_s, timeout_s=0.4, duration_s=self.duration_s)
+        self.rig = Rig(planning=self.link)  # type: ignore[arg-type]
+        self.server = Scribbler(self, latencies)
+        self.shared = np.frombuffer(self.block, np.uint8)
+        self.script = iter(script)
+        self.pause = self.number = 0
+        self.ended = False
+        self.due: Counter = Counter()
+        self.played: tuple[Any, Any] = (None, None)
+
+    def pass_ticks(self, ticks: int) -> None:
+        for _ in range(ticks):
+            while self.pause == 0 and not self.ended:
+                self.act()
+            self.pause -= 1
+            self.rig.tick()
+            self.check_rows()
+
+    def act(self) -> None:
+        action = next(self.script, None)
+        if action is None:
+            self.ended = True
+            return
+        (kind, value), self.pause = action
+        name = str(self.number)
+        self.number += 1
+        if kind == "goal":
+            self.rig.go(name, **value)
+            self.due[name] += 1
+        elif kind == "cancel":
+            self.rig.manager.cancel(0, str(value))
+        else:
+            self.rig.stop(ResultCode.ESTOP if value else ResultCode.CANCELLED, value)
+
+    def check_rows(self) -> None:
+        player = self.rig.manager._player
+        source = player._source
+        if not player.active[0] or not np.shares_memory(source, self.shared):
+            self.played = None, None
+            return
+        if self.played[0] is not source:
+            self.played = source, source.copy()
+        assert np.array_equal(source, self.played[1])
+
+    def run(self) -> None:
+        for _ in range(100_000):
+            self.pass_ticks(1)
+            self.server.serve_once()
+            if self.ended and not self.rig.manager.busy.any():
+                return
+        raise AssertionError("still busy")
+
+
+others = st.tuples(st.just("cancel"), st.integers(0, 8)) | st.tuples(st.just("stop"), st.booleans())
+actions = st.tuples(st.one_of(goals, goals, others), st.integers(0, 5) | st.integers(0, 400))
+
+
+@settings(max_examples=60)
+@given(st.lists(actions, min_size=1, max_size=7), st.lists(st.integers(0, 300), max_size=10), st.integers(MIN_LEAD, 40))
+def test_whatever_happens_while_another_process_plans(script: list, latencies: list[int], lead: int) -> None:
+    world = World(script, latencies, lead / HZ)
+    world.run()
+    world.rig.check()
+    results = world.rig.manager.take_results(0)
+    assert Counter(result.task_id for result in results) == world.due
+    assert all(result.message for result in results)
+    assert not world.rig.velocity.any()
+
+
+def test_a_sequence_of_goals_is_played_from_the_shared_memory() -> None:
+    goals_ = [(("goal", {"joint_target": joints(0.3 * k)}), 0) for k in (1, -1, 2)]
+    world = World(goals_, [5, 5, 5], 0.025)
+    shared_ticks = 0
+    while not world.ended or world.rig.manager.busy.any():
+        world.pass_ticks(1)
+        world.server.serve_once()
+        shared_ticks += world.played[0] is not None
+    assert [code for _, code in world.rig.results()] == [ResultCode.SUCCEEDED] * 3
+    assert shared_ticks > HZ
+    assert world.rig.position[0, :6].tolist() == list(joints(0.6))
+
+
+# --- numbers ---------------------------------------------------------------------------------------------------------
+
+
+def test_another_process_plans_for_one_arm_only() -> None:
+    link, _, _, _ = linked()
+    with pytest.raises(ConfigError, match="arm 1"):
+        link.request(1, ramp(3), STATE, None, 0)
+
+
+def test_the_block_of_memory_has_the_stated_size() -> None:
+    size = PlanLink.nbytes(6, 100, 2.0)
+    PlanLink(bytearray(size), 6, 100, duration_s=2.0)
+    with pytest.raises(ValueError, match="buffer"):
+        PlanLink(bytearray(size - 1), 6, 100, duration_s=2.0)
+
+
+@pytest.mark.parametrize("timeout_s", [0.0, -1.0, np.nan, np.inf])
+def test_a_timeout_is_positive(timeout_s: float) -> None:
+    with pytest.raises(ConfigError, match="time-out is"):
+        PlanLink(bytearray(PlanLink.nbytes(6, 100)), 6, 100, timeout_s=timeout_s)

@@ -1,0 +1,393 @@
+"""Real-time privileges: granted, refused, required, given back; with a faked kernel, and for real in a child."""
+
+import errno
+import gc
+import json
+import os
+import pickle
+import resource
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.realtime.privileges import (
+    GRANT_BANDWIDTH,
+    GRANT_LATENCY_FILE,
+    Grant,
+    Privileges,
+    RealtimeSettings,
+    describe_refusals,
+)
+from bhd_lerobot.realtime.system_calls import CAP_IPC_LOCK, CAP_SYS_NICE, MCL_CURRENT, MCL_FUTURE, SystemCalls
+
+FIFO = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+NAMES = ["collector", "memory lock", "cpu latency", "timer slack", "scheduler"]
+INITIAL = {
+    "scheduler": (os.SCHED_OTHER, 0),
+    "affinity": {0, 1, 2},
+    "slack": 50_000,
+    "locked": 0,
+    "latency": None,
+}
+
+
+class FakeKernel(SystemCalls):
+    """A kernel that refuses what it is told to, and remembers the rest."""
+
+    def __init__(
+        self, *refused: str, capabilities: tuple[int, ...] = (CAP_SYS_NICE, CAP_IPC_LOCK), limit: int = 0
+    ) -> None:
+        self.refused = set(refused)
+        self.state: dict[str, Any] = dict(INITIAL)
+        self._capabilities = sum(1 << bit for bit in capabilities)
+        self._limit = limit
+
+    def _do(self, name: str, key: str, value: object) -> None:
+        if name in self.refused:
+            raise PermissionError(errno.EPERM, "Operation not permitted")
+        self.state[key] = value
+
+    def scheduler(self) -> tuple[int, int]:
+        return self.state["scheduler"]
+
+    def set_scheduler(self, policy: int, priority: int) -> None:
+        cleared = self.state["scheduler"][0] & ~policy & os.SCHED_RESET_ON_FORK
+        if cleared and "clear the flag" in self.refused:
+            raise PermissionError(errno.EPERM, "Operation not permitted")
+        self._do("scheduler", "scheduler", (policy, priority))
+
+    def affinity(self) -> set[int]:
+        return self.state["affinity"]
+
+    def set_affinity(self, processors: set[int]) -> None:
+        self._do("affinity", "affinity", processors)
+
+    def timer_slack(self) -> int:
+        return self.state["slack"]
+
+    def set_timer_slack(self, slack: int) -> None:
+        self._do("timer slack", "slack", slack)
+
+    def lock_memory(self, flags: int) -> None:
+        self._do("memory lock", "locked", flags)
+
+    def unlock_memory(self) -> None:
+        self.state["locked"] = 0
+
+    def hold_cpu_latency(self, latency_us: int) -> int:
+        self._do("cpu latency", "latency", latency_us)
+        return 7
+
+    def close(self, handle: int) -> None:
+        assert handle == 7
+        self.state["latency"] = None
+
+    def limit(self, which: int) -> int:
+        return self._limit
+
+    def capabilities(self) -> int:
+        return self._capabilities
+
+
+@pytest.fixture(autouse=True)
+def collector() -> Iterator[None]:
+    """The collector of the process that tests is real: it must be as before, whatever a test does."""
+    assert gc.isenabled()
+    frozen = gc.get_freeze_count()
+    yield
+    enabled = gc.isenabled()
+    gc.enable()
+    assert enabled
+    assert gc.get_freeze_count() <= frozen
+
+
+def one_cpu() -> tuple[int, ...]:
+    return (min(os.sched_getaffinity(0)),)
+
+
+# --- settings --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("priority", [0, 100, -1, True, 80.0])
+def test_a_priority_that_there_is_not_is_refused(priority: Any) -> None:
+    with pytest.raises(ConfigError, match=f"{priority!r}; it must be a whole number from 1 to 99"):
+        RealtimeSettings(priority=priority)
+
+
+def test_a_processor_that_there_is_not_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"processor\(s\) 4096; this process may run on .*Leave the affinity empty"):
+        RealtimeSettings(affinity=(*one_cpu(), 4096))
+
+
+def test_settings_and_grants_travel_to_and_from_a_process() -> None:
+    settings = RealtimeSettings(priority=20, affinity=one_cpu(), require=True)
+    assert pickle.loads(pickle.dumps(settings)) == settings
+    grant = Grant("scheduler", "SCHED_FIFO", False, "no", "ask")
+    assert pickle.loads(pickle.dumps(grant)) == grant
+    assert Grant(**json.loads(json.dumps(grant.as_dict()))) == grant
+
+
+# --- a faked kernel --------------------------------------------------------------------------------------------------
+
+
+def test_everything_is_granted_and_given_back() -> None:
+    kernel = FakeKernel()
+    privileges = Privileges(kernel)
+    grants = privileges.acquire(RealtimeSettings(priority=81, affinity=one_cpu()))
+    assert [grant.name for grant in grants] == ["affinity", *NAMES]
+    assert all(grant.granted and grant.detail and not grant.remedy for grant in grants)
+    assert describe_refusals(grants) == ""
+    assert kernel.state == {
+        "scheduler": (FIFO, 81),
+        "affinity": set(one_cpu()),
+        "slack": 1,
+        "locked": MCL_CURRENT | MCL_FUTURE,
+        "latency": 0,
+    }
+    assert not gc.isenabled()
+    assert gc.get_freeze_count() > 1000
+    privileges.release()
+    assert kernel.state == INITIAL
+    assert gc.isenabled()
+    assert gc.get_freeze_count() == 0
+    privileges.release()
+
+
+def test_only_what_is_wanted_is_asked_for() -> None:
+    kernel = FakeKernel()
+    settings = RealtimeSettings(lock_memory=False, hold_cpu_latency=False, freeze_collector=False)
+    with Privileges(kernel) as privileges:
+        assert [grant.name for grant in privileges.acquire(settings)] == ["timer slack", "scheduler"]
+        assert kernel.state == {**INITIAL, "slack": 1, "scheduler": (FIFO, 80)}
+        assert gc.isenabled()
+    assert kernel.state == INITIAL
+
+
+@pytest.mark.parametrize("name", ["affinity", "memory lock", "cpu latency", "timer slack", "scheduler"])
+def test_one_refusal_is_reported_with_a_remedy_and_stops_nothing_else(name: str) -> None:
+    kernel = FakeKernel(name, capabilities=())
+    with Privileges(kernel) as privileges:
+        grants = privileges.acquire(RealtimeSettings(affinity=one_cpu()))
+        # Without the capability and within a limit, what comes later is not locked, so that is a refusal, too.
+        refused = {name, "memory lock"}
+        assert {grant.name for grant in grants if not grant.granted} == refused
+        grant = next(grant for grant in grants if grant.name == name)
+        assert "Operation not permitted" in grant.detail
+        assert grant.remedy
+        lines = describe_refusals(grants).splitlines()
+        assert len(lines) == len(refused)
+        assert any(line.startswith(f"real time: {name} refused") and grant.remedy in line for line in lines)
+    assert kernel.state == INITIAL
+
+
+def test_without_the_right_the_fall_back_is_named_with_every_way_to_the_right() -> None:
+    kernel = FakeKernel("scheduler", capabilities=())
+    with Privileges(kernel) as privileges:
+        grant = privileges.acquire(RealtimeSettings(priority=97))[-1]
+        assert kernel.state["scheduler"] == (os.SCHED_OTHER, 0)
+        assert kernel.state["slack"] == 1
+    assert "SCHED_OTHER with a timer slack of 1 ns" in grant.detail
+    for part in (
+        f"setcap cap_sys_nice,cap_ipc_lock+ep {os.path.realpath(sys.executable)}",
+        "@realtime - rtprio 97",  # a limit of 95 would not do for this priority
+        "--cap-add=SYS_NICE --cap-add=IPC_LOCK --ulimit rtprio=97 --ulimit memlock=-1",
+    ):
+        assert part in grant.remedy
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "limit"), [((CAP_SYS_NICE,), 0), ((), 80), ((), 95), ((), resource.RLIM_INFINITY)]
+)
+def test_who_has_the_right_and_is_refused_hears_of_control_groups(capabilities: tuple[int, ...], limit: int) -> None:
+    with Privileges(FakeKernel("scheduler", capabilities=capabilities, limit=limit)) as privileges:
+        assert privileges.acquire(RealtimeSettings())[-1].remedy == GRANT_BANDWIDTH
+
+
+def test_a_limit_below_the_priority_is_no_right() -> None:
+    with Privileges(FakeKernel("scheduler", capabilities=(), limit=79)) as privileges:
+        assert "setcap" in privileges.acquire(RealtimeSettings())[-1].remedy
+
+
+def test_within_a_limit_future_memory_is_not_locked_because_an_allocation_could_then_fail() -> None:
+    kernel = FakeKernel(capabilities=(CAP_SYS_NICE,), limit=8192 * 1024)
+    with Privileges(kernel) as privileges:
+        grant = next(g for g in privileges.acquire(RealtimeSettings()) if g.name == "memory lock")
+        assert kernel.state["locked"] == MCL_CURRENT
+    assert not grant.granted
+    assert "8192 KiB" in grant.detail
+    assert "memlock" in grant.remedy
+
+
+def test_the_latency_file_has_a_remedy_of_its_own() -> None:
+    with Privileges(FakeKernel("cpu latency")) as privileges:
+        refused = [grant for grant in privileges.acquire(RealtimeSettings()) if not grant.granted]
+    assert [grant.remedy for grant in refused] == [GRANT_LATENCY_FILE]
+
+
+def test_required_and_refused_is_an_error_and_nothing_is_kept() -> None:
+    kernel = FakeKernel("scheduler", capabilities=())
+    with pytest.raises(RealtimeError, match=r"SCHED_FIFO priority 80.*refused.*setcap.*require_realtime = false"):
+        Privileges(kernel).acquire(RealtimeSettings(require=True))
+    assert kernel.state == INITIAL
+
+
+def test_requiring_concerns_the_scheduler_only() -> None:
+    with Privileges(FakeKernel("cpu latency", "memory lock")) as privileges:
+        assert privileges.acquire(RealtimeSettings(require=True))[-1].granted
+
+
+def test_an_unforeseen_error_keeps_nothing() -> None:
+    class Broken(FakeKernel):
+        def timer_slack(self) -> int:
+            raise RuntimeError("planted")
+
+    kernel = Broken()
+    with pytest.raises(RuntimeError, match="planted"):
+        Privileges(kernel).acquire(RealtimeSettings())
+    assert kernel.state == INITIAL
+
+
+def test_acquiring_twice_is_an_error_and_again_after_a_release_is_not() -> None:
+    with Privileges(FakeKernel()) as privileges:
+        privileges.acquire(RealtimeSettings())
+        with pytest.raises(RealtimeError, match="call release"):
+            privileges.acquire(RealtimeSettings())
+        privileges.release()
+        assert privileges.acquire(RealtimeSettings())[-1].granted
+
+
+def test_who_may_not_clear_the_flag_still_leaves_the_real_time_class() -> None:
+    kernel = FakeKernel("clear the flag")
+    with Privileges(kernel) as privileges:
+        privileges.acquire(RealtimeSettings())
+    assert kernel.state["scheduler"] == (os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, 0)
+
+
+def test_a_collector_that_was_off_stays_off() -> None:
+    gc.disable()
+    try:
+        with Privileges(FakeKernel()) as privileges:
+            privileges.acquire(RealtimeSettings())
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+# --- the real kernel, in a child process -----------------------------------------------------------------------------
+
+# Gives up the right to real-time priorities, as an ordinary user has none. Needs no right itself.
+GIVE_UP = """
+    import ctypes, resource
+    resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+    resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = (ctypes.c_uint32 * 2)(0x20080522, 0)  # version 3, this thread
+    data = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; twice 32 bits
+    assert libc.capget(header, data) == 0
+    for bit in (14, 23):
+        data[0] &= ~(1 << bit)
+        data[1] &= ~(1 << bit)
+    assert libc.capset(header, data) == 0, ctypes.get_errno()
+"""
+START = """
+    import gc, json, os, sys
+    from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
+    from bhd_lerobot.realtime.system_calls import SystemCalls
+    calls = SystemCalls()
+    before = [calls.scheduler(), calls.timer_slack(), sorted(calls.affinity())]
+"""
+REPORT = """
+    privileges = Privileges()
+    grants = privileges.acquire(RealtimeSettings(affinity=(min(os.sched_getaffinity(0)),)))
+    during = [calls.scheduler(), calls.timer_slack(), sorted(calls.affinity())]
+    kilobytes = next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmLck:"))
+    files = [os.readlink(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd")
+             if os.path.exists(f"/proc/self/fd/{n}")]
+    collecting = gc.isenabled()
+    reader, writer = os.pipe()
+    if (child := os.fork()) == 0:
+        os.write(writer, json.dumps(calls.scheduler()).encode())
+        os._exit(0)
+    forked = json.loads(os.read(reader, 100))
+    os.waitpid(child, 0)
+    privileges.release()
+    after = [calls.scheduler(), calls.timer_slack(), sorted(calls.affinity())]
+    print(json.dumps(dict(
+        before=before, during=during, after=after, forked=forked, kilobytes=kilobytes, files=files,
+        collecting=[collecting, gc.isenabled()], grants={g.name: g.as_dict() for g in grants},
+        unwanted=sorted({"torch", "lerobot", "mujoco"} & set(sys.modules)),
+    )))
+"""
+REQUIRE = """
+    Privileges().acquire(RealtimeSettings(require=True))
+"""
+
+
+def run(*parts: str) -> subprocess.CompletedProcess[str]:
+    program = "".join(textwrap.dedent(part) for part in parts)
+    return subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=False,
+        stdin=subprocess.DEVNULL,
+        cwd=Path(__file__).resolve().parents[2],
+    )
+
+
+def report(*parts: str) -> dict[str, Any]:
+    done = run(*parts)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_a_process_without_the_right_falls_back_and_says_how_to_get_it() -> None:
+    result = report(GIVE_UP, START, REPORT)
+    scheduler = result["grants"]["scheduler"]
+    assert not scheduler["granted"]
+    assert "Operation not permitted" in scheduler["detail"]
+    assert "SCHED_OTHER with a timer slack of 1 ns" in scheduler["detail"]
+    assert "setcap cap_sys_nice" in scheduler["remedy"]
+    assert result["during"][:2] == [[os.SCHED_OTHER, 0], 1]
+    assert result["after"] == result["before"]
+    memory = result["grants"]["memory lock"]
+    assert not memory["granted"]  # no interpreter fits into 64 KiB
+    assert "64 KiB" in memory["detail"]
+    assert result["kilobytes"] == 0
+    # What needs no right is granted all the same.
+    assert all(result["grants"][name]["granted"] for name in ("affinity", "collector", "timer slack"))
+    assert result["collecting"] == [False, True]
+
+
+def test_a_process_without_the_right_that_requires_it_ends_with_an_error() -> None:
+    done = run(GIVE_UP, START, REQUIRE)
+    assert done.returncode != 0
+    assert "RealtimeError: SCHED_FIFO priority 80, reset on fork is required and was refused." in done.stderr
+    assert "setcap" in done.stderr
+
+
+def test_a_process_has_what_its_grants_say_and_gives_it_back() -> None:
+    result = report(START, REPORT)
+    grants = result["grants"]
+    assert list(grants) == ["affinity", *NAMES]
+    assert all(bool(grant["remedy"]) != grant["granted"] for grant in grants.values())
+    if grants["scheduler"]["granted"]:
+        assert result["during"][0] == [FIFO, 80]
+    else:
+        assert result["during"][:2] == [result["before"][0], 1]
+    assert result["forked"] == [os.SCHED_OTHER, 0]
+    assert (result["kilobytes"] > 1000) >= grants["memory lock"]["granted"]
+    assert ("/dev/cpu_dma_latency" in result["files"]) == grants["cpu latency"]["granted"]
+    assert result["during"][2] == result["before"][2][:1]
+    assert result["collecting"] == [False, True]
+    # Who has the right by limit alone cannot clear the flag.
+    before, after = result["before"], result["after"]
+    assert after[0] in (before[0], [before[0][0] | os.SCHED_RESET_ON_FORK, 0])
+    assert after[1:] == before[1:]
+    assert result["unwanted"] == []

@@ -1,0 +1,352 @@
+"""A caller and a cerebellum in two parts of a test, on one virtual clock; between them only records in memory."""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.arm.controller import ArmController
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
+from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, Request
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.realtime.mailbox import Mailbox
+from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestKind, RequestServer, request_dtype
+from tests.control import support
+from tests.control.goal_rig import ARM, HOME, HZ, joints
+
+TICK_NS = NANOSECONDS // HZ
+
+
+class ObedientArm:
+    """A plant that is where it is commanded to be."""
+
+    n = 1
+
+    def __init__(self) -> None:
+        self.controller: ArmController | None = None
+        self.fault = False
+
+    def read(self, out: PlantReading) -> None:
+        out.position[:] = HOME if self.controller is None else self.controller.command
+        out.velocity[:] = 0.0 if self.controller is None else self.controller.velocity
+        out.fault[:] = self.fault
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        assert np.isfinite(ctrl).all()
+
+
+class Pair:
+    """A cerebellum that serves requests every tick, and a client that waits a tick at a time."""
+
+    def __init__(self, capacity: int = 4, events: int = 4, active: bool = True) -> None:
+        self.now_ns, self.alive = 0, True
+        plant, controller = ObedientArm(), ArmController(ARM, 1, HZ, HZ // 50)
+        controller.configure(np.array([0]), self.reading(plant))
+        plant.controller = controller
+        self.plant = plant
+        self.cerebellum = Cerebellum(ARM, plant, HZ, controller=controller)
+        blocks = [bytearray(Mailbox.nbytes(dtype, size)) for dtype, size in self.shapes(capacity, events)]
+        ours, theirs = (
+            [Mailbox(*shape, block) for shape, block in zip(self.shapes(capacity, events), blocks, strict=True)]
+            for _ in range(2)
+        )
+        self.server = RequestServer(self.cerebellum, *theirs)
+        self.requests, self.events = ours
+        self.client = RequestClient(*ours, self.tick, 0.1, lambda: self.now_ns)
+        if active:
+            assert self.client.request(Request.CONFIGURE) == Reason.ACCEPTED
+            assert self.client.request(Request.ACTIVATE) == Reason.ACCEPTED
+
+    @staticmethod
+    def shapes(capacity: int, events: int) -> list[tuple[np.dtype, int]]:
+        return [(request_dtype(6), capacity), (EVENT_DTYPE, events)]
+
+    @staticmethod
+    def reading(plant: ObedientArm) -> PlantReading:
+        reading = PlantReading(1, 7)
+        plant.read(reading)
+        return reading
+
+    def tick(self, ticks: int = 1) -> None:
+        for _ in range(ticks):
+            self.now_ns += TICK_NS
+            if self.alive:
+                self.server.serve(self.now_ns)
+                self.cerebellum.tick(self.now_ns)
+
+    def rest(self) -> None:
+        for _ in range(20_000):
+            if not self.cerebellum.controller.busy.any():
+                self.tick()
+                return
+            self.tick()
+        raise AssertionError("still busy")
+
+    @property
+    def mode(self) -> Mode:
+        return Mode(int(self.cerebellum.mode[0]))
+
+    def results(self) -> list[tuple[str, ResultCode]]:
+        return [(result.task_id, result.code) for result in self.client.take_results()]
+
+
+def goal(name: str, target: float = 0.2, **fields: Any) -> BrainCommand:
+    return BrainCommand(name, joint_target=joints(target), **fields)
+
+
+# --- each kind of request --------------------------------------------------------------------------------------------
+
+
+def test_modes() -> None:
+    pair = Pair(active=False)
+    assert pair.client.request(Request.ACTIVATE) == Reason.WRONG_MODE
+    assert pair.client.request(Request.CONFIGURE) == Reason.ACCEPTED
+    assert pair.client.request(Request.ACTIVATE) == Reason.ACCEPTED
+    assert pair.mode == Mode.HOLD
+    pair.cerebellum.estop_word[0] = 1
+    pair.tick()
+    assert pair.client.request(Request.ACTIVATE) == Reason.ESTOP
+    assert pair.client.request(Request.RESET) == Reason.ACCEPTED
+    assert pair.client.request(Request.ACTIVATE) == Reason.ACCEPTED
+    assert pair.client.request(Request.DEACTIVATE) == Reason.ACCEPTED
+    pair.tick(2)
+    assert pair.mode == Mode.SAFE_OFF
+
+
+def test_goals_and_their_results() -> None:
+    pair = Pair()
+    assert pair.client.submit(goal("a")) is None
+    assert pair.client.submit(goal("b", 0.3)) is None
+    pair.rest()
+    assert pair.results() == [("a", ResultCode.SUCCEEDED), ("b", ResultCode.SUCCEEDED)]
+    assert pair.results() == []
+    assert pair.cerebellum.command[0, :6].tolist() == list(joints(0.3))
+
+
+@pytest.mark.parametrize(
+    ("command", "code", "words"),
+    [
+        (goal("a", 99.0), ResultCode.JOINT_LIMIT, "must be within"),
+        (goal("a", max_velocity=-1.0), ResultCode.BAD_VELOCITY, "max_velocity is -1.0"),
+        (goal("é" * 33), ResultCode.BAD_TARGET, "66 bytes"),
+        (BrainCommand("a", joint_target=(1.0,)), ResultCode.BAD_TARGET, "6 numbers"),
+        (BrainCommand("a"), ResultCode.BAD_TARGET, "no target"),
+    ],
+)
+def test_a_refusal_is_also_the_goals_one_result(command: BrainCommand, code: ResultCode, words: str) -> None:
+    pair = Pair()
+    refusal = pair.client.submit(command)
+    assert refusal is not None
+    assert (refusal.code, refusal.success) == (code, False)
+    assert words in refusal.message
+    pair.tick()
+    assert pair.client.take_results() == [refusal]
+    assert not pair.cerebellum.controller.busy.any()
+
+
+@pytest.mark.parametrize("again", [goal("a"), BrainCommand("a", joint_target=(1.0,))], ids=["fits", "does not fit"])
+def test_a_goal_that_has_the_name_of_a_live_one_leaves_that_one_its_result(again: BrainCommand) -> None:
+    pair = Pair()
+    pair.client.submit(goal("a"))
+    assert pair.client.submit(again) is not None
+    assert pair.results() == []
+    pair.rest()
+    assert pair.results() == [("a", ResultCode.SUCCEEDED)]
+    refusal = pair.client.submit(again)
+    assert refusal is not None
+    pair.tick()
+    assert pair.client.take_results() == [refusal]
+
+
+def test_cancel() -> None:
+    pair = Pair()
+    pair.client.submit(goal("a", 2.0))
+    pair.tick(50)
+    assert pair.client.cancel("b") == ResultCode.UNKNOWN_ID
+    assert pair.client.cancel("x" * 65) == ResultCode.UNKNOWN_ID
+    assert pair.client.cancel("a") == ResultCode.SUCCEEDED
+    pair.rest()
+    assert pair.results() == [("a", ResultCode.CANCELLED)]
+
+
+def test_a_restart_forgets_results_and_names() -> None:
+    pair = Pair(events=2)
+    for name in "abcd":  # more than there is room for
+        pair.client.submit(goal(name, 99.0))
+    pair.client.submit(goal("live", 2.0))
+    for number in range(6):
+        pair.cerebellum.submit(0, goal(str(number), 99.0))
+    pair.tick(50)
+    pair.client.restart()
+    assert pair.results() == []
+    pair.tick(5)
+    assert pair.results() == []
+    assert pair.mode == Mode.UNCONFIGURED
+    pair.client.request(Request.CONFIGURE)
+    pair.client.request(Request.ACTIVATE)
+    assert pair.client.submit(goal("a")) is None
+    pair.rest()
+    assert pair.results() == [("a", ResultCode.SUCCEEDED)]
+
+
+def test_an_emergency_stop_ends_goals_and_refuses_others() -> None:
+    pair = Pair()
+    pair.client.submit(goal("a", 2.0))
+    pair.tick(50)
+    pair.cerebellum.estop_word[0] = 1
+    refusal = pair.client.submit(goal("b"))
+    assert refusal is not None
+    assert refusal.code == ResultCode.ESTOP
+    pair.rest()
+    assert Counter(pair.results()) == Counter([("a", ResultCode.ESTOP), ("b", ResultCode.ESTOP)])
+
+
+def test_a_robot_that_takes_no_goals_says_so() -> None:
+    rig = support.Rig()
+    requests, events = Mailbox(request_dtype(0)), Mailbox(EVENT_DTYPE)
+    server = RequestServer(rig.cerebellum, requests, events)
+    client = RequestClient(requests, events, lambda: server.serve(0), clock_ns=lambda: 0)
+    refusal = client.submit(BrainCommand("a", gripper=0.0))
+    assert refusal is not None
+    assert "takes setpoints" in refusal.message
+    assert client.cancel("a") == ResultCode.UNKNOWN_ID
+    assert client.request(Request.DEACTIVATE) == Reason.ACCEPTED
+
+
+# --- who does not answer ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", RequestKind)
+def test_a_cerebellum_that_does_not_answer_is_named_and_does_nothing_later(kind: RequestKind) -> None:
+    pair = Pair()
+    pair.client.submit(goal("live", 2.0))
+    pair.tick(50)
+    pair.alive = False
+    calls = {
+        RequestKind.MODE: lambda: pair.client.request(Request.DEACTIVATE),
+        RequestKind.GOAL: lambda: pair.client.submit(goal("a")),
+        RequestKind.CANCEL: lambda: pair.client.cancel("live"),
+        RequestKind.RESTART: pair.client.restart,
+    }
+    began = pair.now_ns
+    with pytest.raises(RealtimeError, match=f"has not answered a {kind.name} request within 0.1 s"):
+        calls[kind]()
+    assert pair.now_ns - began == pytest.approx(0.1e9, abs=2 * TICK_NS)
+    pair.alive = True
+    pair.tick(2)
+    assert pair.server.expired == 1
+    assert pair.mode == Mode.TRACKING
+    pair.rest()
+    assert pair.results() == [("live", ResultCode.SUCCEEDED)]
+
+
+def test_a_full_mailbox_is_waited_for_and_then_named() -> None:
+    pair = Pair(capacity=2)
+    pair.alive = False
+    for _ in range(4):
+        with pytest.raises(RealtimeError, match="has not answered"):
+            pair.client.submit(goal("a"))
+    assert len(pair.requests) == 2
+    pair.alive = True
+    assert pair.client.submit(goal("b")) is None  # behind the two that have expired
+    assert pair.server.expired == 2
+    pair.rest()
+    assert pair.results() == [("b", ResultCode.SUCCEEDED)]
+
+
+def test_a_reply_that_comes_too_late_is_not_taken_for_another_ones() -> None:
+    pair = Pair(events=1)
+    pair.client.submit(goal("a", 2.0))
+    assert pair.events.post(np.zeros(1, EVENT_DTYPE)[0])  # no room: the request is left where it is
+    pair.client._take_events = lambda *_: None  # type: ignore[method-assign]
+    with pytest.raises(RealtimeError):
+        pair.client.cancel("a")
+    del pair.client._take_events
+    assert pair.client.cancel("b") == ResultCode.UNKNOWN_ID
+    pair.rest()
+    assert pair.results() == [("a", ResultCode.SUCCEEDED)]
+
+
+def test_who_comes_later_is_not_answered_with_what_is_left() -> None:
+    pair = Pair()
+    pair.client.submit(goal("a", 2.0))
+    pair.requests.post(pair_request(pair, 1))
+    pair.tick()
+    later = RequestClient(pair.requests, pair.events, pair.tick, 0.1, lambda: pair.now_ns)
+    assert later.cancel("nobody") == ResultCode.UNKNOWN_ID
+
+
+def pair_request(pair: Pair, number: int) -> Any:
+    record = np.zeros(1, request_dtype(6))[0]
+    record["number"], record["expires_ns"], record["mode"] = number, pair.now_ns + NANOSECONDS, Request.ACTIVATE
+    return record
+
+
+# --- laws ------------------------------------------------------------------------------------------------------------
+
+
+def test_results_that_nobody_takes_are_kept() -> None:
+    pair = Pair(events=1)
+    due = []
+    for number in range(30):
+        refusal = pair.client.submit(goal(str(number), 99.0))
+        assert isinstance(refusal, CommandResult)
+        due.append((str(number), ResultCode.JOINT_LIMIT))
+    for number in range(30, 40):
+        pair.cerebellum.submit(0, goal(str(number), 99.0))
+        due.append((str(number), ResultCode.JOINT_LIMIT))
+    pair.tick(100)
+    assert len(pair.events) == 1
+    taken = []
+    for _ in range(60):
+        taken += pair.results()
+        pair.tick()
+    assert taken == due
+
+
+steps = st.one_of(
+    st.tuples(st.just("goal"), st.sampled_from([0.05, -0.1, 99.0]), st.booleans()),
+    st.tuples(st.just("cancel"), st.integers(0, 12), st.none()),
+    st.tuples(st.just("estop"), st.none(), st.none()),
+    st.tuples(st.just("mode"), st.sampled_from(Request), st.none()),
+    st.tuples(st.just("take"), st.none(), st.none()),
+    st.tuples(st.just("stall"), st.none(), st.none()),
+    st.tuples(st.just("tick"), st.integers(1, 120), st.none()),
+)
+
+
+@settings(max_examples=60)
+@given(st.lists(steps, max_size=20), st.integers(1, 3), st.integers(1, 3))
+def test_every_goal_that_was_answered_has_one_result(script: list, capacity: int, events: int) -> None:
+    pair, due, taken = Pair(capacity, events), Counter[str](), Counter[str]()
+    for number, (kind, value, extra) in enumerate(script):
+        name = str(number)
+        if kind == "goal":
+            answer = pair.client.submit(goal(name, value, preempt=extra))
+            assert answer is None or answer.task_id == name
+            due[name] += 1
+        elif kind == "cancel":
+            pair.client.cancel(str(value))
+        elif kind == "estop":
+            pair.cerebellum.estop_word[0] = 1
+        elif kind == "mode":
+            assert isinstance(pair.client.request(value), Reason)
+        elif kind == "take":
+            taken.update(result.task_id for result in pair.client.take_results())
+        elif kind == "stall":
+            pair.alive = False
+            with pytest.raises(RealtimeError):
+                pair.client.submit(goal(name))
+            pair.alive = True
+        else:
+            pair.tick(value)
+    for _ in range(30):
+        pair.rest()
+        taken.update(result.task_id for result in pair.client.take_results())
+    assert taken == due

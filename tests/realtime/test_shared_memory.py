@@ -1,0 +1,241 @@
+"""Blocks of shared memory: found by name, and gone when nobody holds them any more, however their holders ended."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.realtime import shared_memory
+from bhd_lerobot.realtime.shared_memory import SharedBlock, check_platform, names, sweep
+
+HOLD = """
+import sys, time
+from bhd_lerobot.realtime.shared_memory import SharedBlock
+block = SharedBlock.{how}
+memory = block.section("a")
+memory[0] = 7
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def name() -> Iterator[str]:
+    yield f"test-{os.getpid()}"
+    sweep()
+
+
+def files(name: str) -> list[Path]:
+    """Return the files of blocks of a name."""
+    return list(shared_memory.FOLDER.glob(f"{shared_memory.PREFIX}{name}.*"))
+
+
+def hold(name: str, how: str) -> subprocess.Popen[str]:
+    process = subprocess.Popen([sys.executable, "-c", HOLD.format(how=how)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+
+
+def test_sections_are_separate_zeroed_and_seen_by_whoever_attaches(name: str) -> None:
+    block = SharedBlock.create(name, {"a": 10, "b": 100}, {"robot": "ur5", "names": ["é"]})
+    other = SharedBlock.attach(name)
+    assert other.about == {"robot": "ur5", "names": ["é"]}
+    a, b = np.frombuffer(block.section("a"), np.uint8), np.frombuffer(other.section("b"), np.uint8)
+    assert (len(a), len(b)) == (10, 100)
+    assert not a.any()
+    assert not b.any()
+    np.frombuffer(other.section("a"), np.uint8)[:] = 5
+    assert (a == 5).all()
+    assert not b.any()
+    assert names() == [name] or name in names()
+    block.close()
+    assert name in names()
+    other.close()
+    other.close()
+    assert name not in names()
+    assert not files(name)
+
+
+def test_a_name_is_taken_as_long_as_anybody_holds_it(name: str) -> None:
+    process = hold(name, f"create({name!r}, {{'a': 8}}, {{}})")
+    try:
+        with pytest.raises(RealtimeError, match="running already"):
+            SharedBlock.create(name, {"a": 8}, {})
+    finally:
+        kill(process)
+    SharedBlock.create(name, {"a": 8}, {}).close()
+
+
+def test_a_kill_of_the_maker_leaves_it_to_the_others_and_a_kill_of_all_leaves_rubbish_that_is_swept(name: str) -> None:
+    maker = hold(name, f"create({name!r}, {{'a': 8}}, {{}})")
+    other = hold(name, f"attach({name!r})")
+    kill(maker)
+    assert sweep() == []
+    with pytest.raises(RealtimeError, match="running already"):
+        SharedBlock.create(name, {"a": 8}, {})
+    kill(other)
+    assert len(files(name)) == 1
+    assert name not in names()
+    assert name in sweep()
+    assert not files(name)
+
+
+def test_attaching_to_what_does_not_run_names_what_does(name: str) -> None:
+    block = SharedBlock.create(name, {"a": 8}, {})
+    with pytest.raises(RealtimeError, match=f"'nobody'.*Running: .*{name}"):
+        SharedBlock.attach("nobody")
+    block.close()
+
+
+@pytest.mark.parametrize("bad", ["", "a/b", "../x", "a b", "x" * 200])
+def test_names_that_are_no_names_are_refused(bad: str) -> None:
+    with pytest.raises(ConfigError, match="cannot be called"):
+        SharedBlock.create(bad, {"a": 8}, {})
+
+
+def test_no_room_is_said_before_anything_is_used(name: str) -> None:
+    with pytest.raises(RealtimeError, match="No room"):
+        SharedBlock.create(name, {"a": 1 << 50}, {})
+    assert name not in names()
+    assert not files(name)
+
+
+def test_a_file_that_is_no_block_is_refused(name: str) -> None:
+    path = shared_memory.FOLDER / f"{shared_memory.PREFIX}{name}.{'0' * 16}"
+    path.touch(0o600)
+    for content in (b"", b"something else entirely"):
+        path.write_bytes(content)
+        with pytest.raises(RealtimeError, match="not a block"):
+            SharedBlock.attach(name)
+    path.unlink()
+
+
+def plant(path: Path, kind: str, content: bytes) -> bool:
+    """Put a file of somebody else's into the folder; return whether this user can do that."""
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "link":
+        path.symlink_to("/etc/hostname")
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as server:
+            server.bind(str(path))
+    else:
+        path.write_bytes(content)
+        path.chmod(0o666 if kind == "open to all" else 0o600)
+    if kind == "of another user" and os.geteuid():
+        path.unlink()
+        return False
+    if not os.geteuid():
+        os.chown(path, 65534 if kind != "open to all" else -1, -1, follow_symlinks=False)
+    return True
+
+
+def test_files_of_others_are_neither_in_the_way_nor_read_nor_removed(name: str) -> None:
+    """The folder is everybody's; a block is known by its owner, its kind and its mode, and not by its name."""
+    real = SharedBlock.create(name, {"a": 8}, {"robot": "real"})
+    content = files(name)[0].read_bytes()
+    for kind in ("folder", "pipe", "link", "socket", "open to all", "of another user"):
+        for at, planted in enumerate((f"{name}-x", f"{name}-x.{'0' * 16}", f"{name}.{'0' * 16}", name)):
+            path = shared_memory.FOLDER / f"{shared_memory.PREFIX}{planted}"
+            if not plant(path, kind, content.replace(b"real", b"fake")):
+                continue
+            try:
+                assert f"{name}-x" not in names()
+                assert sweep() == []
+                with pytest.raises(RealtimeError, match="No running robot"):
+                    SharedBlock.watch(f"{name}-x")
+                with pytest.raises(RealtimeError, match="No running robot"):
+                    SharedBlock.attach(f"{name}-x")
+                block = SharedBlock.create(f"{name}-x", {"a": 8}, {})
+                block.close()
+                watched = SharedBlock.watch(name)
+                assert watched.about == {"robot": "real"}, (kind, at)
+                watched.close()
+                assert os.path.lexists(path)
+            finally:
+                path.rmdir() if kind == "folder" else path.unlink()
+    real.close()
+
+
+def test_a_block_is_for_its_user_alone_and_its_file_cannot_be_foreseen(name: str) -> None:
+    found = set()
+    for _ in range(3):
+        block = SharedBlock.create(name, {"a": 8}, {})
+        (path,) = files(name)
+        found.add(path.name)
+        assert (path.stat().st_uid, path.stat().st_mode & 0o777) == (os.geteuid(), 0o600)
+        block.close()
+    assert len(found) == 3
+
+
+def test_what_a_killed_run_left_is_removed_at_the_next_start_and_what_lives_is_kept(name: str) -> None:
+    old = shared_memory.FOLDER / f"{shared_memory.PREFIX}{name}-old"  # as version 0.1 called it
+    other = shared_memory.FOLDER / f"{shared_memory.PREFIX}{name}-notes"  # another program's
+    dead, living = (hold(f"{name}-{what}", f"create({f'{name}-{what}'!r}, {{'a': 8}}, {{}})") for what in "dl")
+    try:
+        kill(dead)
+        (left,) = files(f"{name}-d")
+        shutil.copy(left, old)
+        old.chmod(0o600)
+        other.write_text("mine")
+        other.chmod(0o600)
+        block = SharedBlock.create(name, {"a": 8}, {})
+        assert not left.exists()
+        assert not old.exists()
+        assert other.exists()
+        assert f"{name}-l" in names()
+        attached = SharedBlock.attach(f"{name}-l")
+        assert attached.section("a")[0] == 7
+        attached.close()
+        block.close()
+    finally:
+        kill(living)
+        other.unlink(missing_ok=True)
+
+
+def test_of_several_that_start_at_once_no_two_have_the_name(name: str) -> None:
+    code = (
+        "import sys\nfrom bhd_lerobot.realtime.shared_memory import SharedBlock\nfrom bhd_lerobot.errors import "
+        "RealtimeError\nsys.stdin.read(1)\ntry:\n    block = SharedBlock.create(sys.argv[1], {'a': 8}, {})\n"
+        "    print('made', flush=True)\nexcept RealtimeError as error:\n    print(error, flush=True)\nsys.stdin.read(1)"
+    )
+    command = [sys.executable, "-c", code, name]
+    started = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    for process in started:
+        assert process.stdin is not None
+        process.stdin.write("x")
+        process.stdin.flush()
+    said = [process.stdout.readline() if process.stdout else "" for process in started]
+    assert said.count("made\n") <= 1
+    assert len(files(name)) == said.count("made\n")
+    assert all("running already" in line or line == "made\n" for line in said), said
+    for process in started:
+        process.communicate()
+
+
+@pytest.mark.parametrize(("machine", "system"), [("aarch64", "Linux"), ("x86_64", "Darwin"), ("riscv64", "Linux")])
+def test_other_platforms_are_refused_with_the_way_out(machine: str, system: str) -> None:
+    with pytest.raises(RealtimeError, match="lockstep"):
+        check_platform(machine, system)
+
+
+def test_this_platform_is_one_that_was_checked() -> None:
+    check_platform("x86_64", "Linux")
+    assert time.monotonic_ns() > 0

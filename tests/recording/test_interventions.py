@@ -1,0 +1,306 @@
+"""Episodes in which somebody takes over: what is flagged, what is recorded, and that nothing else changes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.policies.baselines import NoopConfig, RandomBrain, RandomConfig
+from bhd_lerobot.policies.brain import Goals, Mixed, Observation
+from bhd_lerobot.policies.dagger.brain import CorrectedBrain, CorrectedConfig
+from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
+from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.rollout.drivers import DriverLog, flagged, spans
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.registry import make_brain, make_simulation, make_task
+from bhd_lerobot.rollout.replay import Replay
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.tasks.avoid import AvoidConfig
+from bhd_lerobot.tasks.pick import PickConfig
+from bhd_lerobot.tasks.reach import ReachConfig
+from bhd_lerobot.tasks.task import Event
+from tests.recording.support import data_columns, episode_rows, run_record
+
+SECONDS = 2.0
+NOBODY: dict[str, Any] = {"collision_s": None, "stall_s": None}
+
+
+def run(kind: str, brain: Any, n: int = 2, episodes: int = 3, seconds: float = SECONDS) -> list[Episode]:
+    if kind == "ur5":
+        simulation = make_simulation(UR5Config(), n)
+        task = make_task(ReachConfig(duration_s=seconds), n, 25)
+    else:
+        simulation = make_simulation(TurtleBot3Config(beams=36), n)
+        task = make_task(AvoidConfig(duration_s=seconds), n, 10)
+    return list(EpisodeLoop(simulation, task, brain).run([EpisodeSpec(i, 2 * i) for i in range(episodes)]))
+
+
+def assert_same(first: Episode, second: Episode, but: tuple[str, ...] = ()) -> None:
+    for key, column in first.columns.items():
+        if key not in but:
+            np.testing.assert_array_equal(second.columns[key], column, err_msg=key)
+
+
+class Wave:
+    """An arm that swings around where it began, each joint in its own way."""
+
+    name, robot_type, uses_images, has_plan = "wave", "any", False, False
+
+    def bind(self, *_: Any) -> None: ...
+
+    def reset(self, ids: np.ndarray, seeds: Any, n: int, instructions: Any = ()) -> None:
+        if not hasattr(self, "frame") or len(self.frame) != n:
+            self.frame, self.start = np.zeros(n, int), np.zeros((n, 7))
+        self.frame[ids] = 0
+
+    def act(self, seen: Any) -> np.ndarray:
+        new = (self.frame == 0) & seen.running
+        self.start[new] = seen.state[new, :7]
+        swing = 0.5 * np.sin(self.frame / 20)[:, None] * np.array([1, -0.6, -0.5, 1, -1, 1, 0])
+        self.frame[seen.running] += 1
+        return self.start + swing
+
+    def parameters(self) -> dict[str, Any]:
+        return {"type": "wave"}
+
+
+# --- laws ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "expert"), [("turtlebot3", GapFollowerConfig()), ("ur5", ReachBrainConfig())], ids=["setpoints", "goals"]
+)
+def test_a_learner_that_nobody_corrects_drives_as_if_alone(kind: str, expert: Any) -> None:
+    random = RandomConfig(scale=0.1)
+    corrected = make_brain(CorrectedConfig(random, expert, **NOBODY))
+    alone, together = run(kind, RandomBrain(random)), run(kind, corrected)
+    for first, second in zip(alone, together, strict=True):
+        assert_same(first, second)
+        assert first.interventions is None
+        assert second.interventions == []
+        assert (second.columns[keys.EVENT] != Event.INTERVENTION).all()
+
+
+def test_exactly_the_frames_that_the_expert_drove_are_flagged_and_its_actions_are_recorded() -> None:
+    settings = CorrectedConfig(NoopConfig(), GapFollowerConfig(), **{**NOBODY, "patience_s": 0.5, "hold_s": 0.3})
+    for episode in run("turtlebot3", make_brain(settings)):
+        event, action = episode.columns[keys.EVENT], episode.columns[keys.ACTION]
+        flags = (np.arange(20) % 8) >= 5
+        flags[-1] = False  # the end of an episode says more
+        assert (event == Event.INTERVENTION).tolist() == flags.tolist()
+        assert event[-1] == episode.outcome.event != Event.INTERVENTION
+        assert (action[~flags] == 0).all()
+        assert (np.abs(action[flags]).max(axis=1) > 0).all()
+        assert episode.interventions is not None
+        assert [(one.first, one.end) for one in episode.interventions] == [(5, 8), (13, 16)]
+        assert {one.cause for one in episode.interventions} == {"time is up"}
+        assert episode.commands is None
+        assert episode.goal_frames is None
+
+
+class Spy(GapFollowerBrain):
+    """Remembers everything that it was shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[np.ndarray] = []
+
+    def act(self, observation: Any) -> np.ndarray:
+        self.seen.append(observation.state.copy())
+        return super().act(observation)
+
+
+def test_a_rule_has_seen_the_whole_episode_and_does_what_it_would_do_with_that_memory() -> None:
+    spy = Spy()
+    settings = CorrectedConfig(RandomConfig(), GapFollowerConfig(), **{**NOBODY, "patience_s": 1.0})
+    (episode,) = run("turtlebot3", CorrectedBrain(settings, RandomBrain(RandomConfig()), spy), n=1, episodes=1)
+    np.testing.assert_array_equal(np.array(spy.seen)[:, 0], episode.columns[keys.OBSERVATION_STATE].astype(float))
+    other = GapFollowerBrain()
+    simulation = make_simulation(TurtleBot3Config(beams=36), 1)
+    other.bind(simulation.observation_names, simulation.action_names, 10)
+    other.reset(np.arange(1), [0], 1)
+    advised = [other.act(Observation(simulation.observation_names, state))[0] for state in spy.seen]
+    np.testing.assert_array_equal(episode.columns[keys.ACTION][10:], np.array(advised, np.float32)[10:])
+
+
+# --- goals in the middle of an episode --------------------------------------------------------------------------------
+
+
+def corrected_wave(**values: Any) -> CorrectedBrain:
+    settings = CorrectedConfig(NoopConfig(), ReachBrainConfig(), **{**NOBODY, **values})
+    return CorrectedBrain(settings, Wave(), ReachBrain())
+
+
+@pytest.mark.parametrize("hold_s", [None, 0.4])
+def test_goals_take_over_an_arm_in_motion_without_a_jump_and_give_it_back(hold_s: float | None) -> None:
+    limits = ur5().limits
+    episodes = run("ur5", corrected_wave(patience_s=0.6, hold_s=hold_s), seconds=2.4)
+    for episode in episodes:
+        columns = episode.columns
+        assert episode.goal_frames is not None
+        by_goals = np.zeros(episode.frames, np.bool_)
+        for first, end in episode.goal_frames:
+            by_goals[first:end] = True
+        assert not by_goals[:15].any()
+        assert by_goals[15:25].all()
+        assert episode.interventions is not None
+        assert [(one.first, one.end) for one in episode.interventions] == episode.goal_frames
+        assert episode.commands
+        assert {frame for frame, _ in episode.commands} <= set(np.flatnonzero(by_goals).tolist())
+        speed = np.diff(columns[keys.APPLIED_ACTION][:, :6], axis=0) * 25
+        assert np.abs(speed[13]).max() > 0.1  # it was in motion when it was taken over
+        assert (np.abs(speed) <= np.array(limits.velocity[:6]) * 1.001).all()
+        # Between two frames the speed changes by no more than the limit of acceleration allows.
+        change = np.abs(np.diff(speed, axis=0)) * 25
+        assert (change <= np.array(limits.acceleration[:6]) * 1.01).all()
+        # While goals are followed, what is learned is where the reference was.
+        applied = columns[keys.APPLIED_ACTION].astype(np.float32)
+        np.testing.assert_array_equal(columns[keys.ACTION][by_goals], applied[by_goals])
+        assert (columns[keys.ACTION][~by_goals] != applied[~by_goals]).any()
+        assert columns[keys.SUBTASK][0] == "the learner drives"
+        assert columns[keys.SUBTASK][15] == "move the tool to the target"
+
+
+def test_an_episode_does_not_depend_on_those_beside_it() -> None:
+    for kind, brain in (
+        ("ur5", lambda: corrected_wave(patience_s=0.4, hold_s=0.5)),
+        (
+            "turtlebot3",
+            lambda: make_brain(CorrectedConfig(RandomConfig(), GapFollowerConfig(), patience_s=0.5, hold_s=0.4)),
+        ),
+    ):
+        for one, other in zip(run(kind, brain(), n=1), run(kind, brain(), n=3), strict=True):
+            assert_same(one, other)
+            assert one.interventions == other.interventions
+            assert one.commands == other.commands
+
+
+# --- datasets --------------------------------------------------------------------------------------------------------
+
+AVOID = {"brain__type": "corrected", "brain__learner__type": "random", "brain__expert__type": "gap_follower"}
+TURNS = {"brain__patience_s": 1, "brain__hold_s": 1}
+REACH = {
+    "robot__type": "ur5",
+    "robot__beams": None,
+    "task__type": "reach",
+    "brain__type": "corrected",
+    "brain__learner__type": "random",
+    "brain__learner__scale": 0.05,
+    "brain__expert__type": "reach",
+    "brain__patience_s": 0.4,
+    "brain__hold_s": 1.0,
+}
+
+
+@pytest.mark.parametrize("robot", [{**AVOID, **TURNS}, REACH], ids=["avoid", "reach"])
+def test_the_dataset_is_the_same_for_any_number_of_simulations_and_replays_bit_exactly(
+    tmp_path: Path, robot: dict[str, Any]
+) -> None:
+    one, many = tmp_path / "one", tmp_path / "many"
+    run_record(one, **robot)
+    run_record(many, **robot, n_envs=8)
+    assert data_columns(one) == data_columns(many)
+    assert episode_rows(one) == episode_rows(many)
+    columns, rows = data_columns(one), episode_rows(one)
+    for index, row in enumerate(rows):
+        mine = np.array(columns["episode_index"]) == index
+        found = json.loads(row["bhd/interventions"])
+        assert found
+        assert row["bhd/intervened_frames"] == sum(end - first for first, end, _ in found)
+        event = np.array(columns["event"])[mine]
+        wanted = np.zeros(len(event), np.bool_)
+        for first, end, cause in found:
+            wanted[first:end] = True
+            assert cause in {"time is up", "no progress", "about to collide"}
+        wanted[-1] = False
+        assert ((event == Event.INTERVENTION) == wanted).all()
+        brain = json.loads(row["bhd/brain"])
+        assert (brain["type"], brain["learner"]["type"]) == ("corrected", "random")
+        assert Replay(one, index).open_loop().identical
+
+
+def test_training_finds_the_flagged_frames(tmp_path: Path) -> None:
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+    from bhd_lerobot.datasets.loader.selection import intervention_weights
+
+    root = tmp_path / "d"
+    run_record(root, **AVOID, brain__patience_s=1, dataset__num_episodes=2)
+    weights = intervention_weights(LeRobotDatasetMetadata("test/avoid", root=root), None, 3.0)
+    assert weights is not None
+    # 3 s at 10 Hz: the learner's second, the expert's two, and a last frame that says how it ended.
+    assert weights.tolist() == ([1.0] * 10 + [3.0] * 19 + [1.0]) * 2
+
+
+def test_a_pick_that_the_learner_does_not_even_begin_succeeds() -> None:
+    simulation = make_simulation(UR5Config(), 4)
+    brain = make_brain(CorrectedConfig(NoopConfig(), PickBrainConfig(), stall_s=0.5))
+    loop = EpisodeLoop(simulation, make_task(PickConfig(), 4, 25), brain)
+    for episode in loop.run([EpisodeSpec(i, 2 * i) for i in range(4)]):
+        assert episode.outcome.success
+        assert episode.interventions is not None
+        assert [one.cause for one in episode.interventions] == ["no progress"]
+        assert episode.plan["attempts"] >= 1
+
+
+# --- the log, and frames that went by on the wall clock --------------------------------------------------------------
+
+
+class Stub:
+    """Says who drives."""
+
+    def __init__(self) -> None:
+        self.taken = np.zeros(1, np.bool_)
+
+    def interventions(self) -> np.ndarray:
+        return self.taken
+
+    def causes(self) -> list[str]:
+        return ["late"]
+
+
+def test_frames_that_went_by_while_the_brain_thought_belong_to_who_drove_before() -> None:
+    stub = Stub()
+    log = DriverLog(stub, 1, 10)
+    first, length = np.zeros(1, np.intp), np.zeros(1, np.int64)
+    log.start(first)
+    log.decided(Mixed(np.zeros((1, 2)), np.array([False]), {}))
+    log.frame(first, length, is_missed=False)
+    stub.taken[:] = True
+    log.decided(Mixed(np.zeros((1, 2)), np.array([True]), {}))
+    for frame, is_missed in ((1, True), (2, True), (3, False)):
+        taken, by_goals = log.frame(first, length + frame, is_missed=is_missed)
+        assert bool(taken[0]) is bool(by_goals[0]) is (not is_missed)
+    (only,) = log.interventions(0, 4) or []
+    assert (only.first, only.end, only.cause) == (3, 4, "late")
+    assert log.goal_frames(0, 4) == [(3, 4)]
+
+
+def test_frames_that_went_by_before_the_first_decision_belong_to_the_first() -> None:
+    log = DriverLog(object(), 1, 4)
+    log.start(np.zeros(1, np.intp))
+    log.decided(Goals({}))
+    taken, by_goals = log.frame(np.zeros(1, np.intp), np.zeros(1, np.int64), is_missed=True)
+    assert (bool(taken[0]), bool(by_goals[0])) == (False, True)
+    assert log.interventions(0, 1) is None
+    assert log.goal_frames(0, 1) is None  # always
+
+
+def test_what_ends_an_episode_is_not_overwritten() -> None:
+    event = np.array([Event.NOTHING, Event.NOTHING, Event.SUCCESS, Event.COLLISION])
+    taken = np.array([False, True, True, False])
+    assert flagged(event, taken).tolist() == [0, Event.INTERVENTION, Event.SUCCESS, Event.COLLISION]
+
+
+@pytest.mark.parametrize(
+    ("mask", "expected"), [([], []), ([0, 0], []), ([1, 1], [(0, 2)]), ([1, 0, 1, 1, 0], [(0, 1), (2, 4)])]
+)
+def test_spans(mask: list[int], expected: list[tuple[int, int]]) -> None:
+    assert spans(np.array(mask, np.bool_)) == expected

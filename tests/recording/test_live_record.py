@@ -1,0 +1,271 @@
+"""bhd-record on the wall clock: complete datasets, refusals, emergency stops, and what a kill leaves behind."""
+
+import io
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+
+from bhd_lerobot.control.messages import Mode
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.realtime.shared_memory import names, sweep
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.recording.record import record
+from bhd_lerobot.recording.report import ESTOP_STATUS, RecordResult
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.tasks.avoid import AvoidTask
+from bhd_lerobot.tasks.task import Event
+from tests.recording.support import data_columns, options, run_record
+from tests.robots.host.support import is_alive, is_gone, unique
+from tests.waiting import until
+
+LIVE = {
+    "robot__clock": "realtime",
+    "robot__realtime__brain_timeout_s": 20,
+    "robot__realtime__recorder_timeout_s": 20,
+    "robot__realtime__most_misses": 10**6,
+}
+ARM = {"robot__type": "ur5", "robot__beams": None, "brain__type": "pick", "task__type": "pick"}
+
+
+def live_options(root: Path, **overrides: object) -> list[str]:
+    return options(root, **{**LIVE, "dataset__num_episodes": 2, "dataset__episode_time_s": 2, **overrides})
+
+
+def run_live(root: Path, **overrides: object) -> tuple[RecordResult, str]:
+    """Record on the wall clock, in this process; return the result and what was printed."""
+    console = Console(file=io.StringIO(), width=160)
+    result = record(parse(RecordConfig, live_options(root, **overrides)), console)
+    return result, console.file.getvalue()
+
+
+def episodes(root: Path) -> list[dict[str, Any]]:
+    return pq.read_table(root / "meta" / "episodes").to_pylist()
+
+
+@pytest.mark.parametrize("robot", [{}, ARM], ids=["turtlebot3", "ur5"])
+def test_a_recording_is_complete_and_no_frame_is_lost_uncounted(tmp_path, robot):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root, name = tmp_path / "d", unique("record")
+    result, text = run_live(root, robot__id=name, **robot)
+    assert (result.recorded, result.exit_status) == (2, 0)
+    assert f"kill -USR1 {os.getpid()}" in text
+    assert is_gone(name)
+    dataset = LeRobotDataset("test/avoid", root=root, video_backend="pyav")
+    assert (dataset.num_episodes, dataset.num_frames) == (2, result.frames)
+    columns = {key: np.array(values) for key, values in data_columns(root).items()}
+    info = dataset_info(root)
+    assert info.compact
+    for index, row in enumerate(episodes(root)):
+        rows = columns["episode_index"] == index
+        timing = json.loads(row["bhd/timing"])
+        assert timing["clock"] == "realtime"
+        if columns["event"][rows][-1] == Event.TIMEOUT:
+            assert rows.sum() == 2 * dataset.fps
+        assert timing["frames"] == rows.sum()
+        # Every frame that was due by the end is there, or counted as lost.
+        times = columns["control.time"][rows].ravel()
+        numbers = np.rint(times * dataset.fps).astype(int)
+        assert np.all(np.diff(times) > 0)
+        assert numbers[-1] + 1 == rows.sum() + timing["drops"]
+        assert timing["ticks"] + timing["skipped"] >= rows.sum()
+        assert (columns["control.age"][rows] >= 0).all()
+        grants = json.loads(row["bhd/realtime"])
+        assert {grant["name"] for grant in grants} >= {"scheduler", "memory lock"}
+
+
+def test_an_episode_that_no_machine_could_keep_is_rejected_and_the_dataset_stays_as_it_was(tmp_path):
+    root, name = tmp_path / "d", unique("reject")
+    result, _ = run_live(root, robot__id=name, dataset__num_episodes=1, dataset__episode_time_s=1)
+    assert result.recorded == 1
+    before = data_columns(root)
+    with pytest.raises(RealtimeError, match=r"Episode 1 was too unpunctual 3 times.*resume=true"):
+        run_live(
+            root,
+            robot__id=name,
+            dataset__episode_time_s=1,
+            resume="true",
+            timing__reject="true",
+            timing__max_lateness_s=1e-9,
+        )
+    assert data_columns(root) == before
+    assert len(dataset_info(root).episodes) == 1
+    assert is_gone(name)
+
+
+class Program:
+    """bhd-record as a program of its own, with a terminal."""
+
+    def __init__(self, root: Path, name: str, **overrides: object) -> None:
+        self.root, self.name = root, name
+        self.person, device = pty.openpty()
+        self.log = root.parent / "log"
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", _MAIN, *live_options(root, robot__id=name, **overrides)],
+                stdin=device,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+        os.close(device)
+
+    def saved(self) -> int:
+        try:
+            return int(json.loads((self.root / "meta" / "info.json").read_text())["total_episodes"])
+        except (OSError, ValueError):
+            return 0
+
+    def wait_for_second_episode(self) -> None:
+        """Wait until one episode is saved and the next is under way."""
+        until(lambda: self.saved() >= 1 or self.process.poll() is not None, "an episode is saved")
+        time.sleep(0.3)
+        assert self.process.poll() is None, self.log.read_text()
+
+    def children(self) -> list[int]:
+        return [
+            int(pid) for pid in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        ]
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self.person)
+
+
+_MAIN = """
+import fcntl, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY)
+from bhd_lerobot.recording.record import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture
+def programs():
+    made: list[Program] = []
+
+    def make(*arguments: Any, **overrides: Any) -> Program:
+        made.append(Program(*arguments, **overrides))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def test_a_key_stops_the_robot_and_the_run_then_a_kill_and_it_goes_on_every_time(tmp_path, programs):
+    root, name = tmp_path / "d", unique("program")
+    many = {"dataset__num_episodes": 100, "dataset__episode_time_s": 2}
+    stopped = programs(root, name, **many)
+    stopped.wait_for_second_episode()
+    os.write(stopped.person, b" ")
+    assert stopped.process.wait(60) == ESTOP_STATUS, stopped.log.read_text()
+    text = " ".join(stopped.log.read_text().split())
+    assert "space or e, or kill -USR1" in text
+    assert "Emergency stop (key)" in text
+    assert "--resume=true" in text
+    assert is_gone(name)
+    columns = {key: np.array(values) for key, values in data_columns(root).items()}
+    assert int(columns["event"][-1]) == Event.ESTOP
+    assert int(columns["control.mode"][-1]) == Mode.ESTOP
+    assert not (columns["event"][:-1] == Event.ESTOP).any()
+    assert not (columns["control.mode"][:-1] == Mode.ESTOP).any()
+    assert dataset_info(root).compact
+    before = stopped.saved()
+    assert before >= 2
+
+    killed = programs(root, name, resume="true", **many)
+    until(lambda: killed.saved() > before or killed.process.poll() is not None, "one more is saved")
+    children = killed.children()
+    assert len(children) == 2
+    assert name in names()
+    killed.process.send_signal(signal.SIGKILL)
+    killed.process.wait()
+    until(lambda: not any(is_alive(pid) for pid in children), "the robot's processes end by themselves")
+    sweep()
+    assert is_gone(name)
+    saved = killed.saved()
+    assert saved > before
+
+    result, _ = run_live(root, robot__id=name, resume="true", dataset__num_episodes=saved + 1)
+    assert (result.recorded, result.episodes) == (1, saved + 1)
+    after = {key: np.array(values) for key, values in data_columns(root).items()}
+    assert dataset_info(root).compact
+    assert sorted(set(after["episode_index"].tolist())) == list(range(saved + 1))
+    for key in ("action", "observation.state", "event"):
+        assert np.array_equal(after[key][: len(columns[key])], columns[key]), key
+
+
+def test_in_lockstep_a_signal_stops_all_episodes_that_run(tmp_path):
+    """As on the wall clock: what was running is saved with its outcome, nothing else is begun."""
+    root = tmp_path / "d"
+    console = Console(file=io.StringIO(), width=160)
+    config = parse(RecordConfig, options(root, dataset__num_episodes=20, n_envs=3, dataset__episode_time_s=60))
+    begun: list[int] = []
+
+    judge = AvoidTask.judge
+
+    def judged(self: Any, truth: Any, running: Any) -> Any:
+        begun.append(1)
+        if len(begun) == 30:
+            os.kill(os.getpid(), signal.SIGUSR1)
+        return judge(self, truth, running)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(AvoidTask, "judge", judged)
+        result = record(config, console)
+    assert result.exit_status == ESTOP_STATUS
+    assert result.outcomes["estop"] == 3
+    assert result.estop == "signal SIGUSR1"
+    assert re.search(r"Emergency stop \(signal SIGUSR1\)", console.file.getvalue())
+    columns = data_columns(root)
+    assert columns["event"].count(int(Event.ESTOP)) == 3
+    assert len(set(columns["episode_index"])) == result.recorded
+
+
+def test_a_press_between_two_episodes_begins_no_other(tmp_path, monkeypatch):
+    save = DatasetRecorder.save
+
+    def pressing(self: Any, *arguments: Any, **options: Any) -> Any:
+        saved = save(self, *arguments, **options)
+        if self.num_episodes == 2:
+            os.kill(os.getpid(), signal.SIGUSR2)
+        return saved
+
+    monkeypatch.setattr(DatasetRecorder, "save", pressing)
+    root = tmp_path / "d"
+    result, text = run_record(root, dataset__num_episodes=5, dataset__episode_time_s=1, estop_signal="usr2")
+    assert (result.recorded, result.exit_status) == (2, ESTOP_STATUS)
+    assert result.estop == "signal SIGUSR2"
+    assert "--resume=true" in text
+    assert int(Event.ESTOP) not in data_columns(root)["event"]  # both had ended before
+    result, _ = run_record(root, dataset__num_episodes=5, dataset__episode_time_s=1, resume="true")
+    assert (result.recorded, result.exit_status) == (3, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"estop_signal": "SIGINT"}, "'SIGINT'. Valid: SIGUSR1"),
+        ({"estop_key": "true"}, "standard input is no terminal"),
+    ],
+)
+def test_an_input_that_cannot_be_is_refused_before_anything_is_written(tmp_path, change, message):
+    with pytest.raises(ConfigError, match=message):
+        run_record(tmp_path / "d", **change)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,311 @@
+"""bhd-record: same seed same bytes, resume after any kill, signals, bad input, what is in the run folder."""
+
+import json
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetExistsError, DatasetMismatchError, RenderingError
+from bhd_lerobot.recording import record as record_module
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import encode, parse
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from tests.recording.support import data_columns, episode_rows, options, run_record
+
+
+def test_same_seed_same_bytes_for_any_number_of_simulations(tmp_path):
+    reference = None
+    for n_envs, threads in ((1, 1), (7, 2), (64, 2)):
+        root = tmp_path / f"n{n_envs}"
+        # 9 episodes on 7 simulations: two of them start when others end, in the middle of the run.
+        run_record(root, n_envs=n_envs, threads=threads, dataset__num_episodes=9, seed=5, robot__beams=360)
+        table = pq.read_table(root / "data").drop_columns(["task_index"])
+        content = {name: table[name].combine_chunks() for name in table.column_names}
+        rows = episode_rows(root)
+        if reference is None:
+            reference = content, rows
+        for name, column in content.items():
+            assert column.equals(reference[0][name]), (n_envs, name)
+        assert rows == reference[1]
+
+
+def test_another_seed_gives_other_episodes(tmp_path):
+    run_record(tmp_path / "a", seed=1)
+    run_record(tmp_path / "b", seed=2)
+    assert data_columns(tmp_path / "a")["observation.state"] != data_columns(tmp_path / "b")["observation.state"]
+
+
+def test_what_is_recorded_is_consistent(tmp_path):
+    root = tmp_path / "d"
+    result, _ = run_record(root, dataset__num_episodes=4, n_envs=2, robot__odometry="true", seed=3)
+    columns = {name: np.array(values) for name, values in data_columns(root).items()}
+    assert result.episodes == result.recorded == 4
+    for episode in range(4):
+        rows = columns["episode_index"] == episode
+        length = rows.sum()
+        assert np.allclose(columns["control.time"][rows], np.arange(length) / 10, atol=0, rtol=0)
+        assert np.array_equal(np.unique(columns["control.age"][rows]), np.float32([0.0, 0.1]))
+        assert columns["next.done"][rows].tolist() == [False] * (length - 1) + [True]
+        assert columns["next.success"][rows][:-1].sum() == 0
+        assert (columns["event"][rows][:-1] == 0).all()
+        assert columns["event"][rows][-1] != 0
+        row = dataset_info(root).episodes[episode]
+        assert row.frames == length
+        assert bool(columns["next.success"][rows][-1]) == row.metadata["success"]
+        score = columns["next.reward"][rows].sum() + 1 / row.metadata["cells_free"]
+        assert score == pytest.approx(row.metadata["score"], abs=1e-6)
+        physics = columns["simulation.state"][rows]
+        assert np.hypot(*np.diff(physics[:, :2], axis=0).T).sum() == pytest.approx(row.metadata["path_m"], abs=0.03)
+        # The command applied chases the one asked for, within what the acceleration allows in one frame.
+        applied, asked = columns["control.applied_action"][rows], columns["action"][rows]
+        assert (np.abs(np.diff(applied, axis=0)) <= np.array([0.25, 0.32]) + 1e-6).all()
+        assert np.allclose(applied[asked[:, 0] > 0, 0], 0.2, atol=1e-6)
+        seeds = [int(e.metadata["seed"]) for e in dataset_info(root).episodes]
+        assert len(set(seeds)) == 4
+        assert all(seed % 2 == 0 for seed in seeds)  # training seeds are even
+
+
+def test_stock_lerobot_reads_it(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root = tmp_path / "d"
+    run_record(root)
+    dataset = LeRobotDataset("test/avoid", root=root, video_backend="pyav", delta_timestamps={"action": [0.0, 0.1]})
+    columns = data_columns(root)
+    assert dataset.num_episodes == 3
+    item = dataset[4]
+    assert np.array_equal(item["observation.state"].numpy(), np.float32(columns["observation.state"][4]))
+    assert np.array_equal(item["action"].numpy(), np.float32(columns["action"][4:6]))
+    assert item["task"] == "Roam without touching anything."
+    assert set(dataset.meta.stats) >= {"observation.state", "action"}
+
+
+def test_an_existing_root_is_refused_and_left_alone(tmp_path):
+    root = tmp_path / "d"
+    run_record(root)
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    with pytest.raises(DatasetExistsError, match="exists already"):
+        run_record(root)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+
+
+def test_resume_adds_the_episodes_that_an_undisturbed_run_has(tmp_path):
+    run_record(tmp_path / "whole", dataset__num_episodes=5, n_envs=2)
+    run_record(tmp_path / "parts", dataset__num_episodes=2, n_envs=3)
+    result, _ = run_record(tmp_path / "parts", dataset__num_episodes=5, n_envs=1, resume="true")
+    assert (result.recorded, result.episodes) == (3, 5)
+    assert data_columns(tmp_path / "parts") == data_columns(tmp_path / "whole")
+
+
+def test_resume_of_a_complete_dataset_adds_nothing(tmp_path):
+    run_record(tmp_path / "d")
+    before = data_columns(tmp_path / "d")
+    result, _ = run_record(tmp_path / "d", resume="true")
+    assert result.recorded == 0
+    assert data_columns(tmp_path / "d") == before
+
+
+@pytest.mark.parametrize(
+    ("change", "shown"),
+    [
+        ({"seed": 9}, "seed"),
+        ({"robot__beams": 18}, "observation.state"),
+        ({"brain__safe_distance_m": 0.4}, "safe_distance_m"),
+        ({"task__arena": "turtlebot3_world"}, "arena"),
+        ({"dataset__fps": 20}, "fps"),
+        ({"split": "held_out"}, "held_out"),
+    ],
+)
+def test_resume_refuses_another_recording_and_shows_the_difference(tmp_path, change, shown):
+    run_record(tmp_path / "d")
+    before = data_columns(tmp_path / "d")
+    with pytest.raises(DatasetMismatchError, match=shown):
+        run_record(tmp_path / "d", resume="true", dataset__num_episodes=5, **change)
+    assert data_columns(tmp_path / "d") == before
+
+
+def _start(root: Path, **overrides) -> subprocess.Popen:
+    command = [sys.executable, "-m", "bhd_lerobot.recording.record", *options(root, **overrides)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _wait_for_episodes(root: Path, count: int, process: subprocess.Popen) -> None:
+    while process.poll() is None:
+        try:
+            if json.loads((root / "meta" / "info.json").read_text())["total_episodes"] >= count:
+                return
+        except (OSError, ValueError):
+            pass
+        time.sleep(0.01)
+
+
+def test_killed_and_resumed_is_the_same_as_undisturbed(tmp_path):
+    many = {"dataset__num_episodes": 20, "n_envs": 2, "seed": 1}
+    run_record(tmp_path / "whole", **many)
+    generator = random.Random(1)
+    root = tmp_path / "killed"
+    for wanted in (1, 13):
+        process = _start(root, resume="true", **many)
+        _wait_for_episodes(root, wanted, process)
+        time.sleep(generator.random() * 0.05)
+        process.kill()
+        process.communicate()
+    result, _ = run_record(root, resume="true", **many)
+    assert result.episodes == 20
+    assert data_columns(root) == data_columns(tmp_path / "whole")
+    assert dataset_info(root).compact
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_the_run_with_a_finalised_dataset(tmp_path, number):
+    root = tmp_path / "d"
+    process = _start(root, dataset__num_episodes=100_000, n_envs=2)
+    _wait_for_episodes(root, 2, process)
+    process.send_signal(number)
+    _, text = process.communicate()
+    assert process.returncode == 128 + number, text
+    assert number.name in text
+    assert "--resume=true" in text
+    summary = dataset_info(root)
+    assert summary.compact
+    assert len(summary.episodes) >= 2
+    assert len(data_columns(root)["index"]) == summary.frames
+
+
+def test_a_failing_save_leaves_the_earlier_episodes_and_names_the_cause(tmp_path, monkeypatch):
+    calls = []
+    save = record_module.DatasetRecorder.save
+
+    def failing(self, *args, **kwargs):
+        calls.append(1)
+        if len(calls) == 3:
+            raise BhdError("the disk is full")
+        return save(self, *args, **kwargs)
+
+    monkeypatch.setattr(record_module.DatasetRecorder, "save", failing)
+    with pytest.raises(BhdError, match="disk is full"):
+        run_record(tmp_path / "d", dataset__num_episodes=5)
+    assert len(dataset_info(tmp_path / "d").episodes) == 2
+    assert dataset_info(tmp_path / "d").compact
+
+
+def test_the_run_folder_has_the_resolved_configuration_and_a_picture(tmp_path):
+    result, text = run_record(tmp_path / "d")
+    saved = tmp_path / "d_run" / "config.yaml"
+    again = parse(RecordConfig, [f"--config_path={saved}"])
+    assert encode(again) == yaml.safe_load(saved.read_text())
+    assert (tmp_path / "d_run" / "trajectories.png").stat().st_size > 5_000
+    for part in (f"{result.successes} of 3", "mean score", "real time", "trajectories.png"):
+        assert part in text
+
+
+def test_the_film_is_made_where_images_can_be_rendered(tmp_path):
+    import av
+
+    try:
+        run_record(tmp_path / "d", preview_video="true")
+    except RenderingError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    with av.open(str(tmp_path / "d_run" / "episode.mp4")) as film:
+        frames = list(film.decode(video=0))
+    assert len(frames) >= 10
+    assert frames[0].to_ndarray(format="rgb24").std() > 5
+
+
+def test_without_opengl_the_recording_goes_on_and_says_so(tmp_path, monkeypatch):
+    def no_gl(*args):
+        raise RenderingError("No image can be rendered here. Install EGL.")
+
+    monkeypatch.setattr(record_module, "Preview", no_gl)
+    result, text = run_record(tmp_path / "d", preview_video="null")
+    assert result.recorded == 3
+    assert "No film of an episode: No image can be rendered here" in text
+    with pytest.raises(RenderingError):
+        run_record(tmp_path / "e", preview_video="true")
+    assert not (tmp_path / "e").exists()
+
+
+def test_a_camera_is_recorded_frame_by_frame(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root = tmp_path / "d"
+    small = {"robot__camera": "true", "robot__camera_width": 64, "robot__camera_height": 48, "n_envs": 2}
+    try:
+        run_record(root, **small)
+    except RenderingError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    dataset = LeRobotDataset("test/avoid", root=root, video_backend="pyav")
+    assert dataset.meta.features["observation.images.front"]["shape"] == (48, 64, 3)
+    assert len(list(root.rglob("*.mp4"))) == 1
+    images = [dataset[i]["observation.images.front"] for i in (0, 29, 30, len(dataset) - 1)]
+    assert all(image.shape == (3, 48, 64) for image in images)
+    assert len({image.numpy().tobytes() for image in images}) == 4
+
+
+def test_episodes_come_in_order_and_are_dropped_when_told_to_stop(tmp_path):
+    config = parse(RecordConfig, options(tmp_path / "d", dataset__num_episodes=4))
+    simulation = record_module.make_simulation(config.robot, 3)
+    task = record_module.make_task(config.task, 3, 10)
+    loop = EpisodeLoop(simulation, task, record_module.make_brain(config.brain))
+    specs = [record_module.EpisodeSpec(i, 2 * i) for i in (3, 0, 2, 1)]
+    assert [episode.spec.index for episode in loop.run(specs)] == [3, 0, 2, 1]
+    count = 0
+
+    def stop() -> bool:
+        nonlocal count
+        count += 1
+        return count > 5
+
+    assert list(loop.run(specs, stop)) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dataset__num_episodes": 0}, "num_episodes is 0"),
+        ({"n_envs": 0}, "n_envs is 0"),
+        ({"n_envs": -3}, "n_envs is -3"),
+        ({"seed": -1}, "seed is -1"),
+        ({"split": "trian"}, "split is 'trian'"),
+        ({"robot__fps": 20, "dataset__fps": 10}, "leave robot.fps out"),
+        ({"dataset__fps": 7}, "valid values of fps"),
+        ({"dataset__episode_time_s": 0}, "episode_time_s is 0"),
+        ({"dataset__episode_time_s": ".nan"}, "episode_time_s is nan"),
+        ({"task__duration_s": 12}, "task.duration_s is 12.* and dataset.episode_time_s is 3"),
+        ({"brain__type": "avoidence"}, "Did you mean 'avoidance'"),
+        ({"task__type": "avoidd"}, "Did you mean 'avoid'"),
+        ({"robot__type": "turtlebot4"}, "Did you mean 'turtlebot3'"),
+        ({"robot__beems": 3}, "Did you mean 'robot.beams'"),
+        ({"dataset__num_episode": 3}, "Did you mean 'dataset.num_episodes'"),
+        ({"task__duration_s": "long"}, "must be float"),
+        ({"resume": 3}, "must be bool"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_written(tmp_path, change, message):
+    with pytest.raises(ConfigError, match=message):
+        run_record(tmp_path / "d", **change)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_line_prints_a_sentence_and_a_status(tmp_path, capsys):
+    assert record_module.main(options(tmp_path / "d", robot__beems=3)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: Unknown option 'robot.beems'. Did you mean 'robot.beams'?")
+    assert "Traceback" not in error
+    assert record_module.main(["--help"]) == 0
+    assert "--dataset.num_episodes" in capsys.readouterr().out
+
+
+def test_the_example_configuration_parses():
+    path = Path(__file__).parents[2] / "configs" / "record" / "turtlebot3_avoid.yaml"
+    config = parse(RecordConfig, [f"--config_path={path}", "--dataset.num_episodes=20", "--seed=1"])
+    assert (config.dataset.num_episodes, config.seed) == (20, 1)

@@ -1,0 +1,251 @@
+"""bhd-record and bhd-replay with the UR5: goals, plans, instructions, and the same bytes for any number of arms."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.errors import ConfigError, RenderingError
+from bhd_lerobot.rollout.provenance import scene_from_json
+from bhd_lerobot.rollout.replay import Replay
+from tests.recording.support import data_columns, episode_rows, options, run_record
+
+PICK = {
+    "robot__type": "ur5",
+    "brain__type": "language",
+    "task__type": "pick",
+    "task__randomisation__enabled": "true",
+    "dataset__episode_time_s": 20,
+    "robot__beams": None,
+}
+
+SPOKEN = {"dataset__num_episodes": 4, "seed": 6, "task__language": "any", "dataset__language": "true"}
+
+
+def record(root, **overrides):
+    return run_record(root, **{**PICK, **overrides})
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    root = tmp_path_factory.mktemp("ur5") / "d"
+    record(root, **SPOKEN, n_envs=3)
+    return root
+
+
+def test_same_seed_same_bytes_for_any_number_of_arms(recorded, tmp_path):
+    for n_envs, threads in ((1, 1), (4, 2)):
+        root = tmp_path / f"n{n_envs}"
+        record(root, **SPOKEN, n_envs=n_envs, threads=threads)
+        one, other = (pq.read_table(folder / "data") for folder in (recorded, root))
+        assert one.column_names == other.column_names
+        for name in one.column_names:
+            assert one[name].combine_chunks().equals(other[name].combine_chunks()), name
+        assert episode_rows(root) == episode_rows(recorded)
+
+
+def test_every_episode_has_outcome_instruction_plan_goals_and_results(recorded):
+    for episode in dataset_info(recorded).episodes:
+        metadata = episode.metadata
+        assert metadata["success"]
+        scene = scene_from_json(metadata["scene"])
+        assert episode.task == scene.instruction
+        plan = json.loads(metadata["plan"])
+        assert plan["instruction"] == episode.task
+        assert plan["target"] == scene.target_object  # found by its name, not by the task's mark
+        assert [skill for skill, _ in plan["steps"]][-1] == "hold"
+        goals, results = json.loads(metadata["goals"]), json.loads(metadata["results"])
+        sent = [goal["task_id"] for _, goal in goals]
+        assert sorted(sent) == sorted(name for _, name, *_ in results)  # each ends exactly once
+        assert len(set(sent)) == len(sent)
+        assert all(success for _, _, success, *_ in results)
+        assert scene.variation.sensor_noise > 0
+
+
+def test_columns_tell_what_happened(recorded):
+    columns = {name: np.array(values) for name, values in data_columns(recorded).items()}
+    names = json.loads((recorded / "meta" / "info.json").read_text())["features"]
+    environment = names["observation.environment_state"]["names"]
+    for episode in dataset_info(recorded).episodes:
+        rows = columns["episode_index"] == episode.index
+        state = columns["observation.environment_state"][rows]
+        target = int(np.argmax([state[0, environment.index(f"object_{k}_target")] for k in range(5)]))
+        height = state[:, environment.index(f"object_{target}_z")]
+        assert height[-1] - height[0] > 0.1
+        assert np.allclose(columns["next.reward"][rows].sum(), 1.0, atol=1e-5)
+        said = columns["subtask"][rows].tolist()
+        order = list(dict.fromkeys(said))
+        assert [text.split()[0] for text in order] == ["move", "close", "lift", "hold"]
+        # The action is where the reference stands at the end of the frame: one frame later the arm is there.
+        action, seen = columns["action"][rows], columns["observation.state"][rows]
+        assert np.abs(action[:-1, :6] - seen[1:, :6]).max() < 0.06
+        assert np.array_equal(action, columns["control.applied_action"][rows])
+
+
+@pytest.mark.parametrize("episode", [0, 3])
+def test_replay_repeats_goals_and_states_bit_for_bit(recorded, episode):
+    replay = Replay(recorded, episode)
+    assert replay.goals
+    assert replay.open_loop().identical
+    result = Replay(recorded, episode).state_exact()
+    assert result.identical
+    assert np.ptp(result.recorded_xy, axis=0).max() > 0.01  # there was something to repeat
+
+
+def test_the_recorded_reference_replayed_as_setpoints_stays_close(recorded):
+    replay = Replay(recorded, 1)
+    replay.goals = None  # as on a robot that takes setpoints only
+    result = replay.open_loop()
+    assert not result.identical
+    assert result.position_m.max() < 0.01
+
+
+def test_stock_lerobot_reads_it(recorded):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("test/avoid", root=recorded, video_backend="pyav", delta_timestamps={"action": [0, 0.04]})
+    columns = data_columns(recorded)
+    item = dataset[7]
+    assert np.array_equal(item["action"].numpy(), np.float32(columns["action"][7:9]))
+    assert item["subtask"] == columns["subtask"][7]
+    assert item["task"] == dataset_info(recorded).episodes[0].task
+    assert item["observation.environment_state"].shape == (80,)
+    # LeRobot's own reading of its language column: what was being done at that time.
+    from lerobot.datasets.language_render import active_at
+
+    for index in (0, 7, 60, len(dataset) - 1):
+        item = dataset[index]
+        said = active_at(float(item["timestamp"]), persistent=item["language_persistent"], style="subtask")
+        assert said["content"] == item["subtask"] == columns["subtask"][index]
+        plan = active_at(float(item["timestamp"]), persistent=item["language_persistent"], style="plan")
+        assert plan["content"].startswith("1. find the ")
+    assert set(dataset.meta.stats) >= {"observation.environment_state", "action"}
+
+
+def test_reach_is_recorded_and_repeated(tmp_path):
+    root = tmp_path / "d"
+    result, _ = record(root, task__type="reach", brain__type="reach", dataset__num_episodes=3, n_envs=2)
+    assert result.successes == 3
+    assert Replay(root, 2).open_loop().identical
+
+
+def test_tool_actions_are_recorded_as_tool_poses(tmp_path):
+    root = tmp_path / "d"
+    record(root, robot__action_space="tool", dataset__num_episodes=1)
+    features = json.loads((root / "meta" / "info.json").read_text())["features"]
+    assert features["action"]["names"][:4] == ["tool_x.pos", "tool_y.pos", "tool_z.pos", "tool_qw.pos"]
+    action = np.array(data_columns(root)["action"])
+    assert np.allclose(np.sqrt((action[:, 3:7] ** 2).sum(axis=1)), 1, atol=1e-6)
+    assert np.abs(np.diff(action[:, 3:7], axis=0)).max() < 0.2  # no flips of the quaternion's sign
+    replay = Replay(root, 0)
+    assert replay.open_loop().identical
+    replay.goals = None
+    assert replay.open_loop().position_m.max() < 0.01
+
+
+def test_an_instruction_without_a_matching_object_is_not_carried_out_and_says_why(tmp_path):
+    root = tmp_path / "d"
+    result, _ = record(
+        root, brain__instruction="pick up the elephant", dataset__num_episodes=1, dataset__episode_time_s=1
+    )
+    assert result.successes == 0
+    (episode,) = dataset_info(root).episodes
+    plan = json.loads(episode.metadata["plan"])
+    assert "elephant" in plan["problem"]
+    assert plan["steps"] == []
+    assert data_columns(root)["subtask"][-1].startswith("cannot:")
+    state = np.array(data_columns(root)["observation.state"])
+    assert np.abs(state[:, 7:]).max() < 0.1  # nothing moved but by the noise
+    assert json.loads(episode.metadata["goals"]) == []
+    assert Replay(root, 0).open_loop().identical
+
+
+def test_killed_and_resumed_is_the_same_as_undisturbed(recorded, tmp_path):
+    root = tmp_path / "killed"
+    many = {**PICK, **SPOKEN, "resume": "true"}
+    command = [sys.executable, "-m", "bhd_lerobot.recording.record", *options(root, **many)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE)
+    while process.poll() is None:
+        try:
+            if json.loads((root / "meta" / "info.json").read_text())["total_episodes"] >= 1:
+                break
+        except (OSError, ValueError):
+            pass
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    record(root, **SPOKEN, n_envs=2, resume="true")
+    assert data_columns(root) == data_columns(recorded)
+
+
+def test_cameras_are_recorded(tmp_path):
+    root = tmp_path / "d"
+    try:
+        record(
+            root,
+            robot__camera="true",
+            robot__camera_width=64,
+            robot__camera_height=48,
+            dataset__num_episodes=1,
+            dataset__episode_time_s=1,
+        )
+    except RenderingError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    features = json.loads((root / "meta" / "info.json").read_text())["features"]
+    for camera in ("scene", "wrist"):
+        assert features[f"observation.images.{camera}"]["shape"] == [48, 64, 3]
+    assert len(list(root.rglob("*.mp4"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"task__type": "avoid", "brain__type": "avoidance"}, "is for robot.type = 'turtlebot3'"),
+        ({"brain__type": "gap_follower"}, "Brains for it: corrected, language, learned, noop, pick, random, reach"),
+        ({"brain__type": "reach"}, "target_x"),
+        ({"task__max_objects": 6}, "max_objects is 6"),
+        ({"task__language": "fr"}, "task.language"),
+        ({"task__randomisation__size": 1.5}, "randomisation.size is 1.5"),
+        ({"brain__max_velocity": 99}, r"brain\.max_velocity is 99"),
+        ({"brain__attempts": 0}, "brain.attempts is 0"),
+        ({"robot__action_space": "joints"}, "Did you mean 'joint'"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_written(tmp_path, change, message):
+    root = tmp_path / "d"
+    with pytest.raises(ConfigError, match=message):
+        run_record(root, **{**{key: value for key, value in PICK.items() if "randomisation" not in key}, **change})
+    assert not root.exists()
+
+
+def test_the_base_is_still_recorded(tmp_path):
+    result, _ = run_record(tmp_path / "d", dataset__num_episodes=1)
+    assert result.episodes == 1
+
+
+def test_pytorch_collates_its_frames(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from torch.utils.data import DataLoader
+
+    record(tmp_path / "d", dataset__num_episodes=1)
+    dataset = LeRobotDataset("test/avoid", root=tmp_path / "d", video_backend="pyav")
+    batch = next(iter(DataLoader(dataset, batch_size=4)))
+    assert batch["action"].shape == (4, 7)
+    assert len(batch["subtask"]) == len(batch["task"]) == 4
+
+
+def test_why_a_brain_gave_up_is_in_the_summary(tmp_path):
+    _, text = record(
+        tmp_path / "d",
+        brain__instruction="make me a coffee",
+        dataset__num_episodes=2,
+        dataset__episode_time_s=1,
+    )
+    assert "gave up 2 times" in text
+    assert "coffee" in text

@@ -1,0 +1,138 @@
+"""What the tests of robots on the wall clock share. They wait as long as it takes; what they state does not."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from bhd_lerobot.control.fifo import RingReader
+from bhd_lerobot.control.messages import Mode, Watchdog
+from bhd_lerobot.realtime.block import LiveBlock
+from bhd_lerobot.realtime.shared_memory import FOLDER, PREFIX, names
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.host.config import RealtimeConfig
+from bhd_lerobot.robots.host.state import WATCHDOGS
+from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+from tests.waiting import until
+
+
+def relaxed(**options: Any) -> RealtimeConfig:
+    """Return options with which a busy machine alone does not stop a robot."""
+    return RealtimeConfig(**{"brain_timeout_s": 20.0, "recorder_timeout_s": 20.0, "most_misses": 10**6, **options})
+
+
+def turtlebot(name: str, *, require_realtime: bool = False, **options: Any) -> TurtleBot3:
+    """Return an unconnected base on the wall clock, in an empty place."""
+    return TurtleBot3(
+        TurtleBot3Config(
+            id=name,
+            clock="realtime",
+            arena="empty",
+            beams=36,
+            odometry=True,
+            command_timeout_s=20.0,
+            require_realtime=require_realtime,
+            realtime=relaxed(**options),
+        )
+    )
+
+
+def unique(name: str) -> str:
+    """Return a robot's id that no test of another process uses."""
+    return f"test-{name}-{os.getpid()}"
+
+
+def is_alive(pid: int) -> bool:
+    """Return whether a process runs: not ended, and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def is_gone(name: str) -> bool:
+    """Return whether nothing of a robot is left in shared memory."""
+    return name not in names() and not any(FOLDER.glob(f"{PREFIX}{name}.*"))
+
+
+def mode(robot: Any) -> Mode:
+    """Return a robot's mode."""
+    return Mode(int(robot.simulation.modes[0]))
+
+
+def drive(robot: TurtleBot3, speed: float = 0.2) -> None:
+    """Send a base straight on, and wait until it moves."""
+
+    def moves() -> bool:
+        robot.send_action({"x.vel": speed, "theta.vel": 0.0})
+        return bool(robot.get_observation()["x.vel"] > 0.5 * speed)
+
+    until(moves, "the base moves")
+
+
+def watchdog_count(state: Any, watchdog: Watchdog) -> int:
+    """Return how often a watchdog was raised in a stretch."""
+    return int(state["watchdogs"][WATCHDOGS.index(watchdog)])
+
+
+class States:
+    """All states that a robot publishes from now on, read by another process."""
+
+    def __init__(self, name: str) -> None:
+        self.block = LiveBlock.attach(name)
+        self._reader = RingReader(self.block.ring)
+        self.all: list[Any] = []
+
+    def read(self) -> "States":
+        """Take what is there."""
+        while (state := self._reader.read()) is not None:
+            self.all.append(state.copy())
+        return self
+
+    def first(self, wanted: Mode) -> int:
+        """Return the number of the first state in a mode."""
+        return next(k for k, state in enumerate(self.all) if state["mode"][0] == wanted)
+
+    def has(self, wanted: Mode) -> bool:
+        """Return whether a state in this mode was read so far."""
+        return any(state["mode"][0] == wanted for state in self.read().all)
+
+
+CHILD = """
+import json, sys, time
+from live_support import drive, turtlebot
+robot = turtlebot({name!r}, **{options!r})
+robot.connect()
+drive(robot)
+print(json.dumps({{"pids": robot.simulation.link.pids}}), flush=True)
+while True:
+    robot.send_action({{"x.vel": 0.2, "theta.vel": 0.0}})
+    time.sleep(0.05)
+"""
+
+
+@contextmanager
+def driving_child(name: str, **options: Any) -> Iterator[tuple[subprocess.Popen, dict]]:
+    """Run a program that connects a base and drives it; yield it, and what it says about its robot.
+
+    Args:
+        name: the robot's id.
+        options: of `turtlebot`.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-c", CHILD.format(name=name, options=options)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(str(Path(__file__).parents[k]) for k in (0, 2))},
+    )
+    try:
+        assert process.stdout is not None
+        yield process, json.loads(process.stdout.readline())
+    finally:
+        process.kill()
+        process.communicate()

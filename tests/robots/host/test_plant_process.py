@@ -1,0 +1,525 @@
+"""A plant in a process of its own: it follows fresh commands, and stops the robot when there are none.
+
+The loop runs on a virtual clock. Processes are started few times, and what they did is read from their own record, by
+laws that hold however late anything was.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.arenas import make_arena
+from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.realtime.block import LiveBlock, Word
+from bhd_lerobot.realtime.grid import Slot, TickGrid
+from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, RemotePlant
+from bhd_lerobot.realtime.shared_memory import names
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.config import RealtimeConfig
+from bhd_lerobot.robots.host.plant_loop import PlantLoop, PlantTick
+from bhd_lerobot.robots.host.plant_process import SensedWorld
+from bhd_lerobot.robots.host.plant_stop import ServoStop, WheelStop, make_stop
+from bhd_lerobot.robots.host.remote_plant import RemoteSimulation, plant_shape
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.host.state import WATCHDOGS
+from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+from bhd_lerobot.sim.plant import SimulatedPlant
+from bhd_lerobot.sim.world import World
+from tests.waiting import until
+
+HZ = 200
+PERIOD = NANOSECONDS // HZ
+TIMEOUT = 20_000_000
+START = 10 * NANOSECONDS
+
+
+class FakeWorld:
+    """Wheels that slow down by `brake` in a tick when they are commanded to stand, and else turn as they are told."""
+
+    def __init__(self, brake: float = 0.5) -> None:
+        self.brake = brake
+        self.velocity = 0.0
+        self.advanced = 0
+        self.wanted: NDArray[np.float64] = np.zeros((1, 2))
+        self.ticks: list[tuple[PlantTick, PlantPhase, list[float]]] = []
+
+    def read(self, out: PlantReading) -> None:
+        out.velocity[:] = self.velocity
+
+    def write(self, actuators: NDArray[np.float64]) -> None:
+        self.wanted = actuators.copy()
+
+    def advance(self) -> None:
+        self.advanced += 1
+        wanted = float(self.wanted[0, 0])
+        self.velocity = wanted if wanted else max(0.0, self.velocity - self.brake)
+
+    def publish(self, tick: PlantTick, reading: PlantReading, guard: CommandGuard) -> None:
+        self.ticks.append((tick, guard.phase, tick.actuators[0].tolist()))
+
+
+class LoopRig:
+    """A loop, and on its clock a cerebellum that sends a command every period until it dies."""
+
+    def __init__(self, world: FakeWorld, dies_ns: int, happens: dict[int, Any] | None = None) -> None:
+        shape = plant_shape(SIMULATIONS["turtlebot3"]())
+        self.link = PlantLink(shape)
+        self.now = START - 20_000_000
+        self.remote = RemotePlant(self.link, lambda: self.sent)
+        self.sent, self.dies = START, dies_ns
+        self.words = np.zeros(64, np.int64)
+        self.orphan = False
+        self.happens = happens or {}
+        self.guard = CommandGuard(self.link, TIMEOUT)
+        self.world = world
+        self.loop = PlantLoop(
+            world,
+            self.guard,
+            WheelStop(2),
+            self.words,
+            joints=2,
+            control_hz=HZ,
+            most_catch_up=10,
+            is_orphan=lambda: self.orphan,
+            clock=lambda: self.now,
+            sleep=self.sleep,
+        )
+
+    def sleep(self, seconds: float) -> None:
+        self.now += round(seconds * NANOSECONDS)
+        while self.sent <= min(self.now, self.dies):
+            self.remote.write(np.full((1, 2), 6.0))
+            self.sent += PERIOD
+        for when in [one for one in self.happens if one <= self.now]:
+            self.happens.pop(when)(self)
+        assert self.now < START + 60 * NANOSECONDS, "the loop does not end"
+
+
+def end(rig: LoopRig) -> None:
+    rig.words[Word.END] = rig.words[Word.PAUSE] = 1
+
+
+def test_it_ticks_half_a_period_after_the_cerebellum_and_waits_for_its_first_command() -> None:
+    rig = LoopRig(FakeWorld(), START + 50 * PERIOD, {START + 20 * PERIOD: lambda r: r.words.__setitem__(Word.PAUSE, 1)})
+    rig.loop.run(START)
+    dues = [tick.slot.due_ns for tick, _, _ in rig.world.ticks]
+    assert dues == list(range(dues[0], dues[-1] + 1, PERIOD))
+    assert {(due - START) % PERIOD for due in dues} == {PERIOD // 2}
+    assert dues[0] < START - 15_000_000
+    phases = [phase for tick, phase, _ in rig.world.ticks if tick.slot.due_ns < START]
+    assert set(phases) == {PlantPhase.WAITING}
+    driven = [phase for tick, phase, _ in rig.world.ticks if tick.slot.due_ns > START]
+    assert set(driven) == {PlantPhase.DRIVEN}
+    assert rig.world.advanced == len(driven) == 21  # while it waited the world stood still
+    assert rig.words[Word.PLANT_ALIVE] == rig.now
+
+
+def test_silence_stops_the_wheels_within_the_time_out_and_a_tick() -> None:
+    rig = LoopRig(FakeWorld(), START + 30 * PERIOD, {START + NANOSECONDS: end})
+    rig.loop.run(START)
+    last = START + 30 * PERIOD
+    stopped = [tick for tick, phase, _ in rig.world.ticks if phase == PlantPhase.STOPPED]
+    assert 0 < stopped[0].start_ns - last <= TIMEOUT + PERIOD
+    for tick, phase, actuators in rig.world.ticks:
+        if tick.slot.due_ns > START:
+            assert actuators == ([0.0, 0.0] if phase == PlantPhase.STOPPED else [6.0, 6.0])
+    assert rig.guard.stops == 1
+
+
+@pytest.mark.parametrize("orphan", [False, True])
+def test_a_process_that_is_to_end_sees_its_robot_to_rest_first(orphan: bool) -> None:
+    def ask(rig: LoopRig) -> None:
+        if orphan:
+            rig.orphan = True
+        else:
+            end(rig)
+
+    rig = LoopRig(FakeWorld(brake=0.1), START + 30 * PERIOD, {START + 29 * PERIOD: ask})
+    rig.loop.run(START)
+    assert rig.world.velocity < 1e-9
+    assert rig.guard.phase == PlantPhase.STOPPED
+    assert rig.now - START < 2 * NANOSECONDS
+
+
+def test_a_robot_that_does_not_come_to_rest_is_left_in_the_end() -> None:
+    rig = LoopRig(FakeWorld(brake=0.0), START + 30 * PERIOD, {START + 31 * PERIOD: end})
+    rig.loop.run(START)
+    assert rig.world.velocity == 6.0
+    assert 3 * NANOSECONDS < rig.now - START < 5 * NANOSECONDS
+
+
+@pytest.mark.parametrize(("away", "skipped", "advanced"), [(2, 1, 2), (3, 2, 3), (31, 30, 11)])
+def test_missed_ticks_are_caught_up_within_a_bound(away: int, skipped: int, advanced: int) -> None:
+    world = FakeWorld()
+    rig = LoopRig(world, START + 1000 * PERIOD, {START + 50 * PERIOD: lambda r: r.words.__setitem__(Word.PAUSE, 1)})
+    advance = world.advance
+
+    def late() -> None:
+        """Be away for some periods while the fifth tick runs."""
+        advance()
+        rig.now += away * PERIOD if world.advanced == 5 else 0
+
+    world.advance = late  # type: ignore[method-assign]
+    grid = rig.loop.run(START)
+    assert grid.skipped == skipped
+    ticks = [(tick.slot, phase) for tick, phase, _ in world.ticks if tick.slot.due_ns > START]
+    assert ticks[5][0].skipped == skipped
+    assert world.advanced == len(ticks) - 1 + advanced
+    # Who was away for longer than a command may be old cannot vouch for the robot any more.
+    assert ticks[-1][1] == (PlantPhase.STOPPED if away * PERIOD > TIMEOUT else PlantPhase.DRIVEN)
+
+
+# --- how each kind of robot stops ------------------------------------------------------------------------------------
+
+
+def test_a_servo_follows_a_fast_joint_and_holds_a_slow_one() -> None:
+    stop, reading = ServoStop(ur5()), PlantReading(1, 7)
+    last = np.full((1, 7), 0.03)
+    stop.begin(last)
+    reading.velocity[:] = [[1.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.1]]
+    for position in (0.1, 0.2, 0.3):
+        reading.position[:] = position
+        assert stop.command(reading).tolist() == [[position, 0.1, *[position] * 4, 0.03]]
+    reading.velocity[:] = 0.0
+    stop.command(reading)
+    reading.position[:], reading.velocity[:] = 0.5, 1.0  # pushed
+    assert stop.command(reading).tolist() == [[0.3, 0.1, *[0.3] * 4, 0.03]]
+    stop.begin(last)
+    assert stop.command(reading).tolist() == [[*[0.5] * 6, 0.03]]  # the next stop begins anew
+
+
+@pytest.mark.parametrize("actuation", ["position", "torque"])
+def test_an_arm_comes_to_rest_and_stays_there_by_itself(actuation: Any) -> None:
+    body = ur5(actuation=actuation)
+    world = World(body, 1)
+    plant, stop, reading = SimulatedPlant(world), make_stop(body, 7), PlantReading(1, 7)
+    world.qvel[:, :6] = [1.0, -1.0, 1.5, 2.0, 2.0, -2.0]
+    stop.begin(np.asarray(body.home)[None])
+    effort = np.asarray(body.limits.effort)
+    speeds, positions = [], []
+    for _ in range(1000):
+        plant.read(reading)
+        command = stop.command(reading)
+        assert actuation == "position" or (np.abs(command[0, :6]) <= effort[:6]).all()
+        plant.write(command)
+        world.step()
+        speeds.append(np.abs(reading.velocity[0, :6]).max())
+        positions.append(reading.position[0].copy())
+    assert max(speeds[250:]) < 0.05  # half a second
+    assert speeds[-1] < 0.01
+    assert np.abs(positions[-1] - positions[-500]).max() < 1e-3
+    assert np.abs(positions[-1][:6] - positions[0][:6]).max() < 0.3  # it braked, and fell nowhere
+
+
+# --- a simulation in two parts ---------------------------------------------------------------------------------------
+
+ARENA = make_arena("random", seed=3)
+
+
+def turtlebot3() -> TurtleBot3Simulation:
+    return TurtleBot3Simulation(TurtleBot3Config(odometry=True, imu=True), 1, 1)
+
+
+def arm() -> UR5Simulation:
+    return UR5Simulation(UR5Config(), 1, 1)
+
+
+SIMULATIONS: dict[str, Any] = {"turtlebot3": turtlebot3, "ur5": arm}
+
+
+class Parts:
+    """A cerebellum and a world that know of each other by a link, beside the same robot in one part."""
+
+    def __init__(self, kind: str) -> None:
+        self.whole: Simulation = SIMULATIONS[kind]()
+        self.now = 0
+        there, own = SIMULATIONS[kind](), SIMULATIONS[kind]()
+        shape = plant_shape(own)
+        link = PlantLink(shape)
+        self.remote = RemoteSimulation(own, link)
+        self.remote.remote._clock = lambda: self.now
+        self.world = SensedWorld(there, link.states, shape.state_dtype, lambda: self.now)
+        self.guard = CommandGuard(link, TIMEOUT)
+        self.loop = PlantLoop(
+            self.world,
+            self.guard,
+            make_stop(there.body, shape.joints),
+            np.zeros(64, np.int64),
+            joints=shape.joints,
+            control_hz=own.rates.control_hz,
+            most_catch_up=10,
+            is_orphan=lambda: False,
+        )
+        self.period = self.loop.period_ns
+        self.grid, self.slot = TickGrid(0, self.period), Slot(0, 0, 0, 0)
+        self.sims = [self.whole, self.remote]
+        self.scene = ARENA if kind == "turtlebot3" else UR5(UR5Config()).make_scene()
+        self.place()
+
+    def place(self) -> None:
+        self.world.place(self.scene, 5)
+        self.guard.place()
+        self.loop.tick(self.slot, self.now, self.grid)
+        for simulation in self.sims:
+            simulation.reset(np.zeros(1, np.intp), [self.scene], [5])
+
+    def plant_tick(self) -> None:
+        self.now += self.period
+        self.loop.tick(self.slot, self.now, self.grid)
+
+    def hang(self) -> None:
+        """Let the plant go on alone until it stops."""
+        while self.guard.phase != PlantPhase.STOPPED:
+            self.plant_tick()
+
+    def tick(self) -> None:
+        for simulation in self.sims:
+            simulation.cerebellum.tick(self.now)
+        self.plant_tick()
+        for simulation in self.sims:
+            simulation.advance()
+
+
+@pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
+def test_a_robot_in_two_parts_does_and_sees_the_same_as_one_in_one_part(kind: str) -> None:
+    parts = Parts(kind)
+    rng = np.random.default_rng(0)
+    start = parts.whole.cerebellum.command.copy()
+    for tick in range(300):
+        if tick % 20 == 0:
+            values = start + rng.normal(0.0, 0.05, start.shape)
+            for simulation in parts.sims:
+                simulation.bridge.send(values, due_ns=parts.now)
+        parts.tick()
+        (seen, oldest), (remote_seen, remote_oldest) = (simulation.sense() for simulation in parts.sims)
+        np.testing.assert_array_equal(remote_seen, seen)
+        assert parts.remote.tick - remote_oldest == parts.whole.tick - oldest
+    np.testing.assert_array_equal(parts.remote.physics_state, parts.whole.physics_state)
+    assert np.abs(seen - start[:, :1]).max() > 0.1
+    np.testing.assert_array_equal(
+        parts.remote.cerebellum.controller.odometry(), parts.whole.cerebellum.controller.odometry()
+    )
+
+
+def test_touches_reach_the_cerebellums_process_once_each() -> None:
+    parts = Parts("turtlebot3")
+    there = parts.world.simulation
+    for expected in (True, False, True):
+        if expected:
+            there.touches[0][:] = True
+        parts.plant_tick()
+        parts.remote.advance()
+        assert parts.remote.touches[0].tolist() == [expected]
+        parts.remote.touches[0][:] = False
+    assert not there.touches[0].any()
+
+
+def test_after_a_stop_and_a_reset_the_arm_goes_on_from_where_it_is() -> None:
+    parts = Parts("ur5")
+    cerebellum = parts.remote.cerebellum
+    values = cerebellum.command.copy()
+    values[0, 0] += 1.0
+    values[0, -1] = 0.02
+    for tick in range(100):
+        if tick % 20 == 0:
+            parts.remote.bridge.send(values, due_ns=parts.now)
+        parts.tick()
+    assert cerebellum.mode[0] == Mode.TRACKING
+    parts.hang()
+
+    requests: list[Request] = []
+
+    def answer(now_ns: int) -> None:
+        for request in requests:
+            cerebellum.request(request)
+
+    serve = parts.remote.resuming(answer)
+    for _ in range(400):
+        parts.tick()
+        serve(parts.now)
+        assert cerebellum.mode[0] == Mode.FAULT
+        assert parts.guard.phase == PlantPhase.STOPPED
+    away = np.abs(cerebellum.command - cerebellum.reading.position)[0, :6].max()
+    assert away > 0.01  # the reference came to rest elsewhere
+    opening = cerebellum.command[0, -1]
+    before = cerebellum.reading.position.copy()
+    requests.append(Request.RESET)
+    serve(parts.now)
+    requests.clear()
+    for _ in range(200):
+        parts.tick()
+        serve(parts.now)
+    assert parts.guard.phase == PlantPhase.DRIVEN
+    assert cerebellum.mode[0] == Mode.INACTIVE
+    assert np.abs(cerebellum.reading.position - before)[0, :6].max() < 1e-3  # no jump
+    assert cerebellum.command[0, -1] == opening
+
+
+@pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
+def test_a_new_scene_forgets_a_stop(kind: str) -> None:
+    parts = Parts(kind)
+    parts.tick()
+    parts.hang()
+    parts.tick()
+    assert parts.remote.cerebellum.mode[0] == Mode.FAULT
+    parts.place()
+    for _ in range(5):
+        parts.tick()
+        assert parts.remote.cerebellum.mode[0] == Mode.HOLD
+        assert parts.guard.phase == PlantPhase.DRIVEN
+
+
+def test_the_process_needs_neither_torch_nor_lerobot() -> None:
+    modules = ("plant_process", "turtlebot3_simulation", "ur5_simulation")
+    code = "".join(f"import bhd_lerobot.robots.{module}\n" for module in modules)
+    code += "import sys; print(sorted({'torch', 'lerobot'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+# --- configuration ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_time_out_that_means_nothing_is_refused(value: float) -> None:
+    with pytest.raises(ConfigError, match=r"plant_timeout_s .*cannot be turned off"):
+        RealtimeConfig(plant_timeout_s=value)
+
+
+def test_the_plants_time_out_is_also_the_cerebellums() -> None:
+    assert RealtimeConfig(plant_timeout_s=0.05).limits().plant_timeout_s == 0.05
+    assert not RealtimeConfig().plant_process
+
+
+def test_a_time_out_of_less_than_two_ticks_is_refused_before_anything_starts() -> None:
+    before = names()
+    with pytest.raises(ConfigError, match=r"plant_timeout_s is 0.009; at control_hz = 200 .* at least 0.01 s"):
+        TurtleBot3(live(TurtleBot3Config, plant_timeout_s=0.009)).connect()
+    assert names() == before
+
+
+# --- processes -------------------------------------------------------------------------------------------------------
+
+LONG = 0.2  # [s] time-out of the plant in these tests: other tests may keep all processors busy for longer than 20 ms
+
+
+def live(kind: Any, plant_timeout_s: float = LONG) -> Any:
+    config = kind(id=f"test-plant-{os.getpid()}", clock="realtime")
+    config.realtime = RealtimeConfig(plant_process=True, plant_timeout_s=plant_timeout_s, most_misses=1000)
+    return config
+
+
+@contextmanager
+def moving(kind: str) -> Iterator[tuple[Any, PlantLink]]:
+    """Yield a robot that moves, and what its plant publishes."""
+    robot: Any = TurtleBot3(live(TurtleBot3Config)) if kind == "turtlebot3" else UR5(live(UR5Config))
+    robot.connect()
+    block = None
+    try:
+        block = LiveBlock.attach(robot.simulation.link.block.name)
+        link = PlantLink.of(block)
+        assert link is not None
+        names, command = robot.action_names, robot.simulation.live_bridge.latest["command"][0].tolist()
+        target = {"x.vel": 0.2, "theta.vel": 0.0} if kind == "turtlebot3" else dict(zip(names, command, strict=True))
+        while True:
+            if kind == "ur5":
+                target["shoulder_pan.pos"] += 0.04
+            robot.send_action(target)
+            time.sleep(0.04)
+            state: Any = link.states.latest()
+            if np.abs(state["velocity"]).max() > (3.0 if kind == "turtlebot3" else 0.5):
+                break
+        yield robot, link
+    finally:
+        robot.disconnect()
+        if block is not None:
+            block.close()
+
+
+@pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
+def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
+    with moving(kind) as (robot, link):
+        live_link = robot.simulation.link
+        timeout, period = round(LONG * NANOSECONDS), NANOSECONDS // robot.simulation.rates.control_hz
+        os.kill(live_link.pids["cerebellum"], signal.SIGKILL)
+        last: Any = None
+        stopped: Any = None
+
+        def look() -> bool:
+            """Find the last tick before the stop and the first of it, before they are overwritten."""
+            nonlocal last, stopped
+            newest = len(link.states) - 1
+            rows = [link.states.copy(number) for number in range(max(0, newest - link.shape.kept + 2), newest + 1)]
+            for row in (row for row in rows if row is not None):
+                if row["phase"] == PlantPhase.DRIVEN:
+                    last = row
+                elif row["phase"] == PlantPhase.STOPPED and stopped is None:
+                    stopped = row
+            return stopped is not None
+
+        until(look)
+        # The first tick on the plant's grid at which the last command was too old.
+        assert last["command"] == stopped["command"]
+        assert last["start_ns"] - last["command_ns"] <= timeout < stopped["start_ns"] - stopped["command_ns"]
+        ticks = stopped["index"] - last["index"]
+        assert stopped["due_ns"] - stopped["command_ns"] <= timeout + ticks * period
+        assert (stopped["phase"], stopped["stops"], stopped["stopped_ns"]) == (2, 1, stopped["start_ns"])
+        if kind == "turtlebot3":
+            assert not stopped["actuators"].any()
+
+        until(lambda: np.abs(link.states.latest()["velocity"]).max() < 0.01)  # type: ignore[index]
+        with pytest.raises(RealtimeError, match=r"cerebellum's process was killed by signal 9. The plant stops"):
+            live_link.check()
+        block_name, plant = live_link.block.name, live_link._processes["plant"]
+    assert plant.returncode == 0  # it ended in order
+    assert block_name not in names()
+
+
+def test_a_cerebellum_that_was_stopped_finds_a_fault_and_goes_on_after_a_reset() -> None:
+    with moving("turtlebot3") as (robot, link):
+        pid = robot.simulation.link.pids["cerebellum"]
+        os.kill(pid, signal.SIGSTOP)
+        until(lambda: link.states.latest()["phase"] == PlantPhase.STOPPED)  # type: ignore[index]
+        until(lambda: np.abs(link.states.latest()["velocity"]).max() < 0.01)  # type: ignore[index]
+        os.kill(pid, signal.SIGCONT)
+        until(lambda: robot.simulation.modes[0] == Mode.FAULT)
+        assert link.states.latest()["phase"] == PlantPhase.STOPPED  # type: ignore[index]
+        bridge = robot.simulation.live_bridge
+        until(lambda: bool(bridge.reset().accepted.all()))
+        until(lambda: link.states.latest()["phase"] == PlantPhase.DRIVEN)  # type: ignore[index]
+        robot.activate()
+        robot.send_action({"x.vel": 0.1, "theta.vel": 0.0})
+        assert link.states.latest()["stops"] == 1  # type: ignore[index]
+
+
+def test_a_plant_that_is_stopped_or_killed_is_a_fault_and_an_error_that_says_so() -> None:
+    with moving("turtlebot3") as (robot, _):
+        live_link = robot.simulation.link
+        os.kill(live_link.pids["plant"], signal.SIGSTOP)
+        until(lambda: robot.simulation.modes[0] == Mode.FAULT)
+        seen = WATCHDOGS.index(Watchdog.PLANT)
+        until(lambda: robot.simulation.live_bridge.latest["watchdogs"][seen] > 0)
+        with pytest.raises(RealtimeError, match=r"plant's process \(\d+\) has shown no sign of life for 2\.\d s"):
+            until(live_link.check)  # it says nothing until then
+        os.kill(live_link.pids["plant"], signal.SIGKILL)
+        until(lambda: live_link._processes["plant"].poll() is not None)
+        with pytest.raises(RealtimeError, match=r"plant's process was killed by signal 9. The cerebellum is in FAULT"):
+            live_link.check()
+        block_name = live_link.block.name
+    assert block_name not in names()

@@ -1,0 +1,168 @@
+"""A base on the wall clock, in processes of its own: its life, its motion, and every way to stop it."""
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import suppress
+
+import pytest
+from lerobot.utils.errors import DeviceNotConnectedError
+
+from bhd_lerobot.control.estop import EstopInputs
+from bhd_lerobot.control.messages import Mode
+from bhd_lerobot.errors import CommandRefusedError, ConfigError, RealtimeError
+from bhd_lerobot.realtime.block import LiveBlock, Word
+from bhd_lerobot.realtime.shared_memory import names
+from bhd_lerobot.robots.conformance import check_robot
+from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+from tests.robots.host.support import drive, is_alive, is_gone, mode, turtlebot, unique
+from tests.waiting import until
+
+NAME = unique("shared")
+
+
+@pytest.fixture(scope="module")
+def robot() -> Iterator[TurtleBot3]:
+    robot = turtlebot(NAME)
+    robot.connect()
+    yield robot
+    robot.disconnect()
+    assert is_gone(NAME)
+
+
+@pytest.fixture
+def driving(robot: TurtleBot3) -> Iterator[TurtleBot3]:
+    """The same robot on its way, whatever the test before did to it; afterwards it is ready again."""
+    drive(robot)
+    yield robot
+    recover(robot)
+
+
+def recover(robot: TurtleBot3) -> None:
+    """Lead a robot out of an emergency stop."""
+
+    until(lambda: robot.simulation.bridge.reset().accepted[0], "the robot is at rest")
+    assert mode(robot) == Mode.INACTIVE
+    with pytest.raises(CommandRefusedError, match="not active"):
+        robot.send_action({"x.vel": 0.1, "theta.vel": 0.0})
+    robot.activate()
+    assert mode(robot) == Mode.HOLD
+
+
+def expect_stop(robot: TurtleBot3) -> None:
+    until(lambda: mode(robot) == Mode.ESTOP, "the emergency stop is latched")
+    with pytest.raises(CommandRefusedError, match="emergency stop"):
+        robot.send_action({"x.vel": 0.2, "theta.vel": 0.0})
+    until(lambda: abs(robot.get_observation()["x.vel"]) < 0.01, "the base stands")
+    with pytest.raises(CommandRefusedError, match="emergency stop"):
+        robot.activate()
+    assert mode(robot) == Mode.ESTOP
+
+
+def test_the_real_time_process_has_imported_neither_torch_nor_lerobot(robot):
+    link = robot.simulation.link
+    assert link.about["heavy"] == []
+    assert link.about["pid"] == link.pids["cerebellum"] != os.getpid()
+    assert {grant["name"] for grant in link.grants} >= {"scheduler", "memory lock", "collector", "timer slack"}
+
+
+def test_observations_flow_and_actions_move_it(driving):
+    before = driving.get_observation()
+    tick = int(driving.simulation.live_bridge.latest["tick"])
+    until(lambda: driving.get_observation()["x.pos"] > before["x.pos"] + 0.02, "the base gets somewhere")
+    assert int(driving.simulation.live_bridge.latest["tick"]) > tick
+    applied = driving.send_action({"x.vel": 0.1, "theta.vel": 0.0})
+    assert set(applied) == {"x.vel", "theta.vel"}
+    driving.estop()
+
+
+def test_estop_from_python(driving):
+    driving.estop()
+    expect_stop(driving)
+
+
+def test_estop_from_a_signal(driving):
+    with EstopInputs(driving.estop) as inputs:
+        inputs.add_signal(signal.SIGUSR1)
+        os.kill(os.getpid(), signal.SIGUSR1)
+        expect_stop(driving)
+        assert inputs.causes == ["signal SIGUSR1"]
+
+
+def test_estop_from_a_wire_that_is_cut(driving):
+    """A reset leads nowhere while it is cut."""
+    reader, writer = os.pipe()
+    driving.add_estop_input(reader, "button")
+    try:
+        os.close(writer)
+        expect_stop(driving)
+        with suppress(CommandRefusedError):  # it may still be braking
+            driving.reset()
+        until(lambda: mode(driving) == Mode.ESTOP, "the wire is still cut")
+    finally:
+        driving.remove_estop_inputs()
+        os.close(reader)
+
+
+def test_estop_from_a_callable(driving):
+    state = {"pressed": False}
+    driving.add_estop_input(lambda: state["pressed"], "relay")
+    assert mode(driving) == Mode.TRACKING
+    state["pressed"] = True
+    expect_stop(driving)
+    state["pressed"] = False
+    driving.remove_estop_inputs()
+
+
+def test_estop_from_another_process(driving):
+    block = LiveBlock.attach(NAME)
+    block.words[Word.ESTOP] = 1
+    block.close()
+    expect_stop(driving)
+
+
+def test_deactivation_ends_in_safe_off(driving):
+    assert driving.simulation.bridge.deactivate().accepted.all()
+    until(lambda: mode(driving) == Mode.SAFE_OFF, "the base is at rest")
+    with pytest.raises(CommandRefusedError, match="not active"):
+        driving.send_action({"x.vel": 0.2, "theta.vel": 0.0})
+
+
+def test_what_is_no_input_is_refused(robot):
+    with pytest.raises(ConfigError, match="file descriptor"):
+        robot.add_estop_input("button")
+
+
+def test_the_same_id_twice_is_refused_and_harms_nobody(robot):
+    second = turtlebot(NAME)
+    with pytest.raises(RealtimeError, match=f"{NAME}.*running already"):
+        second.connect()
+    assert not second.is_connected
+    second.disconnect()
+    assert NAME in names()
+    robot.get_observation()
+
+
+def test_two_robots_at_once_and_the_second_connects_twice(robot):
+    name = unique("second")
+    second = turtlebot(name)
+    for _ in range(2):
+        second.connect()
+        try:
+            assert {NAME, name} <= set(names())
+            pids = second.simulation.link.pids
+            assert not set(pids.values()) & set(robot.simulation.link.pids.values())
+            drive(second)
+            assert mode(robot) in (Mode.HOLD, Mode.TRACKING)
+        finally:
+            second.disconnect()
+        assert is_gone(name)
+        assert not any(is_alive(pid) for pid in pids.values())
+        with pytest.raises(DeviceNotConnectedError):
+            second.get_observation()
+    assert NAME in names()
+
+
+def test_it_keeps_lerobots_contract():
+    assert check_robot(lambda: turtlebot(unique("contract")), adversarial=True) == ()
+    assert is_gone(unique("contract"))

@@ -1,0 +1,131 @@
+"""Brains that plan several frames ahead: what a chunk does is what its actions, sent one by one, would have done."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.control.messages import Mode, Watchdog
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.policies.brain import Chunk
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.registry import make_simulation, make_task
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.tasks.avoid import AvoidConfig
+from bhd_lerobot.tasks.reach import ReachConfig
+from bhd_lerobot.tasks.task import Event
+
+FRAMES = 20
+
+
+class Script:
+    """Plays the rows of a script: one by one, or `length` of them at a time, every `every` frames."""
+
+    name, robot_type, uses_images, has_plan = "script", "any", False, False
+
+    def __init__(self, rows: np.ndarray, length: int = 0, every: int = 1) -> None:
+        self.rows, self.length, self.every = rows, length, every
+        self.frame = 0
+
+    def bind(self, *args: Any) -> None:
+        pass
+
+    def reset(self, *args: Any) -> None:
+        self.frame = 0
+
+    def act(self, observation: Any) -> Any:
+        frame = self.frame
+        self.frame += 1
+        n = len(observation.state)
+        if not self.length:
+            return np.tile(self.rows[frame], (n, 1))
+        if frame % self.every:
+            return None
+        return Chunk(np.tile(self.rows[frame : frame + self.length][:, None], (1, n, 1)))
+
+    def parameters(self) -> dict[str, Any]:
+        return {}
+
+
+def run(kind: str, brain: Script, n: int = 2) -> list[Episode]:
+    if kind == "ur5":
+        simulation = make_simulation(UR5Config(), n)
+        task = make_task(ReachConfig(duration_s=FRAMES / 25), n, 25)
+    else:
+        simulation = make_simulation(TurtleBot3Config(beams=36), n)
+        task = make_task(AvoidConfig(duration_s=FRAMES / 10), n, 10)
+    return list(EpisodeLoop(simulation, task, brain).run([EpisodeSpec(i, 2 * i) for i in range(3)]))
+
+
+def script(kind: str) -> np.ndarray:
+    time = np.arange(2 * FRAMES)
+    if kind == "ur5":
+        home = np.array(UR5Config().body().home)
+        return home + 0.02 * np.sin(time / 4)[:, None] * np.array([1, -1, 1, 2, -2, 3, 0.0])
+    return np.stack([0.1 + 0.05 * np.sin(time / 3), 0.8 * np.cos(time / 5)], axis=1)
+
+
+@pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
+@pytest.mark.parametrize(("length", "every"), [(5, 5), (8, 3), (30, 10), (1, 1)])
+def test_a_chunk_does_what_its_actions_sent_one_by_one_do(kind: str, length: int, every: int) -> None:
+    rows = script(kind)
+    one_by_one, chunked = run(kind, Script(rows)), run(kind, Script(rows, length, every))
+    assert len(one_by_one) == len(chunked) == 3
+    for first, second in zip(one_by_one, chunked, strict=True):
+        assert first.columns.keys() == second.columns.keys()
+        for key, column in first.columns.items():
+            np.testing.assert_array_equal(second.columns[key], column, err_msg=key)
+
+
+@pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
+def test_a_chunk_that_is_used_up_means_hold(kind: str) -> None:
+    (episode, *_) = run(kind, Script(script(kind), 4, FRAMES))
+    columns = episode.columns
+    assert len(columns[keys.ACTION]) == FRAMES
+    # What is asked for stays what it was last asked for; nobody makes something up.
+    np.testing.assert_array_equal(columns[keys.ACTION][4:], np.tile(columns[keys.ACTION][3], (FRAMES - 4, 1)))
+    assert columns[keys.MODE][3] == Mode.TRACKING
+    assert columns[keys.MODE][-1] == Mode.HOLD
+    assert (columns[keys.WATCHDOG] & Watchdog.COMMAND_AGE).any()
+    steps = np.abs(np.diff(columns[keys.APPLIED_ACTION][-3:], axis=0))
+    assert (steps < 1e-6).all()
+
+
+class Breaker(Script):
+    """Latches a fault in the first simulation, in its fifth frame."""
+
+    def __init__(self, rows: np.ndarray) -> None:
+        super().__init__(rows)
+        self.simulation: Any = None
+        self.is_broken = False
+
+    def act(self, observation: Any) -> Any:
+        if self.frame == 4 and not self.is_broken:
+            self.is_broken = True
+            self.simulation.cerebellum.reading.fault[0] = True
+        return super().act(observation)
+
+
+def test_a_latched_fault_ends_the_episode_and_the_next_one_moves_again() -> None:
+    simulation = make_simulation(TurtleBot3Config(beams=36), 2)
+    task = make_task(AvoidConfig(duration_s=FRAMES / 10), 2, 10)
+    brain = Breaker(script("turtlebot3"))
+    brain.simulation = simulation
+    plant_fault = simulation.cerebellum.reading.fault
+    episodes = []
+    for episode in EpisodeLoop(simulation, task, brain).run([EpisodeSpec(i, 2 * i) for i in range(3)]):
+        plant_fault[:] = False
+        episodes.append(episode)
+    first, second, third = episodes
+    assert first.outcome.event == Event.FAULT
+    assert not first.outcome.success
+    assert first.frames == 5
+    assert first.columns[keys.MODE][-1] == Mode.FAULT
+    assert first.columns[keys.EVENT].tolist() == [0, 0, 0, 0, Event.FAULT]
+    for other in (second, third):
+        assert other.outcome.event != Event.FAULT
+        assert other.frames == FRAMES
+        assert (other.columns[keys.MODE] != Mode.FAULT).all()
+    assert np.abs(third.columns[keys.APPLIED_ACTION]).max() > 0.05

@@ -1,0 +1,157 @@
+"""What a person says during an episode is in its frames and in its outcome."""
+
+import os
+import pty
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.marks import Marks
+from bhd_lerobot.rollout.registry import make_simulation, make_task
+from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.tasks.avoid import AvoidConfig
+from bhd_lerobot.tasks.task import OUTCOMES, Event
+
+ALL = np.array([True, True])
+NOTHING = np.zeros(2, np.int64)
+
+
+def test_an_outcome_is_handed_over_once() -> None:
+    marks = Marks(2)
+    marks.outcome("dropped", 1)
+    event, driven = marks.frame(NOTHING, ALL)
+    assert event.tolist() == [Event.NOTHING, Event.DROPPED]
+    assert not driven.any()
+    assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
+    assert NOTHING.tolist() == [0, 0]
+
+
+def test_it_waits_for_its_simulation_and_not_for_the_next_episode() -> None:
+    marks = Marks(2)
+    marks.outcome("success", 1)
+    assert marks.frame(NOTHING, np.array([True, False]))[0].tolist() == [0, 0]
+    marks.begin(np.array([1]))
+    assert marks.frame(NOTHING, ALL)[0].tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("hard", [Event.ESTOP, Event.FAULT])
+def test_what_the_robot_did_stays(hard: Event) -> None:
+    marks = Marks(2)
+    marks.outcome("success")
+    marks.outcome("success", 1)
+    assert marks.frame(np.array([hard, Event.TIMEOUT]), ALL)[0].tolist() == [hard, Event.SUCCESS]
+
+
+def test_keys() -> None:
+    marks = Marks(2)
+    marks.hear(b"xI")
+    assert marks.frame(NOTHING, ALL)[1].tolist() == [True, False]
+    marks.hear(b"i")
+    assert not marks.frame(NOTHING, ALL)[1].any()
+    marks.hear(b"f\xff")
+    assert marks.frame(NOTHING, ALL)[0].tolist() == [Event.FAILURE, 0]
+    marks.hear(b"fs")
+    assert marks.frame(NOTHING, ALL)[0].tolist() == [Event.SUCCESS, 0]
+
+
+def test_wrong_names_are_refused() -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'success'"):
+        Marks().outcome("sucess")
+    with pytest.raises(ConfigError, match="no simulation 1; valid: 0 to 0"):
+        Marks().intervention(simulation=1)
+    for name in OUTCOMES:
+        Marks().outcome(name)
+
+
+def test_an_outcome_that_the_task_cannot_have_is_refused() -> None:
+    simulation = make_simulation(TurtleBot3Config(beams=36), 1)
+    loop = EpisodeLoop(simulation, make_task(AvoidConfig(), 1, 10), GapFollowerBrain(GapFollowerConfig()))
+    with pytest.raises(ConfigError, match="dropped"):
+        loop.marks.outcome("dropped")
+    loop.marks.outcome("stuck")
+
+
+def run(say: dict[tuple[int, int], Any], episodes: int = 3) -> list[Episode]:
+    """Run episodes of two simulations and call what is to be said when a simulation has done so many frames."""
+    simulation = make_simulation(TurtleBot3Config(beams=36), 2)
+    task = make_task(AvoidConfig(duration_s=2.0), 2, 10)
+    loop = EpisodeLoop(simulation, task, GapFollowerBrain(GapFollowerConfig()))
+    done = [0, 0]
+
+    def look(sim: int, values: dict[str, Any]) -> None:
+        done[sim] += 1
+        if (sim, done[sim]) in say:
+            say[sim, done[sim]](loop.marks)
+
+    loop.observer = look
+    return list(loop.run([EpisodeSpec(i, 2 * i) for i in range(episodes)]))
+
+
+def test_in_the_loop_an_outcome_ends_its_episode_and_no_other() -> None:
+    plain = run({})
+    marked = run({(1, 5): lambda marks: marks.outcome("success", 1)})
+    assert [len(one.columns[keys.EVENT]) for one in plain] == [20, 20, 20]
+    assert [len(one.columns[keys.EVENT]) for one in marked] == [20, 6, 20]
+    assert (marked[1].outcome.success, marked[1].outcome.event) == (True, Event.SUCCESS)
+    assert marked[1].columns[keys.SUCCESS].tolist() == [False] * 5 + [True]
+    assert marked[1].columns[keys.EVENT].tolist() == [0] * 5 + [Event.SUCCESS]
+    assert marked[1].columns[keys.DONE].tolist() == [False] * 5 + [True]
+    for key, column in plain[1].columns.items():
+        if key not in (keys.EVENT, keys.SUCCESS, keys.DONE, keys.REWARD):
+            np.testing.assert_array_equal(marked[1].columns[key], column[:6], err_msg=key)
+    assert marked[0].outcome == plain[0].outcome
+
+
+def test_in_the_loop_an_intervention_flags_its_frames() -> None:
+    plain = run({}, 1)
+    marked = run({(0, 4): lambda m: m.intervention(True), (0, 9): lambda m: m.intervention(False)}, 1)
+    expected = [
+        Event.INTERVENTION if 4 <= frame < 9 else event for frame, event in enumerate(plain[0].columns["event"])
+    ]
+    assert marked[0].columns[keys.EVENT].tolist() == expected
+    np.testing.assert_array_equal(marked[0].columns[keys.ACTION], plain[0].columns[keys.ACTION])
+
+
+def test_keys_of_a_terminal_reach_a_recording(tmp_path: Path) -> None:
+    """`s` in a terminal ends an episode on the wall clock, minutes before its time is up."""
+    from bhd_lerobot.datasets.format.summary import dataset_info
+
+    ours, theirs = pty.openpty()
+    code = "import os, sys; os.setsid(); import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); " + (
+        "from bhd_lerobot.recording.record import main; sys.exit(main())"
+    )
+    root = Path(__file__).resolve().parents[2]
+    arguments = [
+        f"--config_path={root}/configs/record/turtlebot3_avoid.yaml", "--robot.clock=realtime", "--robot.beams=36",
+        f"--dataset.root={tmp_path}/d", "--dataset.repo_id=t/t", "--dataset.num_episodes=1", "--preview_video=false",
+        f"--output_dir={tmp_path}/o", "--dataset.episode_time_s=600",
+    ]  # fmt: skip
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env={**os.environ, "PYTHONPATH": str(root)},
+    ) as process:  # fmt: skip
+        os.close(theirs)
+        assert process.stdout is not None
+        said = b""
+        while b"s success, f failure" not in said:
+            line = os.read(process.stdout.fileno(), 4096)
+            assert line, said.decode()
+            said += line
+        while process.poll() is None:
+            os.write(ours, b"s")  # what is said between two episodes is forgotten, so it is said until it is heard
+            time.sleep(0.2)
+        said += process.stdout.read()
+    os.close(ours)
+    assert process.returncode == 0, said.decode()
+    (episode,) = dataset_info(tmp_path / "d").episodes
+    assert (episode.metadata["outcome"], episode.metadata["success"]) == ("success", True)

@@ -1,0 +1,133 @@
+"""bhd-replay: bit-exact on its own recordings, and a number where it is not."""
+
+import math
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.rollout import replay as module
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.rollout.replay import Replay, ReplayConfig
+from tests.recording.support import run_record
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    root = tmp_path_factory.mktemp("replay") / "d"
+    run_record(root, n_envs=3, seed=4, dataset__num_episodes=4, dataset__episode_time_s=6, robot__odometry="true")
+    return root
+
+
+@pytest.mark.parametrize("episode", [0, 3])
+def test_open_loop_repeats_the_recording_bit_for_bit(recorded, episode):
+    result = Replay(recorded, episode).open_loop()
+    assert result.identical
+    assert result.not_compared == ()
+    assert result.position_m.max() == 0
+    travelled = np.hypot(*np.diff(result.recorded_xy, axis=0).T).sum()
+    assert travelled > 0.3  # there was something to repeat
+
+
+def test_every_recorded_state_gives_the_recorded_observation(recorded):
+    result = Replay(recorded, 2).state_exact()
+    assert result.identical
+    assert result.not_compared == ("x.pos", "y.pos", "theta.pos")
+
+
+def test_scans_between_frames_are_counted_in_state_mode(tmp_path):
+    run_record(tmp_path / "d", dataset__fps=4, dataset__num_episodes=1, dataset__episode_time_s=5)
+    assert Replay(tmp_path / "d", 0).state_exact().observation.max() == 0
+    assert Replay(tmp_path / "d", 0).open_loop().identical
+
+
+def test_a_changed_action_diverges_from_its_frame_on(recorded):
+    replay = Replay(recorded, 1)
+    replay.columns["action"] = replay.columns["action"].copy()
+    replay.columns["action"][30] += 0.05
+    result = replay.open_loop()
+    assert not result.identical
+    assert result.state[:31].max() == 0
+    assert result.state[31] > 0
+    assert result.position_m[-1] > 1e-3
+    assert replay.state_exact().identical  # the states were not touched
+
+
+def test_a_quaternion_and_its_negative_are_the_same_orientation(recorded):
+    replay = Replay(recorded, 1)
+    states = replay.columns["simulation.state"].copy()
+    turned = states.copy()
+    turned[:, 3:7] *= -1  # the same rotation
+    replay.columns["simulation.state"] = turned
+    assert replay.open_loop().angle_rad.max() == pytest.approx(0, abs=1e-12)
+
+
+def test_the_command_draws_and_reports(recorded, tmp_path, capsys):
+    status = module.main([f"--dataset.root={recorded}", f"--output_dir={tmp_path}", "--tolerance_m=0"])
+    text = capsys.readouterr().err
+    assert status == 0
+    assert text.count("identical") == 2
+    for mode in ("open_loop", "state"):
+        assert (tmp_path / f"episode_000000_{mode}.png").stat().st_size > 5_000
+
+
+def test_a_divergence_beyond_the_tolerance_is_the_exit_status(recorded, tmp_path, monkeypatch):
+    original = Replay.open_loop
+
+    def disturbed(self):
+        self.columns["action"] = self.columns["action"] * np.float32(0.9)
+        return original(self)
+
+    monkeypatch.setattr(Replay, "open_loop", disturbed)
+    arguments = [f"--dataset.root={recorded}", f"--output_dir={tmp_path}", "--mode=open_loop"]
+    assert module.main([*arguments, "--tolerance_m=1e-6"]) == 1
+    assert module.main([*arguments, "--tolerance_m=100"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--mode=openloop"], "Did you mean 'open_loop'"),
+        (["--tolerance_m=-1"], "tolerance_m is -1"),
+        (["--mod=state"], "Did you mean 'mode'"),
+    ],
+)
+def test_bad_options(options, message):
+    with pytest.raises(ConfigError, match=message):
+        parse(ReplayConfig, options)
+
+
+def test_an_episode_that_does_not_exist(recorded, capsys):
+    assert module.main([f"--dataset.root={recorded}", "--dataset.episode=9"]) == 2
+    assert "from 0 to 3" in capsys.readouterr().err
+
+
+def test_a_dataset_of_another_program_is_refused_with_a_remedy(recorded, tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    features = {"action": {"dtype": "float32", "shape": (2,), "names": ["x.vel", "theta.vel"]}}
+    dataset = LeRobotDataset.create("test/other", 10, features, root=tmp_path / "other", use_videos=False)
+    for _ in range(3):
+        dataset.add_frame({"action": np.zeros(2, np.float32), "task": "none"})
+    dataset.save_episode()
+    dataset.finalize()
+    with pytest.raises(DatasetError, match="lerobot-replay"):
+        Replay(tmp_path / "other", 0)
+
+
+def test_other_versions_are_named(recorded):
+    replay = Replay(recorded, 0)
+    assert replay.changed_versions() == {}
+    replay.metadata["versions"] = replay.metadata["versions"].replace('"mujoco":"', '"mujoco":"0.')
+    assert list(replay.changed_versions()) == ["mujoco"]
+
+
+def test_recorded_columns_are_read_as_they_are(recorded):
+    table = pq.read_table(recorded / "data")
+    rows = table.filter(pa.compute.equal(table["episode_index"], 1))
+    columns = Replay(recorded, 1).columns
+    assert columns["observation.state"].tolist() == rows["observation.state"].to_pylist()
+    assert columns["next.done"].dtype == bool
+    assert math.isclose(columns["control.time"][1], 0.1)

@@ -1,0 +1,138 @@
+"""Messages: serialised as rosbags does it, read back from either byte order, refused where they are something else."""
+
+import re
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.rosbag.exporter.episode import scan_stream
+from bhd_lerobot.rosbag.messages import types
+from bhd_lerobot.rosbag.messages.base import ScanPart
+from bhd_lerobot.rosbag.messages.cdr import encode
+from bhd_lerobot.rosbag.messages.cdr_read import decode
+from bhd_lerobot.rosbag.messages.parts import Frames, header, header_stamps
+from bhd_lerobot.rosbag.messages.split import parts_of
+from bhd_lerobot.tasks.task import Event
+from tests.rosbag.support import STORE, odometry, scan
+
+SCAN, JOINTS = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/JointState"
+
+
+def test_what_is_encoded_is_what_rosbags_writes():
+    stamps = np.array([5 * 10**9 + 7, 6 * 10**9])
+    position, rng = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.random.default_rng(0)
+    ranges = rng.random((2, 37)).astype(np.float32)
+    trees = {
+        SCAN: {"header": header(stamps, "base_scan"), "range_max": 3.5, "ranges": ranges},
+        JOINTS: {"header": header(stamps, "x"), "name": ["a", "bcd", ""], "position": position},
+        "sensor_msgs/msg/CompressedImage": {"header": header(stamps, "c"), "format": "jpeg", "data": [1, 2, 255]},
+        types.NUMBERS: {
+            "header": header(stamps),
+            "frame_index": [3, -4],
+            "names": ["p", "qq"],
+            "values": ranges[:, :2],
+        },
+        "tf2_msgs/msg/TFMessage": {
+            "transforms": [{"child_frame_id": name, "transform": {"rotation": {"w": 1.0}}} for name in ("a", "bb")]
+        },
+    }
+    for msgtype, tree in trees.items():
+        for message in encode(msgtype, tree, 2):
+            read = types.type_store().deserialize_cdr(message, msgtype)
+            assert bytes(types.type_store().serialize_cdr(read, msgtype)) == message, msgtype
+    second = STORE.deserialize_cdr(encode(SCAN, trees[SCAN], 2)[1], SCAN)
+    assert (second.header.stamp.sec, second.header.frame_id) == (6, "base_scan")
+    assert np.array_equal(second.ranges, ranges[1])
+
+
+@pytest.mark.parametrize("little", [True, False])
+def test_decoding_takes_either_byte_order_and_any_lengths(little):
+    kinds = [(360, "base_scan"), (5, "base_scan"), (360, "laser"), (360, "base_scan")]
+    scans = [scan(10**9 * k + k, beams=beams, frame=frame) for k, (beams, frame) in enumerate(kinds, start=1)]
+    data = [bytes(STORE.serialize_cdr(one, SCAN, little_endian=little)) for one in scans]
+    found = decode(SCAN, data, ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id", "ranges", "range_max"))
+    assert found["header.stamp.sec"].tolist() == found["header.stamp.nanosec"].tolist() == [1, 2, 3, 4]
+    assert found["header.frame_id"].tolist() == ["base_scan", "base_scan", "laser", "base_scan"]
+    for one, ranges in zip(scans, found["ranges"], strict=True):
+        assert np.array_equal(one.ranges, ranges)
+    assert found["range_max"].tolist() == [3.5] * 4
+
+
+def test_a_message_of_another_type_cut_off_or_of_another_encoding_is_refused():
+    whole = bytes(STORE.serialize_cdr(odometry(10**9), "nav_msgs/msg/Odometry"))
+    for wrong in (whole, whole[:40], whole[:3], b""):
+        with pytest.raises(DatasetError, match=r"LaserScan"):
+            decode(SCAN, [wrong], ("ranges",))
+    with pytest.raises(DatasetError, match="plain CDR"):
+        decode("nav_msgs/msg/Odometry", [b"\x00\x07" + whole[2:]], ("child_frame_id",))
+
+
+@pytest.mark.parametrize(
+    ("definition", "prefix", "enum"),
+    [
+        (types.STATE, "", Mode),
+        (types.OUTCOME, "", Event),
+        (types.STATE, "LIMIT_", Limit),
+        (types.STATE, "WATCHDOG_", Watchdog),
+    ],
+)
+def test_constants_of_the_messages_are_those_of_the_program(definition, prefix, enum):
+    told = dict(re.findall(rf"int64 {prefix}([A-Z][A-Z_]*)=(\d+)", types.DEFINITIONS[definition]))
+    values = {int(value) for name, value in told.items() if prefix or not name.startswith(("LIMIT", "WATCHDOG"))}
+    assert values == {int(one) for one in enum if prefix == "" or int(one)}
+
+
+@pytest.mark.parametrize(
+    ("names", "velocity"), [(["b_joint", "a_joint"], [1.0, 2.0]), (["a_joint", "b_joint"], []), (["a_joint"], [1.0])]
+)
+def test_joints_in_another_order_or_without_speeds_are_not_taken_for_ours(names, velocity):
+    (part,) = parts_of("observation.state", ["a.pos", "b.pos", "a.vel", "b.vel"], "ur5", lidar=None)
+    values = np.array([[1.0, 2.0, 3.0, 4.0]])
+    frames = Frames(0, np.array([0]), np.array([10**18]))
+    assert np.array_equal(part.decode(part.encode(frames, values)), values)
+    fields = {"header": header(frames.stamps), "name": names, "position": values[:, : len(names)], "velocity": velocity}
+    with pytest.raises(DatasetError, match=r"joint"):
+        part.decode(encode(JOINTS, fields, 1))
+
+
+def test_of_an_unknown_robot_everything_is_plain_numbers():
+    names = ["x.vel", "theta.vel", "shoulder.pos"]
+    (part,) = parts_of("observation.state", names, "so100", lidar=None)
+    assert (part.msgtype, part.topic, part.names) == (types.NUMBERS, "/bhd/observation_state", tuple(names))
+    kinds = [type(one).__name__ for one in parts_of("observation.state", names, "ur5", lidar=None)]
+    assert kinds == ["OdometryPart", "JointsPart"]
+
+
+def test_a_yaw_that_goes_on_turning_comes_back_to_the_bit():
+    values = np.zeros((200, 5))
+    values[:, 4] = np.cumsum(np.random.default_rng(0).uniform(-0.1, 0.28, 200)).astype(np.float32)
+    names = ["x.vel", "theta.vel", "x.pos", "y.pos", "theta.pos"]
+    (part,) = parts_of("observation.state", names, "turtlebot3", lidar=None)
+    index = np.arange(200)
+    assert values[-1, 4] > 4 * np.pi
+    messages = part.encode(Frames(0, index, index * 10**8 + 10**18), values)
+    assert np.array_equal(part.decode(messages).astype(np.float32), values.astype(np.float32))
+
+
+def test_without_rosbags_the_command_that_installs_it_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag2", None)
+    with pytest.raises(ConfigError, match=r"pip install -e '\.\[ros2\]'"):
+        types.require_rosbags()
+
+
+def test_a_scan_is_never_stamped_before_an_observation_that_did_not_have_it():
+    """On the wall clock the age includes the way to the brain: 5 ms here, for a scan 1 ms after an observation."""
+    lidar = turtlebot3_burger().lidar
+    part = ScanPart("/scan", tuple(f"scan_{beam:03d}.pos" for beam in range(4)), lidar)
+    observed = np.array([0, 100, 200, 300]) * 10**6 + 10**18
+    values = np.repeat([[1.0], [1.0], [2.0], [2.0]], 4, axis=1)
+    age = np.array([0.005, 0.105, 0.104, 0.204], np.float32)
+    stream = scan_stream(part, Frames(0, np.arange(4), observed), values, age)
+    received, messages = zip(*stream.messages, strict=True)
+    assert received == (observed[0], observed[2])
+    first, second = header_stamps(SCAN, messages)
+    assert first == pytest.approx(observed[0] - 5 * 10**6, abs=100)
+    assert second == observed[1] + 1

@@ -1,0 +1,237 @@
+"""Bags as they are found: any storage, any compression, several files, and every kind of damage."""
+
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pytest
+import yaml
+from backports import zstd
+from mcap.writer import CompressionType
+from mcap_ros2.writer import Writer as McapWriter
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+
+from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.rosbag.storage.find import find_bags
+from tests.rosbag.support import STORE, drive, write
+
+TOPICS = ("/cmd_vel", "/odom", "/scan")
+
+
+@pytest.fixture(scope="module")
+def messages():
+    return drive(seconds=3)
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory, messages):
+    folder = tmp_path_factory.mktemp("bags")
+    return {storage: write(folder / storage, messages, storage) for storage in ("mcap", "sqlite3")}
+
+
+def expected(messages):
+    """Return topic -> times of reception and bytes."""
+    found = {topic: ([], []) for topic in TOPICS}
+    for topic, received, message in messages:
+        found[topic][0].append(received)
+        found[topic][1].append(bytes(STORE.serialize_cdr(message, message.__msgtype__)))
+    return found
+
+
+def check(path: Path, messages, *, problems: int = 0, whole: bool = True) -> int:
+    """Compare what is read with what was written, or with its beginning; return how many messages were read."""
+    (bag,) = find_bags(path)
+    topics = bag.topics()
+    assert set(topics) <= set(TOPICS)
+    read = bag.read(TOPICS)
+    total = 0
+    for topic, (times, data) in expected(messages).items():
+        count = len(read[topic].data)
+        total += count
+        assert (read[topic].received.tolist(), read[topic].data) == (times[:count], data[:count])
+        assert topics[topic].count == count if topic in topics else not count
+        assert count == len(times) or not whole
+        assert [payload for _, payload in bag.payloads(topic)] == data[:count]
+    assert len(bag.problems) == problems, bag.problems
+    return total
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_both_storages_read_back_also_as_a_bare_file(bags, messages, storage):
+    assert check(bags[storage], messages) == len(messages)
+    (file,) = (one for one in bags[storage].iterdir() if one.suffix in (".mcap", ".db3"))
+    assert check(file, messages) == len(messages)
+
+
+@pytest.mark.parametrize(
+    ("mode", "storage"),
+    [("FILE", "MCAP"), ("FILE", "SQLITE3"), ("MESSAGE", "SQLITE3"), ("MESSAGE", "MCAP"), ("STORAGE", "MCAP")],
+)
+def test_compressed_bags(tmp_path, messages, mode, storage):
+    writer = Writer(tmp_path / "b", version=9, storage_plugin=StoragePlugin[storage])
+    writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    with writer:
+        connections = {}
+        for topic, received, message in messages:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], received, STORE.serialize_cdr(message, kind))
+    assert check(tmp_path / "b", messages) == len(messages)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_files_of_another_writer(tmp_path, messages, compression, use_chunking):
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file, chunk_size=20_000, compression=compression)
+        writer._writer._Writer__use_chunking = use_chunking
+        schemas = {}
+        for topic, received, message in messages:
+            kind = message.__msgtype__
+            if kind not in schemas:
+                text, _ = STORE.generate_msgdef(kind, ros_version=2)
+                schemas[kind] = writer.register_msgdef(kind, text)
+            fields = STORE.serialize_cdr(message, kind)
+            channel = writer._channel_ids.get(topic)
+            if channel is None:
+                channel = writer._channel_ids[topic] = writer._writer.register_channel(topic, "cdr", schemas[kind].id)
+            writer._writer.add_message(channel, received, bytes(fields), received)
+        writer.finish()
+    assert check(path, messages) == len(messages)
+
+
+def test_a_bag_of_several_files_is_read_in_their_order(tmp_path, messages):
+    half = len(messages) // 2
+    parts = [write(tmp_path / f"part{index}", part) for index, part in enumerate((messages[:half], messages[half:]))]
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    for index, part in enumerate(parts):
+        shutil.copy(part / f"{part.name}.mcap", bag / f"bag_{index}.mcap")
+    (bag / "metadata.yaml").write_text(
+        yaml.safe_dump(
+            {
+                "rosbag2_bagfile_information": {
+                    "relative_file_paths": ["bag/bag_0.mcap", "bag_1.mcap"],
+                    "message_count": len(messages),
+                }
+            }
+        )
+    )
+    assert check(bag, messages) == len(messages)
+    (bag / "metadata.yaml").unlink()
+    assert check(bag, messages, problems=1) == len(messages)  # it says so
+    assert [one.path.name for one in find_bags(tmp_path)] == ["bag", "part0", "part1"]
+
+
+def test_a_bag_that_is_cut_off_anywhere_gives_what_is_before_or_is_refused(tmp_path, bags, messages):
+    whole = (bags["mcap"] / "mcap.mcap").read_bytes()
+    path, last = tmp_path / "cut.mcap", 0
+    for size in [*range(0, len(whole), len(whole) // 60), *range(len(whole) - 400, len(whole), 7)]:
+        path.write_bytes(whole[:size])
+        if size < 8:
+            with pytest.raises(DatasetError, match=r"cut\.mcap"):
+                check(path, messages)
+            continue
+        complete = whole.index(b"\x0f\x04\0\0\0\0\0\0\0") + 13 <= size  # the end of the data is there
+        last = max(last, check(path, messages, problems=int(not complete), whole=False))
+    assert last == len(messages)
+
+
+def test_a_cut_compressed_chunk_gives_what_can_be_had(tmp_path, messages):
+    writer = Writer(tmp_path / "b", version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        kind = "sensor_msgs/msg/LaserScan"
+        connection = writer.add_connection("/scan", kind, typestore=STORE)
+        for topic, received, message in messages:
+            if topic == "/scan":
+                writer.write(connection, received, STORE.serialize_cdr(message, kind))
+    path = tmp_path / "b" / "b.mcap"
+    path.write_bytes(path.read_bytes()[:2000])
+    (bag,) = find_bags(tmp_path / "b")
+    read = bag.read(["/scan"])
+    assert len(bag.problems) == 1
+    assert len(read["/scan"].data) < 15
+
+
+def test_a_damaged_chunk_is_left_out_and_told(tmp_path, messages):
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file, chunk_size=1000, compression=CompressionType.NONE)
+        schema = writer.register_msgdef("std_msgs/String", "string data")
+        for number in range(100):
+            writer.write_message("/s", schema, {"data": f"number {number:03d}"}, log_time=number)
+        writer.finish()
+    content = bytearray(path.read_bytes())
+    content[content.index(b"number 050")] ^= 1
+    path.write_bytes(content)
+    (bag,) = find_bags(path)
+    read = bag.read(["/s"])["/s"]
+    assert len(bag.problems) == 1
+    assert "checksum" in bag.problems[0]
+    assert 0 < len(read.data) < 100
+    assert {0, 99} <= set(read.received.tolist())
+
+
+def test_a_damaged_database_gives_what_is_before_or_is_refused(tmp_path, bags, messages):
+    whole = (bags["sqlite3"] / "sqlite3.db3").read_bytes()
+    path = tmp_path / "cut.db3"
+    totals = []
+    for share in (0.5, 0.7, 0.9):
+        path.write_bytes(whole[: int(len(whole) * share)])
+        (bag,) = find_bags(path)
+        read = bag.read(TOPICS)
+        assert len(bag.problems) == 1
+        for topic, (times, data) in expected(messages).items():
+            count = len(read[topic].data)
+            assert (read[topic].received.tolist(), read[topic].data) == (times[:count], data[:count])
+        totals.append(sum(len(one.data) for one in read.values()))
+    assert 0 < totals[0] < totals[1] < totals[2] < len(messages)
+    for size in (0, 200, 5000):
+        path.write_bytes(whole[:size])
+        with pytest.raises(DatasetError, match=r"cut\.db3"):
+            find_bags(path)[0].read(TOPICS)
+
+
+def test_messages_that_the_metadata_count_and_the_file_lacks_are_told(tmp_path, bags):
+    shutil.copytree(bags["sqlite3"], tmp_path / "b")
+    with sqlite3.connect(tmp_path / "b" / "sqlite3.db3") as connection:
+        connection.execute("DELETE FROM messages WHERE id > 50")
+    (bag,) = find_bags(tmp_path / "b")
+    bag.read(TOPICS)
+    with Reader(bags["sqlite3"]) as reader:
+        assert f"count {reader.message_count} messages; it has 50" in bag.problems[0]
+
+
+def test_what_is_no_bag_is_refused(tmp_path, bags):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.txt").write_text("x")
+    (tmp_path / "no.mcap").write_bytes(b"")
+    (tmp_path / "no.db3").write_bytes(b"SQLite format 3\0" + bytes(100))
+    lacking = tmp_path / "lacking"
+    shutil.copytree(bags["mcap"], lacking)
+    (lacking / "mcap.mcap").unlink()
+    for name in ("none", "empty", "notes.txt", "lacking"):
+        with pytest.raises(DatasetError, match=name):
+            find_bags(tmp_path / name)
+    for name in ("no.mcap", "no.db3"):
+        with pytest.raises(DatasetError, match=name):
+            find_bags(tmp_path / name)[0].read(TOPICS)
+
+
+def test_metadata_that_cannot_be_read_are_told(tmp_path, bags, messages):
+    shutil.copytree(bags["mcap"], tmp_path / "b")
+    text = (tmp_path / "b" / "metadata.yaml").read_text()
+    (tmp_path / "b" / "metadata.yaml").write_text(text[: len(text) // 2] + "\n\t: [")
+    assert check(tmp_path / "b", messages, problems=1) == len(messages)
+
+
+def test_a_compressed_file_that_is_cut_off(tmp_path, bags):
+    packed = zstd.compress((bags["mcap"] / "mcap.mcap").read_bytes())
+    for size in (5, len(packed) // 2):
+        path = tmp_path / "b.mcap.zstd"
+        path.write_bytes(packed[:size])
+        with pytest.raises(DatasetError, match="zstd"):
+            find_bags(path)[0].read(TOPICS)

@@ -1,0 +1,405 @@
+import io
+import json
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from lerobot.configs import FeatureType, PolicyFeature
+from rich.console import Console
+
+pytest.importorskip("stable_baselines3")
+
+from bhd_lerobot.envs.vector import BhdVectorEnv
+from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
+from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
+from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
+from bhd_lerobot.training.rl import checkpoint
+from bhd_lerobot.training.rl import train as module
+from bhd_lerobot.training.rl.adapter import RlVecEnv
+from bhd_lerobot.training.rl.build import make_learner
+from bhd_lerobot.training.rl.config import RlConfig, is_rl, parse_rl
+from bhd_lerobot.training.rl.features import ActionUnits, FeatureStack
+from bhd_lerobot.training.rl.parts import make_parts, single_action
+from bhd_lerobot.training.rl.shaping import Shaping
+from bhd_lerobot.training.rl.train import RlResult, main, train
+
+# How much the network's rows may differ when they are computed beside others, in m/s and rad/s.
+TOLERANCE = 2e-6
+
+BASE = {
+    "algorithm": "ppo",
+    "robot.type": "turtlebot3",
+    "robot.beams": 36,
+    "task.type": "avoid",
+    "task.duration_s": 1,
+    "env.n_envs": 4,
+    "env.threads": 1,
+    "policy.n_obs_steps": 2,
+    "policy.obs_stride": 2,
+    "policy.hidden_dims": [16, 8],
+    "policy.critic_dims": [8],
+    "policy.scan.transform": "inverse",
+    "ppo.n_steps": 8,
+    "ppo.batch_size": 16,
+    "ppo.n_epochs": 2,
+    "validation.freq": 64,
+    "validation.n_episodes": 2,
+    "validation.n_envs": 2,
+    "steps": 96,
+    "threads": 1,
+}
+
+
+def options(root: Path | None = None, **overrides: object) -> list[str]:
+    values = {**BASE, **{key.replace("__", "."): value for key, value in overrides.items()}}
+    if root is not None:
+        values["output_dir"] = root
+    return [f"--{key}={value}" for key, value in values.items() if value is not None]
+
+
+def run(root: Path, **overrides: object) -> RlResult:
+    return train(parse_rl(options(root, **overrides)), Console(file=io.StringIO()))
+
+
+def weights(folder: Path) -> bytes:
+    return (folder / "pretrained_model" / "model.safetensors").read_bytes()
+
+
+def rows(path: Path) -> list[dict]:
+    timing = ("minutes", "frames_per_s", "gathering_s", "update_s")
+    lines = (path / "metrics.jsonl").read_text().splitlines()
+    return [{k: v for k, v in json.loads(line).items() if k not in timing} for line in lines]
+
+
+def actions(folder: Path, states: np.ndarray, fps: int = 10) -> np.ndarray:
+    """Return what the exported policy does, shape (frames, n, actions), given states of shape (frames, n, width)."""
+    contract = PolicyContract.load(folder)
+    brain = LearnedBrain(LearnedBrainConfig(path=str(folder)))
+    names = contract.observation_names or ()
+    brain.bind(names, contract.action_names or (), fps, ())
+    n = states.shape[1]
+    brain.reset(np.arange(n), [0] * n, n)
+    return np.stack([np.asarray(brain.act(Observation(names, one.astype(np.float64), {}))) for one in states])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> RlResult:
+    return run(tmp_path_factory.mktemp("rl") / "run", validation__rule="{type: gap_follower}")
+
+
+def test_a_run_leaves_checkpoints_metrics_a_curve_and_its_configuration(finished: RlResult) -> None:
+    folder = finished.output_dir
+    assert finished.step == 96
+    assert (folder / "learning_curve.png").stat().st_size > 10_000
+    names = {one.name for one in (folder / "checkpoints").iterdir()}
+    assert {"000000000", "000000064", "000000096", "last", "best"} == names
+    found = rows(folder)
+    assert [row["step"] for row in found if "val_score" in row] == [0, 64, 96]
+    assert all(np.isfinite(row["kl"]) for row in found if "kl" in row)
+    assert any("return" in row for row in found)
+    assert finished.rule is not None
+    assert finished.rule.episodes == 2
+    again = parse_rl([f"--config_path={folder}", "--resume=true"])
+    assert again.ppo.n_steps == 8
+    assert again.output_dir == str(folder)
+    contract = PolicyContract.load(folder)
+    assert (contract.robot_type, contract.fps) == ("turtlebot3", 10)
+    assert contract.action_names == ("x.vel", "theta.vel")
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_seed_others(finished: RlResult, tmp_path: Path) -> None:
+    same = run(tmp_path / "same", validation__rule="{type: gap_follower}")
+    assert finished.checkpoint is not None
+    assert same.checkpoint is not None
+    assert weights(same.checkpoint) == weights(finished.checkpoint)
+    assert rows(same.output_dir) == rows(finished.output_dir)
+    other = run(tmp_path / "other", validation__rule="{type: gap_follower}", seed=1)
+    assert other.checkpoint is not None
+    assert weights(other.checkpoint) != weights(finished.checkpoint)
+
+
+def test_a_run_goes_on_where_it_was(finished: RlResult, tmp_path: Path) -> None:
+    first = run(tmp_path / "run", steps=64)
+    assert first.checkpoint is not None
+    with pytest.raises(ConfigError, match="has done 64 of 64"):
+        train(parse_rl([f"--config_path={tmp_path / 'run'}", "--resume=true"]), Console(file=io.StringIO()))
+    command = [f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=128"]
+    second = train(parse_rl(command), Console(file=io.StringIO()))
+    assert second.step == 128
+    steps = [row["step"] for row in rows(second.output_dir)]
+    assert steps == sorted(steps)
+    assert steps[0] == 0
+    state = torch.load(second.checkpoint / "training_state" / "learner.pt", weights_only=True)  # type: ignore[operator]
+    assert state["step"] == 128
+    assert state["updates"] == 8  # two epochs in each of four updates
+    assert json.loads((second.checkpoint / "training_state/run.json").read_text())["next_episode"] > 4  # type: ignore[operator]
+
+
+def test_a_checkpoint_with_other_widths_is_not_resumed(tmp_path: Path) -> None:
+    run(tmp_path / "run", steps=32)
+    command = [f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=64", "--policy.critic_dims=[4]"]
+    with pytest.raises(ConfigError, match="cannot be resumed"):
+        train(parse_rl(command), Console(file=io.StringIO()))
+
+
+@pytest.mark.parametrize("channels", [[], [4]])
+def test_the_exported_policy_does_what_the_learners_actor_does(tmp_path: Path, channels: list[int]) -> None:
+    config = parse_rl(options(**{"policy.scan.channels": channels, "policy__layer_norm": "true"}))
+    env = BhdVectorEnv(4, config.environment, config.robot, config.task, autoreset_mode="Disabled", threads=1)
+    parts = make_parts(config, env)
+    stack, units = FeatureStack(parts.front, parts.before, 4), ActionUnits(parts.after)
+    adapter = RlVecEnv(env, stack, units, Shaping(config.reward, 0.99, 4))
+    learner = make_learner(config, parts, adapter, lambda step: 0.0)
+    learner.learn(64, log_interval=2**60)
+    assert any(len(p) and p.grad is not None for p in parts.actor.net.parameters())
+    checkpoint.export(tmp_path, parts, learner.policy.log_std)
+    states = np.random.default_rng(0).uniform(0.1, 3.0, (7, 4, 38)).astype(np.float32)
+    wanted = []
+    for frame, one in enumerate(states):
+        state = {"observation.state": one}
+        if frame == 0:
+            stack.restart(np.arange(4), state)
+        else:
+            stack.push(state)
+        mean, _ = learner.predict(stack.features(), deterministic=True)
+        wanted.append(units(mean))
+    env.close()
+    np.testing.assert_allclose(actions(tmp_path, states), wanted, rtol=0, atol=TOLERANCE)
+
+
+def test_a_checkpoint_that_is_exported_without_training_does_the_same(finished: RlResult, tmp_path: Path) -> None:
+    assert finished.checkpoint is not None
+    config = parse_rl(options(start_from=finished.checkpoint, policy__hidden_dims=[3]))
+    env = BhdVectorEnv(4, config.environment, config.robot, config.task, autoreset_mode="Disabled", threads=1)
+    parts = make_parts(config, env)
+    stack = FeatureStack(parts.front, parts.before, 4)
+    adapter = RlVecEnv(env, stack, ActionUnits(parts.after), Shaping(config.reward, 0.99, 4))
+    learner = make_learner(config, parts, adapter, lambda step: 0.0)
+    checkpoint.export(tmp_path, parts, learner.policy.log_std)
+    env.close()
+    states = np.random.default_rng(0).uniform(0.1, 3.0, (5, 4, 38)).astype(np.float32)
+    np.testing.assert_array_equal(actions(tmp_path, states), actions(finished.checkpoint, states))
+
+
+def test_while_the_critic_warms_up_the_actor_stays_and_the_anchor_keeps_it_near(
+    finished: RlResult, tmp_path: Path
+) -> None:
+    assert finished.checkpoint is not None
+    start = finished.checkpoint
+    frozen = run(tmp_path / "frozen", start_from=start, critic_warmup=96)
+    assert frozen.checkpoint is not None
+    assert weights(frozen.checkpoint) == weights(frozen.output_dir / "checkpoints" / "000000000")
+
+    def moved(name: str, coef: float) -> float:
+        result = run(
+            tmp_path / name,
+            start_from=start,
+            ppo__lr=0.01,
+            anchor__coef=coef,
+            anchor__batch_size=4,
+            anchor__decay=False,
+        )
+        states = np.random.default_rng(0).uniform(0.1, 3.0, (3, 4, 38)).astype(np.float32)
+        return float(np.abs(actions(result.output_dir, states) - actions(start, states)).mean())
+
+    free = moved("free", 0.0)
+    assert free > 1e-3
+    assert moved("kept", 100.0) < free
+
+
+def test_ctrl_c_saves_and_tells_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    step = RlVecEnv.step_wait
+    count = []
+
+    def interrupted(self: RlVecEnv) -> tuple:
+        count.append(1)
+        if len(count) == 10:
+            signal.raise_signal(signal.SIGINT)
+        return step(self)
+
+    monkeypatch.setattr(RlVecEnv, "step_wait", interrupted)
+    assert main(options(tmp_path / "run")) == 130
+    assert len(count) == 10
+    assert "--resume=true" in capsys.readouterr().err
+    assert (tmp_path / "run/checkpoints/last/pretrained_model/model.safetensors").is_file()
+    monkeypatch.setattr(RlVecEnv, "step_wait", step)
+    assert main([f"--config_path={tmp_path / 'run'}", "--resume=true"]) == 0
+
+
+def test_without_stable_baselines3_the_message_says_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    assert main(options(tmp_path / "run")) == 2
+    assert "pip install -e '.[rl]'" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"steps": 0}, "steps is 0; it must be at least 1"),
+        ({"steps": -5}, "steps is -5"),
+        ({"max_minutes": 0}, "max_minutes is 0"),
+        ({"env__n_envs": 0}, "env.n_envs is 0"),
+        ({"reward__events": "{colision: -1}"}, "Did you mean 'collision'"),
+        ({"reward__events": "{collision: .nan}"}, "must be a finite number"),
+        ({"reward__potential": "pose"}, "only a task with a target pose"),
+        ({"algorithm": "sac"}, "Valid: ppo"),
+        ({"validation__seed": 0}, "judged on the episodes"),
+        ({"critic_warmup": 10}, "needs --start_from"),
+        ({"robot__type": "ur5", "robot__beams": None}, "this task is for 'turtlebot3'"),
+        ({"ppo__gamma": 1.5}, "between 0 and 1"),
+        ({"ppo__learning_rate": 1.0}, "Unknown option 'ppo.learning_rate'"),
+        ({"resume": "true"}, "resume needs --output_dir"),
+        ({"ppo.ent_coef": ".nan"}, "ppo.ent_coef is nan"),
+        ({"ppo.vf_coef": -1}, "ppo.vf_coef is -1"),
+        ({"ppo.max_grad_norm": ".nan"}, "ppo.max_grad_norm is nan"),
+        ({"ppo.target_kl": -1}, "ppo.target_kl is -1"),
+        ({"ppo.log_std_init": ".nan"}, "ppo.log_std_init is nan"),
+        ({"reward.frame": ".nan"}, "reward.frame is nan"),
+        ({"reward.events": "{collision: .inf}"}, "reward.events.collision is inf"),
+        ({"reward.per_m": ".nan"}, "reward.per_m is nan"),
+        ({"anchor.coef": ".nan"}, "anchor.coef is nan"),
+        ({"policy.critic_dims": [0]}, "policy.critic_dims is 0"),
+        ({"policy.activation": "gelul"}, "Did you mean 'gelu'"),
+        ({"policy.n_obs_steps": 0}, "policy.n_obs_steps is 0"),
+    ],
+)
+def test_wrong_values_are_named(overrides: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parse_rl(options(**overrides))
+
+
+def test_a_checkpoint_of_another_robot_is_refused(finished: RlResult, tmp_path: Path) -> None:
+    config = {"robot__type": "ur5", "robot__beams": None, "task__type": "reach", "policy__scan__transform": None}
+    with pytest.raises(ConfigError, match="trained on the robot 'turtlebot3'"):
+        run(tmp_path / "run", start_from=finished.checkpoint, **config)
+    with pytest.raises(ConfigError, match="trained on other observation features"):
+        run(tmp_path / "beams", start_from=finished.checkpoint, robot__beams=72)
+
+
+def test_a_checkpoint_of_another_architecture_is_refused(tmp_path: Path) -> None:
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+
+    act = ACTConfig(
+        chunk_size=2, n_action_steps=1, dim_model=8, n_heads=1, dim_feedforward=8, n_encoder_layers=1, device="cpu",
+        use_vae=False, push_to_hub=False,
+    )  # fmt: skip
+    act.input_features = {
+        "observation.state": PolicyFeature(FeatureType.STATE, (38,)),
+        "observation.environment_state": PolicyFeature(FeatureType.ENV, (2,)),
+    }
+    act.output_features = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
+    ACTPolicy(act).save_pretrained(tmp_path)
+    for one in make_pre_post_processors(act, dataset_stats={}):
+        one.save_pretrained(tmp_path)
+    with pytest.raises(ConfigError, match="'act'; PPO starts from a 'bhd_mlp'"):
+        run(tmp_path / "run", start_from=tmp_path)
+
+
+def test_a_folder_that_exists_is_not_overwritten_and_one_without_a_run_not_resumed(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="exists"):
+        run(tmp_path)
+    with pytest.raises(ConfigError, match="no run to resume"):
+        run(tmp_path, resume="true")
+    with pytest.raises(ConfigError, match="no run to resume"):
+        run(tmp_path / "missing", resume="true")
+
+
+def test_a_command_line_with_an_algorithm_asks_for_reinforcement_learning(tmp_path: Path) -> None:
+    assert is_rl(["--algorithm=ppo"])
+    assert is_rl(["--config_path=configs/train/ppo_turtlebot3.yaml", "--steps=5"])
+    assert not is_rl(["--dataset.repo_id=a/b", "--policy.type=bhd_mlp"])
+    assert not is_rl([f"--config_path={tmp_path / 'missing.yaml'}"])
+    other = tmp_path / "bc.yaml"
+    other.write_text(yaml.safe_dump({"dataset": {"repo_id": "a/b"}}))
+    assert not is_rl([f"--config_path={other}"])
+
+
+@pytest.mark.parametrize("name", ["ppo_turtlebot3", "ppo_ur5_reach"])
+def test_the_shipped_configurations_are_valid(name: str) -> None:
+    config: RlConfig = parse_rl([f"--config_path=configs/train/{name}.yaml"])
+    assert config.max_minutes is not None
+    assert config.max_minutes <= 20
+
+
+def test_bhd_train_hands_over_what_names_an_algorithm(tmp_path: Path, capsys) -> None:
+    from bhd_lerobot.training.train import main as bhd_train
+
+    assert bhd_train(options(tmp_path / "run", steps=0)) == 2
+    assert "steps is 0" in capsys.readouterr().err
+    assert bhd_train(options(tmp_path / "run", steps=32)) == 0
+    assert (tmp_path / "run/checkpoints/last/pretrained_model/config.json").is_file()
+
+
+def test_a_later_action_of_the_checkpoints_chunk_may_become_the_actors(tmp_path: Path) -> None:
+    policy = MlpPolicy(mlp(chunk_size=4))
+    first, third = single_action(policy), single_action(policy, 2)
+    batch = {"observation.state": torch.linspace(-1, 1, 10).reshape(2, 5)}
+    chunk = policy.predict_action_chunk(batch)
+    for actor, index in ((first, 0), (third, 2)):
+        torch.testing.assert_close(actor.predict_action_chunk(batch)[:, 0], chunk[:, index], rtol=0, atol=1e-6)
+        assert actor.config.chunk_size == 1
+        assert actor.log_std is not None
+
+
+def test_an_action_beyond_the_chunk_is_refused(finished: RlResult, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"start_action is 3; the policy .* predicts 1: 0 to 0"):
+        run(tmp_path / "run", start_from=finished.checkpoint, start_action=3)
+
+
+def mlp(**values: object) -> MlpConfig:
+    config = MlpConfig(hidden_dims=[8], device="cpu", push_to_hub=False, **values)  # type: ignore[arg-type]
+    config.input_features = {"observation.state": PolicyFeature(FeatureType.STATE, (5,))}
+    config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
+    return config
+
+
+def test_a_run_that_fails_before_it_began_leaves_nothing(tmp_path: Path, capsys) -> None:
+    assert main(options(tmp_path / "run", start_from=tmp_path / "none")) == 2
+    assert "There is no policy at" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file" / "run", tmp_path / ("x" * 300)):
+        with pytest.raises(ConfigError, match="--output_dir"):
+            run(folder)
+
+
+def test_weights_that_are_no_numbers_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoil(learner, steps, updated, is_over) -> None:
+        for one in learner.policy.parameters():
+            one.data.fill_(float("nan"))
+        raise ValueError("the distribution's mean is nan")
+
+    monkeypatch.setattr("bhd_lerobot.training.rl.build.learn", spoil)
+    with pytest.raises(BhdError, match=r"weights are not finite .*000000000 is intact.*--ppo\.lr"):
+        run(tmp_path / "run")
+
+
+def test_a_full_disk_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module.MetricsFile, "append", full)
+    with pytest.raises(BhdError, match=r"No space left on device.*intact.*--resume=true"):
+        run(tmp_path / "run")
+    assert (tmp_path / "run" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
+
+
+def test_ctrl_c_before_the_run_began_is_no_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def stopped(config: RlConfig) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "train", stopped)
+    assert main(options(tmp_path / "run")) == 130
+    assert "Interrupted" in capsys.readouterr().err

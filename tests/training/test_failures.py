@@ -1,0 +1,340 @@
+import errno
+import json
+import math
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.policies.act.modeling_act import ACTPolicy
+
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
+from bhd_lerobot.training import output
+from bhd_lerobot.training.arguments import parse_train
+from bhd_lerobot.training.log import MetricsFile
+from bhd_lerobot.training.train import main
+from tests.training.support import ACT, MLP, curve, make_dataset, options, poison, run_train
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_dataset(tmp_path_factory.mktemp("data") / "set")
+
+
+@pytest.fixture(scope="module")
+def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "trained"
+    run_train(options(data, run, MLP, steps=10))
+    return run
+
+
+def refused(arguments: list[str], error: type[BhdError], match: str) -> None:
+    """Assert that a command line is refused and leaves nothing behind."""
+    folders = [Path(one.partition("=")[2]) for one in arguments if one.startswith("--output_dir=")]
+    before = [one.exists() for one in folders]
+    with pytest.raises(error, match=match):
+        run_train(arguments)
+    assert [one.exists() for one in folders] == before
+
+
+def test_an_error_is_one_sentence_and_status_2(data: Path, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
+    assert main(options(data / "nowhere", tmp_path / "run")) == 2
+    said = capfd.readouterr().err
+    assert "error: " in said
+    assert "nowhere" in said
+    assert "Traceback" not in said
+
+
+def test_a_missing_dataset_names_where_it_was_looked_for(tmp_path: Path) -> None:
+    refused(
+        options(tmp_path / "none", tmp_path / "run"), DatasetError, rf"{tmp_path / 'none'} does not exist.*dataset.root"
+    )
+    refused(options(tmp_path, tmp_path / "run", dataset__root=None), DatasetError, r"lerobot/t/t does not exist")
+
+
+def test_an_empty_dataset(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "set" / "meta").mkdir(parents=True)
+    info = json.loads((data / "meta" / "info.json").read_text())
+    (tmp_path / "set" / "meta" / "info.json").write_text(json.dumps({**info, "total_episodes": 0, "total_frames": 0}))
+    refused(options(tmp_path / "set", tmp_path / "run"), DatasetError, "no episode")
+
+
+def test_a_dataset_without_statistics(tmp_path: Path) -> None:
+    root = make_dataset(tmp_path / "set", episodes=2)
+    (root / "meta" / "stats.json").unlink()
+    refused(options(root, tmp_path / "run"), DatasetError, "no statistics.*bhd-data repair")
+
+
+def test_no_episode_after_filtering_says_what_there_is(data: Path, tmp_path: Path) -> None:
+    arguments = options(data, tmp_path / "run", selection__outcome="dropped")
+    refused(arguments, DatasetError, r"dropped.*4 success")
+    arguments = options(data, tmp_path / "run", selection__outcome="sucess")
+    refused(arguments, ConfigError, r"sucess.*Did you mean 'success'")
+
+
+def test_everything_held_out(data: Path, tmp_path: Path) -> None:
+    arguments = options(data, tmp_path / "run", dataset__episodes="[0]", dataset__eval_split=0.5)
+    refused(arguments, DatasetError, "no episode to train on")
+
+
+def test_an_episode_that_does_not_exist(data: Path, tmp_path: Path) -> None:
+    refused(options(data, tmp_path / "run", dataset__episodes="[0, 17]"), DatasetError, "no episode 17.*0 to 5")
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_value_that_is_not_finite_is_named(tmp_path: Path, value: float) -> None:
+    root = make_dataset(tmp_path / "set", episodes=3)
+    poison(root, "observation.state", 27, value)
+    message = r"episode 1, frame 7.*'observation.state' \(a\.pos\) is (nan|inf)"
+    refused(options(root, tmp_path / "run"), DatasetError, message)
+    result, _ = run_train(options(root, tmp_path / "run", dataset__episodes="[0, 2]", steps=2))  # the remedy works
+    assert result.step == 2
+
+
+def test_a_policy_without_the_input_that_it_needs(tmp_path: Path) -> None:
+    root = make_dataset(tmp_path / "set", episodes=2, environment=False)
+    refused(
+        options(root, tmp_path / "run"),
+        ConfigError,
+        r"'act' cannot be made.*observation.state, action.*environment state",
+    )
+
+
+def test_a_dataset_that_lacks_what_a_checkpoint_reads(trained: Path, tmp_path: Path) -> None:
+    root = make_dataset(tmp_path / "set", episodes=2, environment=False)
+    arguments = options(root, tmp_path / "run", {}, policy__path=trained)
+    refused(arguments, DatasetError, r"needs 'observation.environment_state' of shape \(2,\)")
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"robot": "other"}, r"robot 'toy'.*'other'"),
+        ({"fps": 20}, r"10 frames a second.*20"),
+        ({"environment": False}, r"environment features.*goal_x"),
+    ],
+)
+def test_fine_tuning_on_what_does_not_fit_is_refused(
+    trained: Path, tmp_path: Path, change: dict[str, Any], match: str
+) -> None:
+    root = make_dataset(tmp_path / "set", episodes=2, **change)
+    refused(options(root, tmp_path / "run", {}, fine_tune=trained), DatasetMismatchError, match)
+
+
+def test_fine_tuning_on_other_units_is_refused(data: Path, trained: Path, tmp_path: Path) -> None:
+    file = trained / "checkpoints" / "last" / "pretrained_model" / "bhd.json"
+    before = file.read_text()
+    try:
+        file.write_text(json.dumps({**json.loads(before), "units": "degrees"}))
+        arguments = options(data, tmp_path / "run", {}, fine_tune=trained)
+        refused(arguments, DatasetMismatchError, r"values are in SI.*trained on values in degrees")
+    finally:
+        file.write_text(before)
+
+
+@pytest.mark.parametrize(("statistics", "shifts"), [("checkpoint", False), ("dataset", True)])
+def test_fine_tuning_keeps_or_renews_the_statistics(
+    trained: Path, tmp_path: Path, statistics: str, shifts: bool
+) -> None:
+    root = make_dataset(tmp_path / "set", episodes=3, shift=5.0)
+    arguments = options(root, tmp_path / "run", {}, fine_tune=trained, fine_tune_statistics=statistics, steps=2)
+    result, _ = run_train([*arguments, "--policy.optimizer_lr=1e-5"])
+    assert result.checkpoint is not None
+    name = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
+    from safetensors.torch import load_file
+
+    files = [folder / "pretrained_model" / name for folder in (trained / "checkpoints" / "last", result.checkpoint)]
+    old, new = (load_file(file)["action.mean"] for file in files)
+    assert bool(torch.allclose(new, old)) != shifts
+    config = json.loads((result.checkpoint / "pretrained_model" / "config.json").read_text())
+    assert config["optimizer_lr"] == 1e-5
+    assert config["hidden_dims"] == [16, 16]  # from the checkpoint
+
+
+def test_fine_tuning_starts_from_the_weights(data: Path, trained: Path, tmp_path: Path) -> None:
+    run_train(options(data, tmp_path / "more", {}, fine_tune=trained, steps=1, log_freq=1))
+    run_train(options(data, tmp_path / "new", MLP, steps=1, log_freq=1))
+    assert curve(tmp_path / "more")[0]["loss"] < curve(tmp_path / "new")[0]["loss"]
+
+
+def test_fine_tuning_changes_only_the_parameters_that_are_asked_for(data: Path, trained: Path, tmp_path: Path) -> None:
+    changes = {"steps": 4, "save_freq": 2, "log_freq": 1, "fine_tune_parameters": "['*.bias']"}
+    result, _ = run_train(options(data, tmp_path / "run", {}, fine_tune=trained, **changes))
+    assert result.checkpoint is not None
+    from safetensors.torch import load_file
+
+    folders = (trained / "checkpoints" / "last", result.checkpoint)
+    old, new = (load_file(folder / "pretrained_model" / "model.safetensors") for folder in folders)
+    assert set(old) == set(new)
+    for name, values in old.items():
+        assert bool(torch.equal(values, new[name])) != name.endswith(".bias"), name
+    # A run that goes on knows which they were.
+    whole = curve(tmp_path / "run")
+    again = tmp_path / "run" / "checkpoints" / "000002" / "pretrained_model"
+    resumed, _ = run_train([f"--config_path={again / 'train_config.json'}", "--resume=true"])
+    assert resumed.checkpoint is not None
+    assert curve(tmp_path / "run") == whole
+    again_new = load_file(resumed.checkpoint / "pretrained_model" / "model.safetensors")
+    assert all(torch.equal(values, again_new[name]) for name, values in new.items())
+
+
+def test_a_checkpoint_that_is_not_there(data: Path, tmp_path: Path) -> None:
+    arguments = options(data, tmp_path / "run", {}, fine_tune=tmp_path / "none")
+    refused(arguments, ConfigError, r"no policy at .*none.*does not exist")
+    with pytest.raises(ConfigError, match="No checkpoint to resume at"):
+        parse_train(["--resume=true", f"--config_path={tmp_path / 'none'}"])
+    with pytest.raises(ConfigError, match="resume needs --config_path"):
+        parse_train(["--resume=true"])
+
+
+def test_a_damaged_checkpoint_is_not_resumed(data: Path, tmp_path: Path) -> None:
+    run_train(options(data, tmp_path / "run", MLP, steps=5))
+    state = tmp_path / "run" / "checkpoints" / "last" / "training_state" / "optimizer_state.safetensors"
+    state.write_bytes(b"torn")
+    with pytest.raises(ConfigError, match="cannot be resumed from"):
+        run_train(["--resume=true", f"--config_path={tmp_path / 'run'}", "--steps=9"])
+
+
+def test_weights_that_are_damaged_are_named(data: Path, trained: Path, tmp_path: Path) -> None:
+    shutil.copytree(trained, tmp_path / "damaged", symlinks=True)
+    file = tmp_path / "damaged" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors"
+    file.write_bytes(file.read_bytes()[:200])
+    for key in ("fine_tune", "policy.path"):
+        arguments = options(data, tmp_path / "run", {key: tmp_path / "damaged"})
+        refused(arguments, ConfigError, r"'bhd_mlp' cannot be made from .*damaged.*header")
+    with pytest.raises(ConfigError, match=r"'bhd_mlp' cannot be made from .*damaged"):
+        run_train(["--resume=true", f"--config_path={tmp_path / 'damaged'}", "--steps=12"])
+
+
+def test_an_environment_of_another_robot(tmp_path: Path) -> None:
+    root = make_dataset(tmp_path / "set", episodes=2, robot="ur5")
+    env = {"env__type": "bhd", "env__task": "TurtleBot3Avoid-v0", "env_eval_freq": 2}
+    message = r"env.task is 'TurtleBot3Avoid-v0', which is for a turtlebot3; .* Valid: UR5Pick-v0, UR5Reach-v0"
+    refused(options(root, tmp_path / "run", MLP, **env), ConfigError, message)
+
+
+def test_metrics_that_cannot_be_written_leave_the_checkpoint(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = MetricsFile.append
+
+    def full(self: MetricsFile, row: dict[str, Any]) -> None:
+        if row["step"] > 10:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(self, row)
+
+    def no_picture(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(MetricsFile, "append", full)
+    monkeypatch.setattr(output, "draw_loss", no_picture)
+    with pytest.raises(BhdError, match=r"metrics of step 15 .*No space left.*000010 is intact.*resume"):
+        run_train(options(data, tmp_path / "run", MLP))
+    monkeypatch.undo()
+    result, _ = run_train(["--resume=true", f"--config_path={tmp_path / 'run'}"])
+    assert (result.step, [row["step"] for row in curve(tmp_path / "run")]) == (20, [5, 10, 15, 20])
+
+
+def test_a_dataset_that_grew_since_is_not_resumed_on(tmp_path: Path) -> None:
+    root = make_dataset(tmp_path / "set", episodes=2)
+    run_train(options(root, tmp_path / "run", MLP, steps=5))
+    bigger = make_dataset(tmp_path / "bigger", episodes=3)
+    with pytest.raises(BhdError, match=r"40 frames.*60.*--fine_tune"):
+        run_train(["--resume=true", f"--config_path={tmp_path / 'run'}", "--steps=9", f"--dataset.root={bigger}"])
+
+
+def test_what_is_held_out_stays_so_when_a_run_is_resumed(tmp_path: Path) -> None:
+    root = make_dataset(tmp_path / "set", episodes=5, instructions=5)
+    run = tmp_path / "run"
+    held_out = {"dataset__episodes": "[0, 1, 2, 3]", "dataset__eval_split": 0.3, "eval_steps": 5}
+    _, said = run_train(options(root, run, MLP, steps=5, **held_out))
+    assert "2 episodes, 2 held out" in said
+    again = ["--resume=true", f"--config_path={run}", "--steps=9"]
+    with pytest.raises(BhdError, match=r"2 episodes \(0, 3\) held out, and now it would be 2 episodes \(0, 4\)"):
+        run_train([*again, "--dataset.episodes=[0, 1, 2, 4]"])
+    own = run / "checkpoints" / "last" / "pretrained_model" / "bhd_train.json"
+    values = json.loads(own.read_text())
+    assert values["selection"].pop("hold_out") == "episode"
+    own.write_text(json.dumps(values))  # as it was written when LeRobot's rule was the only one
+    assert parse_train(again).config.selection.hold_out == "instruction"
+    own.unlink()  # a checkpoint of lerobot-train
+    assert parse_train(again).config.selection.hold_out == "instruction"
+
+
+def test_a_loss_that_is_not_a_number_stops_and_keeps_the_last_checkpoint(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    forward = ACTPolicy.forward
+
+    def breaks(self: ACTPolicy, batch: dict) -> tuple:
+        loss, outputs = forward(self, batch)
+        calls.append(batch["index"])
+        return (loss * math.nan if len(calls) == 13 else loss), outputs
+
+    monkeypatch.setattr(ACTPolicy, "forward", breaks)
+    with pytest.raises(BhdError, match=r"loss is nan at step 13 .*batch of episode:frame \d+:\d+.*step 10 is kept"):
+        run_train(options(data, tmp_path / "run"))
+    monkeypatch.undo()
+    assert sorted(one.name for one in (tmp_path / "run" / "checkpoints").iterdir()) == ["000010", "last"]
+    result, _ = run_train(["--resume=true", f"--config_path={tmp_path / 'run'}"])
+    assert result.step == 20
+
+
+def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "precious").touch()
+    refused(options(data, tmp_path / "run"), ConfigError, r"output folder .*run exists.*--output_dir")
+    assert [one.name for one in (tmp_path / "run").iterdir()] == ["precious"]
+    with pytest.raises(ConfigError, match=r"File name too long.*--output_dir"):
+        run_train(options(data, tmp_path / ("x" * 300)))
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"policy.type": "akt"}, r"'akt'. Did you mean 'act'\? Valid: .*bhd_mlp.*diffusion"),
+        ({"policy.chunk_sise": 3}, r"policy.chunk_sise.*Did you mean 'policy.chunk_size'"),
+        ({"stepps": 3}, r"stepps.*Did you mean 'steps'"),
+        ({"steps": 0}, "steps is 0; it must be at least 1"),
+        ({"steps": 2.5}, "steps is 2.5; it must be int"),
+        ({"batch_size": 0}, "batch_size is 0"),
+        ({"budget_gib": 0}, "budget_gib is 0"),
+        ({"threads": 0}, "threads is 0"),
+        ({"fine_tune_statistics": "both"}, "both.*checkpoint, dataset"),
+        (
+            {"fine_tune_parameters": "[model.*,net.9.*]"},
+            r"'net\.9\.\*' matches no parameter of the policy, which has model",
+        ),
+        ({"fine_tune_parameters": "[]"}, r"fine_tune_parameters is \[\]; it matches no parameter .* and \d+ more"),
+        ({"selection.min_score": 2}, "min_score is 2"),
+        ({"selection.intervention_weight": -1}, "intervention_weight is -1"),
+        ({"selection.hold_out": "task"}, "Unknown selection.hold_out 'task'. Valid: episode, instruction"),
+        ({"dataset.streaming": "true"}, "dataset.streaming is not for bhd-train"),
+        ({"peft.r": 4}, "peft"),
+        ({"policy.push_to_hub": "true"}, "--policy.repo_id"),
+        ({"optimizer.type": "sgd"}, "use_policy_training_preset"),
+        ({"eval_steps": 5}, "eval_steps > 0 requires dataset.eval_split"),
+        ({"policy.type": None}, "policy.type is missing. Valid: .*act"),
+        ({"policy.n_heads": "[1]"}, r"policy.n_heads is \[1\]"),
+        ({"policy.device": "tpu"}, r"(?i)cannot be used: .*tpu"),
+        ({"dataset.eval_split": ".nan"}, r"cannot be used: .*eval_split.*nan"),
+        ({"dataset.episodes": 3}, "dataset.episodes is 3; it must be a list of int"),
+        ({"log_freq": -1}, "log_freq is -1; it must be at least 0"),
+        ({"tolerance_s": ".nan"}, "tolerance_s is nan"),
+        ({"selection.intervention_weight": ".inf"}, "is inf; it must be 0 or more, and finite"),
+        ({"env.type": "bhd", "env_eval_freq": 2, "eval.n_episodes": 0}, "eval.n_episodes is 0"),
+        ({"policy.optimizer_lr": ".nan"}, r"optimizer cannot be made: .*nan.*policy\.optimizer_"),
+    ],
+)
+def test_a_configuration_that_cannot_be_honoured(
+    data: Path, tmp_path: Path, change: dict[str, Any], match: str
+) -> None:
+    refused(options(data, tmp_path / "run", {**ACT, **change}), ConfigError, match)
+
+
+def test_no_policy_at_all(data: Path, tmp_path: Path) -> None:
+    arguments = [one for one in options(data, tmp_path / "run", {}) if "policy" not in one]
+    refused(arguments, ConfigError, "No policy is given.*bhd_mlp")

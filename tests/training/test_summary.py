@@ -1,0 +1,67 @@
+"""What `bhd-train` says at its end."""
+
+import shlex
+from dataclasses import asdict
+
+import pytest
+
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import describe
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.tasks.avoid import AvoidConfig
+from bhd_lerobot.tasks.catalog import robot_of_task
+from bhd_lerobot.tasks.config_task import TaskConfig
+from bhd_lerobot.tasks.pick import PickConfig
+from bhd_lerobot.tasks.reach import ReachConfig
+from bhd_lerobot.tasks.variation import RandomisationConfig
+from bhd_lerobot.training.summary import how_to_evaluate
+
+
+@pytest.mark.parametrize(
+    ("robot", "task"),
+    [
+        (UR5Config(action_space="tool", tool_pose=True, fps=50), PickConfig(max_objects=1)),
+        (
+            UR5Config(control="impedance", action_space="tool", stale_after_s=0.05),
+            ReachConfig(hold_s=1.0, randomisation=RandomisationConfig(enabled=True, camera_error_m=[0.01, 0.0, 0.02])),
+        ),
+        (TurtleBot3Config(odometry=True, beams=36), AvoidConfig(trail=True, arena="empty")),
+        (TurtleBot3Config(), AvoidConfig()),
+    ],
+)
+def test_the_command_evaluates_with_the_robot_and_the_task_of_the_recordings(robot, task) -> None:
+    parameters = {"type": TaskConfig.get_choice_name(type(task)), **asdict(task)}
+    contract = PolicyContract(robot_type=robot.type, task=parameters, robot=describe(robot))
+    said, command = how_to_evaluate(contract, "run/checkpoints/000100")
+    assert said == "Evaluate it with:"
+    program, *options = shlex.split(command)
+    assert program == "bhd-eval"
+    config = parse(EvalConfig, [*options, "--brain.type=learned"])  # which is what a path alone means to bhd-eval
+    assert describe(config.robot) == describe(robot)
+    assert config.task == task
+    (brain,) = config.brains.values()
+    assert brain.path == "run/checkpoints/000100/pretrained_model"
+
+
+def test_options_at_their_defaults_are_not_repeated() -> None:
+    contract = PolicyContract(robot_type="ur5", task={"type": "pick"}, robot=describe(UR5Config(tool_pose=True)))
+    assert how_to_evaluate(contract, "c")[1] == (
+        "  bhd-eval --robot.type=ur5 --robot.tool_pose=true --task.type=pick --brain.path=c/pretrained_model"
+    )
+
+
+def test_a_robot_that_is_not_simulated_is_driven_by_lerobot() -> None:
+    said, command = how_to_evaluate(PolicyContract(robot_type="so101_follower"), "c")
+    assert "drive the robot" in said
+    assert command == "  lerobot-rollout --robot.type=so101_follower --policy.path=c/pretrained_model --duration=60"
+
+
+@pytest.mark.parametrize("robot", [TurtleBot3Config(), UR5Config()])
+def test_of_a_simulated_robot_without_a_task_one_of_its_tasks_is_an_example(robot) -> None:
+    said, command = how_to_evaluate(PolicyContract(robot_type=robot.type), "c")
+    assert "does not say its task" in said
+    config = parse(EvalConfig, [*shlex.split(command)[1:], "--brain.type=learned"])
+    assert robot_of_task(config.task) == robot.type

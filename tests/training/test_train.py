@@ -1,0 +1,283 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import draccus
+import pytest
+import torch
+import yaml
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.policies.factory import get_policy_class
+from lerobot.scripts import lerobot_train
+
+from bhd_lerobot.errors import BhdError, ConfigError, MemoryBudgetError
+from bhd_lerobot.training import checkpoint
+from bhd_lerobot.training import train as train_module
+from bhd_lerobot.training.arguments import parse_train
+from bhd_lerobot.training.log import MetricsFile
+from bhd_lerobot.training.train import main
+from tests.training.support import ACT, MLP, curve, make_dataset, options, run_train
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_dataset(tmp_path_factory.mktemp("data") / "set")
+
+
+def test_a_run_leaves_metrics_a_curve_its_configuration_and_checkpoints(data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    result, said = run_train(options(data, run, eval_steps=10, dataset__eval_split=0.3))
+    rows = curve(run)
+    assert [row["step"] for row in rows] == [5, 10, 15, 20]
+    assert [row["step"] for row in rows if "held_out_loss" in row] == [10, 20]
+    assert all({"epoch", "loss", "l1_loss", "kld_loss", "lr", "grad_norm"} <= set(row) for row in rows)
+    assert rows[-1]["loss"] < rows[0]["loss"]
+    assert (run / "loss.png").stat().st_size > 5000
+    assert sorted(one.name for one in (run / "checkpoints").iterdir()) == ["000010", "000020", "last"]
+    assert os.readlink(run / "checkpoints" / "last") == "000020"
+    assert result.checkpoint == run / "checkpoints" / "000020"
+    assert str(result.checkpoint / "pretrained_model") in said
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["steps"] == 20
+    assert config["policy"]["input_features"]["observation.state"]["shape"] == [4]
+
+
+def test_a_checkpoint_is_what_stock_lerobot_reads(data: Path, tmp_path: Path) -> None:
+    result, _ = run_train(options(data, tmp_path / "run", steps=5))
+    assert result.checkpoint is not None
+    folder = result.checkpoint / "pretrained_model"
+    assert get_policy_class("act").from_pretrained(folder).config.chunk_size == 5
+    values = json.loads((folder / "train_config.json").read_text())
+    assert draccus.decode(TrainPipelineConfig, values).steps == 5  # refuses keys that it does not know
+    contract = json.loads((folder / "bhd.json").read_text())
+    assert (contract["robot_type"], contract["fps"], contract["action_names"]) == ("toy", 10, ["a.pos", "b.pos"])
+
+
+def test_config_yaml_gives_the_same_run_again(data: Path, tmp_path: Path) -> None:
+    run_train(options(data, tmp_path / "one", selection__outcome="success", selection__intervention_weight=3.0))
+    config = tmp_path / "one" / "config.yaml"
+    run_train([f"--config_path={config}", f"--output_dir={tmp_path / 'two'}"])
+    assert curve(tmp_path / "one") == curve(tmp_path / "two")
+
+
+@pytest.mark.parametrize("policy", [ACT, MLP], ids=["act", "bhd_mlp"])
+def test_the_first_losses_are_those_of_lerobot_train(
+    data: Path, tmp_path: Path, policy: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result, _ = run_train(options(data, tmp_path / "ours", policy, steps=14, log_freq=1, save_freq=0))
+    values = json.loads((result.output_dir / "train_config.json").read_text())
+    values |= {"output_dir": str(tmp_path / "stock"), "checkpoint_path": None, "optimizer": None, "scheduler": None}
+    monkeypatch.setattr(sys, "argv", ["lerobot-train"])
+    losses: list[float] = []
+    original = lerobot_train.update_policy
+
+    def spy(tracker, *args, **kwargs):
+        tracker, outputs = original(tracker, *args, **kwargs)
+        losses.append(tracker.metrics["loss"].val)
+        return tracker, outputs
+
+    monkeypatch.setattr(lerobot_train, "update_policy", spy)
+    lerobot_train.train(draccus.decode(TrainPipelineConfig, values))
+    assert [row["loss"] for row in curve(tmp_path / "ours")] == losses
+    path = "checkpoints/last/pretrained_model/model.safetensors"
+    assert (tmp_path / "ours" / path).read_bytes() == (tmp_path / "stock" / path).read_bytes()
+
+
+def test_evaluating_does_not_change_the_training(data: Path, tmp_path: Path) -> None:
+    split = {"dataset__eval_split": 0.3}
+    run_train(options(data, tmp_path / "one", **split))
+    run_train(options(data, tmp_path / "two", eval_steps=3, **split))
+    losses = [[row["loss"] for row in curve(tmp_path / name) if "loss" in row] for name in ("one", "two")]
+    assert losses[0] == losses[1]
+
+
+@pytest.mark.parametrize("budget", [4.0, 1e-6], ids=["in memory", "lerobot's loader"])
+def test_a_resumed_run_continues_to_the_same_bits(
+    data: Path, tmp_path: Path, budget: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # 12 is no multiple of log_freq, so a window of metrics is cut in two as well.
+    common = {"save_freq": 12, "eval_steps": 10, "dataset__eval_split": 0.3, "budget_gib": budget}
+    _, said = run_train(options(data, tmp_path / "whole", **common))
+    assert ("LeRobot's own loader" in said) == (budget < 1)
+
+    class KilledError(Exception):
+        pass
+
+    save = checkpoint.save
+
+    def killed(*args, **kwargs):
+        save(*args, **kwargs)
+        raise KilledError
+
+    monkeypatch.setattr(checkpoint, "save", killed)
+    with pytest.raises(KilledError):
+        run_train(options(data, tmp_path / "cut", **common))
+    monkeypatch.undo()
+    with (tmp_path / "cut" / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 13, "loss": 1}\n{"step": 14, "lo')  # what came after the checkpoint, and a torn line
+    last = tmp_path / "cut" / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    result, said = run_train(["--resume=true", f"--config_path={last}"])
+    assert result.step == 20
+    assert "after step 12" in said
+    assert curve(tmp_path / "cut") == curve(tmp_path / "whole")
+    weights = "checkpoints/last/pretrained_model/model.safetensors"
+    assert (tmp_path / "cut" / weights).read_bytes() == (tmp_path / "whole" / weights).read_bytes()
+
+
+def spawn(arguments: list[str]) -> subprocess.Popen:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "bhd_lerobot.training.train", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+
+
+def wait_for(condition, process: subprocess.Popen) -> None:
+    while not condition():
+        assert process.poll() is None, process.stdout.read()
+        time.sleep(0.01)
+
+
+def test_sigkill_anywhere_and_resuming_gives_the_undisturbed_curve(data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "cut"
+    # A constant learning rate, because another one depends on the number of steps.
+    common = {"log_freq": 7, "save_freq": 10, "policy": {**MLP, "policy.scheduler": "constant"}}
+    process = spawn(options(data, run, steps=5000, **common))
+    try:
+        wait_for(lambda: len(list((run / "checkpoints").glob("0*"))) > 3, process)
+        process.kill()
+        process.wait()
+    finally:
+        process.kill()
+        process.stdout.close()
+    done = json.loads((run / "checkpoints" / "last" / "training_state" / "training_step.json").read_text())["step"]
+    assert 0 < done < 5000
+    run_train(["--resume=true", f"--config_path={run}", f"--steps={done + 25}"])
+    run_train(options(data, tmp_path / "whole", steps=done + 25, **common))
+    assert curve(run) == curve(tmp_path / "whole")
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> None:
+    run = tmp_path / "run"
+    common = {"steps": 30, "save_freq": 0, "policy": MLP}
+    run_train(options(data, tmp_path / "whole", **common))
+    append = MetricsFile.append
+
+    def press(self: MetricsFile, row: dict) -> None:
+        append(self, row)
+        if row["step"] == 15:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(MetricsFile, "append", press)
+    assert main(options(data, run, **common)) == 130
+    monkeypatch.undo()
+    path = run / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    assert f"bhd-train --resume=true --config_path={path}" in capfd.readouterr().err
+    result, _ = run_train(["--resume=true", f"--config_path={path}"])
+    assert result.step == 30
+    assert curve(run) == curve(tmp_path / "whole")
+
+
+def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    calls = []
+    flush = checkpoint._flush
+
+    class Killed(BaseException):
+        pass
+
+    def die_the_second_time(folder: Path) -> None:
+        calls.append(folder)
+        if len(calls) == 2:
+            (folder / "pretrained_model" / "model.safetensors").write_bytes(b"half")
+            raise Killed
+        flush(folder)
+
+    monkeypatch.setattr(checkpoint, "_flush", die_the_second_time)
+    with pytest.raises(Killed):
+        run_train(options(data, run))
+    monkeypatch.undo()
+    assert os.readlink(run / "checkpoints" / "last") == "000010"
+    assert (run / "checkpoints" / ".000020.part").is_dir()
+    result, _ = run_train(["--resume=true", f"--config_path={run}"])
+    assert result.step == 20
+    assert sorted(one.name for one in (run / "checkpoints").iterdir()) == ["000010", "000020", "last"]
+
+
+def test_a_full_disk_ends_with_the_checkpoint_before_intact(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save = checkpoint.save_checkpoint
+
+    def full(folder: Path, step: int, *args, **kwargs):
+        save(folder, step, *args, **kwargs)
+        if step == 20:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "save_checkpoint", full)
+    with pytest.raises(BhdError, match=r"checkpoint of step 20 .* No space left"):
+        run_train(options(data, tmp_path / "run"))
+    assert sorted(one.name for one in (tmp_path / "run" / "checkpoints").iterdir()) == ["000010", "last"]
+
+
+def test_a_finished_run_says_how_to_go_on(data: Path, tmp_path: Path) -> None:
+    run_train(options(data, tmp_path / "run", steps=5))
+    with pytest.raises(ConfigError, match=r"5 of 5 steps.*--steps"):
+        run_train(["--resume=true", f"--config_path={tmp_path / 'run'}"])
+    result, _ = run_train(["--resume=true", f"--config_path={tmp_path / 'run'}", "--steps=7"])
+    assert result.step == 7
+
+
+def test_a_run_that_was_moved_resumes_where_it_is(data: Path, tmp_path: Path) -> None:
+    run_train(options(data, tmp_path / "run", steps=5))
+    (tmp_path / "run").rename(tmp_path / "moved")
+    result, _ = run_train(["--resume=true", f"--config_path={tmp_path / 'moved'}", "--steps=7"])
+    assert result.output_dir == tmp_path / "moved"
+    assert not (tmp_path / "run").exists()
+
+
+def test_only_the_chosen_episodes_are_learned_from(data: Path, tmp_path: Path) -> None:
+    arguments = options(data, tmp_path / "run", selection__outcome="[success, collision]", selection__min_score=0.2)
+    _, said = run_train(arguments)
+    assert "4 episodes" in said
+    saved = json.loads((tmp_path / "run" / "train_config.json").read_text())
+    assert saved["dataset"]["episodes"] == [2, 3, 4, 5]
+
+
+def test_interventions_can_be_left_out(data: Path, tmp_path: Path) -> None:
+    _, said = run_train(options(data, tmp_path / "run", selection__intervention_weight=0))
+    assert f"{6 * 17} samples in an epoch" in said
+
+
+def test_too_little_memory_falls_back_and_says_so(data: Path, tmp_path: Path) -> None:
+    _, said = run_train(options(data, tmp_path / "run", budget_gib=1e-7, steps=5))
+    assert "LeRobot's own loader" in said
+    assert issubclass(MemoryBudgetError, BhdError)
+    run_train(options(data, tmp_path / "memory", steps=5))
+    assert curve(tmp_path / "run") == curve(tmp_path / "memory")
+
+
+def test_cameras_are_learned_from(tmp_path: Path) -> None:
+    root = make_dataset(tmp_path / "set", episodes=2, frames=6, camera=True)
+    extra = {"policy__pretrained_backbone_weights": "null", "steps": 2, "log_freq": 1}
+    result, _ = run_train(options(root, tmp_path / "run", **extra))
+    assert all(torch.isfinite(torch.tensor(row["loss"])) for row in result.rows)
+
+
+def test_help_names_lerobots_options_and_ours(capsys: pytest.CaptureFixture) -> None:
+    assert main(["--help"]) == 0
+    said = capsys.readouterr().out
+    assert "--steps" in said
+    assert "--selection.outcome" in said
+    assert "bhd_mlp" in said
+
+
+def test_the_program_is_registered() -> None:
+    assert train_module.main is main
+    assert parse_train(options(Path("x"), None)).config.policy.type == "act"
