@@ -15,7 +15,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 # Command lines, and the modules behind them: the tests of a checkout must not depend on what is in PATH.
 _MODULES = {
     "bhd-record": "bhd_lerobot.recording.record",
-    "bhd-train": "bhd_lerobot.training.train",
+    "bhd-train": "bhd_lerobot.cli.train",
     "bhd-eval": "bhd_lerobot.evaluation.evaluate",
 }
 

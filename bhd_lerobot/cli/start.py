@@ -95,7 +95,7 @@ def record() -> int:
 
 def train() -> int:
     """Run `bhd-train`."""
-    return run("bhd_lerobot.training.train")
+    return run("bhd_lerobot.cli.train")
 
 
 def evaluate() -> int:

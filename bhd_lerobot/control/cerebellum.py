@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Body, MobileBase
-from bhd_lerobot.control.base.controller import BaseController
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
@@ -22,7 +21,6 @@ from bhd_lerobot.control.messages import (
     mode_reason,
 )
 from bhd_lerobot.control.plant import Plant, PlantReading
-from bhd_lerobot.errors import ConfigError
 
 _TRACKING = int(Mode.TRACKING)  # numpy compares plain numbers faster
 MOVING = 0.01  # [rad/s] a joint faster than this moves: the articles' `is_moving`
@@ -46,17 +44,15 @@ class Cerebellum:
         body: the robot.
         plant: the joints.
         control_hz: ticks a second [Hz].
+        controller: what turns commands into actuator commands.
         fifo: where commands come from; a new one if None.
         ring: where every tick's state is published, of dtype `state_dtype(n)`; nowhere if None.
         estop_word: n 64-bit integers that any process may set to something else than 0; new memory if None.
-        controller: what turns commands into actuator commands; may be left out for a `MobileBase`.
 
     Attributes:
         requested: the setpoint that was last taken, before all limits, shape (n, width).
         setpoints_taken: how many have been taken.
 
-    Raises:
-        ConfigError: the body cannot do what its limits allow, or it needs a controller and none was given.
     """
 
     def __init__(
@@ -64,19 +60,15 @@ class Cerebellum:
         body: Body,
         plant: Plant,
         control_hz: int,
+        controller: Controller,
         *,
         fifo: CommandFifo | None = None,
         ring: StateRing | None = None,
         estop_word: NDArray[np.int64] | None = None,
-        controller: Controller | None = None,
     ) -> None:
         self.body, self.plant, self.control_hz = body, plant, control_hz
         self.n = n = plant.n
-        if controller is None:
-            if not isinstance(body, MobileBase):
-                raise ConfigError(f"The body {body.name!r} is not a wheeled base; give its controller.")
-            controller = BaseController(body, n, control_hz)
-        self.controller: Controller = controller
+        self.controller = controller
         self.width = width = self.controller.width
         self.command = self.controller.command
         self.fifo = CommandFifo(n, width) if fifo is None else fifo

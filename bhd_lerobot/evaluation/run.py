@@ -15,8 +15,9 @@ from bhd_lerobot.errors import BhdError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
 from bhd_lerobot.evaluation.record import BrainRecorder
-from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.rollout.drivers import TimedBrain
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.plots import Trajectory
 from bhd_lerobot.rollout.registry import make_brain, make_task
@@ -24,30 +25,6 @@ from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import episode_seed
 
 FILMS = 2  # failures of each brain that are filmed, unless said otherwise
-
-
-class TimedBrain:
-    """A brain whose calls are timed; everything else is the brain's own.
-
-    Attributes:
-        times: duration of each call of `act` [s].
-    """
-
-    def __init__(self, brain: Brain) -> None:
-        self._brain = brain
-        self.times: list[float] = []
-
-    def __getattr__(self, name: str) -> Any:
-        """Return what the brain has."""
-        return getattr(self._brain, name)
-
-    def act(self, observation: Observation) -> Any:
-        """Return what the brain wants, and remember how long it took."""
-        started = time.perf_counter()
-        try:
-            return self._brain.act(observation)
-        finally:
-            self.times.append(time.perf_counter() - started)
 
 
 @dataclass

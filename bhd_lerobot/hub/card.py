@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.cli.data.info import meaning_of
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.read import read_episode
 from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
@@ -21,7 +20,6 @@ from bhd_lerobot.datasets.remote.listing import PICTURE
 from bhd_lerobot.datasets.remote.push import Card
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import BhdError
-from bhd_lerobot.evaluation.statistics import wilson
 
 SHOWN = 12  # episodes in a picture from above
 FRAMES = 6  # of an episode, in a picture from a camera
@@ -98,10 +96,12 @@ def _success(summary: DatasetSummary) -> str:
     known = [bool(one.metadata["success"]) for one in summary.episodes if one.metadata.get("success") is not None]
     if not known:
         return ""
-    share = wilson(sum(known), len(known))
+    from scipy.stats import binomtest
+
+    low, high = binomtest(sum(known), len(known)).proportion_ci(method="wilson")
     return (
-        f"{sum(known)} of {len(known)} episodes succeeded: {share.value:.1%}; 95 % interval of the share (Wilson): "
-        f"{share.low:.1%} to {share.high:.1%}."
+        f"{sum(known)} of {len(known)} episodes succeeded: {np.mean(known):.1%}; 95 % interval of the share (Wilson): "
+        f"{low:.1%} to {high:.1%}."
     )
 
 
@@ -110,7 +110,7 @@ def _shape(feature: dict[str, Any]) -> str:
 
 
 def _meaning(key: str, feature: dict[str, Any]) -> str:
-    said = meaning_of(key, feature)
+    said = keys.meaning_of(key, feature)
     names = [str(name) for name in feature.get("names") or []] if isinstance(feature.get("names"), list) else []
     units = [f"`{suffix}` in {unit}" for suffix, unit in _UNITS if any(name.endswith(suffix) for name in names)]
     return said + (f" ({', '.join(units)})" if units else "")

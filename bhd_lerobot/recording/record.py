@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from bhd_lerobot.cli.data.push import check_pushable, left_by_interrupt, push_command, push_dataset, tell
 from bhd_lerobot.cluster.loop import ClusterLoop, open_crew
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
@@ -21,6 +20,7 @@ from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetEditedError, RealtimeError, RenderingError
+from bhd_lerobot.hub.push import check_pushable, left_by_interrupt, push_command, push_dataset, tell
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.recording.config import RecordConfig

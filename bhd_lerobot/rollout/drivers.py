@@ -1,12 +1,13 @@
-"""Who drives in each frame: the brain or one who took over, by setpoints or by goals."""
+"""Who drives in each frame: the brain or one who took over, by setpoints or by goals; and how long the brain thinks."""
 
+import time
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.policies.brain import Goals, Mixed
+from bhd_lerobot.policies.brain import Brain, Goals, Mixed, Observation
 from bhd_lerobot.tasks.task import Event
 
 Mask = NDArray[np.bool_]
@@ -121,3 +122,27 @@ def spans(mask: Mask) -> list[tuple[int, int]]:
     """Return where a mask of shape (frames,) is true, as first frames and those after the last."""
     edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
     return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+
+
+class TimedBrain:
+    """A brain whose calls are timed; everything else is the brain's own.
+
+    Attributes:
+        times: duration of each call of `act` [s].
+    """
+
+    def __init__(self, brain: Brain) -> None:
+        self._brain = brain
+        self.times: list[float] = []
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what the brain has."""
+        return getattr(self._brain, name)
+
+    def act(self, observation: Observation) -> Any:
+        """Return what the brain wants, and remember how long it took."""
+        started = time.perf_counter()
+        try:
+            return self._brain.act(observation)
+        finally:
+            self.times.append(time.perf_counter() - started)

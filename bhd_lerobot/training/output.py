@@ -11,9 +11,9 @@ import yaml
 from lerobot.common.train_utils import push_checkpoint_to_hub
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
-from bhd_lerobot.cli.data.push import check_pushable
 from bhd_lerobot.datasets.remote.hub_errors import hub_errors
 from bhd_lerobot.errors import BhdError, ConfigError, TransferError
+from bhd_lerobot.hub.push import check_pushable
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
 from bhd_lerobot.training import checkpoint

@@ -27,7 +27,6 @@ from bhd_lerobot.training.env import EnvEvaluation
 from bhd_lerobot.training.log import Row, TrainingProgress
 from bhd_lerobot.training.loop import Hooks, LoopOptions, TrainingLoop
 from bhd_lerobot.training.output import RunOutput
-from bhd_lerobot.training.rl.config import is_rl
 from bhd_lerobot.training.setup import (
     build_optimizer,
     build_policy,
@@ -229,12 +228,8 @@ def _agreement(stop: StopRequest, accelerator: Any) -> Any:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `bhd-train`; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
+    """Train on a dataset; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    if is_rl(arguments):
-        from bhd_lerobot.training.rl.train import main as learn_by_trial
-
-        return learn_by_trial(arguments)
     if any(one in ("-h", "--help") for one in arguments):
         print(describe(BhdTrainConfig))
         return 0
@@ -250,6 +245,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 __all__ = ["TrainResult", "main", "resume_command", "train"]
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.control.messages import NANOSECONDS, Request, SendResult, Setpoint
@@ -50,7 +51,7 @@ class Rig:
 
     def __init__(self, n: int = 1, active: bool = True, **options: object) -> None:
         self.plant = PerfectPlant(n)
-        self.cerebellum = Cerebellum(BODY, self.plant, HZ, **options)  # type: ignore[arg-type]
+        self.cerebellum = Cerebellum(BODY, self.plant, HZ, BaseController(BODY, n, HZ), **options)  # type: ignore[arg-type]
         self.n = n
         self.now = 0
         self.sequence = 0

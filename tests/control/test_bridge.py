@@ -7,6 +7,7 @@ import pytest
 from bhd_lerobot.bodies.arenas import random_arena
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
@@ -20,14 +21,20 @@ RATES = Rates(200, 200, 10)
 
 def perfect(n: int = 1, rates: Rates = RATES, timeout: float = 0.5) -> LockstepBridge:
     body = dataclasses.replace(BODY, limits=dataclasses.replace(BODY.limits, command_timeout_s=timeout))
-    bridge = LockstepBridge(Cerebellum(body, PerfectPlant(n), rates.control_hz), rates, lambda: None)
+    bridge = LockstepBridge(
+        Cerebellum(body, PerfectPlant(n), rates.control_hz, BaseController(body, n, rates.control_hz)),
+        rates,
+        lambda: None,
+    )
     bridge.restart(np.arange(n))
     return bridge
 
 
 def simulated(n: int = 1, rates: Rates = RATES, threads: int | None = None) -> tuple[LockstepBridge, World]:
     world = World(turtlebot3_burger(), n, physics_hz=rates.physics_hz, threads=threads)
-    cerebellum = Cerebellum(world.body, SimulatedPlant(world), rates.control_hz)
+    cerebellum = Cerebellum(
+        world.body, SimulatedPlant(world), rates.control_hz, BaseController(world.body, n, rates.control_hz)
+    )
     bridge = LockstepBridge(cerebellum, rates, lambda: world.step(rates.steps_per_tick))
     bridge.restart(np.arange(n))
     return bridge, world
@@ -71,7 +78,7 @@ def test_a_frame_longer_than_the_time_out_is_an_error_that_says_how_fast_is_enou
 
 def test_a_cerebellum_of_another_rate_is_an_error() -> None:
     with pytest.raises(ConfigError, match=r"200.*100"):
-        LockstepBridge(Cerebellum(BODY, PerfectPlant(), 100), RATES, lambda: None)
+        LockstepBridge(Cerebellum(BODY, PerfectPlant(), 100, BaseController(BODY, 1, 100)), RATES, lambda: None)
 
 
 def test_a_chunk_is_one_command_a_frame() -> None:

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Setpoint
@@ -375,7 +376,7 @@ def test_a_blocked_wheel_is_not_asked_for_more_than_its_torque() -> None:
     weak = dataclasses.replace(BODY, drive=dataclasses.replace(BODY.drive, max_torque=0.06))
     plant = PerfectPlant()
     plant.write = lambda ctrl: np.copyto(plant.written, ctrl)  # type: ignore[method-assign]
-    cerebellum = Cerebellum(weak, plant, HZ)
+    cerebellum = Cerebellum(weak, plant, HZ, BaseController(weak, 1, HZ))
     cerebellum.request(Request.CONFIGURE)
     cerebellum.request(Request.ACTIVATE)
     cerebellum.offer(Setpoint(1, 0, np.array([[0.2, 0.0]])))
@@ -390,7 +391,7 @@ def test_a_blocked_wheel_is_not_asked_for_more_than_its_torque() -> None:
 def test_wheels_that_are_too_slow_for_the_turning_limit_are_an_error() -> None:
     slow = dataclasses.replace(BODY, drive=dataclasses.replace(BODY.drive, max_wheel_speed=5.0))
     with pytest.raises(ConfigError, match=r"theta.vel is 2.84.*2\.06"):
-        Cerebellum(slow, PerfectPlant(), HZ)
+        BaseController(slow, 1, HZ)
 
 
 # --- state -----------------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.body import Rates
+from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.messages import Mode, Reason
@@ -39,7 +40,9 @@ class Rig:
         self.block = layout.create(f"test-bridge-{os.getpid()}", {})
         other = LiveBlock.attach(self.block.name)
         self.other = other
-        self.cerebellum = Cerebellum(BODY, PerfectPlant(1), HZ, fifo=other.fifo, estop_word=other.estop_word)
+        self.cerebellum = Cerebellum(
+            BODY, PerfectPlant(1), HZ, BaseController(BODY, 1, HZ), fifo=other.fifo, estop_word=other.estop_word
+        )
         requests, events = (Mailbox(request_dtype(0), buffer=other.section("requests")),
                             Mailbox(EVENT_DTYPE, buffer=other.section("events")))  # fmt: skip
         server = RequestServer(self.cerebellum, requests, events)

@@ -130,7 +130,7 @@ def test_a_resumed_run_continues_to_the_same_bits(
 
 def spawn(arguments: list[str]) -> subprocess.Popen:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "bhd_lerobot.training.train", *arguments]
+    command = [sys.executable, "-m", "bhd_lerobot.cli.train", *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
 
 

@@ -117,7 +117,7 @@ def info(root: Path, console: Console) -> None:
         features.add_column(heading)
     for key, feature in summary.features.items():
         # Units stand in square brackets, which rich would take for markup.
-        features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), escape(meaning_of(key, feature)))
+        features.add_row(key, feature["dtype"], str(tuple(feature["shape"])), escape(keys.meaning_of(key, feature)))
     console.print(features)
     if not summary.episodes:
         return
@@ -173,28 +173,6 @@ def _timing(timings: Sequence[TimingSummary]) -> str:
         f"wall-clock time: {late} of {frames} frames out of tolerance, {skipped} ticks skipped, {drops} frames or "
         "states lost; `bhd-data timing` says more"
     )
-
-
-def meaning_of(key: str, feature: dict[str, Any]) -> str:
-    """Return what a column holds, in words; the names of a vector where there is nothing better."""
-    if key in keys.SCALARS:
-        return keys.SCALARS[key][1]
-    if key in _LEROBOT_COLUMNS:
-        return _LEROBOT_COLUMNS[key]
-    names = feature.get("names") or []
-    if isinstance(names, list) and len(names) > 6:
-        return f"{', '.join(map(str, names[:3]))}, … {names[-1]}"
-    return ", ".join(map(str, names)) if isinstance(names, list) else ""
-
-
-_LEROBOT_COLUMNS = {
-    keys.SUBTASK: "what the brain was doing, in words",
-    "timestamp": "frame_index / fps [s]",
-    "frame_index": "number of the frame in its episode",
-    "episode_index": "number of the episode in the dataset",
-    "index": "number of the frame in the dataset",
-    "task_index": "number of the instruction",
-}
 
 
 def _plain(summary: DatasetSummary) -> dict[str, Any]:

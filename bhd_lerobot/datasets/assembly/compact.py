@@ -1,6 +1,7 @@
 """From one file per episode to few files, in one step that a kill cannot leave half done.
 
-New folders are built beside the old ones; files that need no change are linked. See `bhd_lerobot.datasets.storage.atomic`.
+New folders are built beside the old ones; files that need no change are linked. See
+`bhd_lerobot.datasets.storage.atomic`.
 """
 
 from collections.abc import Callable, Iterator, Mapping

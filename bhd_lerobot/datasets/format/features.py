@@ -115,3 +115,25 @@ def dataset_features(
 
 def _vector(dtype: str, names: Sequence[str]) -> dict[str, Any]:
     return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
+
+
+def meaning_of(key: str, feature: dict[str, Any]) -> str:
+    """Return what a column holds, in words; the names of a vector where there is nothing better."""
+    if key in SCALARS:
+        return SCALARS[key][1]
+    if key in _LEROBOT_COLUMNS:
+        return _LEROBOT_COLUMNS[key]
+    names = feature.get("names") or []
+    if isinstance(names, list) and len(names) > 6:
+        return f"{', '.join(map(str, names[:3]))}, … {names[-1]}"
+    return ", ".join(map(str, names)) if isinstance(names, list) else ""
+
+
+_LEROBOT_COLUMNS = {
+    SUBTASK: "what the brain was doing, in words",
+    "timestamp": "frame_index / fps [s]",
+    "frame_index": "number of the frame in its episode",
+    "episode_index": "number of the episode in the dataset",
+    "index": "number of the frame in the dataset",
+    "task_index": "number of the instruction",
+}

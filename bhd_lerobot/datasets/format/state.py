@@ -144,7 +144,8 @@ def load_state(root: Path, *, films: bool = True) -> DatasetState:
         root: the dataset.
         films: whether films must be there, too.
 
-    Reads file footers, not their pages: a damaged value inside a file is found by `bhd_lerobot.datasets.recovery.repair.repair`.
+    Reads file footers, not their pages: a damaged value inside a file is found by
+    `bhd_lerobot.datasets.recovery.repair.repair`.
 
     Raises:
         DatasetError: `root` is not a dataset, or a link in it leads out of it.

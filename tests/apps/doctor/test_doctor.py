@@ -75,7 +75,8 @@ def noisy_and_dead():
     os.kill(os.getpid(), signal.SIGKILL)
 
 def measure_and_list(rate, seconds):
-    return latency_test.measure(RealtimeSettings(), rate, seconds), sorted({"torch", "lerobot", "mujoco"} & set(sys.modules))
+    measured = latency_test.measure(RealtimeSettings(), rate, seconds)
+    return measured, sorted({"torch", "lerobot", "mujoco"} & set(sys.modules))
 """
 
 

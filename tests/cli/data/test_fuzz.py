@@ -13,12 +13,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from tests.data import loader_support, support
 
 from bhd_lerobot.apps.view.dataset import ViewedDataset
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.errors import DatasetError
 from tests.cli.data import fuzz_support
+from tests.datasets import support
+from tests.datasets.loader import support as loader_support
 from tests.recording.support import run_record
 
 SEEDS = {"": range(200), "full": range(6000)}

@@ -334,7 +334,7 @@ def test_the_shipped_configurations_are_valid(name: str) -> None:
 
 
 def test_bhd_train_hands_over_what_names_an_algorithm(tmp_path: Path, capsys) -> None:
-    from bhd_lerobot.training.train import main as bhd_train
+    from bhd_lerobot.cli.train import main as bhd_train
 
     assert bhd_train(options(tmp_path / "run", steps=0)) == 2
     assert "steps is 0" in capsys.readouterr().err
