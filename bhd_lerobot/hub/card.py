@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
 from bhd_lerobot.datasets.remote.card import CardFacts, compose

@@ -19,8 +19,8 @@ from rich.table import Table
 
 from bhd_lerobot.control.commands import BrainCommand
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.identity import default_root
-from bhd_lerobot.datasets.format.read import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.robots.host.simulation import Simulation

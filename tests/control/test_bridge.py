@@ -21,11 +21,8 @@ RATES = Rates(200, 200, 10)
 
 def perfect(n: int = 1, rates: Rates = RATES, timeout: float = 0.5) -> LockstepBridge:
     body = dataclasses.replace(BODY, limits=dataclasses.replace(BODY.limits, command_timeout_s=timeout))
-    bridge = LockstepBridge(
-        Cerebellum(body, PerfectPlant(n), rates.control_hz, BaseController(body, n, rates.control_hz)),
-        rates,
-        lambda: None,
-    )
+    controller = BaseController(body, n, rates.control_hz)
+    bridge = LockstepBridge(Cerebellum(body, PerfectPlant(n), rates.control_hz, controller), rates, lambda: None)
     bridge.restart(np.arange(n))
     return bridge
 

@@ -1,8 +1,8 @@
 """The plant's process: the simulated world of one robot, ticking on the wall clock as a motor controller would.
 
 Started by `LiveLink` as ``python -m bhd_lerobot.robots.host.plant_process``, where ``robot.realtime.plant_process``
-asks for it. It imports neither torch nor LeRobot. At every tick of its own it takes the newest command of the cerebellum, or
-stops the robot by itself if that is too old, steps the world, and publishes what its sensors read.
+asks for it. It imports neither torch nor LeRobot. At every tick of its own it takes the newest command of the
+cerebellum, or stops the robot by itself if that is too old, steps the world, and publishes what its sensors read.
 """
 
 import gc

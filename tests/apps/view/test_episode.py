@@ -8,7 +8,7 @@ from bhd_lerobot.apps.view.episode import _said
 from bhd_lerobot.apps.view.groups import MAX_LINES, names_of, scan_of, sections, unit_of
 from bhd_lerobot.apps.view.packing import pack, unpack
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.datasets.format.columns import read_episode
 from tests.datasets.loader.support import length, record_ours
 
 COUNTERS = {"timestamp", "frame_index", "episode_index", "index", "task_index"}

@@ -22,8 +22,8 @@ from bhd_lerobot.bodies.ur5 import ur5 as ur5_body
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.cli.data.export import robot_view
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
+from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.features import dataset_features
-from bhd_lerobot.datasets.format.read import read_episode
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder

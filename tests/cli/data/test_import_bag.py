@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.cli.data import main
-from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import observation_names

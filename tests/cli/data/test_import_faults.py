@@ -12,7 +12,7 @@ from PIL import Image
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from bhd_lerobot.cli.data import main
-from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from tests.cli.data.import_support import TASK, imported, refused, run
 from tests.rosbag import support as bags

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bhd_lerobot.datasets.format.columns import read_columns
-from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.datasets.format.columns import read_columns, read_episode
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError
 

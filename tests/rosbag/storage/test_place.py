@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.datasets.format.read import read_episode
+from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.validate.findings import Severity
