@@ -10,7 +10,7 @@ from bhd_lerobot.envs.register import ENVIRONMENTS, NAMESPACE
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.robots.catalog import robot_config
 from bhd_lerobot.tasks.catalog import robot_of_task
-from bhd_lerobot.tasks.config_task import TaskConfig
+from bhd_lerobot.tasks.task import TaskConfig
 
 Overrides = Mapping[str, Any] | None
 

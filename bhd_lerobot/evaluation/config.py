@@ -7,10 +7,9 @@ from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.cluster.config import RayConfig, check_engine
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.rollout.registry import SIMULATED_ROBOTS, robot_of_brain, robot_of_task
-from bhd_lerobot.tasks.config_task import TaskConfig
-from bhd_lerobot.tasks.task import SPLITS
+from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 
 YARDSTICKS = ("noop", "random")
 """Brains that are there to be compared with; `fail_below` asks nothing of them."""

@@ -12,8 +12,7 @@ from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, Observation, find_columns
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Observation, find_columns
 
 _SPEED, _POSITION = ".vel", ".pos"
 

@@ -9,11 +9,10 @@ from bhd_lerobot.cluster.config import RayConfig, check_engine
 from bhd_lerobot.control.estop import estop_signal
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.recording.live_view import check_options
 from bhd_lerobot.rollout.registry import SIMULATED_ROBOTS, brains_for, robot_of_brain, robot_of_task
-from bhd_lerobot.tasks.config_task import TaskConfig
-from bhd_lerobot.tasks.task import SPLITS
+from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 
 
 @dataclass

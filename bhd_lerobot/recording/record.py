@@ -8,6 +8,8 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -24,7 +26,6 @@ from bhd_lerobot.hub.push import check_pushable, left_by_interrupt, push_command
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.language_rows import language_column
 from bhd_lerobot.recording.live_view import live_view
 from bhd_lerobot.recording.report import RecordResult, tell_refusals, tell_summary
 from bhd_lerobot.recording.resume_advice import instead_of_resuming
@@ -40,6 +41,33 @@ from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import stop_on_signals
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Task, episode_seed, outcomes_of
+
+
+def language_column(plan: dict[str, Any], subtasks: NDArray, fps: int) -> NDArray:
+    """Return LeRobot's column of what is said and stays valid: the plan, and every subtask from when it began.
+
+    Every frame of an episode holds the same rows.
+
+    Args:
+        plan: the plan; its `steps` are pairs of a skill and a text.
+        subtasks: what the brain was doing in each frame, shape (frames,).
+        fps: frames a second [Hz].
+    """
+    rows: list[dict[str, Any]] = []
+
+    def say(style: str, content: str, frame: int) -> None:
+        when = {"timestamp": frame / fps, "camera": None, "tool_calls": None}
+        rows.append({"role": "assistant", "content": content, "style": style, **when})
+
+    if plan.get("steps"):
+        say("plan", "\n".join(f"{number}. {text}" for number, (_, text) in enumerate(plan["steps"], 1)), 0)
+    for frame, text in enumerate(subtasks):
+        if frame == 0 or text != subtasks[frame - 1]:
+            say("subtask", str(text), frame)
+    column = np.empty(len(subtasks), dtype=object)
+    column[:] = [rows] * len(subtasks)
+    return column
+
 
 _ATTEMPTS = 3  # that an episode gets to be punctual
 

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot
-from bhd_lerobot.robots.tool_space import TOOL_NAMES
-from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, UR5Simulation, observation_names
+from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, TOOL_NAMES, UR5Simulation, observation_names
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 

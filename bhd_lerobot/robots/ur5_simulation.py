@@ -12,7 +12,7 @@ from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.commands import Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Reason
@@ -20,7 +20,6 @@ from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
 from bhd_lerobot.robots.latency import LatePlant
-from bhd_lerobot.robots.tool_space import TOOL_NAMES, pose_matrices
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
@@ -29,6 +28,35 @@ from bhd_lerobot.tasks.variation import MAX_LATENCY_S
 
 if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
     from bhd_lerobot.robots.config_ur5 import UR5Config
+
+TOOL_NAMES = (
+    "tool_x.pos",
+    "tool_y.pos",
+    "tool_z.pos",
+    "tool_qw.pos",
+    "tool_qx.pos",
+    "tool_qy.pos",
+    "tool_qz.pos",
+    "gripper.pos",
+)
+"""Position [m] and orientation (unit quaternion) of the tool frame in the base frame, and the gripper's opening [m]."""
+
+_SLACK = 0.2  # how far a policy's quaternion may be from unit length; it is normalised
+
+
+def pose_matrices(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], str | None]:
+    """Return the homogeneous transform of a position and a quaternion wxyz, and what is wrong with them, if anything.
+
+    Args:
+        values: x, y, z [m], w, x, y, z, shape (7,). The quaternion is normalised, as a network's output is only nearly
+            of unit length.
+    """
+    length = float(np.sqrt((values[3:] * values[3:]).sum()))
+    if not abs(length - 1) <= _SLACK:
+        return np.eye(4), f"the quaternion {values[3:].tolist()} has the length {length:g}; it must be near 1"
+    x, y, z, *quaternion = values.tolist()
+    return Pose((x, y, z), (quaternion[0], quaternion[1], quaternion[2], quaternion[3])).matrix(), None
+
 
 JOINT_ACTIONS = (*(f"{joint}.pos" for joint in JOINTS), "gripper.pos")
 OBSERVED = (*JOINT_ACTIONS, *(f"{joint}.vel" for joint in JOINTS), "gripper.vel")

@@ -4,8 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
-from bhd_lerobot.policies.brain import ANY_ROBOT, Brain
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig
 from bhd_lerobot.policies.dagger.brain import CorrectedBrain, CorrectedConfig, robot_of_both
 from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
 from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import ARENAS, Arena, make_arena
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.tasks.config_task import TaskConfig
-from bhd_lerobot.tasks.task import BaseTruth, Event, Outcome
+from bhd_lerobot.tasks.task import BaseTruth, Event, Outcome, TaskConfig
 
 _BEARINGS_DEG = np.arange(0.0, 360.0, 22.5)
 _DISTANCES_M = np.arange(1, 9) * 0.25

@@ -4,11 +4,10 @@ from collections.abc import Callable
 from typing import Any
 
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
-from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
-from bhd_lerobot.tasks.task import Task
+from bhd_lerobot.tasks.task import Task, TaskConfig
 
 # Importing this module registers every configuration that it names.
 TASKS: dict[type, Callable[[Any, int, int], Task]] = {

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import ARENAS, Arena, make_arena
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.geodesic import WayField, interpolate
-from bhd_lerobot.tasks.task import BaseTruth, Event, Outcome
+from bhd_lerobot.tasks.task import BaseTruth, Event, Outcome, TaskConfig
 
 ENVIRONMENT = ("goal_x", "goal_y", "goal_cos", "goal_sin")
 

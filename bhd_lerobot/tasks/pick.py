@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.tasks.config_task import TaskConfig
-from bhd_lerobot.tasks.task import ArmTruth, Event, Outcome
+from bhd_lerobot.tasks.task import ArmTruth, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
 
 # Where objects stand, in the base frame [m]: what a tool that points down reaches with room to spare.

@@ -15,8 +15,7 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.tasks.config_task import TaskConfig
-from bhd_lerobot.tasks.task import ArmTruth, Event, Outcome
+from bhd_lerobot.tasks.task import ArmTruth, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_variation
 
 # Where targets are, in the base frame [m]: before the arm, over the table.

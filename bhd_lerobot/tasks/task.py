@@ -5,10 +5,16 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Literal, Protocol
 
+import draccus
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
+
+
+class TaskConfig(draccus.ChoiceRegistry):
+    """Base class of task configurations."""
+
 
 Split = Literal["train", "held_out"]
 SPLITS: tuple[Split, ...] = ("train", "held_out")

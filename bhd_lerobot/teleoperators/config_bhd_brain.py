@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from lerobot.teleoperators.config import TeleoperatorConfig
 
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.rollout import registry  # noqa: F401  registers the brains
 

@@ -15,7 +15,7 @@ from bhd_lerobot.errors import quoted
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.robots.host.simulation import describe
 from bhd_lerobot.rollout.registry import SIMULATED_ROBOTS
-from bhd_lerobot.tasks.config_task import TaskConfig
+from bhd_lerobot.tasks.task import TaskConfig
 from bhd_lerobot.training.checkpoint import resume_command
 from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.data import TrainingData

@@ -9,8 +9,7 @@ from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.evaluation.metrics import JerkMeasure, measure
-from bhd_lerobot.robots.tool_space import TOOL_NAMES
-from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS
+from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, TOOL_NAMES
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Event, Outcome
 

@@ -17,14 +17,18 @@ import pytest
 
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.privileges import (
+    CAP_IPC_LOCK,
+    CAP_SYS_NICE,
     GRANT_BANDWIDTH,
     GRANT_LATENCY_FILE,
+    MCL_CURRENT,
+    MCL_FUTURE,
     Grant,
     Privileges,
     RealtimeSettings,
+    SystemCalls,
     describe_refusals,
 )
-from bhd_lerobot.realtime.system_calls import CAP_IPC_LOCK, CAP_SYS_NICE, MCL_CURRENT, MCL_FUTURE, SystemCalls
 
 FIFO = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 NAMES = ["collector", "memory lock", "cpu latency", "timer slack", "scheduler"]
@@ -298,7 +302,7 @@ GIVE_UP = """
 START = """
     import gc, json, os, sys
     from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
-    from bhd_lerobot.realtime.system_calls import SystemCalls
+    from bhd_lerobot.realtime.privileges import SystemCalls
     calls = SystemCalls()
     before = [calls.scheduler(), calls.timer_slack(), sorted(calls.affinity())]
 """

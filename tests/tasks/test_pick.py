@@ -14,7 +14,7 @@ from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.language.instruction import RulePlanner
 from bhd_lerobot.policies.manipulation.grasp import plan_grasp, read_objects
-from bhd_lerobot.policies.manipulation.scene_objects import scene_object
+from bhd_lerobot.policies.manipulation.skills import scene_object
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import ArmTruth, Event
 from bhd_lerobot.tasks.variation import RandomisationConfig

@@ -13,9 +13,9 @@ from bhd_lerobot.robots.host.simulation import describe
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.catalog import robot_of_task
-from bhd_lerobot.tasks.config_task import TaskConfig
 from bhd_lerobot.tasks.pick import PickConfig
 from bhd_lerobot.tasks.reach import ReachConfig
+from bhd_lerobot.tasks.task import TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from bhd_lerobot.training.summary import how_to_evaluate
 

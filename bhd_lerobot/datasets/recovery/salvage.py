@@ -6,11 +6,13 @@ nearly everything is on disk. Here the frames are read without the footer, films
 all of its frames are there in all of its columns and films. Everything else of ``meta`` is made anew from that.
 """
 
+import contextlib
 import datetime
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pyarrow as pa
@@ -23,7 +25,6 @@ from bhd_lerobot.datasets.format.parquet_rescue import rescue
 from bhd_lerobot.datasets.format.state import corrupt, read_identity, repair_with_info
 from bhd_lerobot.datasets.recovery.columns import lost_cameras, misfit, read_info
 from bhd_lerobot.datasets.recovery.evidence import Told
-from bhd_lerobot.datasets.recovery.guard import check_readable, check_unused
 from bhd_lerobot.datasets.recovery.outcomes import RECOVERED, logged, recall
 from bhd_lerobot.datasets.recovery.rows import info_of, rows_of, tasks_of, write_data
 from bhd_lerobot.datasets.recovery.statistics import stats_of
@@ -31,8 +32,9 @@ from bhd_lerobot.datasets.recovery.videos import Films, Found
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import WORK, Workspace, link_others
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
+from bhd_lerobot.datasets.storage.places import check_links
 from bhd_lerobot.datasets.validate.findings import few
-from bhd_lerobot.errors import DatasetCorruptError, UnsupportedDatasetError
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError, UnsupportedDatasetError
 
 
 @dataclass(frozen=True)
@@ -256,3 +258,57 @@ def _keep_aside(root: Path, disk: Disk) -> Path:
             disk.make_folder((aside / path.relative_to(root)).parent)
             disk.link(path, aside / path.relative_to(root))
     return aside
+
+
+_BLOCK = 1 << 20
+
+
+def check_unused(root: Path) -> None:
+    """Check that no other process has a file below `root` open: LeRobot takes no lock.
+
+    Raises:
+        DatasetLockedError: one has.
+    """
+    own, place = str(os.getpid()), root.resolve()
+    for process in Path("/proc").glob("[0-9]*"):
+        if process.name == own:
+            continue
+        with contextlib.suppress(OSError):  # ended meanwhile, or somebody else's
+            for handle in (process / "fd").iterdir():
+                with contextlib.suppress(OSError):
+                    target = Path(os.readlink(handle))
+                    if target != place and place in target.parents:
+                        raise DatasetLockedError(
+                            f"Process {process.name} has {target} open, so {root} may be in the middle of a "
+                            "recording. Wait until it ends; without its last files a running recording looks like a "
+                            "wreck."
+                        )
+
+
+def check_readable(root: Path) -> None:
+    """Check that the disk gives out every byte below `root`.
+
+    A file that may not be read, or not at this moment, is not damaged: its episodes would be given up for nothing.
+
+    Raises:
+        DatasetError: it refuses, or a link leads out of the dataset.
+    """
+    check_links(root)
+
+    def refuse(error: OSError) -> NoReturn:
+        raise DatasetError(
+            f"{error.filename or root} cannot be read: {error.strerror or error}. Such a file is not recovered, for "
+            "it may be whole: check its permissions and the disk, and repeat. Nothing was changed."
+        ) from error
+
+    for folder, _, names in os.walk(root, onerror=refuse):
+        for name in sorted(names):
+            path = Path(folder, name)
+            if path.is_symlink() and not path.exists():
+                continue  # it leads nowhere: the file is missing
+            try:
+                with open(path, "rb", buffering=0) as file:
+                    while file.read(_BLOCK):
+                        pass
+            except OSError as error:
+                refuse(OSError(error.errno, error.strerror, str(path)))

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from bhd_lerobot.datasets.format.info import InfoError, checked_info, parse_object
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import ConfigError, TransferError
+from bhd_lerobot.errors import ConfigError, DatasetError, TransferError
 
 CARD = "README.md"
 PICTURE = "preview.png"
@@ -251,3 +252,21 @@ def largest_first(paths: Iterable[str], files: Mapping[str, RemoteFile]) -> list
 def in_order(paths: Iterable[str]) -> list[str]:
     """Return paths so that what makes the others count comes last: `meta/info.json`."""
     return sorted(paths, key=lambda path: (path.startswith("meta/"), path == layout.INFO, path))
+
+
+def parse_info(content: bytes | None, place: str) -> dict[str, Any]:
+    """Return the content of a `meta/info.json`, checked and with defaults; see `info.checked_info`.
+
+    Args:
+        content: the file; None if it is not there any more.
+        place: whose it is, for messages.
+
+    Raises:
+        DatasetError: it is none, or that of another format; says what is wrong.
+    """
+    if content is None:
+        raise DatasetError(f"{place} is no LeRobot dataset any more: its {layout.INFO} is gone.")
+    try:
+        return checked_info(parse_object(content), place)
+    except InfoError as error:
+        raise DatasetError(f"{place} is no LeRobot dataset: in its {layout.INFO}, {error}.") from error

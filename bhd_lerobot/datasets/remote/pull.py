@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.datasets.format.state import load_state
-from bhd_lerobot.datasets.remote.info import parse_info
 from bhd_lerobot.datasets.remote.listing import (
     MANIFEST,
     SUBSET,
@@ -22,6 +21,7 @@ from bhd_lerobot.datasets.remote.listing import (
     is_whole,
     listed,
     megabytes,
+    parse_info,
     refuse_overlap,
     total,
 )

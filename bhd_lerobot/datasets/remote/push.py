@@ -10,7 +10,6 @@ from bhd_lerobot.datasets.assembly.assemble import EDITS
 from bhd_lerobot.datasets.edit.edits import edits_of
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.remote.card import is_generated
-from bhd_lerobot.datasets.remote.info import parse_info
 from bhd_lerobot.datasets.remote.listing import (
     CARD,
     LISTED,
@@ -20,6 +19,7 @@ from bhd_lerobot.datasets.remote.listing import (
     Remote,
     RemoteFile,
     is_recorded,
+    parse_info,
     refuse_overlap,
     total,
 )

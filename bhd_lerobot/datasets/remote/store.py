@@ -5,14 +5,16 @@ the same by. `meta/info.json` is written last and removed first, so that there i
 """
 
 import contextlib
+import errno
+import json
 import threading
 import uuid
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.datasets.remote.errors import store_errors
 from bhd_lerobot.datasets.remote.listing import (
     LISTED,
     MANIFEST,
@@ -23,11 +25,10 @@ from bhd_lerobot.datasets.remote.listing import (
     refuse_damaged,
     stream_digest,
 )
-from bhd_lerobot.datasets.remote.manifest import Manifest, parse_manifest
 from bhd_lerobot.datasets.remote.pool import WORKERS, run_all
 from bhd_lerobot.datasets.remote.url import LOCAL, open_place, shown
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import TransferError
+from bhd_lerobot.errors import BhdError, TransferError
 
 _FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", "webhdfs", "webdav", "dbfs"}
 """Where folders must be made first. To make the folder of an object store's object may mean to make a bucket."""
@@ -37,6 +38,37 @@ _NOTED_BYTES = 64e6
 
 _PART = ".bhd-part"
 """Ends the temporary names of files that are being written, and no other."""
+
+
+@dataclass
+class Manifest:
+    """What the list says.
+
+    Attributes:
+        files: files that are known, by path.
+        info: the `meta/info.json` that was shown last, while another one is on its way; empty if none is known.
+        push: stands for the push that wrote the list last. Each push writes it before anything else and looks at it
+            again before it shows what it sent, so that two at once notice each other.
+    """
+
+    files: dict[str, RemoteFile] = field(default_factory=dict)
+    info: str = ""
+    push: str = ""
+
+    def to_json(self) -> bytes:
+        """Return it as it is stored."""
+        files = {path: {"size": one.size, LISTED: one.digest} for path, one in sorted(self.files.items())}
+        return json.dumps({"format": 1, "push": self.push, "info": self.info, "files": files}, indent=1).encode()
+
+
+def parse_manifest(content: bytes) -> Manifest:
+    """Return what a list says; nothing if it cannot be read, as after a kill: then all is compared by sending it."""
+    try:
+        found = json.loads(content)
+        files = {path: RemoteFile(int(one["size"]), str(one[LISTED]), LISTED) for path, one in found["files"].items()}
+        return Manifest(files, str(found.get("info", "")), str(found.get("push", "")))
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        return Manifest()
 
 
 class StoreDataset:
@@ -298,3 +330,47 @@ def _matters(path: str) -> bool:
 
 def _about(item: Item) -> RemoteFile:
     return RemoteFile(item.size, digest(item.content, LISTED), LISTED)
+
+
+@contextmanager
+def store_errors(url: str, action: str) -> Iterator[None]:
+    """Turn what goes wrong between this machine and a store into a `TransferError`."""
+    try:
+        yield
+    except BhdError:
+        raise
+    except Exception as error:  # of fsspec, of the store's own client: each has its own tree
+        raise TransferError(f"Could not {action} {url}: {_explain(error)}") from error
+
+
+def _explain(error: BaseException) -> str:
+    kind, text = type(error).__name__, " ".join(str(error).split())[:300].rstrip(".")
+    for holds, meaning in (
+        (
+            "Credentials" in kind or "Unable to locate credentials" in text,
+            "no credentials were found ({}). For S3 set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile.",
+        ),
+        (
+            "EndpointConnection" in kind or isinstance(error, ConnectionError) or "Could not connect" in text,
+            "the store cannot be reached ({}). Check the connection, and AWS_ENDPOINT_URL for a store of your own.",
+        ),
+        (
+            isinstance(error, FileNotFoundError),
+            "it does not exist ({}). Check the name; a bucket must be made first.",
+        ),
+        (
+            isinstance(error, PermissionError),
+            "no permission ({}). The key may be wrong or have expired, or may not be used for this.",
+        ),
+        (
+            isinstance(error, TimeoutError) or "Timeout" in kind,
+            "the store did not answer in time ({}). Check the connection.",
+        ),
+        (
+            isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
+            "the disk is full ({}). Free some space on it.",
+        ),
+    ):
+        if holds:
+            return meaning.format(text or kind)
+    return f"{text or 'no reason given'} ({kind})."

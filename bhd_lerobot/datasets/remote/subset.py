@@ -10,8 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bhd_lerobot.datasets.format.state import corrupt
-from bhd_lerobot.datasets.remote.info import parse_info
-from bhd_lerobot.datasets.remote.listing import SUBSET
+from bhd_lerobot.datasets.remote.listing import SUBSET, parse_info
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import to_json
 from bhd_lerobot.errors import DatasetError

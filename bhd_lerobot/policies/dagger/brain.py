@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, Mixed, Observation
-from bhd_lerobot.policies.config_brain import BrainConfig, DriverConfig
+from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Mixed, Observation
 from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
 from bhd_lerobot.policies.dagger.takeover import DisagreementWatch, PatienceWatch, StallWatch, Watch, collision_watch
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain

@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.language.instruction import RulePlanner
 from bhd_lerobot.policies.manipulation.grasp import SeenObject
 from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig, _Work
-from bhd_lerobot.policies.manipulation.scene_objects import scene_object
-from bhd_lerobot.policies.manipulation.skills import Plan, Planner
+from bhd_lerobot.policies.manipulation.skills import Plan, Planner, scene_object
 
 
 @BrainConfig.register_subclass("language")

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, Chunk, Observation
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Chunk, Observation
 from bhd_lerobot.policies.learned.contract import WEIGHT_FILES, PolicyContract, find_checkpoint
 
 if TYPE_CHECKING:

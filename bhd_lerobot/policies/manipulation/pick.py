@@ -12,8 +12,7 @@ from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, check_camera
 from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED, MAX_OPENING
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import ConfigError, InstructionError
-from bhd_lerobot.policies.brain import Observation, find_columns
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
 from bhd_lerobot.policies.manipulation.grasp import (
     Grasp,
@@ -23,8 +22,7 @@ from bhd_lerobot.policies.manipulation.grasp import (
     pointing_down,
     read_objects,
 )
-from bhd_lerobot.policies.manipulation.scene_objects import scene_object
-from bhd_lerobot.policies.manipulation.skills import Plan, Skill, make_plan
+from bhd_lerobot.policies.manipulation.skills import Plan, Skill, make_plan, scene_object
 
 _SQUEEZE = 0.03  # [m] how far inside the object the fingers are sent: the gripper's force limit does the rest
 _MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers

@@ -12,8 +12,7 @@ from bhd_lerobot.bodies.tabletop import check_camera_error
 from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation, find_columns
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
 
 _TARGET = tuple(f"target_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))

@@ -13,6 +13,7 @@ from typing import Any, Protocol, Self
 
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, TableObject
 from bhd_lerobot.errors import ConfigError, InstructionError, unknown_name
+from bhd_lerobot.policies.manipulation.grasp import SeenObject
 
 
 class Skill(StrEnum):
@@ -292,3 +293,9 @@ def _step(number: int, value: object, objects: dict[int, SceneObject], target: S
     # None leaves it to the plan's target.
     thing = target if fields["object"] is None else _object(fields["object"], f"Step {number}: object", objects)
     return PlanStep(Skill(name), thing.index, Skill(name).text(thing.name))
+
+
+def scene_object(seen: SeenObject) -> SceneObject:
+    """Return an object under the name of the colour that its own is nearest to."""
+    colour = min(COLOURS, key=lambda name: sum((a - b) ** 2 for a, b in zip(COLOURS[name], seen.colour, strict=True)))
+    return SceneObject(seen.index, seen.kind, colour, seen.position, seen.size)

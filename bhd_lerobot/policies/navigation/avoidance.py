@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation, find_columns, find_scan
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns, find_scan
 
 _ROUNDING = 1e-6  # [m]
 

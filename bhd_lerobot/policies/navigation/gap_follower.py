@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation, find_columns
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns
 from bhd_lerobot.policies.navigation.clearance import HALF_TRACK, QUANTUM, SPACING, make_paths
 from bhd_lerobot.policies.navigation.scan import ScanReader
 from bhd_lerobot.policies.navigation.steering import Steering, check_driving, keep_heading, wrap

@@ -12,7 +12,7 @@ from bhd_lerobot.envs.register import ENVIRONMENTS
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.rollout import configuration
 from bhd_lerobot.rollout.registry import robot_of_task
-from bhd_lerobot.tasks.config_task import TaskConfig
+from bhd_lerobot.tasks.task import TaskConfig
 from bhd_lerobot.training.rl.sections import (
     EVENTS,
     POTENTIALS,

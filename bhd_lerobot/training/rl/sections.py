@@ -3,7 +3,7 @@
 import copy
 from dataclasses import dataclass, field
 
-from bhd_lerobot.policies.config_brain import BrainConfig
+from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
 from bhd_lerobot.tasks.task import Event
 

@@ -15,7 +15,7 @@ from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.edit.edits import delete, edits_of, keep
 from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.datasets.recovery import guard
+from bhd_lerobot.datasets.recovery import salvage as guard
 from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.datasets.storage import disk
 from bhd_lerobot.datasets.validate.dataset import check_dataset

@@ -18,8 +18,7 @@ from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.loader.table import open_metadata
 from bhd_lerobot.datasets.recovery.columns import read_info
 from bhd_lerobot.datasets.recovery.repair import repair
-from bhd_lerobot.datasets.remote.info import parse_info
-from bhd_lerobot.datasets.remote.listing import RemoteFile
+from bhd_lerobot.datasets.remote.listing import RemoteFile, parse_info
 from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.places import (
