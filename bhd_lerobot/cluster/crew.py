@@ -181,6 +181,8 @@ class Crew:
     def _hand_out(self, worker: Worker, limit: int) -> None:
         last = limit if self._failed is None else min(limit, self._failed[0] - 1)
         while worker.is_ready and len(worker.tasks) < _QUEUED and self._waiting and self._waiting[0].number <= last:
+            if worker.tasks and (self._waiting[0].is_suspect or worker.tasks[0].is_suspect):
+                return
             task = heapq.heappop(self._waiting)
             worker.tasks.append(task)
             self._call(worker, "run", worker.actor.run.remote(task.specs), task)
@@ -226,8 +228,10 @@ class Crew:
                     f"{self._lost_early} workers in a row were lost before they were ready, the last on {worker.host}: "
                     f"{cause} Ray's logs are on that machine, in /tmp/ray/session_latest/logs."
                 ) from error
-        if worker.tasks:
-            worker.tasks[0].deaths += 1  # the others were only waiting
+        for task in worker.tasks:
+            task.is_suspect = True
+        if len(worker.tasks) == 1:
+            worker.tasks[0].deaths += 1
             if worker.tasks[0].deaths >= _DEATHS:
                 raise ClusterError(
                     f"{_DEATHS} workers were lost while they ran {worker.tasks[0]}, the last on {worker.host}: {cause} "

@@ -17,11 +17,14 @@ class Task:
     Attributes:
         number: its place in the run.
         specs: the episodes.
-        deaths: how many workers were lost while they ran it.
+        is_suspect: a worker that had it was lost, so that it runs alone from then on: the result of an earlier task
+            may be lost with its worker, and nobody could say which one of several was running.
+        deaths: how many workers were lost that had nothing else.
     """
 
     number: int
     specs: list[Spec] = field(compare=False)
+    is_suspect: bool = field(default=False, compare=False)
     deaths: int = field(default=0, compare=False)
 
     def __str__(self) -> str:

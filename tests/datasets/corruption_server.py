@@ -3,6 +3,7 @@
 Reads one JSON job per line and answers with how the child ended.
 """
 
+import gc
 import json
 import os
 import signal
@@ -115,6 +116,8 @@ def run(job: dict[str, Any]) -> None:
 
 def main() -> None:
     """Serve jobs until the input ends."""
+    gc.collect()
+    gc.freeze()  # or a child that collects garbage copies every page
     for line in sys.stdin:
         child = os.fork()
         if child == 0:

@@ -3,6 +3,7 @@
 Reads one JSON job per line and answers with the process id of the child, then with how it ended.
 """
 
+import gc
 import itertools
 import json
 import os
@@ -76,6 +77,8 @@ def run(job: dict[str, Any]) -> None:
 
 def main() -> None:
     """Serve jobs until the input ends."""
+    gc.collect()
+    gc.freeze()  # or a child that collects garbage copies every page
     for line in sys.stdin:
         child = os.fork()
         if child == 0:

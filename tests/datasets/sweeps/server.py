@@ -6,6 +6,7 @@ makes them, and the steps of `Disk` that Python does not report.
 """
 
 import errno
+import gc
 import json
 import os
 import signal
@@ -120,6 +121,9 @@ def run(job: dict[str, Any]) -> None:
 def main() -> None:
     """Serve jobs until the input ends."""
     type_store()
+    data._parser()  # imports every command
+    gc.collect()
+    gc.freeze()  # or a child that collects garbage copies every page
     for line in sys.stdin:
         child = os.fork()
         if child == 0:
