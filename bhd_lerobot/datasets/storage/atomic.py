@@ -117,10 +117,10 @@ class Workspace:
 
     def close(self) -> None:
         """Remove the workspace and all that is left in it; a second call does nothing."""
-        shutil.rmtree(self._shell, ignore_errors=True)
-        for folder in (self.place / WORK, self.place / layout.STAGING) if self._is_inside else ():
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+        if self._is_inside:
+            _clean_inside(self.place)
+        else:
+            shutil.rmtree(self._shell, ignore_errors=True)
         for lock in (self._lock, self._shell_lock):
             if lock is not None:
                 lock.release()
@@ -191,9 +191,6 @@ def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = Fal
         except BaseException:
             with contextlib.suppress(OSError):
                 (work / "new").rename(new)
-                for name in ("ready.tmp", _INVALID.name):
-                    (work / name).unlink(missing_ok=True)
-                (work / "old").rmdir()
             raise
         sentences = _done.get()
         before = None if sentences is None else list(sentences)
@@ -236,7 +233,7 @@ def remove_abandoned(place: Path) -> None:
         if ours.fullmatch(folder.name):
             with contextlib.suppress(OSError, DatasetLockedError), contextlib.closing(RootLock(folder)):
                 shutil.rmtree(folder)
-    if os.path.exists(place / WORK):
+    if os.path.isdir(place / layout.STAGING) and _names(place / layout.STAGING) <= {WORK.name}:
         with contextlib.suppress(OSError, DatasetLockedError), contextlib.closing(RootLock(place)):
             _clean_inside(place)
 
