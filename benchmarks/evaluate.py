@@ -30,7 +30,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy
 from rich.console import Console
 
-from benchmarks._spread import ratios, spread, write
+from benchmarks._turns import ratios, spread, write
 from bhd_lerobot.envs.config_env import BhdEnvConfig
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate

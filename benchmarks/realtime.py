@@ -31,7 +31,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from benchmarks._spread import ratios, write
+from benchmarks._turns import ratios, write
 from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.datasets.format.features import dataset_features
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder

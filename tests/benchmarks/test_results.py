@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks._spread import ratios, spread, write
+from benchmarks._turns import ratios, spread, write
 from benchmarks.envs import BARE, OURS, TooLateError, summary, time_limit
 from benchmarks.results.__main__ import MEASURES
 from benchmarks.results.adaptation import recovered, successes
