@@ -3,7 +3,7 @@
 Two workers of this machine against one, each one process with one thread, and one worker against the same episodes in
 one process without Ray. TurtleBot3, `gap_follower`, episodes of full length. The cluster is started once and its
 workers are kept: what is measured is recording, from handing out the first episode to having saved the last. What a
-start costs is told beside it. They run in turns; the first turn is not counted.
+start costs is printed beside it. They run in turns; the first turn is not counted.
 """
 
 import argparse
