@@ -11,6 +11,8 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 
+from benchmarks._episodes import add_options, run, seeds_of
+from benchmarks._turns import verdict
 from bhd_lerobot.evaluation.statistics import wilson
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.policies.language.language_brain import LanguageBrain
@@ -18,11 +20,9 @@ from bhd_lerobot.policies.manipulation.pick import PickBrain
 from bhd_lerobot.policies.manipulation.reach import ReachBrain
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
-from bhd_lerobot.tasks.task import Task, episode_seed
+from bhd_lerobot.tasks.task import Task
 from bhd_lerobot.tasks.variation import RandomisationConfig
 
 SIDE_BY_SIDE = 32
@@ -59,22 +59,13 @@ def cases() -> list[Case]:
     ]
 
 
-def run(case: Case, seeds: list[int]) -> list[Episode]:
-    """Run a case on episodes of these seeds."""
-    simulation = UR5Simulation(UR5Config(), SIDE_BY_SIDE)
-    loop = EpisodeLoop(simulation, case.task, case.brain)
-    return list(loop.run([EpisodeSpec(index, seed) for index, seed in enumerate(seeds)]))
-
-
 def main() -> int:
     """Run the cases, print the table, return 0 if every goal is met."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--split", choices=("held_out", "train"), default="held_out")
+    add_options(parser, 1000)
     parser.add_argument("--case", help="only the cases whose name holds this")
     args = parser.parse_args()
-    seeds = [episode_seed(args.seed, episode, args.split) for episode in range(args.episodes)]
+    seeds = seeds_of(args)
     print(f"{args.episodes} {args.split} episodes, seed {args.seed}\n")
     print(f"{'':20}{'success':>9}{'95 %':>20}{'goal':>8}{'mean time':>11}{'real time':>11}  failures")
     missed = False
@@ -82,7 +73,7 @@ def main() -> int:
         if args.case and args.case not in case.name:
             continue
         started = time.perf_counter()
-        episodes = run(case, seeds)
+        episodes = run(UR5Simulation(UR5Config(), SIDE_BY_SIDE), case.task, case.brain, seeds)
         took = time.perf_counter() - started
         good = sum(episode.outcome.success for episode in episodes)
         rate = wilson(good, len(episodes))
@@ -98,8 +89,7 @@ def main() -> int:
                 why = episode.plan.get("problem") or [end.message for _, end in episode.results if not end.success]
                 print(f"    episode {episode.spec.index}: {episode.outcome.event.cause}; {json.dumps(why)}")
         missed |= good / len(episodes) < case.goal
-    print("GOAL MISSED" if missed else "goals met")
-    return int(missed)
+    return verdict(met=not missed)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ import argparse
 import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from benchmarks._spread import ratios, spread, write
+from benchmarks._turns import in_turns, rates, ratios, shown, spread, write
 from bhd_lerobot.cli.data import main as data
 from bhd_lerobot.cli.data.export import robot_view
 from bhd_lerobot.datasets.format import features as keys
@@ -54,13 +54,6 @@ def record(root: Path, episodes: int, frames: int) -> None:
         writer.set_columns(columns)
         recorder.save(writer, task="drive", metadata={"outcome": "success"})
     recorder.finalize()
-
-
-def timed(action: Callable[[], object]) -> float:
-    """Return how long something takes [s]."""
-    started = time.perf_counter()
-    action()
-    return time.perf_counter() - started
 
 
 def bare_write(path: Path, schemas: dict[str, bytes], messages: list[tuple[str, str, int, bytes]]) -> None:
@@ -105,42 +98,41 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
     options = parser.parse_args()
     view, how = robot_view("turtlebot3"), ExportOptions(one_bag=True)
-    turns: dict[str, list[float]] = {name: [] for name in ("export", "restore", "resample", "bare_write", "bare_read")}
     with tempfile.TemporaryDirectory() as folder:
         root, bag, back, file = (Path(folder) / name for name in ("data", "bag", "back", "bare.mcap"))
         record(root, options.episodes, options.frames)
-        for _ in range(options.turns + 1):
-            for path in (bag, back):
-                shutil.rmtree(path, ignore_errors=True)
-            turns["export"].append(timed(lambda: export_bags(root, bag, view=view, options=how)))
-            schemas, messages = bare_read(bag / "bag.mcap")
-            turns["bare_write"].append(timed(lambda s=schemas, m=messages: bare_write(file, s, m)))
-            turns["bare_read"].append(timed(lambda: bare_read(file)))
-            turns["restore"].append(timed(lambda: restore(find_bags(bag), back, "bench/bags")))
-            shutil.rmtree(back)
-            turns["resample"].append(timed(lambda: resample(bag, back)))
+        export_bags(root, bag, view=view, options=how)
         size = (bag / "bag.mcap").stat().st_size
-    count = len(messages)
-    speeds = {name: [count / took for took in values[1:]] for name, values in turns.items()}
+        schemas, messages = bare_read(bag / "bag.mcap")
+        works: dict[str, Callable[[], object]] = {
+            "export": lambda: export_bags(root, bag, view=view, options=how),
+            "bare_write": lambda: bare_write(file, schemas, messages),
+            "bare_read": lambda: bare_read(file),
+            "restore": lambda: restore(find_bags(bag), back, "bench/bags"),
+            "resample": lambda: resample(bag, back),
+        }
+        made = {"export": bag, "restore": back, "resample": back}
+
+        def anew(name: str, run: Callable[[], float]) -> float:
+            if name in made:
+                shutil.rmtree(made[name], ignore_errors=True)
+            return run()
+
+        parts = {name: partial(anew, name, run) for name, run in rates(works, len(messages)).items()}
+        speeds = in_turns(parts, options.turns)
+    peers = {"export": "bare_write", "restore": "bare_read", "resample": "bare_read"}
     results: dict[str, Any] = {
-        "messages": count,
+        "messages": len(messages),
         "megabytes": size / 1e6,
         "messages_per_s": {name: spread(values) for name, values in speeds.items()},
-        "of_the_bare_library": {
-            "export": spread(ratios(speeds["export"], speeds["bare_write"])),
-            "restore": spread(ratios(speeds["restore"], speeds["bare_read"])),
-            "resample": spread(ratios(speeds["resample"], speeds["bare_read"])),
-        },
+        "of_the_bare_library": {name: spread(ratios(speeds[name], speeds[peer])) for name, peer in peers.items()},
     }
     write(options.json, results)
-    print(f"{count:,} messages, {size / 1e6:.1f} MB")
-    for name, beside in (("export", "bare_write"), ("restore", "bare_read"), ("resample", "bare_read")):
-        ours, theirs = results["messages_per_s"][name], results["messages_per_s"][beside]
-        share = results["of_the_bare_library"][name]
+    print(f"{len(messages):,} messages, {size / 1e6:.1f} MB")
+    for name, peer in peers.items():
         print(
-            f"{name:8s} {ours['median']:>9,.0f} messages/s ({ours['low']:,.0f} to {ours['high']:,.0f}); {beside} of "
-            f"the mcap library {theirs['median']:,.0f}: ratio {share['median']:.2f} ({share['low']:.2f} to "
-            f"{share['high']:.2f})"
+            f"{name:8s} {shown(results['messages_per_s'][name], ',.0f')} messages/s; {peer} of the mcap library "
+            f"{results['messages_per_s'][peer]['median']:,.0f}: ratio {shown(results['of_the_bare_library'][name])}"
         )
     return 0
 

@@ -6,22 +6,21 @@ The goal: gap_follower fails no more often than avoidance, at most a third as of
 
 import argparse
 import sys
-import time
 from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks._episodes import add_options, run, seeds_of
+from benchmarks._turns import seconds, verdict
 from bhd_lerobot.evaluation.statistics import mean, ratio_of_means, wilson
 from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
-from bhd_lerobot.tasks.task import Event, Outcome, episode_seed
+from bhd_lerobot.tasks.task import Event, Outcome
 
 GOAL_RATIO = 1.5
 SIDE_BY_SIDE = 50
@@ -54,11 +53,9 @@ class Result:
 def main() -> int:
     """Run both brains, print the table, return 0 if the goal is met."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--split", choices=("held_out", "train"), default="held_out")
+    add_options(parser, 200)
     args = parser.parse_args()
-    seeds = [episode_seed(args.seed, episode, args.split) for episode in range(args.episodes)]
+    seeds = seeds_of(args)
     brains: tuple[Brain, ...] = (AvoidanceBrain(), GapFollowerBrain())
     old, new = results = [measure(brain, seeds) for brain in brains]
     print(f"{args.episodes} {args.split} random arenas, seed {args.seed}, 60 s each\n")
@@ -70,9 +67,7 @@ def main() -> int:
     print(f"\nscore ratio {ratio.value:.3f}, {interval}; goal: {GOAL_RATIO}")
     allowed = old.failures // 3 if old.failures > 0.05 * args.episodes else old.failures
     print(f"failures {new.failures}; allowed: {allowed}")
-    met = ratio.value >= GOAL_RATIO and new.failures <= allowed
-    print("goal met" if met else "GOAL MISSED")
-    return 0 if met else 1
+    return verdict(met=ratio.value >= GOAL_RATIO and new.failures <= allowed)
 
 
 def measure(brain: Brain, seeds: list[int]) -> Result:
@@ -80,9 +75,7 @@ def measure(brain: Brain, seeds: list[int]) -> Result:
     config = TurtleBot3Config()
     n = min(SIDE_BY_SIDE, len(seeds))
     simulation = TurtleBot3Simulation(config, n)
-    loop = EpisodeLoop(simulation, AvoidTask(AvoidConfig(), n, config.fps), brain)
-    specs = [EpisodeSpec(index, seed) for index, seed in enumerate(seeds)]
-    outcomes = [episode.outcome for episode in loop.run(specs)]
+    outcomes = [one.outcome for one in run(simulation, AvoidTask(AvoidConfig(), n, config.fps), brain, seeds)]
     state = simulation.observe().state
     return Result(outcomes, {n: act_ms(brain, simulation.observation_names, state, n) for n in (1, 64)})
 
@@ -91,12 +84,7 @@ def act_ms(brain: Brain, names: tuple[str, ...], state: np.ndarray, n: int) -> f
     """Return the median time of a call for n robots [ms]."""
     brain.reset(np.arange(n), [0] * n, n)
     observation = Observation(names, np.resize(state, (n, state.shape[1])))
-    times = []
-    for _ in range(CALLS):
-        started = time.perf_counter()
-        brain.act(observation)
-        times.append(time.perf_counter() - started)
-    return float(np.median(times)) * 1e3
+    return float(np.median([seconds(lambda: brain.act(observation)) for _ in range(CALLS)])) * 1e3
 
 
 def row(name: str, result: Result) -> str:

@@ -6,16 +6,15 @@ turns; the first of each is not counted.
 """
 
 import argparse
-import statistics
 import sys
 import tempfile
-import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 
-from benchmarks._spread import ratios, spread, write
+from benchmarks._turns import in_turns, rates, ratios, shown, spread, write
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 
@@ -54,22 +53,17 @@ def record(root: Path, episodes: int, frames: int) -> None:
     recorder.finalize()
 
 
-def read(root: Path) -> float:
-    """Return how long it takes to read all data files [s]."""
-    started = time.perf_counter()
+def read(root: Path) -> None:
+    """Read all data files."""
     for path in sorted((root / "data").rglob("*.parquet")):
         pq.ParquetFile(path, page_checksum_verification=True).read()
-    return time.perf_counter() - started
 
 
-def check(root: Path) -> float:
-    """Return how long the check takes [s]."""
-    started = time.perf_counter()
+def check(root: Path) -> None:
+    """Check the dataset."""
     found = check_dataset(root)
-    took = time.perf_counter() - started
     if any(one.severity for one in found.findings):
-        raise AssertionError(f"The dataset is not sound: {found.findings}")
-    return took
+        raise AssertionError(f"The dataset is not valid: {found.findings}")
 
 
 def main() -> int:
@@ -84,23 +78,21 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "data"
         record(root, options.episodes, options.frames)
-        turns = [(check(root), read(root)) for _ in range(options.turns + 1)][1:]
-    speeds = [total / took for took, _ in turns]
-    shares = ratios([total / took for took, _ in turns], [total / took for _, took in turns])
+        works = {"check": partial(check, root), "read": partial(read, root)}
+        speeds = in_turns(rates(works, total), options.turns)
+    speed, share = spread(speeds["check"]), spread(ratios(speeds["check"], speeds["read"]))
     results = {
         "episodes": options.episodes,
         "frames": total,
-        "frames_per_s": spread(speeds),
-        "of_reading_alone": spread(shares),
+        "frames_per_s": speed,
+        "of_reading_alone": share,
         "goal": GOAL,
-        "met": statistics.median(speeds) >= GOAL,
+        "met": speed["median"] >= GOAL,
     }
     write(options.json, results)
-    share = results["of_reading_alone"]
     print(
-        f"{options.episodes} episodes, {total:,} frames: {statistics.median(speeds):,.0f} frames/s "
-        f"({min(speeds):,.0f} to {max(speeds):,.0f}), goal {GOAL:,.0f}; {share['median']:.2f} of the speed of reading "
-        f"alone ({share['low']:.2f} to {share['high']:.2f})"
+        f"{options.episodes} episodes, {total:,} frames: {shown(speed, ',.0f')} frames/s, goal {GOAL:,.0f}; "
+        f"{shown(share)} of the speed of reading alone"
     )
     return int(not results["met"])
 

@@ -3,7 +3,7 @@
 Two workers of this machine against one, each one process with one thread, and one worker against the same episodes in
 one process without Ray. TurtleBot3, `gap_follower`, episodes of full length. The cluster is started once and its
 workers are kept: what is measured is recording, from handing out the first episode to having saved the last. What a
-start costs is told beside it. They run in turns; the first turn is not counted.
+start costs is printed beside it. They run in turns; the first turn is not counted.
 """
 
 import argparse
@@ -12,6 +12,7 @@ import statistics
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 # Before anything imports numpy or torch: one worker is one processor.
@@ -19,7 +20,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 from rich.console import Console
 
-from benchmarks._spread import ratios, spread, write
+from benchmarks._turns import in_turns, ratios, shown, spread, write
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.crew import Crew
 from bhd_lerobot.cluster.loop import ClusterLoop, open_crew
@@ -90,45 +91,43 @@ def main() -> int:
     config = configuration(Path("unused"), options.episode_s)
     quiet = Console(quiet=True)
     started = time.perf_counter()
-    times: dict[str, list[float]] = {"alone": [], "one": [], "two": []}
     shared = {"num_workers": 2, "address": "local"}
     with open_crew(RayConfig(**shared), quiet) as two, Crew(RayConfig(num_workers=1), quiet) as one:
-        crews = {"alone": None, "one": one, "two": two}
+
+        def turn(crew: Crew | None) -> float:
+            if crew is None:
+                return record(config, None, options.episodes)
+            record(config, crew, 4)  # its workers are there, and have imported everything
+            took = record(config, crew, options.episodes)
+            crew.__exit__()  # the other's workers need the processors
+            return took
+
         record(config, two, 2)
         start_s = time.perf_counter() - started
         two.__exit__()
-        for turn in range(options.turns + 1):
-            for name, crew in crews.items():
-                if crew is not None:
-                    record(config, crew, 4)  # its workers are there, and have imported everything
-                took = record(config, crew, options.episodes)
-                if crew is not None:
-                    crew.__exit__()  # the other's workers need the processors
-                if turn:
-                    times[name].append(took)
+        crews = {"alone": None, "one": one, "two": two}
+        times = in_turns({name: partial(turn, crew) for name, crew in crews.items()}, options.turns)
     speeds = {name: [options.episodes / took for took in values] for name, values in times.items()}
-    gain = ratios(speeds["two"], speeds["one"])
-    overhead_ms = [
-        1000 * (one - alone) / options.episodes for one, alone in zip(times["one"], times["alone"], strict=True)
-    ]
+    gain = spread(ratios(speeds["two"], speeds["one"]))
+    pairs = zip(times["one"], times["alone"], strict=True)
+    overhead_ms = spread([1000 * (one - alone) / options.episodes for one, alone in pairs])
     results = {
         "episodes": options.episodes,
         "episode_s": options.episode_s,
         "processors": os.cpu_count(),
         "start_s": start_s,
         "episodes_per_s": {name: spread(values) for name, values in speeds.items()},
-        "two_against_one": spread(gain),
-        "overhead_ms_per_episode": spread(overhead_ms),
+        "two_against_one": gain,
+        "overhead_ms_per_episode": overhead_ms,
         "goal": GOAL,
-        "met": statistics.median(gain) >= GOAL,
+        "met": gain["median"] >= GOAL,
     }
     write(options.json, results)
     for name, said in (("alone", "in one process"), ("one", "one worker"), ("two", "two workers")):
         print(f"{said}: {statistics.median(speeds[name]):.1f} episodes/s of {options.episode_s:g} s")
     print(
-        f"two workers against one: {statistics.median(gain):.2f} ({min(gain):.2f} to {max(gain):.2f}), goal {GOAL}; "
-        f"one worker against one process: {statistics.median(overhead_ms):+.1f} ms an episode "
-        f"({min(overhead_ms):+.1f} to {max(overhead_ms):+.1f}); start {start_s:.1f} s"
+        f"two workers against one: {shown(gain)}, goal {GOAL}; one worker against one process, ms an episode: "
+        f"{shown(overhead_ms, '+.1f')}; start {start_s:.1f} s"
     )
     return int(not results["met"])
 

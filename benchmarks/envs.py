@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from benchmarks._spread import ratios, spread, write
+from benchmarks._turns import in_turns, ratios, spread, write
 from bhd_lerobot.envs.config_env import BhdEnvConfig
 
 # Not imported here: the recorder and the rest that only the measuring process needs. Every process of `AsyncVectorEnv`
@@ -133,15 +134,6 @@ def start(names: list[str], n: int, limit_s: float) -> tuple[dict[str, VectorEnv
     return envs, problems
 
 
-def measure(parts: dict[str, Callable[[float], float]], repeats: int, seconds: float) -> dict[str, list[float]]:
-    """Return environment steps a second of each, turn by turn."""
-    speeds: dict[str, list[float]] = {name: [] for name in parts}
-    for _ in range(repeats):
-        for name, run in parts.items():
-            speeds[name].append(run(seconds))
-    return speeds
-
-
 def summary(speeds: dict[str, list[float]], problems: dict[str, str], n: int) -> dict[str, Any]:
     """Return what was measured, as plain values."""
     over = {name: spread(ratios(speeds[OURS], values)) for name, values in speeds.items() if name != OURS}
@@ -186,7 +178,8 @@ def main() -> int:
     envs, problems = start([*names, OURS], options.n, options.limit)
     try:
         parts = {name: stepper(env) for name, env in reversed(envs.items())} | {BARE: bare(options.n)}
-        speeds = measure(parts, options.repeats, options.seconds)
+        timed = {name: partial(run, options.seconds) for name, run in parts.items()}
+        speeds = in_turns(timed, options.repeats, uncounted=0)
     finally:
         for env in envs.values():
             env.close()

@@ -1,6 +1,6 @@
 """`bhd-eval` beside stock `lerobot-eval` on Gymnasium's SyncVectorEnv: `python -m benchmarks.evaluate`.
 
-Both run the same policy on the same episodes, as many of them side by side, without films, and both are timed from the
+Both run the same policy on the same episodes, as many of them side by side, without video, and both are timed from the
 configuration to the numbers: ours includes its intervals and its report. They run in turns, after a small run of each
 that is not counted: what Python imports at first use belongs to neither. The ratio is the median over the turns.
 
@@ -30,7 +30,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy
 from rich.console import Console
 
-from benchmarks._spread import ratios, spread, write
+from benchmarks._turns import ratios, shown, spread, verdict, write
 from bhd_lerobot.envs.config_env import BhdEnvConfig
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.evaluate import EvalResult, evaluate
@@ -74,7 +74,7 @@ def main() -> int:
     results |= summary(turns, args.episodes)
     show(results)
     write(args.json, results)
-    return 0 if results["met"] else 1
+    return verdict(met=results["met"])
 
 
 @dataclass(frozen=True)
@@ -96,14 +96,14 @@ class Turn:
 
 def summary(turns: Sequence[Turn], episodes: int) -> dict[str, Any]:
     """Return what was measured, as plain values."""
-    stock, ours = ([episodes / seconds for seconds in column] for column in zip(*_seconds(turns), strict=True))
+    stock, ours = [episodes / turn.stock_s for turn in turns], [episodes / turn.ours_s for turn in turns]
     ratio = spread(ratios(ours, stock))
     pairs = [pair for turn in turns for pair in zip(turn.stock, turn.ours.results.episodes, strict=True)]
     return {
         "episodes_per_s": {"lerobot-eval": spread(stock), "bhd-eval": spread(ours)},
         "ratio": ratio,
         # Building, intervals and report: what is not the run of the episodes.
-        "around_s": statistics.median(turn.ours_s - _timing(turn)["wall_s"] for turn in turns),
+        "around_s": statistics.median(turn.ours_s - turn.ours.timing["brains"]["policy"]["wall_s"] for turn in turns),
         "compared": len(pairs),
         "same_success": sum(one["success"] == our.success for one, our in pairs),
         "largest_return_difference": max(abs(one["sum_reward"] - our.reward) for one, our in pairs),
@@ -117,23 +117,13 @@ def show(results: dict[str, Any]) -> None:
     speeds, ratio, n = results["episodes_per_s"], results["ratio"], results["n_envs"]
     print(f"{results['task']}, policy {results['policy']}, seed {results['seed']}, {results['episodes']} episodes")
     for name, what in (("lerobot-eval", f"SyncVectorEnv of {n}"), ("bhd-eval", f"n_envs = {n}")):
-        one = speeds[name]
-        print(f"{name:<13} {what:<20} {one['median']:.2f} episodes/s ({one['low']:.2f} to {one['high']:.2f})")
-    print(f"ratio {ratio['median']:.1f} ({ratio['low']:.1f} to {ratio['high']:.1f}), goal {results['goal']:.0f}")
+        print(f"{name:<13} {what:<20} {shown(speeds[name])} episodes/s")
+    print(f"ratio {shown(ratio, '.1f')}, goal {results['goal']:.0f}")
     print(f"bhd-eval spends {results['around_s']:.1f} s before and after the episodes")
     print(
         f"of {results['compared']} episodes of both, {results['same_success']} ended the same; "
         f"returns differ by at most {results['largest_return_difference']:.2g}"
     )
-    print("goal met" if results["met"] else "GOAL MISSED")
-
-
-def _seconds(turns: Sequence[Turn]) -> list[tuple[float, float]]:
-    return [(turn.stock_s, turn.ours_s) for turn in turns]
-
-
-def _timing(turn: Turn) -> dict[str, Any]:
-    return turn.ours.timing["brains"]["policy"]
 
 
 def run_ours(task: str, path: str, episodes: int, n_envs: int, *, seed: int, folder: Path) -> tuple[float, EvalResult]:
@@ -156,7 +146,7 @@ def run_ours(task: str, path: str, episodes: int, n_envs: int, *, seed: int, fol
 
 
 def run_stock(task: str, path: str, episodes: int, n_envs: int, seed: int) -> tuple[float, list[dict[str, Any]]]:
-    """Run what `lerobot-eval` runs, without films; return how long it took [s], and its episodes."""
+    """Run what `lerobot-eval` runs, without video; return how long it took [s], and its episodes."""
     started = time.perf_counter()
     env_config = BhdEnvConfig(task=TASKS[task][1], vector="sync", seed=seed)
     folder = find_checkpoint(path)

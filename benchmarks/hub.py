@@ -18,16 +18,16 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from benchmarks._spread import ratios, spread, write
+from benchmarks._turns import ratios, seconds, shown, spread, write
 from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.remote.push import push
@@ -67,13 +67,6 @@ def record(root: Path, megabytes: int, files: int) -> int:
             writer.set_columns({"observation.state": rng.random((frames, WIDTH), np.float32)})
             recorder.save(writer, task="none", metadata={"outcome": "success"})
     return sum(path.stat().st_size for path in root.rglob("*") if path.is_file())
-
-
-def took(move: Turn, folder: Path, name: str) -> float:
-    """Return how long a move takes [s]."""
-    started = time.perf_counter()
-    move(folder, name)
-    return time.perf_counter() - started
 
 
 @contextmanager
@@ -179,12 +172,12 @@ def measure(moves: dict[str, Turn], root: Path, folder: Path, turns: int) -> dic
                 if way == "push" and number >= 2:
                     moves["forget"](root, place)  # what it pushed before, so that all of it is sent again
                 os.sync()  # what was written before is not paid for now
-                spent[who] += took(moves[f"{who}{way}"], here, place)
+                spent[who] += seconds(partial(moves[f"{who}{way}"], here, place))
                 if way == "pull":
                     _same(root, here)
                     shutil.rmtree(here)
-            for who, seconds in spent.items():
-                times[f"{who}{way}"].append(seconds / 2)
+            for who, both in spent.items():
+                times[f"{who}{way}"].append(both / 2)
         for who in ("ours", "bare"):
             moves["forget"](root, f"{who}{turn}")
     return {name: values[1:] for name, values in times.items()}
@@ -245,8 +238,7 @@ def main() -> int:
                 met = met and (not has_goal or share["median"] >= GOAL)
                 print(
                     f"{place:>6} {way}: {statistics.median(ours):6.0f} MB/s, the bare client "
-                    f"{statistics.median(bare):6.0f} MB/s; ratio {share['median']:.2f} "
-                    f"({share['low']:.2f} to {share['high']:.2f}){f', goal {GOAL}' if has_goal else ''}",
+                    f"{statistics.median(bare):6.0f} MB/s; ratio {shown(share)}{f', goal {GOAL}' if has_goal else ''}",
                     flush=True,
                 )
     results["met"] = met

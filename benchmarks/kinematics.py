@@ -19,6 +19,7 @@ import pink
 import pinocchio
 from eaik.IK_DH import DhRobot
 
+from benchmarks._turns import seconds, verdict
 from bhd_lerobot.bodies.body import ArmChain
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
@@ -79,15 +80,8 @@ def main() -> int:
     ours = ("ours, all checks", "ours, closed form")
     met = all(solved[name].mean() >= GOAL for name in ours)
     met = met and all(base < float(np.median(times[name])) for name in iterative)
-    print("\ngoal met" if met else "\nGOAL MISSED")
-    return 0 if met else 1
-
-
-def seconds(work: Callable[[], object]) -> float:
-    """Return how long a call takes [s]."""
-    started = time.perf_counter()
-    work()
-    return time.perf_counter() - started
+    print()
+    return verdict(met=met)
 
 
 def admissible(kinematics: ArmKinematics, rng: np.random.Generator, count: int) -> np.ndarray:

@@ -27,7 +27,7 @@ os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks._spread import spread, write
+from benchmarks._turns import spread, write
 from bhd_lerobot.datasets.loader.loader import BatchLoader, TableDataset
 
 BATCH, CHUNK, WORKERS = 64, 50, (0, 2)

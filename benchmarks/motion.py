@@ -11,6 +11,7 @@ import sys
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks._turns import verdict
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.poses import pose_vectors
@@ -45,9 +46,7 @@ def main() -> int:
         f"{'settling after a joint goal at full speed':44}{np.median(settling):>8.3f} s{settling.max():>8.3f} s"
         f"{SETTLE_GOAL_S:>8.1f} s"
     )
-    met = deviations.max() <= PATH_GOAL_M and settling.max() <= SETTLE_GOAL_S
-    print("goals met" if met else "GOAL MISSED")
-    return 0 if met else 1
+    return verdict(met=deviations.max() <= PATH_GOAL_M and settling.max() <= SETTLE_GOAL_S)
 
 
 def follow(simulation: UR5Simulation, goal: BrainCommand) -> tuple[ResultCode, NDArray, NDArray]:

@@ -13,16 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks._spread import write
+from benchmarks._episodes import add_options, run, seeds_of
+from benchmarks._turns import verdict, write
 from bhd_lerobot.evaluation.statistics import mean, wilson
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
-from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
-from bhd_lerobot.tasks.task import Event, Outcome, episode_seed
+from bhd_lerobot.tasks.task import Event, Outcome
 
 GOAL_SUCCESS = 0.99
 GOAL_SPL = 0.85
@@ -47,17 +46,15 @@ class TimedBrain(NavigatorBrain):
 def main() -> int:
     """Run the brain, print what came of it, return 0 if the goal is met."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--split", choices=("held_out", "train"), default="held_out")
+    add_options(parser, 500)
     parser.add_argument("--arena", default="random")
     parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
     args = parser.parse_args()
     task = NavigateConfig(arena=args.arena, random_start=args.arena != "random")
-    seeds = [episode_seed(args.seed, episode, args.split) for episode in range(args.episodes)]
+    seeds = seeds_of(args)
     print(f"{args.episodes} {args.split} scenes, arena {args.arena}, seed {args.seed}\n")
-    outcomes, times = run(task, seeds, min(SIDE_BY_SIDE, len(seeds)))
-    _, alone = run(task, seeds[:5], 1)
+    outcomes, times = drive(task, seeds, min(SIDE_BY_SIDE, len(seeds)))
+    _, alone = drive(task, seeds[:5], 1)
     causes = Counter(outcome.event.cause for outcome in outcomes)
     good = [outcome for outcome in outcomes if outcome.success]
     rate = wilson(len(good), len(outcomes))
@@ -91,17 +88,14 @@ def main() -> int:
             "met": bool(met),
         },
     )
-    print("goal met" if met else "GOAL MISSED")
-    return 0 if met else 1
+    return verdict(met=bool(met))
 
 
-def run(config: NavigateConfig, seeds: list[int], n: int) -> tuple[list[Outcome], np.ndarray]:
+def drive(config: NavigateConfig, seeds: list[int], n: int) -> tuple[list[Outcome], np.ndarray]:
     """Run the brain in the scenes of these seeds, n side by side; return the outcomes, and the times of its calls."""
-    robot = TurtleBot3Config()
-    brain = TimedBrain()
-    loop = EpisodeLoop(TurtleBot3Simulation(robot, n), NavigateTask(config, n, robot.fps), brain)
-    specs = [EpisodeSpec(index, seed) for index, seed in enumerate(seeds)]
-    return [episode.outcome for episode in loop.run(specs)], np.array(brain.times)
+    robot, brain = TurtleBot3Config(), TimedBrain()
+    episodes = run(TurtleBot3Simulation(robot, n), NavigateTask(config, n, robot.fps), brain, seeds)
+    return [episode.outcome for episode in episodes], np.array(brain.times)
 
 
 if __name__ == "__main__":

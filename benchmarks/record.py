@@ -1,21 +1,24 @@
 """Speed of bhd-record, beside what it is made of: `python -m benchmarks.record`.
 
-Without a camera: simulated seconds in a second with everything on (physics, cerebellum, lidar, brain, task, recorder,
-finalising), for 1 and for 64 simulations, beside the bare `Batch.step` with the same number of physics steps and the
-same scans. With a camera: frames a second beside MuJoCo's own renderer, in its fastest settings, feeding the same
-encoder. The two of a pair run in turns in one process; the table shows medians.
+Without a camera: simulated seconds in a second with everything on (physics, cerebellum, lidar or inverse kinematics,
+brain, task, recorder, finalising), of the TurtleBot3's avoid task and the UR5's pick task, for one and for many
+simulations, beside the bare `Batch.step` with the same number of physics steps and the same scans. With a camera:
+frames a second beside MuJoCo's own renderer, in its fastest settings, feeding the same encoder. The two of a pair run
+in turns in one process, after a short run that is not counted; the table shows medians. Exits with 1 if a goal is
+missed.
 """
 
 import argparse
 import io
 import os
 import shutil
-import statistics
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 # MuJoCo's renderer takes its backend from here when it is imported; ours looks for one by itself.
 os.environ.setdefault("MUJOCO_GL", "egl")
@@ -25,52 +28,59 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks._turns import in_turns, ratios, spread
 from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
+from bhd_lerobot.recording.report import RecordResult
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
+from bhd_lerobot.tasks.pick import PickConfig, PickTask
 
-GOALS = {"n_envs = 1": 60.0, "n_envs = 64": 300.0, "camera": 0.8, "image": 0.95}
+# Robot, simulations side by side, episodes, and the goal as times real time.
+CASES = (("turtlebot3", 1, 4, 60.0), ("turtlebot3", 64, 64, 300.0), ("ur5", 1, 24, 20.0), ("ur5", 32, 256, 60.0))
+CONFIGS = {"turtlebot3": "configs/record/turtlebot3_avoid.yaml", "ur5": "configs/record/ur5_pick.yaml"}
+CAMERA_GOAL, IMAGE_GOAL = 0.8, 0.95  # of the peer's speed
 
 
-def run_record(folder: Path, *options: str) -> tuple[float, float, int]:
-    """Record the avoid task; return simulated seconds, seconds that it took, and frames."""
+def run_record(folder: Path, robot: str, *options: str) -> RecordResult:
+    """Record the task of a robot."""
     shutil.rmtree(folder, ignore_errors=True)
-    config = parse(
-        RecordConfig,
-        [
-            "--config_path=configs/record/turtlebot3_avoid.yaml",
-            f"--dataset.root={folder / 'dataset'}",
-            f"--output_dir={folder / 'run'}",
-            "--preview_video=false",
-            "--seed=1",
-            *options,
-        ],
+    own = [f"--dataset.root={folder / 'dataset'}", f"--output_dir={folder / 'run'}", "--preview_video=false"]
+    config = parse(RecordConfig, [f"--config_path={CONFIGS[robot]}", *own, "--seed=1", *options])
+    return record(config, Console(file=io.StringIO()))
+
+
+def real_time(folder: Path, robot: str, n: int, episodes: int, *options: str) -> float:
+    """Return simulated seconds in a second of recording."""
+    result = run_record(folder, robot, f"--n_envs={n}", f"--dataset.num_episodes={episodes}", *options)
+    return result.simulated_s / result.wall_s
+
+
+def bare_step(robot: str, n: int, simulated_s: float = 20.0) -> float:
+    """Return simulated seconds in a second of the physics steps, and of the TurtleBot3 the scans, alone."""
+    simulation: Any = (
+        TurtleBot3Simulation(TurtleBot3Config(), n) if robot == "turtlebot3" else UR5Simulation(UR5Config(), n)
     )
-    result = record(config, Console(file=io.StringIO()))
-    return result.simulated_s, result.wall_s, result.frames
-
-
-def bare_step(n: int, seconds: float) -> float:
-    """Return how long the physics steps and scans of n simulations take for some simulated time [s]."""
-    simulation = TurtleBot3Simulation(TurtleBot3Config(), n)
-    task = AvoidTask(AvoidConfig(), n, 10)
+    fps = simulation.rates.fps
+    task = AvoidTask(AvoidConfig(), n, fps) if robot == "turtlebot3" else PickTask(PickConfig(), n, fps)
     simulation.reset(np.arange(n), [task.sample(2 * i) for i in range(n)], range(n))
-    world, lidar = simulation.world, simulation.lidar
-    world.ctrl[:] = 3.0
-    rngs = [np.random.default_rng(i) for i in range(n)]
-    steps = world.physics_hz // 5
+    world, rngs = simulation.world, [np.random.default_rng(i) for i in range(n)]
+    if robot == "turtlebot3":
+        world.ctrl[:] = 3.0
     started = time.perf_counter()
-    for _ in range(round(seconds * 5)):
-        for _ in range(steps):
+    for _ in range(round(simulated_s * 5)):  # the lidar's rate
+        for _ in range(world.physics_hz // 5):
             world.step(1)
-        lidar.scan(rngs)
-    return time.perf_counter() - started
+        if robot == "turtlebot3":
+            simulation.lidar.scan(rngs)
+    return n * simulated_s / (time.perf_counter() - started)
 
 
 def make_scene() -> TurtleBot3Simulation:
@@ -138,83 +148,61 @@ def encoded_images(folder: Path, frames: int) -> float:
     return frames / seconds
 
 
-def paired(first: Callable[[], float], second: Callable[[], float], repeats: int) -> tuple[float, float, float]:
+def paired(first: Callable[[], float], second: Callable[[], float], turns: int) -> tuple[float, float, float]:
     """Return the medians of two measurements that are taken in turns, and of their ratio."""
-    values = [(first(), second()) for _ in range(repeats)]
-    # The median of the ratios, not the ratio of the medians: a noisy neighbour disturbs both of a pair.
-    return tuple(statistics.median(column) for column in zip(*[(a, b, a / b) for a, b in values], strict=True))
+    values = in_turns({"ours": first, "peer": second}, turns, uncounted=0)
+    columns = values["ours"], values["peer"], ratios(values["ours"], values["peer"])
+    return tuple(spread(column)["median"] for column in columns)
 
 
 def main() -> int:
     """Print the table; return 1 if a goal was missed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--simulated_s", type=float, default=60.0, help="length of an episode")
+    parser.add_argument("--simulated_s", type=float, default=60.0, help="length of an episode of the TurtleBot3")
+    parser.add_argument("--robots", nargs="+", choices=tuple(CONFIGS), default=list(CONFIGS))
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
     table = Table(title="bhd-record", title_justify="left")
     for heading in ("measured", "ours", "peer", "peer is", "ratio", "goal"):
         table.add_column(heading, justify="left" if heading in ("measured", "peer is") else "right")
     missed = []
+
+    def add(what: str, peer_is: str, values: tuple[float, float, float], goal: str, *, met: bool) -> None:
+        mine, peer, ratio = values
+        table.add_row(what, f"{mine:.0f}", f"{peer:.0f}", peer_is, f"{ratio:.2f}", goal)
+        if not met:
+            missed.append(what)
+
+    length = {"turtlebot3": [f"--dataset.episode_time_s={options.simulated_s}"], "ur5": []}
     try:
-        for n, episodes in ((1, 4), (64, 64)):
-            length = f"--dataset.episode_time_s={options.simulated_s}"
+        for robot, n, episodes, goal in CASES:
+            if robot not in options.robots:
+                continue
+            real_time(folder, robot, n, n, *length[robot])
+            ours = partial(real_time, folder, robot, n, episodes, *length[robot])
+            values = paired(ours, partial(bare_step, robot, n), options.repeats)
+            peer_is = "Batch.step and lidar alone" if robot == "turtlebot3" else "Batch.step alone"
+            what = f"{robot}, n_envs = {n}: simulated s per s"
+            add(what, peer_is, values, f">= {goal:.0f} x real time", met=values[0] >= goal)
+        if "turtlebot3" in options.robots:
+            try:
 
-            def ours(n: int = n, episodes: int = episodes, length: str = length) -> float:
-                simulated, wall, _ = run_record(folder, f"--n_envs={n}", f"--dataset.num_episodes={episodes}", length)
-                return simulated / wall
+                def camera() -> float:
+                    one = ("--robot.camera=true", "--n_envs=1", "--dataset.num_episodes=1", *length["turtlebot3"])
+                    result = run_record(folder, "turtlebot3", *one)
+                    return result.frames / result.wall_s
 
-            def bare(n: int = n) -> float:
-                seconds = 20.0
-                return n * seconds / bare_step(n, seconds)
-
-            mine, peer, ratio = paired(ours, bare, options.repeats)
-            key = f"n_envs = {n}"
-            missed += [key] * (mine < GOALS[key])
-            table.add_row(
-                f"{key}: simulated s per s",
-                f"{mine:.0f}",
-                f"{peer:.0f}",
-                "Batch.step and lidar alone",
-                f"{ratio:.2f}",
-                f">= {GOALS[key]:.0f} x real time",
-            )
-        try:
-
-            def camera() -> float:
-                _, wall, frames = run_record(
-                    folder,
-                    "--robot.camera=true",
-                    "--n_envs=1",
-                    "--dataset.num_episodes=1",
-                    f"--dataset.episode_time_s={options.simulated_s}",
-                )
-                return frames / wall
-
-            frames = round(options.simulated_s * 10)
-            mine, peer, ratio = paired(camera, lambda: encoded_images(folder, frames), 2 * options.repeats - 1)
-            missed += ["camera"] * (ratio < GOALS["camera"])
-            table.add_row(
-                "320x240 camera, 10 fps: frames per s",
-                f"{mine:.0f}",
-                f"{peer:.0f}",
-                "MuJoCo's renderer and the same encoder",
-                f"{ratio:.2f}",
-                f"ratio >= {GOALS['camera']}",
-            )
-            mine, peer = images(300)
-            ratio = mine / peer
-            missed += ["image"] * bool(ratio < GOALS["image"])
-            table.add_row(
-                "one 320x240 image: images per s",
-                f"{mine:.0f}",
-                f"{peer:.0f}",
-                "MuJoCo's renderer, fastest settings",
-                f"{ratio:.2f}",
-                f"ratio >= {GOALS['image']}, the same time",
-            )
-        except RenderingError as error:
-            print(f"Camera not measured: {error}")
+                frames = round(options.simulated_s * 10)
+                values = paired(camera, lambda: encoded_images(folder, frames), 2 * options.repeats - 1)
+                what, peer_is = "320x240 camera, 10 fps: frames per s", "MuJoCo's renderer and the same encoder"
+                add(what, peer_is, values, f"ratio >= {CAMERA_GOAL}", met=values[2] >= CAMERA_GOAL)
+                mine, peer = images(300)
+                what, peer_is = "one 320x240 image: images per s", "MuJoCo's renderer, fastest settings"
+                met = bool(mine / peer >= IMAGE_GOAL)
+                add(what, peer_is, (mine, peer, mine / peer), f"ratio >= {IMAGE_GOAL}, the same time", met=met)
+            except RenderingError as error:
+                print(f"Camera not measured: {error}")
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     Console(width=140).print(table)

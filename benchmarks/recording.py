@@ -1,6 +1,6 @@
 """Frames per second of recording: LeRobot's own writer, this package, and pyarrow alone, on the same frames.
 
-Run with ``python benchmarks/recording.py``. All of them record the same episodes in one process, in turns; the table
+Run with ``python -m benchmarks.recording``. All of them record the same episodes in one process, in turns; the table
 shows medians. Both datasets are read back through stock LeRobot and compared value by value. With ``--video`` an
 episode has a camera as well, and LeRobot encodes while it records, with the same codec and options.
 """
@@ -13,8 +13,8 @@ import logging
 import shutil
 import statistics
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from benchmarks._turns import in_turns, seconds
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
@@ -175,23 +176,25 @@ def main() -> None:
     if pictures is None:
         contestants[PYARROW] = lambda root: write_with_pyarrow(root, data, {})
         contestants[PYARROW_PLAIN] = lambda root: write_with_pyarrow(root, data, plain)
-    seconds: dict[str, list[float]] = {name: [] for name in contestants}
-    for repeat in range(arguments.repeats + 1):
-        for name, contestant in contestants.items():
-            folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
-            try:
-                gc.collect()
-                # LeRobot shows a progress bar per episode; into memory, so that the terminal costs it no time.
-                with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
-                    begin = time.perf_counter()
-                    contestant(folder / "dataset")
-                    seconds[name].append(time.perf_counter() - begin)
-                    if repeat == 0 and "pyarrow" not in name:
-                        check(folder / "dataset", data, pictures)
-            finally:
-                shutil.rmtree(folder)
+    done = set()
+
+    def run(name: str) -> float:
+        folder = Path(tempfile.mkdtemp(prefix="bhd-bench-"))
+        try:
+            gc.collect()
+            # LeRobot shows a progress bar per episode; into memory, so that the terminal costs it no time.
+            with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
+                took = seconds(lambda: contestants[name](folder / "dataset"))
+                if name not in done and "pyarrow" not in name:
+                    check(folder / "dataset", data, pictures)
+            done.add(name)
+            return took
+        finally:
+            shutil.rmtree(folder)
+
+    times = in_turns({name: partial(run, name) for name in contestants}, arguments.repeats)
     frames = arguments.episodes * arguments.length
-    rates = {name: frames / statistics.median(times[1:]) for name, times in seconds.items()}  # the first warms up
+    rates = {name: frames / statistics.median(took) for name, took in times.items()}
     shape = f"{arguments.episodes} episodes of {arguments.length} frames, {STATE} floats"
     print(f"{shape}{', camera 320x240' if pictures is not None else ''}; median of {arguments.repeats}")
     references = {"x LeRobot": next(iter(rates)), "x pyarrow": PYARROW, "x pyarrow plain": PYARROW_PLAIN}

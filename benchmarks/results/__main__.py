@@ -12,22 +12,23 @@ from benchmarks.results.adaptation import fine_tune
 from benchmarks.results.learning import avoid, pick, reach
 from benchmarks.results.page import write_page
 from benchmarks.results.runner import REPOSITORY, FailedError, Runner
-from benchmarks.results.section import Measure, Section
+from benchmarks.results.section import Section
 from benchmarks.results.speed import navigate, speed
 
+# Name, title, and what runs the commands and fills the section.
 MEASURES = (
-    Measure("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),
-    Measure("reach", "Reach: a UR5 brings its tool to a pose", reach),
-    Measure("pick", "Pick, from state: a UR5 picks up what it is told to", pick),
-    Measure("fine_tune", "Fine-tune: 10 episodes of a shifted world", fine_tune),
-    Measure("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),
-    Measure("speed", "Speed", speed),
+    ("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),
+    ("reach", "Reach: a UR5 brings its tool to a pose", reach),
+    ("pick", "Pick, from state: a UR5 picks up what it is told to", pick),
+    ("fine_tune", "Fine-tune: 10 episodes of a shifted world", fine_tune),
+    ("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),
+    ("speed", "Speed", speed),
 )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Make the results; return 0, 1 if a goal was missed, or 2 if a command failed."""
-    names = [one.name for one in MEASURES]
+    names = [name for name, _, _ in MEASURES]
     parser = argparse.ArgumentParser(prog="make results", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=names, default=names, help="sections to make")
     parser.add_argument("--folder", type=Path, default=Path("outputs/results"), help="where everything goes")
@@ -39,14 +40,14 @@ def main(arguments: list[str] | None = None) -> int:
     if options.fresh and folder.exists():
         shutil.rmtree(folder)
     sections = []
-    for measure in MEASURES:
-        if measure.name not in options.only:
+    for name, title, measure in MEASURES:
+        if name not in options.only:
             continue
-        section, run = Section(measure.name, measure.title), Runner(folder, is_short=options.short)
+        section, run = Section(name, title), Runner(folder, is_short=options.short)
         try:
-            measure.measure(run, section)
+            measure(run, section)
         except FailedError as error:
-            print(f"{measure.name}: {error}", file=sys.stderr)
+            print(f"{name}: {error}", file=sys.stderr)
             return 2
         section.commands = run.commands
         sections.append(section)

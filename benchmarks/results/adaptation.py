@@ -1,13 +1,12 @@
 """The section about fine-tuning: how much of what a shifted world costs do 10 episodes of it bring back?"""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.results.learning import EPISODES, reach
+from benchmarks.results.learning import TOOL, evaluate, reach, record, train, values
 from benchmarks.results.runner import Runner
-from benchmarks.results.section import Row, Section
+from benchmarks.results.section import Row, Section, rate
 
 GOAL = 0.5
 SHOWN = 10  # episodes of the shifted world that are learned from
@@ -21,7 +20,6 @@ SHIFT = (
     *(f"--task.randomisation.{name}=0" for name in ("sensor_noise_rad", "latency_s")),
 )
 _SHIFTED = "camera 18 mm off"
-_TOOL = ("--robot.action_space=tool", "--robot.tool_pose=true")
 
 
 def fine_tune(run: Runner, section: Section) -> None:
@@ -30,23 +28,24 @@ def fine_tune(run: Runner, section: Section) -> None:
     The policy is told where the target is by that camera. The rule that shows the episodes knows by how much it is off.
     """
     reach(run, Section("reach", ""))
-    data = run.path("fine_tune/data")
-    run.run(
+    record(
+        run,
         "fine_tune_record",
-        [
-            *("bhd-record", "--config_path=configs/record/ur5_reach.yaml", f"--dataset.root={data}", *_TOOL),
-            *(f"--dataset.num_episodes={SHOWN}", "--n_envs=10", "--preview_video=false", "--seed=7", *SHIFT),
-            *("--task.hold_s=1.0", f"--brain.{_ERROR}", f"--output_dir={run.path('fine_tune/data_run')}"),
-        ],
+        "ur5_reach",
+        "fine_tune/data",
+        episodes=SHOWN,
+        options=(*TOOL, "--seed=7", *SHIFT, "--task.hold_s=1.0", f"--brain.{_ERROR}"),
     )
-    base, tuned = run.path("reach/bc"), run.path("fine_tune/bc")
-    train = ["bhd-train", "--config_path=configs/train/fine_tune_ur5_reach.yaml", f"--dataset.root={data}"]
-    short = ("--steps=20",) if run.is_short else ()
-    seconds = run.run("fine_tune_train", [*train, f"--fine_tune={base}", f"--output_dir={tuned}", *short]).seconds
-    original = _evaluate(run, "fine_tune_original", {"base": base, "tuned": tuned})
-    shifted = _evaluate(run, "fine_tune_shifted", {"base": base, "tuned": tuned}, SHIFT)
+    base = f"--fine_tune={run.path('reach/bc')}"
+    seconds = train(run, "fine_tune_train", "fine_tune_ur5_reach", "fine_tune/bc", "fine_tune/data", options=(base,))
+    brains = {"base": "reach/bc", "tuned": "fine_tune/bc"}
+    original, shifted = (
+        evaluate(run, f"fine_tune_{world}", "ur5_reach", brains, baseline="base", options=(*TOOL, *shift))
+        for world, shift in (("original", ()), ("shifted", SHIFT))
+    )
     before, lost, found = (
-        successes(results, name) for results, name in ((original, "base"), (shifted, "base"), (shifted, "tuned"))
+        values(results, name, "success")
+        for results, name in ((original, "base"), (shifted, "base"), (shifted, "tuned"))
     )
     share, low, high = recovered(before, lost, found)
     for results, name, where in (
@@ -55,7 +54,9 @@ def fine_tune(run: Runner, section: Section) -> None:
         (shifted, "tuned", _SHIFTED),
         (original, "tuned", "original world"),
     ):
-        section.rows.append(Row(f"{name}, {where}: success in {len(before)}", rate(results["brains"][name])))
+        brain = results["brains"][name]
+        what = f"{name}, {where}: success in {len(before)}"
+        section.rows.append(Row(what, rate(brain["success"], brain["outcomes"])))
     section.rows += [
         Row(
             f"recovered by {SHOWN} episodes, share of what the shift cost",
@@ -69,12 +70,6 @@ def fine_tune(run: Runner, section: Section) -> None:
         "The share is (tuned, shifted - base, shifted) / (base, original - base, shifted) over the same seeds; its "
         "interval is a bootstrap over them, which draws all three outcomes of a seed together."
     )
-
-
-def successes(results: Mapping[str, Any], brain: str) -> list[bool]:
-    """Return whether each episode of a brain was a success, in the order of the episodes."""
-    own = [one for one in results["episodes"] if one["brain"] == brain]
-    return [one["success"] for one in sorted(own, key=lambda one: one["episode"])]
 
 
 def recovered(before: Sequence[bool], lost: Sequence[bool], found: Sequence[bool]) -> tuple[float, float, float]:
@@ -101,29 +96,3 @@ def recovered(before: Sequence[bool], lost: Sequence[bool], found: Sequence[bool
     low, high = np.quantile(shares, (0.025, 0.975), method="nearest")
     whole = outcomes.mean(axis=1)
     return float((whole[2] - whole[1]) / (whole[0] - whole[1])), float(low), float(high)
-
-
-def rate(brain: Mapping[str, Any]) -> str:
-    """Return a brain's rate of success, with its interval and how the other episodes ended."""
-    success = brain["success"]
-    causes = ", ".join(f"{count} {cause}" for cause, count in brain["outcomes"].items() if cause != "success")
-    text = f"{success['value']:.1%} ({success['low']:.1%} to {success['high']:.1%})"
-    return f"{text}; {causes}" if causes else text
-
-
-def _evaluate(run: Runner, name: str, brains: Mapping[str, Any], options: Sequence[str] = ()) -> Any:
-    episodes = 16 if run.is_short else EPISODES
-    learned = [
-        option
-        for label, folder in brains.items()
-        for option in (f"--brains.{label}.type=learned", f"--brains.{label}.path={folder}")
-    ]
-    run.run(
-        name,
-        [
-            *("bhd-eval", "--config_path=configs/eval/ur5_reach.yaml", f"--n_episodes={episodes}", *learned, *_TOOL),
-            *(f"--only=[{','.join(brains)}]", "--baseline=base", f"--output_dir={run.path(name)}", "--n_envs=32"),
-            *options,
-        ],
-    )
-    return run.read(name, "results.json")

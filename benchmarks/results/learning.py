@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results.runner import FailedError, Runner
-from benchmarks.results.section import Row, Section
+from benchmarks.results.section import Row, Section, mean, rate
 from bhd_lerobot.evaluation.statistics import mean_difference, ratio_of_means
 
 EPISODES = 500
@@ -16,25 +16,25 @@ _ROAMING = ("gap_follower", "avoidance")
 _TRAIL = ("--task.trail=true",)
 _PICK_EPISODES = 10_000
 _AVOID_TRAIN_S, _PPO_TRAIN_S, _PICK_TRAIN_S = 120, 1200, 3600
-_REACH_GOAL, _PICK_GOAL, _PPO_GOAL, _RECOVERED_GOAL = 0.97, 0.85, 1.2, 0.5
+_REACH_GOAL, _PICK_GOAL, _PPO_GOAL = 0.97, 0.85, 1.2
 
 
 def avoid(run: Runner, section: Section) -> None:
     """Cloning rules, and reinforcement learning, on the avoid task."""
-    _record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=200, options=("--seed=100",))
-    seconds = _train(run, "avoid_bc", "bc_turtlebot3_avoid", "avoid/bc", "avoid/data")
+    record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=200, options=("--seed=100",))
+    seconds = train(run, "avoid_bc", "bc_turtlebot3_avoid", "avoid/bc", "avoid/data")
     gap = ("--seed=100", "--brain.type=gap_follower", *_TRAIL)
-    _record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=400, options=gap)
-    _train(run, "avoid_gap_bc", "bc_turtlebot3_avoid", "avoid/gap_bc", "avoid/gap_data")
+    record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=400, options=gap)
+    train(run, "avoid_gap_bc", "bc_turtlebot3_avoid", "avoid/gap_bc", "avoid/gap_data")
     start = (
         *(f"--start_from={run.path('avoid/gap_bc')}", "--see_ignored=true"),
         *("--critic_warmup=65536", "--ppo.log_std_init=-1.0"),
     )
-    ppo_seconds = _train(run, "avoid_ppo", "ppo_turtlebot3", "avoid/ppo", options=start)
-    results = _evaluate(run, "avoid_eval", "turtlebot3_avoid", {"bc": "avoid/bc"}, rules=_ROAMING, baseline="avoidance")
+    ppo_seconds = train(run, "avoid_ppo", "ppo_turtlebot3", "avoid/ppo", options=start)
+    results = evaluate(run, "avoid_eval", "turtlebot3_avoid", {"bc": "avoid/bc"}, rules=_ROAMING, baseline="avoidance")
     # The task tells these two more; the episodes are the same.
     brains = {"gap_bc": "avoid/gap_bc", "ppo": "avoid/ppo/checkpoints/best"}
-    told = _evaluate(
+    told = evaluate(
         run,
         "avoid_trail_eval",
         "turtlebot3_avoid",
@@ -50,14 +50,14 @@ def avoid(run: Runner, section: Section) -> None:
     results["episodes"] += [one for one in told["episodes"] if one["brain"] in brains]
     for name in (*_ROAMING, "bc", *brains):
         section.rows.append(_success_row(results, name))
-        section.rows.append(Row(f"{name}: mean score", _estimate(results["brains"][name]["means"]["score"])))
+        section.rows.append(Row(f"{name}: mean score", mean(results["brains"][name]["means"]["score"])))
     difference = mean_difference(_scores(results, "bc"), _scores(results, "avoidance"))
     more = _failures(results, "bc") - _failures(results, "avoidance")
     section.rows += [
         Row("bc: time of training", f"{seconds:.0f} s", f"at most {_AVOID_TRAIN_S} s", seconds <= _AVOID_TRAIN_S),
         Row(
             "bc - avoidance, its teacher: mean score, paired",
-            _estimate(asdict(difference), signed=True),
+            mean(asdict(difference), "+"),
             "not below 0 for certain",
             difference.high >= 0,
         ),
@@ -72,13 +72,13 @@ def avoid(run: Runner, section: Section) -> None:
         Row("ppo: failures", str(failures["ppo"]), f"at most {least}", failures["ppo"] <= least),
         Row(
             f"ppo / {best}: mean score, paired",
-            _estimate(asdict(ratio)),
+            mean(asdict(ratio)),
             f"at least {_PPO_GOAL}, its interval above 1",
             ratio.value >= _PPO_GOAL and ratio.low > 1,
         ),
     ]
     over = ratio_of_means(_scores(results, "ppo"), _scores(results, "avoidance"))
-    section.rows.append(Row("ppo / avoidance, the rule of the articles: mean score, paired", _estimate(asdict(over))))
+    section.rows.append(Row("ppo / avoidance, the rule of the articles: mean score, paired", mean(asdict(over))))
     section.remarks.append(
         "`bc` imitates `avoidance`, `gap_bc` imitates `gap_follower`. That rule remembers where it has been; a network "
         "does not, so the task tells `gap_bc` and `ppo`, which starts from it, what ground around them they have "
@@ -89,9 +89,9 @@ def avoid(run: Runner, section: Section) -> None:
 def reach(run: Runner, section: Section) -> None:
     """Cloning a rule on the reach task."""
     options = (*TOOL, "--task.hold_s=1.0", "--seed=100")
-    _record(run, "reach_record", "ur5_reach", "reach/data", episodes=10_000, options=options)
-    seconds = _train(run, "reach_bc", "bc_ur5_reach", "reach/bc", "reach/data")
-    results = _evaluate(
+    record(run, "reach_record", "ur5_reach", "reach/data", episodes=10_000, options=options)
+    seconds = train(run, "reach_bc", "bc_ur5_reach", "reach/bc", "reach/data")
+    results = evaluate(
         run, "reach_eval", "ur5_reach", {"bc": "reach/bc"}, rules=("reach",), baseline="reach", options=TOOL
     )
     for name in ("reach", "bc"):
@@ -102,15 +102,15 @@ def reach(run: Runner, section: Section) -> None:
 def pick(run: Runner, section: Section) -> None:
     """Cloning a rule on the pick task, from state."""
     options = (*TOOL, "--seed=100")
-    _record(run, "pick_record", "ur5_pick", "pick/data", episodes=_PICK_EPISODES, options=options)
-    seconds = _train(run, "pick_bc", "bc_ur5_pick", "pick/bc", "pick/data")
-    results = _evaluate(run, "pick_eval", "ur5_pick", {"bc": "pick/bc"}, rules=("pick",), baseline="pick", options=TOOL)
+    record(run, "pick_record", "ur5_pick", "pick/data", episodes=_PICK_EPISODES, options=options)
+    seconds = train(run, "pick_bc", "bc_ur5_pick", "pick/bc", "pick/data")
+    results = evaluate(run, "pick_eval", "ur5_pick", {"bc": "pick/bc"}, rules=("pick",), baseline="pick", options=TOOL)
     section.rows.append(_success_row(results, "pick"))
     success = results["brains"]["bc"]["success"]
     section.rows += [
         Row(
             f"bc: success in {results['brains']['bc']['episodes']}",
-            _with_causes(results["brains"]["bc"]),
+            rate(success, results["brains"]["bc"]["outcomes"]),
             f"lower end at least {_PICK_GOAL:.0%}",
             success["low"] >= _PICK_GOAL,
         ),
@@ -121,7 +121,8 @@ def pick(run: Runner, section: Section) -> None:
 # --- commands ---------------------------------------------------------------------------------------------------------
 
 
-def _record(run: Runner, name: str, config: str, root: str, *, episodes: int, options: Sequence[str] = ()) -> None:
+def record(run: Runner, name: str, config: str, root: str, *, episodes: int, options: Sequence[str] = ()) -> None:
+    """Record episodes of the rule that the configuration names."""
     if run.is_short:
         episodes = max(8, episodes // 50)
     run.run(
@@ -134,7 +135,7 @@ def _record(run: Runner, name: str, config: str, root: str, *, episodes: int, op
     )
 
 
-def _train(
+def train(
     run: Runner, name: str, config: str, output: str, root: str | None = None, *, options: Sequence[str] = ()
 ) -> float:
     """Train, and return how long that took, start-up included [s]."""
@@ -144,14 +145,14 @@ def _train(
     return run.run(name, [*command, *short]).seconds
 
 
-def _evaluate(
+def evaluate(
     run: Runner,
     name: str,
     config: str,
     brains: Mapping[str, str],
     *,
-    rules: Sequence[str],
     baseline: str,
+    rules: Sequence[str] = (),
     options: Sequence[str] = (),
 ) -> Any:
     """Evaluate checkpoints beside rules that the configuration names; return the results."""
@@ -176,10 +177,14 @@ def _evaluate(
 # --- rows -------------------------------------------------------------------------------------------------------------
 
 
+def values(results: Any, brain: str, key: str) -> list[Any]:
+    """Return a value of each episode of a brain, in the order of the episodes."""
+    own = [one for one in results["episodes"] if one["brain"] == brain]
+    return [one[key] for one in sorted(own, key=lambda one: int(one["episode"]))]
+
+
 def _scores(results: Any, name: str) -> list[float]:
-    """Return the score of each episode of a brain, in the order of the episodes."""
-    own = [one for one in results["episodes"] if one["brain"] == name]
-    return [float(one["score"]) for one in sorted(own, key=lambda one: int(one["episode"]))]
+    return [float(one) for one in values(results, name, "score")]
 
 
 def _failures(results: Any, name: str) -> int:
@@ -191,18 +196,4 @@ def _success_row(results: Any, name: str, goal: float | None = None) -> Row:
     brain = results["brains"][name]
     met = None if goal is None else brain["success"]["value"] >= goal
     what = f"{name}: success in {brain['episodes']}"
-    return Row(what, _with_causes(brain), "" if goal is None else f"at least {goal:.0%}", met)
-
-
-def _with_causes(brain: Mapping[str, Any]) -> str:
-    causes = ", ".join(f"{count} {cause}" for cause, count in brain["outcomes"].items() if cause != "success")
-    return f"{_percent(brain['success'])}{f'; {causes}' if causes else ''}"
-
-
-def _percent(estimate: Mapping[str, float]) -> str:
-    return f"{estimate['value']:.1%} ({estimate['low']:.1%} to {estimate['high']:.1%})"
-
-
-def _estimate(estimate: Mapping[str, float], *, signed: bool = False) -> str:
-    sign = "+" if signed else ""
-    return f"{estimate['value']:{sign}.3f} ({estimate['low']:{sign}.3f} to {estimate['high']:{sign}.3f})"
+    return Row(what, rate(brain["success"], brain["outcomes"]), "" if goal is None else f"at least {goal:.0%}", met)

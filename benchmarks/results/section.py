@@ -1,9 +1,9 @@
 """What a section of the results consists of: commands, numbers with their goals, and a picture or two."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from benchmarks.results.runner import Ran, Runner
+from benchmarks.results.runner import Ran
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,13 @@ class Section:
         return lines
 
 
-@dataclass(frozen=True)
-class Measure:
-    """How a section is made.
+def rate(estimate: Mapping[str, float], outcomes: Mapping[str, int]) -> str:
+    """Return a rate with its interval, and how the episodes ended that were no success."""
+    text = f"{estimate['value']:.1%} ({estimate['low']:.1%} to {estimate['high']:.1%})"
+    causes = ", ".join(f"{count} {cause}" for cause, count in outcomes.items() if cause != "success")
+    return f"{text}; {causes}" if causes else text
 
-    Attributes:
-        name: what `--only` calls it.
-        title: its heading.
-        measure: runs the commands and fills the section.
-    """
 
-    name: str
-    title: str
-    measure: Callable[[Runner, Section], None]
+def mean(estimate: Mapping[str, float], sign: str = "") -> str:
+    """Return a mean, a difference (with ``sign`` "+") or a ratio, with its interval."""
+    return f"{estimate['value']:{sign}.3f} ({estimate['low']:{sign}.3f} to {estimate['high']:{sign}.3f})"

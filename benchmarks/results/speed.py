@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from benchmarks.results.runner import Runner
-from benchmarks.results.section import Row, Section
+from benchmarks.results.section import Row, Section, mean, rate
 
 _MISSED = 1  # the exit status of a benchmark that found a goal missed
 _BARE = "Batch.step and lidar alone"
@@ -112,22 +112,15 @@ def evaluate_rows(results: Mapping[str, Any]) -> list[Row]:
 def navigate_rows(results: Mapping[str, Any]) -> list[Row]:
     """Return the rows of `benchmarks.navigate`."""
     success, spl, collisions = results["success"], results["spl"], results["collisions"]
-    ends = ", ".join(f"{count} {cause}" for cause, count in results["ends"].items() if cause != "success")
-    rate = f"{success['value']:.1%} ({success['low']:.1%} to {success['high']:.1%})"
     return [
         Row(
             f"navigator: success in {results['episodes']}",
-            f"{rate}{f'; {ends}' if ends else ''}",
+            rate(success, results["ends"]),
             f"at least {success['goal']:.0%}",
             success["met"],
         ),
         Row("navigator: collisions", str(collisions["value"]), f"at most {collisions['goal']}", collisions["met"]),
-        Row(
-            "navigator: success weighted by path length, mean",
-            f"{spl['value']:.3f} ({spl['low']:.3f} to {spl['high']:.3f})",
-            f"above {spl['goal']:.2f}",
-            spl["met"],
-        ),
+        Row("navigator: success weighted by path length, mean", mean(spl), f"above {spl['goal']:.2f}", spl["met"]),
     ]
 
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks._spread import ratios, spread, write
+from benchmarks._turns import ratios, spread, write
 from benchmarks.envs import BARE, OURS, TooLateError, summary, time_limit
 from benchmarks.results.__main__ import MEASURES
-from benchmarks.results.adaptation import recovered, successes
+from benchmarks.results.adaptation import recovered
+from benchmarks.results.learning import values
 from benchmarks.results.page import write_page
 from benchmarks.results.runner import FailedError, Runner
 from benchmarks.results.section import Row, Section
@@ -33,7 +34,7 @@ def test_a_spread_is_the_median_between_the_ends(tmp_path: Path) -> None:
 
 
 def test_all_sections_have_names_of_their_own() -> None:
-    names = [one.name for one in MEASURES]
+    names = [name for name, _, _ in MEASURES]
     assert len(set(names)) == len(names)
     assert {"avoid", "reach", "pick", "fine_tune", "navigate", "speed"} <= set(names)
 
@@ -129,7 +130,7 @@ def test_the_interval_gets_narrower_with_more_seeds() -> None:
 def test_outcomes_are_in_the_order_of_the_episodes() -> None:
     told = [("a", 1, True), ("b", 0, True), ("a", 0, False)]
     results = {"episodes": [{"brain": name, "episode": number, "success": good} for name, number, good in told]}
-    assert successes(results, "a") == [False, True]
+    assert values(results, "a", "success") == [False, True]
 
 
 # --- page and runner --------------------------------------------------------------------------------------------------

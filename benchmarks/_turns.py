@@ -1,0 +1,68 @@
+"""Measurements that take turns, in a few numbers: what the benchmarks share."""
+
+import json
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Return how long a call takes [s]."""
+    started = time.perf_counter()
+    work()
+    return time.perf_counter() - started
+
+
+def rates(works: Mapping[str, Callable[[], object]], count: int) -> dict[str, Callable[[], float]]:
+    """Return what measures how many a second each of them does, for `in_turns`; a call of one does so many."""
+    return {name: lambda work=work: count / seconds(work) for name, work in works.items()}
+
+
+def in_turns(parts: Mapping[str, Callable[[], float]], turns: int, *, uncounted: int = 1) -> dict[str, list[float]]:
+    """Measure several things in turns, so that a noisy neighbour disturbs all of a turn.
+
+    Args:
+        parts: what measures each of them.
+        turns: how often.
+        uncounted: turns before those, whose values are dropped: what is loaded at first use belongs to none.
+
+    Returns:
+        The values of each, turn by turn.
+    """
+    values: dict[str, list[float]] = {name: [] for name in parts}
+    for turn in range(-uncounted, turns):
+        for name, part in parts.items():
+            value = part()
+            if turn >= 0:
+                values[name].append(value)
+    return values
+
+
+def spread(values: Sequence[float]) -> dict[str, Any]:
+    """Return the median of some measurements, the least and the largest of them, and how many there were."""
+    return {"median": statistics.median(values), "low": min(values), "high": max(values), "turns": len(values)}
+
+
+def ratios(ours: Sequence[float], theirs: Sequence[float]) -> list[float]:
+    """Return ours over theirs, turn by turn: a noisy neighbour disturbs all of a turn."""
+    return [mine / other for mine, other in zip(ours, theirs, strict=True)]
+
+
+def shown(found: Mapping[str, float], form: str = ".2f") -> str:
+    """Return a spread as text: the median, with the least and the largest in brackets."""
+    return f"{found['median']:{form}} ({found['low']:{form}} to {found['high']:{form}})"
+
+
+def write(path: Path | None, results: Any) -> None:
+    """Write results as JSON, if a file was named."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+
+
+def verdict(*, met: bool) -> int:
+    """Print whether the goals were met; return the exit status."""
+    print("goals met" if met else "GOAL MISSED")
+    return int(not met)
