@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from numpy.typing import NDArray
 
 KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
@@ -82,6 +82,3 @@ class ActionUnits:
         """Return actions in the robot's units, shape (n, actions)."""
         with torch.inference_mode():
             return self._after(torch.from_numpy(np.ascontiguousarray(actions, np.float32))).numpy()
-
-
-__all__ = ["ACTION", "ActionUnits", "FeatureStack", "Rows", "rows_of"]
