@@ -15,7 +15,7 @@ from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.training.rl.config import RewardConfig
-from bhd_lerobot.training.rl.features import ActionUnits, FeatureStack, rows_of
+from bhd_lerobot.training.rl.features import FeatureStack, in_units, rows_of
 from bhd_lerobot.training.rl.parts import RlParts
 
 Array = NDArray[np.float64]
@@ -111,7 +111,7 @@ class RlVecEnv(VecEnv):
         self.env = env
         self.stack = FeatureStack(parts.front, parts.before, env.num_envs)
         self.shaping = Shaping(reward, gamma, env.num_envs)
-        self._units = ActionUnits(parts.after)
+        self._after = parts.after
         size = env.single_action_space.shape[0]  # type: ignore[index]
         super().__init__(
             env.num_envs,
@@ -136,7 +136,7 @@ class RlVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Let one frame go by; return vectors, the learner's rewards, ends and infos."""
-        observation, reward, terminated, truncated, info = self.env.step(self._units(self._actions))
+        observation, reward, terminated, truncated, info = self.env.step(in_units(self._after, self._actions))
         self.stack.push(rows_of(observation))
         self._return += reward
         self._length += 1

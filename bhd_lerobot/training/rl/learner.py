@@ -6,6 +6,7 @@ The actor's modules are those of a `bhd_mlp`, so that exporting it is exact.
 import copy
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -230,25 +231,17 @@ def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv, done: Callable
         env: the environments.
         done: how much of the run is done after a step, from 0 to 1.
     """
-    ppo = config.ppo
-    log_std = ppo.log_std_init
+    options = asdict(config.ppo)
+    lr, schedule, log_std = (options.pop(name) for name in ("lr", "lr_schedule", "log_std_init"))
+    options["batch_size"] = min(options["batch_size"], options["n_steps"] * env.num_envs)
     if log_std is None:
         own = parts.actor.log_std
         log_std = 0.0 if own is None or parts.fresh else float(own.detach().mean())
     learner = AnchoredPPO(
         MlpActorCritic,
         env,
-        learning_rate=ppo.lr if ppo.lr_schedule == "constant" else lambda remaining: ppo.lr * remaining,
-        n_steps=ppo.n_steps,
-        batch_size=min(ppo.batch_size, ppo.n_steps * env.num_envs),
-        n_epochs=ppo.n_epochs,
-        gamma=ppo.gamma,
-        gae_lambda=ppo.gae_lambda,
-        clip_range=ppo.clip_range,
-        ent_coef=ppo.ent_coef,
-        vf_coef=ppo.vf_coef,
-        max_grad_norm=ppo.max_grad_norm,
-        target_kl=ppo.target_kl,
+        learning_rate=lr if schedule == "constant" else lambda remaining: lr * remaining,
+        **options,
         seed=config.seed,
         device="cpu",
         policy_kwargs={

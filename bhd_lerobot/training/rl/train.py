@@ -3,12 +3,12 @@
 import json
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -61,15 +61,12 @@ def require_sb3() -> None:
     Raises:
         ConfigError: it is not; the message says how to install it.
     """
-    # A module that is None in sys.modules is blocked, and find_spec raises ValueError for it.
     try:
-        found = find_spec("stable_baselines3") is not None
-    except ValueError:
-        found = False
-    if not found:
+        import stable_baselines3  # noqa: F401
+    except ImportError as error:
         raise ConfigError(
             f"Reinforcement learning needs stable-baselines3, which is not installed. {install_extra('rl')}"
-        )
+        ) from error
 
 
 def train(config: RlConfig, console: Console | None = None) -> RlResult:
@@ -111,21 +108,16 @@ def _run_folder(config: RlConfig) -> Path:
         config.output_dir = f"outputs/train/{datetime.now():%Y-%m-%d/%H-%M-%S}_ppo_{config.robot.type}"
     folder = Path(config.output_dir).expanduser()
     try:
-        is_there = folder.exists()
-    except OSError as error:  # a name that is too long
-        raise ConfigError(f"The run folder {folder} cannot be used: {error.strerror}. Set --output_dir.") from error
-    if is_there and not config.resume:
-        raise ConfigError(
-            f"The output folder {folder} exists. Set another --output_dir, or continue its run with "
-            f"--resume=true --config_path={quoted(folder)}."
-        )
-    if config.resume and not folder.is_dir():
-        raise ConfigError(f"There is no run to resume in {folder}.")
-    try:
+        if folder.exists() and not config.resume:
+            raise ConfigError(
+                f"The output folder {folder} exists. Set another --output_dir, or continue its run with "
+                f"--resume=true --config_path={quoted(folder)}."
+            )
+        if config.resume and not folder.is_dir():
+            raise ConfigError(f"There is no run to resume in {folder}.")
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / f".{CONFIG_NAME}.part").touch()
-        (folder / f".{CONFIG_NAME}.part").unlink()
-    except OSError as error:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:  # also a name that is too long
         raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
     return folder
 

@@ -25,7 +25,7 @@ from bhd_lerobot.training.rl import checkpoint
 from bhd_lerobot.training.rl import train as module
 from bhd_lerobot.training.rl.config import RlConfig, is_rl, parse_rl
 from bhd_lerobot.training.rl.environment import RlVecEnv
-from bhd_lerobot.training.rl.features import ActionUnits
+from bhd_lerobot.training.rl.features import in_units
 from bhd_lerobot.training.rl.learner import make_learner
 from bhd_lerobot.training.rl.parts import make_parts, single_action
 from bhd_lerobot.training.rl.train import RlResult, main, train
@@ -196,7 +196,7 @@ def test_the_exported_policy_does_what_the_learners_actor_does(tmp_path: Path, c
     env = BhdVectorEnv(4, config.environment, config.robot, config.task, autoreset_mode="Disabled", threads=1)
     parts = make_parts(config, env)
     adapter = RlVecEnv(env, parts, config.reward, 0.99)
-    stack, units = adapter.stack, ActionUnits(parts.after)
+    stack = adapter.stack
     learner = make_learner(config, parts, adapter, lambda step: 0.0)
     learner.learn(64, log_interval=2**60)
     assert any(len(p) and p.grad is not None for p in parts.actor.net.parameters())
@@ -210,7 +210,7 @@ def test_the_exported_policy_does_what_the_learners_actor_does(tmp_path: Path, c
         else:
             stack.push(state)
         mean, _ = learner.predict(stack.features(), deterministic=True)
-        wanted.append(units(mean))
+        wanted.append(in_units(parts.after, mean))
     env.close()
     np.testing.assert_allclose(actions(tmp_path, states), wanted, rtol=0, atol=TOLERANCE)
 
@@ -282,40 +282,34 @@ def test_without_stable_baselines3_the_message_says_how_to_install_it(
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ({"steps": 0}, "steps is 0; it must be at least 1"),
-        ({"steps": -5}, "steps is -5"),
-        ({"max_minutes": 0}, "max_minutes is 0"),
-        ({"env__n_envs": 0}, "env.n_envs is 0"),
-        ({"reward__events": "{colision: -1}"}, "Did you mean 'collision'"),
-        ({"reward__events": "{collision: .nan}"}, "must be a finite number"),
-        ({"reward__potential": "pose"}, "only a task with a target pose"),
-        ({"algorithm": "sac"}, "Valid: ppo"),
-        ({"validation__seed": 0}, "judged on the episodes"),
-        ({"critic_warmup": 10}, "needs --start_from"),
-        ({"robot__type": "ur5", "robot__beams": None}, "this task is for 'turtlebot3'"),
-        ({"ppo__gamma": 1.5}, "between 0 and 1"),
-        ({"ppo__learning_rate": 1.0}, "Unknown option 'ppo.learning_rate'"),
-        ({"resume": "true"}, "resume needs --output_dir"),
-        ({"ppo.ent_coef": ".nan"}, "ppo.ent_coef is nan"),
-        ({"ppo.vf_coef": -1}, "ppo.vf_coef is -1"),
-        ({"ppo.max_grad_norm": ".nan"}, "ppo.max_grad_norm is nan"),
-        ({"ppo.target_kl": -1}, "ppo.target_kl is -1"),
-        ({"ppo.log_std_init": ".nan"}, "ppo.log_std_init is nan"),
-        ({"reward.frame": ".nan"}, "reward.frame is nan"),
-        ({"reward.events": "{collision: .inf}"}, "reward.events.collision is inf"),
-        ({"reward.per_m": ".nan"}, "reward.per_m is nan"),
-        ({"anchor.coef": ".nan"}, "anchor.coef is nan"),
-        ({"policy.critic_dims": [0]}, "policy.critic_dims is 0"),
-        ({"policy.activation": "gelul"}, "Did you mean 'gelu'"),
-        ({"policy.n_obs_steps": 0}, "policy.n_obs_steps is 0"),
-    ],
-)
-def test_wrong_values_are_named(overrides: dict, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        parse_rl(options(**overrides))
+WRONG: list[tuple[dict[str, object], str]] = [
+    ({"steps": 0}, "steps is 0; it must be at least 1"),
+    ({"max_minutes": 0}, "max_minutes is 0"),
+    ({"env__n_envs": 0}, "env.n_envs is 0"),
+    ({"reward__events": "{colision: -1}"}, "Did you mean 'collision'"),
+    ({"reward__potential": "pose"}, "only a task with a target pose"),
+    ({"algorithm": "sac"}, "Valid: ppo"),
+    ({"validation__seed": 0}, "judged on the episodes"),
+    ({"critic_warmup": 10}, "needs --start_from"),
+    ({"robot__type": "ur5", "robot__beams": None}, "this task is for 'turtlebot3'"),
+    ({"ppo__gamma": 1.5}, "between 0 and 1"),
+    ({"ppo__learning_rate": 1.0}, "Unknown option 'ppo.learning_rate'"),
+    ({"resume": "true"}, "resume needs --output_dir"),
+    ({"ppo.ent_coef": ".nan"}, "ppo.ent_coef is nan"),
+    ({"ppo.target_kl": -1}, "ppo.target_kl is -1"),
+    ({"reward.frame": ".nan"}, "reward.frame is nan"),
+    ({"reward.events": "{collision: .inf}"}, "reward.events.collision is inf"),
+    ({"anchor.coef": ".nan"}, "anchor.coef is nan"),
+    ({"policy.critic_dims": [0]}, "policy.critic_dims is 0"),
+    ({"policy.activation": "gelul"}, "Did you mean 'gelu'"),
+    ({"policy.n_obs_steps": 0}, "policy.n_obs_steps is 0"),
+]
+
+
+def test_wrong_values_are_named() -> None:
+    for overrides, message in WRONG:
+        with pytest.raises(ConfigError, match=message):
+            parse_rl(options(**overrides))
 
 
 def test_a_checkpoint_of_another_robot_is_refused(finished: RlResult, tmp_path: Path) -> None:
