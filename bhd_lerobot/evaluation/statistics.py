@@ -7,15 +7,15 @@ seed, so that the same numbers give the same interval.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import binomtest, bootstrap
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
 _SEED = 0
-_BLOCK = 2_000_000  # indices drawn at a time: bounds the memory
+_BLOCK = 2_000_000  # values resampled at a time: bounds the memory
 
 
 @dataclass(frozen=True)
@@ -57,21 +57,16 @@ def wilson(successes: int, count: int, confidence: float = CONFIDENCE) -> Estima
         confidence: probability that the interval covers the truth.
 
     Raises:
-        ValueError: more successes than trials, or fewer than none.
+        ValueError: more successes than trials, fewer than none, or a confidence that is not between 0 and 1.
     """
     if not 0 <= successes <= count:
         raise ValueError(f"{successes} successes in {count} trials.")
+    if not 0 < confidence < 1:
+        raise ValueError(f"The confidence is {confidence}; it must be between 0 and 1.")
     if count == 0:
         return Estimate(math.nan, 0.0, 1.0)
-    z = _quantile(confidence)
-    share = successes / count
-    middle = share + z * z / (2 * count)
-    half = z * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    scale = 1 + z * z / count
-    # At the ends the formula is exact in real numbers only.
-    low = 0.0 if successes == 0 else (middle - half) / scale
-    high = 1.0 if successes == count else (middle + half) / scale
-    return Estimate(share, low, high)
+    interval = binomtest(successes, count).proportion_ci(confidence, method="wilson")
+    return Estimate(successes / count, float(interval.low), float(interval.high))
 
 
 def mean(values: ArrayLike, confidence: float = CONFIDENCE) -> Estimate:
@@ -81,7 +76,7 @@ def mean(values: ArrayLike, confidence: float = CONFIDENCE) -> Estimate:
         values: one for each episode, shape (episodes,).
         confidence: probability that the interval covers the truth, with enough episodes.
     """
-    return _bootstrap([values], lambda means: means[0], confidence)
+    return _bootstrap(np.positive, confidence, values)
 
 
 def mean_difference(values: ArrayLike, baseline: ArrayLike, confidence: float = CONFIDENCE) -> Estimate:
@@ -92,7 +87,7 @@ def mean_difference(values: ArrayLike, baseline: ArrayLike, confidence: float = 
         baseline: of the same episodes, in the same order.
         confidence: probability that the interval covers the truth, with enough episodes.
     """
-    return _bootstrap([values, baseline], lambda means: means[0] - means[1], confidence)
+    return _bootstrap(np.subtract, confidence, values, baseline)
 
 
 def ratio_of_means(values: ArrayLike, baseline: ArrayLike, confidence: float = CONFIDENCE) -> Estimate:
@@ -109,12 +104,10 @@ def ratio_of_means(values: ArrayLike, baseline: ArrayLike, confidence: float = C
     if np.size(baseline) == 0 or np.mean(np.asarray(baseline, float)) == 0:
         return Estimate(math.nan, math.nan, math.nan)
 
-    def ratio(means: NDArray[np.float64]) -> NDArray[np.float64]:
-        over = np.full(means.shape[1], math.inf)
-        np.divide(means[0], means[1], out=over, where=means[1] != 0)
-        return over
+    def ratio(over: NDArray[np.float64], under: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.divide(over, under, out=np.full_like(over, math.inf), where=under != 0)
 
-    return _bootstrap([values, baseline], ratio, confidence)
+    return _bootstrap(ratio, confidence, values, baseline)
 
 
 def rate_difference(successes: ArrayLike, baseline: ArrayLike, confidence: float = CONFIDENCE) -> Estimate:
@@ -156,10 +149,8 @@ def discordance(successes: ArrayLike, baseline: ArrayLike) -> Discordance:
     """
     one, two = _paired(np.asarray(successes, bool), np.asarray(baseline, bool))
     better, worse = int(np.sum(one & ~two)), int(np.sum(two & ~one))
-    total, fewer = better + worse, min(better, worse)
-    # Whole numbers until the end: a sum of floats would underflow after a thousand episodes.
-    tail = sum(math.comb(total, k) for k in range(fewer + 1))
-    return Discordance(better, worse, min(1.0, 2 * tail / 2**total))
+    total = better + worse
+    return Discordance(better, worse, float(binomtest(better, total).pvalue) if total else 1.0)
 
 
 def _correlation(both: int, only_one: int, only_two: int, neither: int) -> float:
@@ -173,27 +164,33 @@ def _correlation(both: int, only_one: int, only_two: int, neither: int) -> float
     return product / math.sqrt(margins)
 
 
-def _bootstrap(
-    samples: list[ArrayLike], statistic: Callable[[NDArray[np.float64]], NDArray[np.float64]], confidence: float
-) -> Estimate:
+def _bootstrap(statistic: Callable[..., NDArray[np.float64]], confidence: float, *samples: ArrayLike) -> Estimate:
     """Return a statistic of the means of paired samples with its percentile interval."""
-    values = np.array([np.asarray(sample, np.float64) for sample in _paired(*map(np.asarray, samples))])
-    count = values.shape[1]
+    values = _paired(*(np.asarray(sample, np.float64) for sample in samples))
+    count = len(values[0])
     if count == 0:
         return Estimate(math.nan, math.nan, math.nan)
-    estimate = float(statistic(values.mean(axis=1, keepdims=True))[0])
+
+    def of_means(*resamples: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
+        return statistic(*(np.mean(resample, axis=axis, keepdims=True) for resample in resamples)).squeeze(axis)
+
+    estimate = float(of_means(*values))
     if count == 1:  # resampling one episode would pretend that it is known exactly
         return Estimate(estimate, math.nan, math.nan)
-    rng = np.random.default_rng(_SEED)
-    means = np.empty((len(values), RESAMPLES))
-    block = max(1, _BLOCK // count)
-    for start in range(0, RESAMPLES, block):
-        picks = rng.integers(0, count, (min(block, RESAMPLES - start), count))
-        for row, sample in enumerate(values):
-            means[row, start : start + len(picks)] = sample[picks].mean(axis=1)
+    with np.errstate(invalid="ignore"):  # scipy's standard error, of infinite ratios
+        resampled = bootstrap(
+            values,
+            of_means,
+            n_resamples=RESAMPLES,
+            batch=max(1, _BLOCK // count),
+            vectorized=True,
+            paired=True,
+            method="percentile",
+            rng=_SEED,
+        )
+    # Not scipy's interval, which interpolates: between a number and infinity there is none.
     tail = (1 - confidence) / 2
-    # No interpolation: between a number and infinity there is none.
-    low, high = np.quantile(statistic(means), (tail, 1 - tail), method="nearest")
+    low, high = np.quantile(resampled.bootstrap_distribution, (tail, 1 - tail), method="nearest")
     return Estimate(estimate, float(low), float(high))
 
 
@@ -202,9 +199,3 @@ def _paired(*samples: NDArray) -> tuple[NDArray, ...]:
     if len(lengths) > 1:
         raise ValueError(f"Paired samples must have the same length; got {sorted(lengths)}.")
     return samples
-
-
-def _quantile(confidence: float) -> float:
-    if not 0 < confidence < 1:
-        raise ValueError(f"The confidence is {confidence}; it must be between 0 and 1.")
-    return NormalDist().inv_cdf(0.5 + confidence / 2)

@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,9 +44,6 @@ class TrainingParts:
 def save(config: BhdTrainConfig, step: int, parts: TrainingParts, loop: dict[str, Any], processes: int = 1) -> Path:
     """Write a checkpoint, point `last` at it, and return its folder.
 
-    It is built under another name and renamed when it is complete, so there is never half a checkpoint under a
-    checkpoint's name.
-
     Args:
         config: of the run.
         step: training steps that were done.
@@ -57,9 +56,7 @@ def save(config: BhdTrainConfig, step: int, parts: TrainingParts, loop: dict[str
     """
     assert config.output_dir is not None
     final = get_step_checkpoint_dir(Path(config.output_dir), config.steps, step)
-    part = final.with_name(f".{final.name}.part")
-    try:
-        shutil.rmtree(part, ignore_errors=True)
+    with writing(final) as part:
         save_checkpoint(
             part,
             step,
@@ -74,14 +71,6 @@ def save(config: BhdTrainConfig, step: int, parts: TrainingParts, loop: dict[str
         )
         parts.contract.save(part / PRETRAINED_MODEL_DIR)
         (part / TRAINING_STATE_DIR / LOOP_STATE).write_text(json.dumps(loop), encoding="utf-8")
-        _flush(part)
-        _rename(part, final)
-        _point(final)
-    except Exception as error:  # safetensors raises errors of its own for a full disk
-        shutil.rmtree(part, ignore_errors=True)
-        raise BhdError(
-            f"The checkpoint of step {step} cannot be written to {final.parent}: {error}. Those before it are intact."
-        ) from error
     return final
 
 
@@ -121,20 +110,44 @@ def resume_command(checkpoint: Path) -> str:
     return f"bhd-train --resume=true --config_path={quoted(last)}"
 
 
-def _rename(part: Path, final: Path) -> None:
-    old = final.with_name(f".{final.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if final.exists():  # a kill between the renaming and the link; `last` still points at one before
-        os.replace(final, old)
-    os.replace(part, final)
-    shutil.rmtree(old, ignore_errors=True)
+@contextmanager
+def writing(final: Path) -> Iterator[Path]:
+    """Give a new folder for a checkpoint; when it is complete, rename it and point `last` at it.
+
+    There is never half a checkpoint under a checkpoint's name.
+
+    Args:
+        final: the checkpoint's folder, named by its step.
+
+    Raises:
+        BhdError: it cannot be written; those before it are intact.
+    """
+    part, old = (final.with_name(f".{final.name}.{suffix}") for suffix in ("part", "old"))
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        yield part
+        _flush(part)
+        shutil.rmtree(old, ignore_errors=True)
+        if final.exists():  # a kill between the renaming and the link; `last` still points at one before
+            os.replace(final, old)
+        os.replace(part, final)
+        shutil.rmtree(old, ignore_errors=True)
+        point(final, LAST_CHECKPOINT_LINK)
+    except Exception as error:  # for a full disk, PyTorch and safetensors raise errors of their own
+        shutil.rmtree(part, ignore_errors=True)
+        raise BhdError(
+            f"The checkpoint of step {int(final.name)} cannot be written to {final.parent}: {error}. Those before it "
+            "are intact."
+        ) from error
 
 
-def _point(final: Path) -> None:
-    link = final.with_name(f".{LAST_CHECKPOINT_LINK}.part")
+def point(checkpoint: Path, name: str) -> None:
+    """Have a link beside a checkpoint, such as `last`, lead to it."""
+    link = checkpoint.with_name(f".{name}.part")
     link.unlink(missing_ok=True)
-    link.symlink_to(final.name)
-    os.replace(link, final.with_name(LAST_CHECKPOINT_LINK))
+    link.symlink_to(checkpoint.name)
+    os.replace(link, checkpoint.with_name(name))
 
 
 def _flush(folder: Path) -> None:

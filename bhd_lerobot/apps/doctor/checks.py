@@ -1,4 +1,7 @@
-"""The doctor's checks. Each looks at one thing and returns findings; where it looks can be given, for tests."""
+"""The doctor's checks, each of one thing, and the table of everything that they can find to be wrong.
+
+What a check reads can be given to it, for tests.
+"""
 
 import os
 import platform
@@ -7,6 +10,8 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from importlib import metadata
 from pathlib import Path
 
@@ -15,16 +20,20 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-from bhd_lerobot.apps.doctor.child import Outcome
-from bhd_lerobot.apps.doctor.findings import COMPLAINTS, Finding, complain, fine
-from bhd_lerobot.apps.doctor.latency_test import WakeUps
-from bhd_lerobot.realtime.privileges import GRANT_BANDWIDTH, Grant, real_interpreter
+from bhd_lerobot.apps.doctor.trials import Outcome
+from bhd_lerobot.realtime.privileges import (
+    GRANT_BANDWIDTH,
+    GRANT_LATENCY_FILE,
+    GRANT_RIGHTS,
+    Grant,
+    real_interpreter,
+)
 
 DISTRIBUTION = "lerobot_robot_bhd"
 ROBOTS = ("turtlebot3", "ur5")
 TELEOPERATORS = ("bhd_brain",)
 
-# Of the period, for the wake-up's p99. What is lost to waiting is lost to the tick, and it is jitter: speeds that are
+# Of the period, for the latency's p99. What is lost to waiting is lost to the tick, and it is jitter: speeds that are
 # differences over one period are wrong by as much. Beyond a half, a tick of a quarter of the period has no reserve.
 FINE_SHARE, LATE_SHARE = 0.10, 0.50
 
@@ -37,14 +46,281 @@ _DISK_SPEED = 20e6  # [B/s]
 _TRIAL = 32 * _MIB
 
 
+class Status(StrEnum):
+    """How bad it is."""
+
+    OK = "ok"
+    WARNING = "warning"
+    """It works, but later, slower or with something left out."""
+    PROBLEM = "problem"
+    """Something that a recording with the default options needs does not work."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check found. In the table ``{name}`` stands for a value.
+
+    Attributes:
+        check: the check.
+        status: how bad it is.
+        symptom: what a user notices; this and the next two are empty where all is well.
+        cause: why.
+        remedy: what to do.
+        found: what was measured or read.
+    """
+
+    check: str
+    status: Status
+    symptom: str = ""
+    cause: str = ""
+    remedy: str = ""
+    found: str = ""
+
+
+_W, _P = Status.WARNING, Status.PROBLEM
+_RIGHTS = GRANT_RIGHTS.replace("{rtprio}", "95")
+_REINSTALL = "`make venv` in the checkout, or `pip install -e .` there in the environment that you use"
+_SOFTWARE_GL = "`apt-get install libosmesa6` and `MUJOCO_GL=osmesa`; or another driver"
+_LATE = "{share} of the period passes before 99 % of the wake-ups: other load, a busy host, or rights that were refused"
+
+ROWS: dict[str, Finding] = {
+    "python": Finding(
+        "Python",
+        _P,
+        "packages cannot be installed or imported",
+        "Python {version} is not one of those supported, {asked}",
+        "make the environment with Python 3.12 or 3.13: `PYTHON=/path/to/python3.12 make test`",
+    ),
+    "package.missing": Finding(
+        "versions",
+        _P,
+        "imports fail, or LeRobot does not know our robots",
+        "`{name}` is not installed in this environment",
+        _REINSTALL,
+    ),
+    "package.version": Finding(
+        "versions",
+        _P,
+        "errors about arguments, attributes or types that there are not",
+        "`{name}` is {version}; asked for is {asked}",
+        _REINSTALL,
+    ),
+    "package.extra": Finding(
+        "versions",
+        _W,
+        "errors about arguments, attributes or types that there are not, where the extra {extra} is used",
+        "`{name}` is {version}; the extra {extra} asks for {asked}",
+        "nothing, if you do not use it; otherwise `pip install -e '.[{extra}]'` in the checkout",
+    ),
+    "plugins.error": Finding(
+        "plug-ins",
+        _P,
+        "every `lerobot-*` command fails",
+        "LeRobot cannot be imported: {error}",
+        "repair what the message names, or " + _REINSTALL,
+    ),
+    "plugins.missing": Finding(
+        "plug-ins",
+        _P,
+        "`--robot.type=turtlebot3` or `--teleop.type=bhd_brain` is an invalid choice for `lerobot-record`",
+        "LeRobot did not find {missing}: `lerobot_robot_bhd` is not installed, or its import failed. {error}",
+        _REINSTALL,
+    ),
+    "opengl.missing": Finding(
+        "OpenGL",
+        _W,
+        "no camera images, and no video of an episode",
+        "no OpenGL that renders without a display. {error}",
+        "`apt-get install libegl1 libgl1`, with and without a GPU; unset `MUJOCO_GL`; or leave the cameras off",
+    ),
+    "opengl.crash": Finding(
+        "OpenGL",
+        _P,
+        "a recording ends without a message, or hangs, as soon as an image is rendered",
+        "the OpenGL driver does not work: {error}",
+        _SOFTWARE_GL,
+    ),
+    "opengl.blank": Finding(
+        "OpenGL",
+        _P,
+        "all images are of one colour",
+        "the OpenGL driver {driver} renders nothing",
+        _SOFTWARE_GL,
+    ),
+    "ffmpeg": Finding(
+        "FFmpeg",
+        _P,
+        "no video of an episode; datasets with cameras can be neither written nor read",
+        "PyAV, which brings FFmpeg, cannot encode H.264: {error}",
+        "`pip install --force-reinstall av`",
+    ),
+    "scheduler.rights": Finding(
+        "scheduler",
+        _W,
+        "with `robot.clock = realtime` ticks are late as soon as anything else runs",
+        "this process may not use SCHED_FIFO",
+        _RIGHTS,
+    ),
+    "scheduler.bandwidth": Finding(
+        "scheduler",
+        _W,
+        "with `robot.clock = realtime` ticks are late as soon as anything else runs",
+        "this process has the right to SCHED_FIFO, and its control group or its container refuses",
+        GRANT_BANDWIDTH,
+    ),
+    "scheduler.error": Finding(
+        "scheduler",
+        _P,
+        "the real-time process does not start",
+        "a process that asks for real-time rights ends: {error}",
+        "check for a sandbox (seccomp) that kills, or a memory limit of the container that locked memory exceeds",
+    ),
+    "memory": Finding(
+        "memory lock",
+        _W,
+        "single ticks are late by milliseconds when memory is short",
+        "this process may not lock its memory",
+        _RIGHTS,
+    ),
+    "cpu latency": Finding(
+        "cpu latency",
+        _W,
+        "an idle machine wakes up later than a busy one",
+        "`/dev/cpu_dma_latency` cannot be held at 0, so processors sleep deeply",
+        GRANT_LATENCY_FILE,
+    ),
+    "kernel": Finding(
+        "kernel",
+        _W,
+        "rarely, under load, a tick is late by milliseconds",
+        "the kernel was not built with PREEMPT_RT",
+        "for a simulation, and where `--realtime` is content: nothing. For hardware: a kernel with PREEMPT_RT "
+        "(`apt-get install linux-image-rt-amd64`, `pro enable realtime-kernel`)",
+    ),
+    "throttling.off": Finding(
+        "RT throttling",
+        _W,
+        "a real-time process that hangs takes a processor until the machine is switched off",
+        "`kernel.sched_rt_runtime_us` is -1",
+        "`sysctl -w kernel.sched_rt_runtime_us=950000`",
+    ),
+    "throttling.low": Finding(
+        "RT throttling",
+        _W,
+        "the real-time process stands still for a part of every second, or is refused",
+        "real-time processes may use only {share} of a processor's time",
+        "`sysctl -w kernel.sched_rt_runtime_us=950000`",
+    ),
+    "clock": Finding(
+        "clock source",
+        _W,
+        "every reading of the clock takes microseconds, and ticks are late",
+        "the kernel measures time with {source}",
+        "the kernel parameter `clocksource=tsc`, if `dmesg` does not call the TSC unstable; in a virtual machine the "
+        "host's clock (`kvm-clock`)",
+    ),
+    "shm.missing": Finding(
+        "shared memory",
+        _P,
+        "`robot.clock = realtime` and LeRobot's data loader do not start",
+        "`/dev/shm` is missing, full or not writable: {error}",
+        "`mount -t tmpfs tmpfs /dev/shm`; remove what fills it; in a container: `--shm-size=1g`",
+    ),
+    "shm.small": Finding(
+        "shared memory",
+        _W,
+        "training ends with a bus error in a worker of the data loader",
+        "`/dev/shm` has {free} left",
+        "in a container: `--shm-size=1g`; or `--num_workers=0`",
+    ),
+    "disk.denied": Finding(
+        "disk",
+        _P,
+        "a recording cannot be saved",
+        "{folder} cannot be written: {error}",
+        "another `dataset.root`, or its permissions",
+    ),
+    "disk.full": Finding(
+        "disk",
+        _P,
+        "a recording ends with an error when an episode is saved",
+        "{folder} has {free} left",
+        "free some space, or another `dataset.root`",
+    ),
+    "disk.low": Finding(
+        "disk",
+        _W,
+        "a long recording with cameras may not fit",
+        "{folder} has {free} left",
+        "free some space, or another `dataset.root`",
+    ),
+    "disk.slow": Finding(
+        "disk",
+        _W,
+        "saving an episode takes long",
+        "{folder} takes {speed}, which a network file system may be",
+        "a `dataset.root` on a local disk; copy the dataset afterwards",
+    ),
+    "latency.late": Finding(
+        "latency test",
+        _W,
+        "at {rate} Hz a part of each period is lost to waiting",
+        _LATE,
+        "follow the remedies above; leave a processor free of other work; a lower `control_hz`",
+    ),
+    "latency.missed": Finding(
+        "latency test",
+        _P,
+        "at {rate} Hz ticks are missed: the robot stutters, and stops with a fault",
+        _LATE,
+        "follow the remedies above; leave a processor free of other work; a lower `control_hz`, or "
+        "`robot.clock = lockstep`",
+    ),
+    "latency.error": Finding(
+        "latency test",
+        _P,
+        "the latency cannot be measured",
+        "the measuring process ends: {error}",
+        "see the row of the scheduler",
+    ),
+}
+
+
+def markdown_table() -> str:
+    """Return the table of the documentation, with "…" for values."""
+    rows = ["| check | | symptom | cause | remedy |", "|---|---|---|---|---|"]
+    for one in ROWS.values():
+        texts = [re.sub(r"\{\w+\}", "…", text) for text in (one.symptom, one.cause, one.remedy)]
+        rows.append(f"| {one.check} | {one.status} | {' | '.join(texts)} |")
+    return "\n".join(rows) + "\n"
+
+
+def fine(check: str, found: str) -> Finding:
+    """Return the finding that all is well."""
+    return Finding(check, Status.OK, found=found)
+
+
+def wrong(key: str, found: str, **values: object) -> Finding:
+    """Return a finding of the table.
+
+    Args:
+        key: of `ROWS`.
+        found: what was measured or read.
+        values: for what stands in braces in its texts.
+    """
+    row = ROWS[key]
+    texts = {name: getattr(row, name).format(**values) for name in ("symptom", "cause", "remedy")}
+    return replace(row, found=found, **texts)
+
+
 def check_python(version: str = platform.python_version()) -> list[Finding]:
     """Check that Python is one of those that the package asks for."""
     try:
         asked = metadata.metadata(DISTRIBUTION)["Requires-Python"]
     except metadata.PackageNotFoundError:
-        return [complain("package.missing", "not installed", name=DISTRIBUTION)]
+        return [wrong("package.missing", "not installed", name=DISTRIBUTION)]
     if not SpecifierSet(asked).contains(version, prereleases=True):
-        return [complain("python", version, version=version, asked=asked)]
+        return [wrong("python", version, version=version, asked=asked)]
     return [fine("Python", f"{version} at {real_interpreter()}")]
 
 
@@ -60,87 +336,75 @@ def check_versions(
         version_of: returns the version of an installed package.
     """
     try:
-        extras = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
-        asked = {extra: _requirements(extra) for extra in ("", *extras)}
+        asked = _requirements()
     except metadata.PackageNotFoundError:
-        return [complain("package.missing", "not installed", name=DISTRIBUTION)]
-    findings = []
-    for name, wanted in asked[""].items():
-        try:
-            version = version_of(name)
-        except metadata.PackageNotFoundError:
-            findings.append(complain("package.missing", f"{name} is not installed", name=name))
-            continue
-        if not wanted.contains(version, prereleases=True):
-            values = {"name": name, "version": version, "asked": wanted}
-            findings.append(complain("package.version", f"{name} {version}", **values))
-        elif name in shown:
-            findings.append(fine("versions", f"{name} {version}, asked for is {wanted}"))
-    return findings + _check_extras({extra: asked[extra] for extra in extras}, asked[""], version_of)
-
-
-def _requirements(extra: str) -> dict[str, SpecifierSet]:
-    """Return which versions of which packages ours asks for on this machine: always, or with an extra of it.
-
-    A package may be named several times, as for an extra of its own; all of that holds at once.
-    """
-    asked: dict[str, SpecifierSet] = {}
-    for one in map(Requirement, metadata.requires(DISTRIBUTION) or []):
-        if one.marker is None or one.marker.evaluate({"extra": extra}):
-            name = canonicalize_name(one.name)
-            asked[name] = asked.get(name, SpecifierSet()) & one.specifier
-    return asked
-
-
-def _check_extras(
-    asked: dict[str, dict[str, SpecifierSet]], always: dict[str, SpecifierSet], version_of: Callable[[str], str]
-) -> list[Finding]:
+        return [wrong("package.missing", "not installed", name=DISTRIBUTION)]
     wanted: dict[tuple[str, SpecifierSet], list[str]] = {}
     for extra, packages in asked.items():
         for name, versions in packages.items():
-            if versions != always.get(name):
-                wanted.setdefault((name, versions), []).append(extra)
+            wanted.setdefault((name, versions), []).append(extra)
     findings = []
     for (name, versions), extras in wanted.items():
         try:
             version = version_of(name)
         except metadata.PackageNotFoundError:
-            continue  # nobody says which extras were asked for
-        known = not always.get(name, SpecifierSet()).contains(version, prereleases=True)  # a problem of its own
-        if not known and not versions.contains(version, prereleases=True):
-            values = {"name": name, "version": version, "asked": versions, "extra": ",".join(extras)}
-            findings.append(complain("package.extra", f"{name} {version}", **values))
+            if "" in extras:  # nobody says which of the others were asked for
+                findings.append(wrong("package.missing", f"{name} is not installed", name=name))
+            continue
+        values = {"name": name, "version": version, "asked": versions, "extra": ",".join(extras)}
+        if versions.contains(version, prereleases=True):
+            if "" in extras and name in shown:
+                findings.append(fine("versions", f"{name} {version}, asked for is {versions}"))
+        elif "" in extras:
+            findings.append(wrong("package.version", f"{name} {version}", **values))
+        elif asked[""].get(name, SpecifierSet()).contains(version, prereleases=True):  # or it is known already
+            findings.append(wrong("package.extra", f"{name} {version}", **values))
     return findings
 
 
+def _requirements() -> dict[str, dict[str, SpecifierSet]]:
+    """Return which versions of which packages ours asks for on this machine, by extra; always, for the extra "".
+
+    A package may be named several times, as for an extra of its own; all of that holds at once.
+    """
+    extras = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
+    asked: dict[str, dict[str, SpecifierSet]] = {extra: {} for extra in ("", *extras)}
+    for one in map(Requirement, metadata.requires(DISTRIBUTION) or []):
+        name = canonicalize_name(one.name)
+        for extra, packages in asked.items():
+            if one.marker is None or one.marker.evaluate({"extra": extra}):
+                packages[name] = packages.get(name, SpecifierSet()) & one.specifier
+    return asked
+
+
 def check_plugins(outcome: Outcome) -> list[Finding]:
-    """Judge what `doctor_child.list_plugins` found."""
+    """Judge what `trials.list_plugins` found."""
     if outcome.kind != "value":
-        return [complain("plugins.error", "LeRobot cannot be imported", error=_error(outcome))]
+        return [wrong("plugins.error", "LeRobot cannot be imported", error=_error(outcome))]
     known = outcome.value
     missing = [f"the robot {name}" for name in ROBOTS if name not in known["robots"]]
     missing += [f"the teleoperator {name}" for name in TELEOPERATORS if name not in known["teleoperators"]]
     if missing:
-        return [complain("plugins.missing", outcome.output, missing=", ".join(missing), error=outcome.output)]
+        return [wrong("plugins.missing", outcome.output, missing=", ".join(missing), error=outcome.output)]
     return [fine("plug-ins", f"LeRobot knows {', '.join((*ROBOTS, *TELEOPERATORS))}")]
 
 
 def check_opengl(outcome: Outcome) -> list[Finding]:
-    """Judge what became of `doctor_child.render`."""
+    """Judge what became of `trials.render`."""
     if outcome.kind in ("crash", "timeout"):
-        return [complain("opengl.crash", outcome.error, error=_error(outcome))]
+        return [wrong("opengl.crash", outcome.error, error=_error(outcome))]
     if outcome.kind == "error":
-        return [complain("opengl.missing", "no image", error=outcome.error)]
+        return [wrong("opengl.missing", "no image", error=outcome.error)]
     driver = outcome.value["driver"]
     if outcome.value["spread"] == 0:
-        return [complain("opengl.blank", driver, driver=driver)]
+        return [wrong("opengl.blank", driver, driver=driver)]
     return [fine("OpenGL", driver)]
 
 
 def check_ffmpeg(outcome: Outcome) -> list[Finding]:
-    """Judge what became of `doctor_child.encode`."""
+    """Judge what became of `trials.encode`."""
     if outcome.kind != "value" or outcome.value["bytes"] == 0:
-        return [complain("ffmpeg", "no video", error=_error(outcome) or "it wrote nothing")]
+        return [wrong("ffmpeg", "no video", error=_error(outcome) or "it wrote nothing")]
     found = outcome.value
     shared = "there, too" if found["shared"] else "not there, LeRobot uses PyAV"
     return [
@@ -149,19 +413,19 @@ def check_ffmpeg(outcome: Outcome) -> list[Finding]:
 
 
 def check_rights(outcome: Outcome) -> list[Finding]:
-    """Judge what `doctor_child.ask_rights` was granted."""
+    """Judge what `trials.ask_rights` was granted."""
     if outcome.kind != "value":
-        return [complain("scheduler.error", _error(outcome), error=_error(outcome))]
+        return [wrong("scheduler.error", _error(outcome), error=_error(outcome))]
     grants = {grant.name: grant for grant in (Grant(**fields) for fields in outcome.value)}
     keys = {
         "scheduler": "scheduler.bandwidth" if grants["scheduler"].remedy == GRANT_BANDWIDTH else "scheduler.rights",
         "memory lock": "memory",
-        "cpu latency": "latency",
+        "cpu latency": "cpu latency",
     }
     return [
-        fine(COMPLAINTS[key].check, grants[name].detail)
+        fine(ROWS[key].check, grants[name].detail)
         if grants[name].granted
-        else complain(key, grants[name].detail, python=real_interpreter())
+        else wrong(key, grants[name].detail, python=real_interpreter())
         for name, key in keys.items()
     ]
 
@@ -172,7 +436,7 @@ def check_kernel(release: str = platform.release(), version: str = platform.vers
     found = f"{release} {preemption.group() if preemption else '(no preemption)'}"
     if preemption and preemption.group() in ("PREEMPT_RT", "PREEMPT RT"):
         return [fine("kernel", found)]
-    return [complain("kernel", found)]
+    return [wrong("kernel", found)]
 
 
 def check_throttling(folder: Path = Path("/proc/sys/kernel")) -> list[Finding]:
@@ -180,12 +444,12 @@ def check_throttling(folder: Path = Path("/proc/sys/kernel")) -> list[Finding]:
     try:
         runtime, period = (int((folder / f"sched_rt_{name}_us").read_text()) for name in ("runtime", "period"))
     except (OSError, ValueError) as error:
-        return [fine("RT throttling", f"this kernel tells nothing ({error})")]
+        return [fine("RT throttling", f"this kernel does not say ({error})")]
     if runtime < 0:
-        return [complain("throttling.off", "off")]
+        return [wrong("throttling.off", "off")]
     share = runtime / period
     if share < 0.5:
-        return [complain("throttling.low", f"{share:.0%}", share=f"{share:.0%}")]
+        return [wrong("throttling.low", f"{share:.0%}", share=f"{share:.0%}")]
     return [fine("RT throttling", f"real-time processes may use {share:.0%}")]
 
 
@@ -195,10 +459,10 @@ def check_clock(folder: Path = Path("/sys/devices/system/clocksource/clocksource
         source = (folder / "current_clocksource").read_text().strip()
         others = (folder / "available_clocksource").read_text().split()
     except OSError as error:
-        return [fine("clock source", f"this kernel tells nothing ({error})")]
+        return [fine("clock source", f"this kernel does not say ({error})")]
     found = f"{source} (available: {', '.join(others)})"
     if source in _SLOW_CLOCKS:
-        return [complain("clock", found, source=source)]
+        return [wrong("clock", found, source=source)]
     return [fine("clock source", found)]
 
 
@@ -211,12 +475,12 @@ def check_shared_memory(
             os.posix_fallocate(file.fileno(), 0, _MIB)
         free = free_of(folder)
     except OSError as error:
-        return [complain("shm.missing", str(error), error=error.strerror or error)]
+        return [wrong("shm.missing", str(error), error=error.strerror or error)]
     found = f"{_size(free)} free"
     if free < _SHM_NEEDED:
-        return [complain("shm.missing", found, error=found)]
+        return [wrong("shm.missing", found, error=found)]
     if free < _SHM_ENOUGH:
-        return [complain("shm.small", found, free=_size(free))]
+        return [wrong("shm.small", found, free=_size(free))]
     return [fine("shared memory", found)]
 
 
@@ -238,7 +502,7 @@ def check_disk(
     try:
         free = free_of(folder)
         if free < _DISK_NEEDED:
-            return [complain("disk.full", f"{_size(free)} free", folder=folder, free=_size(free))]
+            return [wrong("disk.full", f"{_size(free)} free", folder=folder, free=_size(free))]
         with tempfile.NamedTemporaryFile(dir=folder, prefix=".bhd-doctor-") as file:
             block = os.urandom(_MIB)
             start = clock()
@@ -248,35 +512,35 @@ def check_disk(
             os.fsync(file.fileno())
             speed = _TRIAL / max(clock() - start, 1e-9)
     except OSError as error:
-        return [complain("disk.denied", str(folder), folder=folder, error=error.strerror or error)]
+        return [wrong("disk.denied", str(folder), folder=folder, error=error.strerror or error)]
     found = f"{_size(free)} free at {folder}, {speed / 1e6:.0f} MB/s"
     findings = []
     if free < _DISK_ENOUGH:
-        findings.append(complain("disk.low", found, folder=folder, free=_size(free)))
+        findings.append(wrong("disk.low", found, folder=folder, free=_size(free)))
     if speed < _DISK_SPEED:
-        findings.append(complain("disk.slow", found, folder=folder, speed=f"{speed / 1e6:.0f} MB/s"))
+        findings.append(wrong("disk.slow", found, folder=folder, speed=f"{speed / 1e6:.0f} MB/s"))
     return findings or [fine("disk", found)]
 
 
-def check_wakeups(outcome: Outcome, robots: dict[str, int]) -> list[Finding]:
+def check_latency(outcome: Outcome, robots: dict[str, int]) -> list[Finding]:
     """Compare a measurement with what robots need.
 
     Args:
-        outcome: what became of `wakeup.measure`.
+        outcome: what became of `latency_test.measure`.
         robots: control rate of each [Hz].
     """
     if outcome.kind != "value":
-        return [complain("wakeup.error", _error(outcome), error=_error(outcome))]
-    measured: WakeUps = outcome.value[0]
+        return [wrong("latency.error", _error(outcome), error=_error(outcome))]
+    p99 = outcome.value["p99"]
     findings = []
     for robot, rate in robots.items():
-        share = measured.p99 * rate
-        found = f"{robot}, {rate} Hz: p99 {measured.p99 * 1e6:.0f} µs is {share:.1%} of {1e3 / rate:g} ms"
+        share = p99 * rate
+        found = f"{robot}, {rate} Hz: p99 {p99 * 1e6:.0f} µs is {share:.1%} of {1e3 / rate:g} ms"
         if share < FINE_SHARE:
-            findings.append(fine("wake-up", found))
+            findings.append(fine("latency test", found))
         else:
-            key = "wakeup.late" if share < LATE_SHARE else "wakeup.missed"
-            findings.append(complain(key, found, rate=rate, share=f"{share:.0%}"))
+            key = "latency.late" if share < LATE_SHARE else "latency.missed"
+            findings.append(wrong(key, found, rate=rate, share=f"{share:.0%}"))
     return findings
 
 

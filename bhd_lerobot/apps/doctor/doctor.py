@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,16 +12,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bhd_lerobot.apps.doctor import checks, child
-from bhd_lerobot.apps.doctor.findings import Finding, Status
-from bhd_lerobot.apps.doctor.latency_test import BINS_US, WakeUps, measure
-from bhd_lerobot.errors import BhdError, ConfigError
-from bhd_lerobot.realtime.privileges import RealtimeSettings
+from bhd_lerobot.apps.doctor import checks
+from bhd_lerobot.apps.doctor.checks import Finding, Status
+from bhd_lerobot.apps.doctor.trials import TIMEOUT_S, Outcome, run_trials
+from bhd_lerobot.errors import ConfigError
 
 _LEAST_POINTS = 1000  # or the 99th percentile rests on fewer than ten wake-ups
 _COLOURS = {Status.OK: "green", Status.WARNING: "yellow", Status.PROBLEM: "red"}
 
-RunChild = Callable[..., child.Outcome]
+RunTrials = Callable[[Sequence[Sequence[Any]], float], list[Outcome]]
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -31,30 +30,33 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument("--root", type=Path, help="folder for datasets, whose disk is checked; LeRobot's by default")
-    parser.add_argument("--realtime", action="store_true", help="measure how late a real-time process wakes up, too")
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of the measurement [s] (default: 10)")
+    parser.add_argument("--realtime", action="store_true", help="latency test: how late a real-time process wakes up")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of the latency test [s] (default: 10)")
     parser.add_argument("--rate", type=int, default=1000, help="wake-ups a second [Hz] (default: 1000)")
     return parser
 
 
-def examine(root: Path, run_child: RunChild = child.run_child) -> Iterator[Finding]:
-    """Yield what every check finds, one check after the other, so that none disturbs another.
+def examine(root: Path, run: RunTrials = run_trials) -> list[Finding]:
+    """Return what every check finds.
 
     Args:
         root: folder for datasets.
-        run_child: how to try something out in a process of its own.
+        run: how to try something out in a process of its own.
     """
-    yield from checks.check_python()
-    yield from checks.check_versions()
-    yield from checks.check_plugins(run_child(child.list_plugins))
-    yield from checks.check_opengl(run_child(child.render, timeout_s=60.0))
-    yield from checks.check_ffmpeg(run_child(child.encode, timeout_s=60.0))
-    yield from checks.check_rights(run_child(child.ask_rights, RealtimeSettings(), timeout_s=60.0))
-    yield from checks.check_kernel()
-    yield from checks.check_throttling()
-    yield from checks.check_clock()
-    yield from checks.check_shared_memory()
-    yield from checks.check_disk(root)
+    rights, ffmpeg, opengl, plugins = run([["rights"], ["ffmpeg"], ["opengl"], ["plug-ins"]], TIMEOUT_S)
+    return [
+        *checks.check_python(),
+        *checks.check_versions(),
+        *checks.check_plugins(plugins),
+        *checks.check_opengl(opengl),
+        *checks.check_ffmpeg(ffmpeg),
+        *checks.check_rights(rights),
+        *checks.check_kernel(),
+        *checks.check_throttling(),
+        *checks.check_clock(),
+        *checks.check_shared_memory(),
+        *checks.check_disk(root),
+    ]
 
 
 def robot_rates() -> dict[str, int]:
@@ -65,20 +67,8 @@ def robot_rates() -> dict[str, int]:
     return {"turtlebot3": turtlebot3_burger().control_hz, "ur5": ur5().control_hz}
 
 
-def measure_wakeups(rate: int, seconds: float, run_child: RunChild = child.run_child) -> child.Outcome:
-    """Measure in a spawned process how late a real-time process wakes up.
-
-    Args:
-        rate: wake-ups a second [Hz].
-        seconds: length of the measurement [s].
-        run_child: how to run it in a process of its own.
-
-    Returns:
-        Its value, if it has one, is a `WakeUps` and the list of grants.
-
-    Raises:
-        ConfigError: a value is out of range, or there would be too few wake-ups to tell a 99th percentile.
-    """
+def _check_options(rate: int, seconds: float) -> None:
+    """Raise a `ConfigError` if a value is out of range, or there would be too few wake-ups for a 99th percentile."""
     if not 10 <= rate <= 10_000:
         raise ConfigError(f"--rate is {rate} Hz; it must be from 10 to 10000.")
     if not 0 < seconds <= 600:
@@ -88,7 +78,6 @@ def measure_wakeups(rate: int, seconds: float, run_child: RunChild = child.run_c
             f"{seconds:g} s at {rate} Hz are {rate * seconds:.0f} wake-ups; a 99th percentile needs "
             f"{_LEAST_POINTS}: --seconds={_LEAST_POINTS / rate:g} or more."
         )
-    return run_child(measure, RealtimeSettings(), rate, seconds, timeout_s=seconds + 60.0)
 
 
 def _findings_table(findings: Sequence[Finding]) -> Table:
@@ -100,7 +89,7 @@ def _findings_table(findings: Sequence[Finding]) -> Table:
     return table
 
 
-def _print_complaints(findings: Sequence[Finding], console: Console) -> None:
+def _print_remedies(findings: Sequence[Finding], console: Console) -> None:
     """Print what is wrong as lines that are not broken, so that a command can be copied from them."""
     for one in findings:
         if one.status is not Status.OK:
@@ -109,21 +98,22 @@ def _print_complaints(findings: Sequence[Finding], console: Console) -> None:
                 console.print(f"  {heading:<8} {escape(text)}", highlight=False, soft_wrap=True)
 
 
-def _print_wakeups(wakeups: WakeUps, console: Console) -> None:
+def _print_latency(measured: dict[str, Any], console: Console) -> None:
+    p50, p99, longest = (f"{measured[key] * 1e6:.0f} µs" for key in ("p50", "p99", "max"))
     console.print(
-        f"Wake-up latency over {wakeups.points} points at {wakeups.rate} Hz: p50 {wakeups.p50 * 1e6:.0f} µs, "
-        f"p99 {wakeups.p99 * 1e6:.0f} µs, max {wakeups.max * 1e6:.0f} µs; missed {wakeups.missed} points. "
-        "Measured now, on this load; no promise.",
+        f"Wake-up latency over {measured['points']} points at {measured['rate']} Hz: p50 {p50}, p99 {p99}, "
+        f"max {longest}; missed {measured['missed']} points. Measured now, on this load; no promise.",
         highlight=False,
     )
-    most = max(wakeups.histogram)
-    for upper, count in zip([*(f"≤ {edge} µs" for edge in BINS_US), "later"], wakeups.histogram, strict=True):
+    most = max(measured["histogram"])
+    edges = [*(f"≤ {edge} µs" for edge in measured["bins_us"]), "later"]
+    for upper, count in zip(edges, measured["histogram"], strict=True):
         # Any wake-up is to be seen, be it one in a million.
         bar = "█" * max(round(40 * count / most), int(count > 0))
         console.print(f"{upper:>10} {count:>8} {bar}", highlight=False)
 
 
-def main(arguments: Sequence[str] | None = None, run_child: RunChild = child.run_child) -> int:
+def main(arguments: Sequence[str] | None = None, run: RunTrials = run_trials) -> int:
     """Run `bhd-doctor`; return the exit status: 0, 1 if there is a problem, 2 for wrong options."""
     options = _parser().parse_args(arguments)
     root = options.root.expanduser() if options.root else None
@@ -131,28 +121,28 @@ def main(arguments: Sequence[str] | None = None, run_child: RunChild = child.run
         from bhd_lerobot.datasets.format.identity import default_root
 
         root = default_root("bhd/doctor").parents[1]
-    console = Console()
-    wakeups: dict[str, Any] | None = None
-    try:
-        with Console(stderr=True).status("Looking at this machine; half a minute …"):
+    console, measured = Console(), None
+    with Console(stderr=True).status("Checking this machine; half a minute …"):
+        if options.realtime:
+            try:
+                _check_options(options.rate, options.seconds)
+            except ConfigError as error:
+                print(f"error: {error}", file=sys.stderr)
+                return 2
             # First, while nothing else goes on.
-            outcome = measure_wakeups(options.rate, options.seconds, run_child) if options.realtime else None
-            findings = list(examine(root, run_child))
-    except BhdError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    if outcome is not None:
-        findings += checks.check_wakeups(outcome, robot_rates())
-        if outcome.kind == "value":
-            wakeups = {**asdict(outcome.value[0]), "bins_us": BINS_US, "grants": outcome.value[1]}
+            [tested] = run([["latency test", options.rate, options.seconds]], options.seconds + 60.0)
+            measured = tested.value
+        findings = examine(root, run)
+        if options.realtime:
+            findings += checks.check_latency(tested, robot_rates())
     if options.json:
-        report = {"findings": [one.as_dict() for one in findings], "wakeups": wakeups}
+        report = {"findings": [asdict(one) for one in findings], "latency_test": measured}
         print(json.dumps(report, indent=1, ensure_ascii=False))
     else:
         console.print(_findings_table(findings))
-        if outcome is not None and outcome.kind == "value":
-            _print_wakeups(outcome.value[0], console)
-        _print_complaints(findings, console)
+        if measured is not None:
+            _print_latency(measured, console)
+        _print_remedies(findings, console)
     return int(any(one.status is Status.PROBLEM for one in findings))
 
 

@@ -5,7 +5,7 @@ A real-time process imports this: neither torch nor LeRobot, and no MuJoCo.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ _WARM_UP = 50  # points of the grid, not counted: the first passes touch memory 
 
 
 @dataclass(frozen=True)
-class WakeUps:
+class Latency:
     """What was measured. Lateness is the time from a point of the grid to the wake-up.
 
     Attributes:
@@ -70,7 +70,7 @@ def walk_grid(
     return woken
 
 
-def summarise(lateness: NDArray[np.int64], rate: int, points: int) -> WakeUps:
+def summarise(lateness: NDArray[np.int64], rate: int, points: int) -> Latency:
     """Return what a walk along a grid has shown.
 
     Args:
@@ -80,7 +80,7 @@ def summarise(lateness: NDArray[np.int64], rate: int, points: int) -> WakeUps:
     """
     p50, p99 = np.quantile(lateness, (0.50, 0.99), method="inverted_cdf") / 1e9
     bins = np.searchsorted(np.array(BINS_US) * 1_000, lateness, side="left")
-    return WakeUps(
+    return Latency(
         rate=rate,
         points=points,
         missed=points - len(lateness),
@@ -91,24 +91,21 @@ def summarise(lateness: NDArray[np.int64], rate: int, points: int) -> WakeUps:
     )
 
 
-def measure(settings: RealtimeSettings, rate: int, seconds: float) -> tuple[WakeUps, list[dict[str, Any]]]:
-    """Measure in this process, with what it is granted of the settings.
+def measure(rate: int, seconds: float) -> dict[str, Any]:
+    """Measure in this process, with what it is granted of what the real-time cerebellum asks for.
 
     Args:
-        settings: what to ask for.
         rate: points of the grid a second [Hz].
         seconds: length of the measurement [s].
 
     Returns:
-        What was measured, and what became of each request.
-
-    Raises:
-        RealtimeError: SCHED_FIFO is refused and required.
+        The fields of a `Latency`; `bins_us`, the edges of its histogram; `grants`, what became of each request.
     """
     lateness = np.zeros(max(1, round(rate * seconds)), np.int64)
     period_ns = round(1e9 / rate)
     with Privileges() as privileges:
-        grants = privileges.acquire(settings)
+        grants = privileges.acquire(RealtimeSettings())
         walk_grid(lateness[:_WARM_UP].copy(), period_ns, time.monotonic_ns, time.sleep)
         woken = walk_grid(lateness, period_ns, time.monotonic_ns, time.sleep)
-    return summarise(lateness[:woken], rate, len(lateness)), [grant.as_dict() for grant in grants]
+    measured = asdict(summarise(lateness[:woken], rate, len(lateness)))
+    return {**measured, "bins_us": BINS_US, "grants": [grant.as_dict() for grant in grants]}

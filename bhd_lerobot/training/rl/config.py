@@ -1,33 +1,217 @@
 """Configuration of reinforcement learning, and how `bhd-train` recognises it."""
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.envs.register import ENVIRONMENTS
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.policies.brain import BrainConfig
+from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
 from bhd_lerobot.rollout import configuration
 from bhd_lerobot.rollout.registry import robot_of_task
-from bhd_lerobot.tasks.task import TaskConfig
-from bhd_lerobot.training.rl.sections import (
-    EVENTS,
-    POTENTIALS,
-    SCHEDULES,
-    SELECTIONS,
-    AnchorConfig,
-    PpoConfig,
-    RewardConfig,
-    RlEnvConfig,
-    RlPolicyConfig,
-    ValidationConfig,
+from bhd_lerobot.tasks.task import Event, TaskConfig
+
+CONFIG_NAME = "config.yaml"
+
+_CHOICES = {
+    "algorithm": ("ppo",),
+    "ppo.lr_schedule": ("linear", "constant"),
+    "reward.potential": ("none", "pose"),
+    "validation.select": ("score", "success", "return"),
+}
+_EVENTS = tuple(event.cause for event in Event if event != Event.NOTHING)
+_LEAST = {
+    "steps": 1,
+    "env.n_envs": 1,
+    "env.threads": 1,
+    "threads": 1,
+    "ppo.n_steps": 2,
+    "ppo.batch_size": 2,
+    "ppo.n_epochs": 1,
+    "validation.freq": 1,
+    "validation.n_episodes": 1,
+    "validation.n_envs": 1,
+    "validation.seed": 0,
+    "anchor.batch_size": 1,
+    "critic_warmup": 0,
+    "start_action": 0,
+    "seed": 0,
+    "policy.critic_dims": 1,
+}
+# What numbers must be, and which of them.
+_RANGES = (
+    ("between 0 and 1", lambda number: 0 <= number <= 1, ("ppo.gamma", "ppo.gae_lambda")),
+    (
+        "positive and finite",
+        lambda number: 0 < number < math.inf,
+        ("ppo.lr", "ppo.clip_range", "ppo.max_grad_norm", "ppo.target_kl", "reward.scale", "max_minutes"),
+    ),
+    (
+        "0 or positive, and finite",
+        lambda number: 0 <= number < math.inf,
+        ("ppo.ent_coef", "ppo.vf_coef", "reward.per_m", "reward.per_rad", "anchor.coef"),
+    ),
+    ("a finite number", math.isfinite, ("ppo.log_std_init", "reward.frame")),
 )
 
-ALGORITHMS = ("ppo",)
-CONFIG_NAME = "config.yaml"
+
+@dataclass
+class RlEnvConfig:
+    """The environments that are learned in.
+
+    Attributes:
+        n_envs: how many run side by side.
+        threads: threads that step the physics; all processors if nothing.
+    """
+
+    n_envs: int = 64
+    threads: int | None = None
+
+
+@dataclass
+class RlPolicyConfig:
+    """The actor, a `bhd_mlp`; with `start_from` the checkpoint decides, and all of this but `critic_dims` is ignored.
+
+    Attributes:
+        n_obs_steps: observations that it looks at.
+        obs_stride: frames from each of them to the next.
+        hidden_dims: widths of the hidden layers.
+        activation: one of bhd_mlp's.
+        layer_norm: normalise each hidden layer before its activation.
+        feature_clip: normalised inputs beyond ± this count as this; nothing turns it off.
+        scan: how a range finder's beams become inputs.
+        critic_dims: widths of the critic's hidden layers.
+    """
+
+    n_obs_steps: int = 1
+    obs_stride: int = 1
+    hidden_dims: list[int] = field(default_factory=lambda: [256, 256])
+    activation: str = "tanh"
+    layer_norm: bool = False
+    feature_clip: float | None = 10.0
+    scan: ScanConfig = field(default_factory=ScanConfig)
+    critic_dims: list[int] = field(default_factory=lambda: [256, 256])
+
+    def actor(self) -> MlpConfig:
+        """Return the configuration of an actor that begins from nothing.
+
+        Raises:
+            ConfigError: a value that a `bhd_mlp` cannot have.
+        """
+        return MlpConfig(
+            n_obs_steps=self.n_obs_steps,
+            obs_stride=self.obs_stride,
+            chunk_size=1,
+            n_action_steps=1,
+            hidden_dims=list(self.hidden_dims),
+            activation=self.activation,
+            layer_norm=self.layer_norm,
+            feature_clip=self.feature_clip,
+            gaussian=True,
+            scan=copy.deepcopy(self.scan),
+            device="cpu",
+            push_to_hub=False,
+        )
+
+
+@dataclass
+class PpoConfig:
+    """Proximal policy optimisation; the names are those of stable-baselines3.
+
+    Attributes:
+        n_steps: frames of each environment between two updates.
+        batch_size: samples of a gradient step.
+        n_epochs: passes over the samples of an update.
+        gamma: discount of a frame.
+        gae_lambda: of the generalised advantage estimate.
+        clip_range: by how much an update may change an action's probability, as a share.
+        ent_coef: weight of the entropy.
+        vf_coef: weight of the critic's loss.
+        max_grad_norm: largest norm of the gradient.
+        lr: learning rate of Adam.
+        lr_schedule: ``"linear"``: to 0 over the training; ``"constant"``.
+        target_kl: an update ends when the policy has changed by 1.5 times this; nothing turns it off.
+        log_std_init: logarithm of the exploration noise, in normalised actions; the checkpoint's own, or 0, if nothing.
+    """
+
+    n_steps: int = 64
+    batch_size: int = 1024
+    n_epochs: int = 5
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_range: float = 0.2
+    ent_coef: float = 0.0
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+    lr: float = 3e-4
+    lr_schedule: str = "linear"
+    target_kl: float | None = None
+    log_std_init: float | None = None
+
+
+@dataclass
+class RewardConfig:
+    """What the learner gets for what the task gives; what is reported is always the task's own reward.
+
+    Attributes:
+        scale: factor on the task's reward.
+        events: added in the frame that ends with an event, by its name: negative for a failure, positive for a success.
+        frame: added in every frame.
+        potential: ``"pose"``: potential-based shaping, which leaves the best policy as it is: gamma times the potential
+            of the new state minus that of the old one; the potential is minus the distance of the tool from the target
+            pose; ``"none"``.
+        per_m: weight of the distance in that potential [1/m].
+        per_rad: weight of the angle in that potential [1/rad].
+    """
+
+    scale: float = 1.0
+    events: dict[str, float] = field(default_factory=dict)
+    frame: float = 0.0
+    potential: str = "none"
+    per_m: float = 2.0
+    per_rad: float = 0.5
+
+
+@dataclass
+class ValidationConfig:
+    """Episodes that judge the policy on the way. They are neither those of the training nor any held-out ones.
+
+    Attributes:
+        freq: environment steps between two validations.
+        n_episodes: how many episodes.
+        n_envs: how many run side by side.
+        seed: run seed of these episodes, of the split `train`; another than the training's.
+        select: what makes a checkpoint the best: ``"score"``, ``"success"`` or ``"return"``.
+        rule: a brain whose level is drawn beside the curve; also what normalisation is estimated from. None if nothing.
+    """
+
+    freq: int = 200_000
+    n_episodes: int = 64
+    n_envs: int = 64
+    seed: int = 777_001
+    select: str = "score"
+    rule: BrainConfig | None = None
+
+
+@dataclass
+class AnchorConfig:
+    """What keeps the actor near the checkpoint that it started from.
+
+    Attributes:
+        coef: weight of the KL divergence from the checkpoint's policy; 0 turns it off.
+        batch_size: samples of a gradient step.
+        decay: whether the weight falls to 0 over the training.
+    """
+
+    coef: float = 0.0
+    batch_size: int = 4096
+    decay: bool = True
 
 
 @dataclass
@@ -112,74 +296,33 @@ class RlConfig:
         return next(name for name, pair in ENVIRONMENTS.items() if pair == (self.robot.type, task))
 
     def _check_names(self) -> None:
-        for name, value, valid in (
-            ("algorithm", self.algorithm, ALGORITHMS),
-            ("ppo.lr_schedule", self.ppo.lr_schedule, SCHEDULES),
-            ("reward.potential", self.reward.potential, POTENTIALS),
-            ("validation.select", self.validation.select, SELECTIONS),
-            *(("event in reward.events", event, EVENTS) for event in self.reward.events),
-        ):
-            if value not in valid:
-                raise ConfigError(unknown_name(name, value, valid))
+        for name, valid in _CHOICES.items():
+            if attrgetter(name)(self) not in valid:
+                raise ConfigError(unknown_name(name, attrgetter(name)(self), valid))
+        for event in self.reward.events:
+            if event not in _EVENTS:
+                raise ConfigError(unknown_name("event in reward.events", event, _EVENTS))
         if self.reward.potential == "pose" and "ur5" not in self.robot.type:
             raise ConfigError("reward.potential is 'pose'; only a task with a target pose of the tool has it (reach).")
 
     def _check_numbers(self) -> None:
-        ppo, validation = self.ppo, self.validation
-        for name, value, least in (
-            ("steps", self.steps, 1),
-            ("env.n_envs", self.env.n_envs, 1),
-            ("env.threads", 1 if self.env.threads is None else self.env.threads, 1),
-            ("threads", 1 if self.threads is None else self.threads, 1),
-            ("ppo.n_steps", ppo.n_steps, 2),
-            ("ppo.batch_size", ppo.batch_size, 2),
-            ("ppo.n_epochs", ppo.n_epochs, 1),
-            ("validation.freq", validation.freq, 1),
-            ("validation.n_episodes", validation.n_episodes, 1),
-            ("validation.n_envs", validation.n_envs, 1),
-            ("validation.seed", validation.seed, 0),
-            ("anchor.batch_size", self.anchor.batch_size, 1),
-            ("critic_warmup", self.critic_warmup, 0),
-            ("start_action", self.start_action, 0),
-            ("seed", self.seed, 0),
-            *(("policy.critic_dims", width, 1) for width in self.policy.critic_dims),
-        ):
-            if value < least:
-                raise ConfigError(f"{name} is {value}; it must be at least {least}.")
-        for name, number in (("ppo.gamma", ppo.gamma), ("ppo.gae_lambda", ppo.gae_lambda)):
-            if not 0 <= number <= 1:
-                raise ConfigError(f"{name} is {number}; it must be between 0 and 1.")
-        for name, number in (
-            ("ppo.lr", ppo.lr),
-            ("ppo.clip_range", ppo.clip_range),
-            ("ppo.max_grad_norm", ppo.max_grad_norm),
-            ("ppo.target_kl", 1.0 if ppo.target_kl is None else ppo.target_kl),
-            ("reward.scale", self.reward.scale),
-        ):
-            if not 0 < number < math.inf:
-                raise ConfigError(f"{name} is {number}; it must be positive and finite.")
-        for name, number in (
-            ("ppo.ent_coef", ppo.ent_coef),
-            ("ppo.vf_coef", ppo.vf_coef),
-            ("reward.per_m", self.reward.per_m),
-            ("reward.per_rad", self.reward.per_rad),
-            ("anchor.coef", self.anchor.coef),
-        ):
-            if not 0 <= number < math.inf:
-                raise ConfigError(f"{name} is {number}; it must be 0 or positive, and finite.")
-        for name, number in (
-            ("ppo.log_std_init", ppo.log_std_init or 0.0),
-            ("reward.frame", self.reward.frame),
-            *((f"reward.events.{event}", number) for event, number in self.reward.events.items()),
-        ):
+        for name, least in _LEAST.items():
+            value = attrgetter(name)(self)
+            for number in value if isinstance(value, list) else [value]:
+                if number is not None and number < least:
+                    raise ConfigError(f"{name} is {number}; it must be at least {least}.")
+        for what, is_valid, names in _RANGES:
+            for name in names:
+                number = attrgetter(name)(self)
+                if number is not None and not is_valid(number):
+                    raise ConfigError(f"{name} is {number}; it must be {what}.")
+        for event, number in self.reward.events.items():
             if not math.isfinite(number):
-                raise ConfigError(f"{name} is {number}; it must be a finite number.")
-        if self.max_minutes is not None and not self.max_minutes > 0:
-            raise ConfigError(f"max_minutes is {self.max_minutes}; it must be positive.")
+                raise ConfigError(f"reward.events.{event} is {number}; it must be a finite number.")
 
 
 def is_rl(arguments: Sequence[str]) -> bool:
-    """Tell whether a command line of `bhd-train` asks for reinforcement learning: `algorithm` is set in it.
+    """Return whether a command line of `bhd-train` asks for reinforcement learning: `algorithm` is set in it.
 
     What is wrong with the command line is left to the parser that reads it next.
     """
@@ -209,11 +352,6 @@ def parse_rl(arguments: Sequence[str]) -> RlConfig:
         for one in arguments
     ]
     return configuration.parse(RlConfig, found)
-
-
-def encode(config: RlConfig) -> dict[str, Any]:
-    """Return a configuration as plain values."""
-    return configuration.encode(config)
 
 
 def _config_file(path: Path) -> Path:

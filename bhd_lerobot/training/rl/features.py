@@ -4,18 +4,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from numpy.typing import NDArray
 
-KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
-"""Names of an environment's observations, and LeRobot's names of them."""
+_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
 
 Rows = dict[str, NDArray[np.float32]]
 
 
 def rows_of(observation: dict[str, Any]) -> Rows:
     """Return an environment's observation, by LeRobot's names, each of shape (n, width)."""
-    return {key: observation[name] for name, key in KEYS.items() if name in observation}
+    return {key: observation[name] for name, key in _KEYS.items() if name in observation}
 
 
 class FeatureStack:
@@ -72,16 +71,7 @@ class FeatureStack:
             return self._front.features(self._before(batch)).numpy()
 
 
-class ActionUnits:
-    """Gives normalised actions the robot's units, by the policy's own postprocessor."""
-
-    def __init__(self, after: Any) -> None:
-        self._after = after
-
-    def __call__(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions in the robot's units, shape (n, actions)."""
-        with torch.inference_mode():
-            return self._after(torch.from_numpy(np.ascontiguousarray(actions, np.float32))).numpy()
-
-
-__all__ = ["ACTION", "ActionUnits", "FeatureStack", "Rows", "rows_of"]
+def in_units(after: Any, actions: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return normalised actions in the robot's units, shape (n, actions), by the policy's own postprocessor."""
+    with torch.inference_mode():
+        return after(torch.from_numpy(np.ascontiguousarray(actions, np.float32))).numpy()

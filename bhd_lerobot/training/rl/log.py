@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -63,28 +62,6 @@ def _points(rows: Sequence[Row], time: str, key: str) -> tuple[list[float], list
     return ([x for x, _ in points], [y for _, y in points]) if points else None
 
 
-class Episodes:
-    """The last episodes of the training, for the log."""
-
-    def __init__(self) -> None:
-        self._last: list[dict[str, Any]] = []
-
-    def add(self, episode: dict[str, Any]) -> None:
-        """Add one that ended."""
-        self._last.append(episode)
-
-    def take(self) -> Row:
-        """Return the means of those that ended since the last call; nothing if none did."""
-        last, self._last = self._last, []
-        if not last:
-            return {}
-        row: Row = {"episodes": len(last)}
-        for key in ("return", "success", "score", "length"):
-            row[key] = float(np.mean([one[key] for one in last]))
-        failures = sorted({one["event"] for one in last if not one["success"]})
-        return row | {cause: sum(one["event"] == cause for one in last) / len(last) for cause in failures}
-
-
 class RlProgress:
     """A bar in a terminal, a line for each logged update elsewhere."""
 
@@ -94,7 +71,7 @@ class RlProgress:
             TextColumn("{task.description}"),
             BarColumn(),
             TextColumn("{task.percentage:.0f}%"),
-            TextColumn("{task.fields[told]}"),
+            TextColumn("{task.fields[numbers]}"),
             TimeRemainingColumn(),
             console=console,
             transient=True,
@@ -103,7 +80,7 @@ class RlProgress:
 
     def __enter__(self) -> "RlProgress":
         self._bar.start()
-        self._task = self._bar.add_task("learning", total=1.0, told="")
+        self._task = self._bar.add_task("learning", total=1.0, numbers="")
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -111,8 +88,8 @@ class RlProgress:
 
     def show(self, row: Row, done: float) -> None:
         """Show a row, and how much of the run is done, from 0 to 1."""
-        told = "  ".join(f"{label} {row[key]:.4g}" for key, label in _SHOWN if row.get(key) is not None)
+        numbers = "  ".join(f"{label} {row[key]:.4g}" for key, label in _SHOWN if row.get(key) is not None)
         if self._console.is_terminal:
-            self._bar.update(self._task, completed=done, told=told)
+            self._bar.update(self._task, completed=done, numbers=numbers)
         elif "val_score" in row:
-            self._console.print(f"step {row['step']:,}  {row['minutes']:.1f} min  {told}")
+            self._console.print(f"step {row['step']:,}  {row['minutes']:.1f} min  {numbers}")

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,9 +25,10 @@ from bhd_lerobot.policies.mlp.processor_mlp import make_bhd_mlp_pre_post_process
 from bhd_lerobot.rollout.provenance import versions
 from bhd_lerobot.rollout.types import Episode
 from bhd_lerobot.training.rl.config import RlConfig
+from bhd_lerobot.training.rl.features import rows_of
 
 Stats = dict[str, dict[str, torch.Tensor]]
-_RANDOM_FRAMES = 50  # of each environment, when nothing else tells how large the observations are
+_RANDOM_FRAMES = 50  # of each environment, when nothing else shows how large the observations are
 
 
 @dataclass
@@ -188,20 +190,18 @@ def _random_run(env: BhdVectorEnv, seed: int) -> Stats:
     rng = np.random.default_rng(seed)
     observation, _ = env.reset()
     low, high = action_bounds(env.stage.simulation.body, env.stage.simulation.action_names)
-    seen: dict[str, list[NDArray[Any]]] = {"agent_pos": [], "environment_state": []}
+    seen: dict[str, list[NDArray[Any]]] = defaultdict(list)
     actions = rng.uniform(low, high, (env.num_envs, len(low))).astype(np.float32)
     for frame in range(_RANDOM_FRAMES):
         if frame % 10 == 0:
             actions = rng.uniform(low, high, (env.num_envs, len(low))).astype(np.float32)
-        for key, parts in seen.items():
-            if key in observation:
-                parts.append(observation[key])
+        for key, rows in rows_of(observation).items():
+            seen[key].append(rows)
         observation, _, terminated, truncated, _ = env.step(actions)
         done = terminated | truncated
         if done.any():
             env.reset(options={"reset_mask": done})
-    names = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
-    return {names[key]: _scale(np.concatenate(parts)) for key, parts in seen.items() if parts}
+    return {key: _scale(np.concatenate(parts)) for key, parts in seen.items()}
 
 
 def _scale(values: NDArray[Any]) -> dict[str, torch.Tensor]:

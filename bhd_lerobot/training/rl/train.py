@@ -3,15 +3,17 @@
 import json
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from importlib.util import find_spec
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from rich.console import Console
 from rich.markup import escape
@@ -21,14 +23,12 @@ from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError, install_extra, quoted
 from bhd_lerobot.rollout import configuration
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
+from bhd_lerobot.training.checkpoint import clean, point
 from bhd_lerobot.training.log import METRICS_NAME, MetricsFile, read_metrics
 from bhd_lerobot.training.rl import checkpoint as checkpoints
-from bhd_lerobot.training.rl.config import RlConfig, parse_rl
-from bhd_lerobot.training.rl.features import ActionUnits, FeatureStack
-from bhd_lerobot.training.rl.folder import remove_empty, run_folder, write_config
-from bhd_lerobot.training.rl.log import PLOT_NAME, Episodes, RlProgress, Row, draw_curve
-from bhd_lerobot.training.rl.parts import RlParts, make_parts
-from bhd_lerobot.training.rl.shaping import Shaping
+from bhd_lerobot.training.rl.config import CONFIG_NAME, RlConfig, parse_rl
+from bhd_lerobot.training.rl.log import PLOT_NAME, RlProgress, Row, draw_curve
+from bhd_lerobot.training.rl.parts import make_parts
 from bhd_lerobot.training.rl.validation import Level, Validation, level
 
 
@@ -61,15 +61,12 @@ def require_sb3() -> None:
     Raises:
         ConfigError: it is not; the message says how to install it.
     """
-    # A module that is None in sys.modules is blocked, and find_spec raises ValueError for it.
     try:
-        found = find_spec("stable_baselines3") is not None
-    except ValueError:
-        found = False
-    if not found:
+        import stable_baselines3  # noqa: F401
+    except ImportError as error:
         raise ConfigError(
             f"Reinforcement learning needs stable-baselines3, which is not installed. {install_extra('rl')}"
-        )
+        ) from error
 
 
 def train(config: RlConfig, console: Console | None = None) -> RlResult:
@@ -83,7 +80,7 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
         BhdError: the configuration cannot be honoured, or training failed. Checkpoints saved before are intact.
     """
     require_sb3()
-    folder = run_folder(config)
+    folder = _run_folder(config)
     threads = torch.get_num_threads()
     if config.threads is not None:
         torch.set_num_threads(config.threads)
@@ -98,7 +95,44 @@ def train(config: RlConfig, console: Console | None = None) -> RlResult:
     finally:
         torch.set_num_threads(threads)
         if not config.resume:
-            remove_empty(folder)
+            _remove_empty(folder)
+
+
+def _run_folder(config: RlConfig) -> Path:
+    """Return the run's folder, made if it was not there; without `output_dir`, a new one, which the configuration gets.
+
+    Raises:
+        ConfigError: it is there and not to be resumed, or to be resumed and not there, or cannot be written.
+    """
+    if config.output_dir is None:
+        config.output_dir = f"outputs/train/{datetime.now():%Y-%m-%d/%H-%M-%S}_ppo_{config.robot.type}"
+    folder = Path(config.output_dir).expanduser()
+    try:
+        if folder.exists() and not config.resume:
+            raise ConfigError(
+                f"The output folder {folder} exists. Set another --output_dir, or continue its run with "
+                f"--resume=true --config_path={quoted(folder)}."
+            )
+        if config.resume and not folder.is_dir():
+            raise ConfigError(f"There is no run to resume in {folder}.")
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:  # also a name that is too long
+        raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
+    return folder
+
+
+def _write_config(config: RlConfig, folder: Path) -> None:
+    """Write the resolved configuration; that of a run which cannot be resumed with another one stays as it was."""
+    values = {**configuration.encode(config), "resume": False}
+    text = yaml.safe_dump(json.loads(json.dumps(values)), sort_keys=False, default_flow_style=None, width=110)
+    (folder / CONFIG_NAME).write_text(text, encoding="utf-8")
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove the folder of a run that failed before it wrote anything, so that it can be started again."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 class _Run:
@@ -109,17 +143,16 @@ class _Run:
     ) -> None:
         self._config, self._console, self._validation, self._stop = config, console, validation, stop
         self._result = RlResult(folder, stopped_by=stop)
-        self._episodes = Episodes()
-        self._best = -float("inf")
-        self._saved = -1
-        self._before_s = 0.0  # how long the run had taken when it was resumed
+        self._before = {"next_episode": 0, "seconds": 0.0}  # what a run that is resumed had done
+        self._saved = self._judged = -1
 
     def go(self) -> RlResult:
         config, result = self._config, self._result
         self._started = time.perf_counter()
-        episodes = (
-            [] if config.validation.rule is None else self._validation.run(config.validation.rule, self._stop.__bool__)
-        )
+        if config.resume:
+            self._before = checkpoints.read_run(result.output_dir)
+        rule = config.validation.rule
+        episodes = [] if rule is None else self._validation.run(rule, self._stop.__bool__)
         result.rule = level(episodes)
         if self._stop:
             return result
@@ -131,34 +164,17 @@ class _Run:
             seed=config.seed,
             autoreset_mode="Disabled",
             threads=config.env.threads,
-            first_episode=self._first_episode(),
+            first_episode=int(self._before["next_episode"]),
             episode_stride=config.env.n_envs,
         )
         with closing(env):
-            parts = make_parts(config, env, episodes)
-            learner = self._learner(parts, env)
-            self._learn(learner, parts, env)
+            from bhd_lerobot.training.rl.environment import RlVecEnv
+            from bhd_lerobot.training.rl.learner import make_learner
+
+            self._env, self._parts = env, make_parts(config, env, episodes)
+            adapter = RlVecEnv(env, self._parts, config.reward, config.ppo.gamma)
+            self._learn(make_learner(config, self._parts, adapter, self._done))
         return result
-
-    def _first_episode(self) -> int:
-        if not self._config.resume:
-            return 0
-        path = self._result.output_dir / "checkpoints/last/training_state" / checkpoints.RUN
-        try:
-            return int(json.loads(path.read_text(encoding="utf-8"))["next_episode"])
-        except (OSError, ValueError, KeyError) as error:
-            raise ConfigError(f"There is no run to resume in {self._result.output_dir}: {error}") from error
-
-    def _learner(self, parts: RlParts, env: BhdVectorEnv) -> Any:
-        from bhd_lerobot.training.rl.adapter import RlVecEnv
-        from bhd_lerobot.training.rl.build import make_learner
-
-        config = self._config
-        stack = FeatureStack(parts.front, parts.before, env.num_envs)
-        shaping = Shaping(config.reward, config.ppo.gamma, env.num_envs)
-        adapter = RlVecEnv(env, stack, ActionUnits(parts.after), shaping)
-        adapter.on_episode = self._episodes.add
-        return make_learner(config, parts, adapter, self._done)
 
     def _done(self, step: int) -> float:
         """Return how much of the run is done, from 0 to 1."""
@@ -167,32 +183,29 @@ class _Run:
         return min(1.0, max(passed, step / self._config.steps))
 
     def _minutes(self) -> float:
-        return (time.perf_counter() - self._started + self._before_s) / 60
+        return (time.perf_counter() - self._started + self._before["seconds"]) / 60
 
-    def _learn(self, learner: Any, parts: RlParts, env: BhdVectorEnv) -> None:
+    def _learn(self, learner: Any) -> None:
+        from bhd_lerobot.training.rl.learner import learn
+
         config, result = self._config, self._result
         metrics = result.output_dir / METRICS_NAME
         rows: list[Row] = []
         if config.resume:
-            result.step, run = checkpoints.load(result.output_dir, learner)
-            self._best = -float("inf") if run["best"] is None else run["best"]
-            self._before_s = run["seconds"]
+            checkpoints.load(result.output_dir, learner)
+            result.step = self._saved = self._judged = int(learner.num_timesteps)
+            result.checkpoint = checkpoints.folder_of(result.output_dir, result.step)
             rows = read_metrics(metrics, result.step)
-            result.checkpoint = (result.output_dir / "checkpoints/last").resolve()
-            best = result.output_dir / "checkpoints" / checkpoints.BEST
-            result.best = best.resolve() if best.exists() else None
-            self._saved = result.step
+            clean(result.output_dir)
         if result.step >= config.steps:
             raise ConfigError(
                 f"The run has done {result.step} of {config.steps} steps. To go on, set more with --steps."
             )
-        write_config(config, result.output_dir)
-        self._file, self._parts, self._env = MetricsFile(metrics, rows), parts, env
-        result.rows = self._file.rows
-        self._judged = result.step
+        _write_config(config, result.output_dir)
+        self._metrics = MetricsFile(metrics, rows)
+        result.rows = self._metrics.rows
+        self._point_to_best()
         with RlProgress(self._console) as self._progress:
-            from bhd_lerobot.training.rl.build import learn
-
             if not config.resume:
                 self._judge(learner, {"step": 0, "minutes": self._minutes()})
             try:
@@ -200,11 +213,15 @@ class _Run:
             except ValueError as error:
                 raise self._diverged(learner) or error from None
             result.step = int(learner.num_timesteps)
-            self._judge_or_save(learner)
-        self._tell()
+            if self._saved != result.step and not self._stop:
+                self._judge(learner, {"step": result.step, "minutes": self._minutes()})
+            elif self._saved != result.step:
+                self._save(learner)
+            self._draw()
+        self._print_summary()
 
     def _diverged(self, learner: Any) -> BhdError | None:
-        """Return what to say if the weights are no numbers any more; the learner only says so of their product."""
+        """Return the error if the weights are no numbers any more; the learner's own is about their product only."""
         if all(bool(torch.isfinite(one).all()) for one in learner.policy.parameters()):
             return None
         kept = "there is none yet" if self._result.checkpoint is None else f"{self._result.checkpoint} is intact"
@@ -220,46 +237,43 @@ class _Run:
     def _updated(self, learner: Any, row: Row) -> None:
         """Log an update; validate when it is time to."""
         self._result.step = int(learner.num_timesteps)
-        row = {"step": self._result.step, "minutes": self._minutes(), **self._episodes.take(), **row}
+        row = {"step": self._result.step, "minutes": self._minutes(), **row}
         if self._result.step - self._judged >= self._config.validation.freq and not self._stop:
             self._judge(learner, row)
-        else:
-            self._log(row)
-
-    def _judge_or_save(self, learner: Any) -> None:
-        if self._stop or self._saved == self._result.step:
-            if self._saved != self._result.step:
-                self._save(learner)
             self._draw()
         else:
-            self._judge(learner, {"step": self._result.step, "minutes": self._minutes()})
+            self._log(row)
 
     def _judge(self, learner: Any, row: Row) -> None:
         """Save, and find out how good the policy is."""
         self._judged = self._result.step
-        folder = self._save(learner)
-        found = self._validation.checkpoint(folder / PRETRAINED_MODEL_DIR, self._stop.__bool__)
-        if found is not None and not self._stop:
-            row = {**row, **found.row()}
-            value = {"score": found.score, "success": found.success, "return": found.reward}[
-                self._config.validation.select
-            ]
-            if value >= self._best:
-                self._best, self._result.best = value, folder
-                checkpoints.point(folder, checkpoints.BEST)
-        self._log(row)
-        self._draw()
+        policy = self._save(learner) / PRETRAINED_MODEL_DIR
+        found = self._validation.checkpoint(policy, self._stop.__bool__)
+        self._log(row if found is None or self._stop else {**row, **found.row()})
+        self._point_to_best()
 
     def _save(self, learner: Any) -> Path:
         following = max(member.course.following for member in self._env.members)
-        best = None if self._best == -float("inf") else self._best
-        run = {"next_episode": following, "best": best, "seconds": self._minutes() * 60}
-        folder = checkpoints.save(self._result.output_dir, self._result.step, self._parts, learner, run)
+        run = {"next_episode": following, "seconds": self._minutes() * 60}
+        folder = checkpoints.save(self._result.output_dir, self._parts, learner, run)
         self._result.checkpoint, self._saved = folder, self._result.step
         return folder
 
+    def _best_row(self) -> Row | None:
+        """Return the row of the best validation, the latest of equals; None if there was none."""
+        key = f"val_{self._config.validation.select}"
+        judged = [row for row in self._result.rows if row.get(key) is not None]
+        return max(judged, key=lambda row: (row[key], row["step"]), default=None)
+
+    def _point_to_best(self) -> None:
+        best = self._best_row()
+        folder = None if best is None else checkpoints.folder_of(self._result.output_dir, best["step"])
+        if folder is not None and folder.is_dir():
+            self._result.best = folder
+            point(folder, checkpoints.BEST)
+
     def _log(self, row: Row) -> None:
-        self._file.append(row)
+        self._metrics.append(row)
         self._progress.show(row, self._done(self._result.step))
 
     def _draw(self) -> None:
@@ -269,14 +283,13 @@ class _Run:
         heading = f"PPO, {config.environment}, {result.step:,} environment steps"
         draw_curve(result.rows, result.output_dir / PLOT_NAME, heading, shown)
 
-    def _tell(self) -> None:
+    def _print_summary(self) -> None:
         result, lines = self._result, []
         lines.append(f"{result.step:,} environment steps in {self._minutes():.1f} min")
         if result.rule is not None:
             lines.append(f"rule on the validation episodes: {_text(result.rule.row())}")
-        judged = [row for row in result.rows if row.get("val_score") is not None]
-        if judged and result.best is not None:
-            best = next((row for row in judged if row["step"] == int(result.best.name)), judged[-1])
+        best = self._best_row()
+        if best is not None and result.best is not None:
             lines.append(f"best, after {best['step']:,} steps: {_text(best)}")
             lines.append(f"best checkpoint: {result.best / PRETRAINED_MODEL_DIR}")
         lines.append(f"curve: {result.output_dir / PLOT_NAME}")

@@ -1,12 +1,10 @@
-"""bhd-doctor: what each check says about a sound and about a broken machine; the grid on a virtual clock."""
+"""bhd-doctor: what each check says about a healthy and about a broken machine; the grid on a virtual clock."""
 
-import importlib
 import json
 import os
 import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -16,12 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.apps.doctor import checks as doctor_checks
-from bhd_lerobot.apps.doctor import child as doctor_child
-from bhd_lerobot.apps.doctor import doctor, latency_test
-from bhd_lerobot.apps.doctor.child import Outcome, run_child
-from bhd_lerobot.apps.doctor.findings import COMPLAINTS, Finding, Status, complain, markdown_table
-from bhd_lerobot.realtime.privileges import GRANT_BANDWIDTH, RealtimeSettings
+from bhd_lerobot.apps.doctor import checks, doctor, latency_test, trials
+from bhd_lerobot.apps.doctor.checks import ROWS, Finding, Status, markdown_table, wrong
+from bhd_lerobot.apps.doctor.trials import Outcome, run_trials
+from bhd_lerobot.realtime.privileges import GRANT_BANDWIDTH
 
 ROOT = Path(__file__).resolve().parents[3]
 GIB = 2**30
@@ -47,9 +43,11 @@ def grants(**refused: str) -> Outcome:
     )
 
 
-def wakeups(p99: float) -> Outcome:
-    histogram = (1000, *[0] * len(latency_test.BINS_US))
-    return value((latency_test.WakeUps(1000, 1000, 0, p99 / 2, p99, 2 * p99, histogram), grants().value))
+def latency(p99: float) -> Outcome:
+    histogram = [1000, *[0] * len(latency_test.BINS_US)]
+    numbers = {"rate": 1000, "points": 1000, "missed": 0, "p50": p99 / 2, "p99": p99, "max": 2 * p99}
+    bins = {"histogram": histogram, "bins_us": latency_test.BINS_US}
+    return value({**numbers, **bins, "grants": grants().value})
 
 
 PLUGINS = value({"robots": ["so101", "turtlebot3", "ur5"], "teleoperators": ["bhd_brain"]})
@@ -59,97 +57,77 @@ VIDEO = value({"bytes": 3000, "pyav": "15.1.0", "libavcodec": "61.19.101", "shar
 
 # --- processes -------------------------------------------------------------------------------------------------------
 
-
-TRIALS = """
-import os, signal, sys
-from bhd_lerobot.realtime.privileges import RealtimeSettings
-from bhd_lerobot.apps.doctor import latency_test
+TRIALS = r"""
+import os, sys, time
+from bhd_lerobot.apps.doctor import trials
+from bhd_lerobot.errors import ConfigError
 
 def noisy():
-    os.write(1, b"a library prints\\n\\n")
-    os.write(2, "and complains: \\xb5s\\n".encode("latin-1"))
+    os.write(1, b"a library prints\n\n")
+    os.write(2, "and complains: \xb5s\n".encode("latin-1"))
     return 7
 
-def noisy_and_dead():
+def crash():
     noisy()
-    os.kill(os.getpid(), signal.SIGKILL)
+    os.abort()
 
-def measure_and_list(rate, seconds):
-    measured = latency_test.measure(RealtimeSettings(), rate, seconds)
-    return measured, sorted({"torch", "lerobot", "mujoco"} & set(sys.modules))
+def refuse(rate):
+    raise ConfigError(f"The rate is {rate}.")
+
+trials.TRIALS |= {
+    "noisy": noisy, "crash": crash, "refuse": refuse, "fail": lambda: int("x"), "exit": lambda: os._exit(3),
+    "hang": lambda: time.sleep(3600), "heavy": lambda: sorted({"torch", "lerobot", "mujoco"} & set(sys.modules)),
+}
+trials.main(sys.argv[1:])
 """
 
 
 @pytest.fixture
-def trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A module that a spawned process can import, which the tests themselves are not."""
+def more_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the child process know trials of ours."""
     (tmp_path / "doctor_trials.py").write_text(TRIALS)
-    monkeypatch.syspath_prepend(tmp_path)
-    yield importlib.import_module("doctor_trials")
-    del sys.modules["doctor_trials"]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    monkeypatch.setattr(trials, "__name__", "doctor_trials")
 
 
-def test_a_value_comes_back_and_nothing_is_printed(trials: Any, capfd: pytest.CaptureFixture[str]) -> None:
-    outcome = run_child(trials.noisy)
-    assert (outcome.kind, outcome.value, outcome.error) == ("value", 7, "")
-    assert outcome.output.startswith("and complains: ")
+def test_whatever_happens_in_a_process_is_an_outcome_and_the_rest_is_tried(
+    more_trials: None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    names = (["noisy"], ["refuse", 0], ["crash"], ["fail"], ["exit"], ["noisy"])
+    noisy, refuse, crash, fail, ended, again = run_trials(names)
+    assert (noisy.kind, noisy.value, noisy.error) == ("value", 7, "")
+    assert noisy.output.startswith("and complains: ")
+    assert refuse == failed("error", "The rate is 0.")
+    assert (crash.kind, crash.error) == ("crash", "ended by SIGABRT")
+    assert crash.output.startswith("and complains: ")
+    assert fail == failed("error", "ValueError: invalid literal for int() with base 10: 'x'")
+    assert ended == failed("crash", "ended with status 3")
+    assert again == noisy
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize(
-    ("function", "arguments", "kind", "error"),
-    [
-        (int, ("x",), "error", "ValueError: invalid literal for int() with base 10: 'x'"),
-        (RealtimeSettings, (0,), "error", "The real-time priority is 0; it must be a whole number from 1 to 99."),
-        (os.abort, (), "crash", "ended by SIGABRT"),
-        (os._exit, (3,), "crash", "ended with status 3"),
-        (time.sleep, (3600,), "timeout", "no answer in 0.1 s"),
-    ],
-)
-def test_whatever_happens_to_a_process_is_an_outcome(
-    function: Callable[..., Any], arguments: tuple[Any, ...], kind: str, error: str
-) -> None:
-    outcome = run_child(function, *arguments, timeout_s=0.1 if kind == "timeout" else 60)
-    assert (outcome.kind, outcome.error) == (kind, error)
+def test_a_process_that_does_not_answer_is_killed(more_trials: None) -> None:
+    assert run_trials([["hang"]], timeout_s=1.0) == [failed("timeout", "no answer in 1 s")]
 
 
-def test_the_last_words_of_a_process_are_kept(trials: Any) -> None:
-    outcome = run_child(trials.noisy_and_dead)
-    assert (outcome.kind, outcome.error) == ("crash", "ended by SIGKILL")
-    assert outcome.output.startswith("and complains: ")
-
-
-def test_without_a_temporary_folder_only_the_last_words_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", "/no/such/folder")
-    assert run_child(divmod, 7, 2) == Outcome("value", value=(3, 1))
-
-
-def test_measuring_for_real_imports_nothing_heavy(trials: Any) -> None:
-    outcome = run_child(trials.measure_and_list, 1000, 0.2)
-    assert outcome.kind == "value", outcome
-    (measured, granted), heavy = outcome.value
-    assert heavy == []
-    assert measured.points == 200
-    assert sum(measured.histogram) + measured.missed == 200
-    assert 0 <= measured.p50 <= measured.p99 <= measured.max
-    assert granted[-1]["name"] == "scheduler"
+def test_measuring_for_real_imports_nothing_heavy(more_trials: None) -> None:
+    tested, heavy = run_trials([["latency test", 1000, 0.2], ["heavy"]])
+    assert tested.kind == "value", tested
+    assert heavy.value == []
+    measured = tested.value
+    assert measured["points"] == 200
+    assert sum(measured["histogram"]) + measured["missed"] == 200
+    assert 0 <= measured["p50"] <= measured["p99"] <= measured["max"]
+    assert measured["grants"][-1]["name"] == "scheduler"
 
 
 def test_real_trials_are_understood() -> None:
-    for trial, check in (
-        (doctor_child.render, doctor_checks.check_opengl),
-        (doctor_child.encode, doctor_checks.check_ffmpeg),
-    ):
-        [finding] = check(run_child(trial))
+    rights, ffmpeg, opengl, plugins = run_trials([["rights"], ["ffmpeg"], ["opengl"], ["plug-ins"]])
+    assert [one.check for one in checks.check_rights(rights)] == ["scheduler", "memory lock", "cpu latency"]
+    assert checks.check_opengl(opengl)[0].status in (Status.OK, Status.WARNING)  # some machines have no OpenGL
+    for finding in (*checks.check_ffmpeg(ffmpeg), *checks.check_plugins(plugins)):
+        assert finding.status is Status.OK, finding
         assert finding.found
-        assert finding.status in (Status.OK, Status.WARNING)  # a machine without OpenGL has no images
-    outcome = run_child(doctor_child.ask_rights, RealtimeSettings())
-    assert [one.check for one in doctor_checks.check_rights(outcome)] == ["scheduler", "memory lock", "cpu latency"]
-
-
-def test_lerobot_knows_our_plugins() -> None:
-    [finding] = doctor_checks.check_plugins(value(doctor_child.list_plugins()))
-    assert finding.status is Status.OK
 
 
 # --- the grid, on a virtual clock ------------------------------------------------------------------------------------
@@ -181,12 +159,6 @@ def walk(points: int, delays: list[int]) -> tuple[np.ndarray, VirtualTime]:
     return lateness[:woken], virtual
 
 
-def test_a_punctual_machine_is_punctual() -> None:
-    lateness, virtual = walk(100, [])
-    np.testing.assert_array_equal(lateness, np.zeros(100))
-    assert set(np.diff(virtual.woken)) == {PERIOD}
-
-
 @given(st.lists(st.integers(0, 4 * PERIOD), max_size=40))
 def test_what_is_late_is_skipped_and_the_phase_is_kept(delays: list[int]) -> None:
     points = 50
@@ -205,12 +177,6 @@ def test_what_is_late_is_skipped_and_the_phase_is_kept(delays: list[int]) -> Non
     assert sum(summary.histogram) + summary.missed == points
 
 
-def test_an_oversleep_of_three_and_a_half_periods_misses_three_points() -> None:
-    lateness, _ = walk(20, [0, 0, 7 * PERIOD // 2])
-    assert len(lateness) == 17
-    assert lateness.tolist() == [0, 0, 7 * PERIOD // 2, *[0] * 14]
-
-
 def test_the_summary_counts_in_bins_and_takes_quantiles() -> None:
     lateness = np.array([5_000] * 98 + [10_000, 10_001])
     summary = latency_test.summarise(lateness, 1000, 100)
@@ -219,7 +185,7 @@ def test_the_summary_counts_in_bins_and_takes_quantiles() -> None:
     assert latency_test.summarise(np.array([11_000_000]), 1000, 1).histogram[-1] == 1
 
 
-# --- a sound machine -------------------------------------------------------------------------------------------------
+# --- a healthy machine -----------------------------------------------------------------------------------------------
 
 
 def kernel_folder(folder: Path, runtime: int = 950_000) -> Path:
@@ -239,29 +205,29 @@ def ticking(step: float) -> Callable[[], float]:
     return lambda: next(times)
 
 
-SOUND: dict[str, Callable[[Path], list[Finding]]] = {
-    "Python": lambda _: doctor_checks.check_python(),
-    "versions": lambda _: doctor_checks.check_versions(),
-    "plug-ins": lambda _: doctor_checks.check_plugins(PLUGINS),
-    "OpenGL": lambda _: doctor_checks.check_opengl(IMAGE),
-    "FFmpeg": lambda _: doctor_checks.check_ffmpeg(VIDEO),
-    "rights": lambda _: doctor_checks.check_rights(grants()),
-    "kernel": lambda _: doctor_checks.check_kernel("6.12", "#1 SMP PREEMPT_RT Debian"),
-    "old kernel": lambda _: doctor_checks.check_kernel("4.19", "#1 SMP PREEMPT RT"),
-    "RT throttling": lambda folder: doctor_checks.check_throttling(kernel_folder(folder)),
-    "no RT throttling": lambda folder: doctor_checks.check_throttling(folder / "none"),
-    "clock source": lambda folder: doctor_checks.check_clock(clock_folder(folder)),
-    "kvm": lambda folder: doctor_checks.check_clock(clock_folder(folder, "kvm-clock")),
-    "no clock source": lambda folder: doctor_checks.check_clock(folder / "none"),
-    "shared memory": lambda folder: doctor_checks.check_shared_memory(folder, lambda _: GIB),
-    "disk": lambda folder: doctor_checks.check_disk(folder / "new", lambda _: 50 * GIB, ticking(0.1)),
-    "wake-up": lambda _: doctor_checks.check_wakeups(wakeups(199e-6), {"ur5": 500}),
+HEALTHY: dict[str, Callable[[Path], list[Finding]]] = {
+    "Python": lambda _: checks.check_python(),
+    "versions": lambda _: checks.check_versions(),
+    "plug-ins": lambda _: checks.check_plugins(PLUGINS),
+    "OpenGL": lambda _: checks.check_opengl(IMAGE),
+    "FFmpeg": lambda _: checks.check_ffmpeg(VIDEO),
+    "rights": lambda _: checks.check_rights(grants()),
+    "kernel": lambda _: checks.check_kernel("6.12", "#1 SMP PREEMPT_RT Debian"),
+    "old kernel": lambda _: checks.check_kernel("4.19", "#1 SMP PREEMPT RT"),
+    "RT throttling": lambda folder: checks.check_throttling(kernel_folder(folder)),
+    "no RT throttling": lambda folder: checks.check_throttling(folder / "none"),
+    "clock source": lambda folder: checks.check_clock(clock_folder(folder)),
+    "kvm": lambda folder: checks.check_clock(clock_folder(folder, "kvm-clock")),
+    "no clock source": lambda folder: checks.check_clock(folder / "none"),
+    "shared memory": lambda folder: checks.check_shared_memory(folder, lambda _: GIB),
+    "disk": lambda folder: checks.check_disk(folder / "new", lambda _: 50 * GIB, ticking(0.1)),
+    "latency test": lambda _: checks.check_latency(latency(199e-6), {"ur5": 500}),
 }
 
 
-@pytest.mark.parametrize("name", SOUND)
-def test_nothing_is_wrong_with_a_sound_machine(name: str, tmp_path: Path) -> None:
-    findings = SOUND[name](tmp_path)
+@pytest.mark.parametrize("name", HEALTHY)
+def test_nothing_is_wrong_with_a_healthy_machine(name: str, tmp_path: Path) -> None:
+    findings = HEALTHY[name](tmp_path)
     assert findings
     for finding in findings:
         assert finding.status is Status.OK, finding
@@ -290,63 +256,63 @@ def full(_: Path) -> int:
 
 
 BROKEN: dict[str, tuple[Callable[[Path], list[Finding]], str]] = {
-    "python": (lambda _: doctor_checks.check_python("3.11.4"), "3.11.4"),
-    "package.missing": (lambda _: doctor_checks.check_versions(version_of=installed(mujoco=None)), "`mujoco`"),
+    "python": (lambda _: checks.check_python("3.11.4"), "3.11.4"),
+    "package.missing": (lambda _: checks.check_versions(version_of=installed(mujoco=None)), "`mujoco`"),
     "package.version": (
-        lambda _: doctor_checks.check_versions(version_of=installed(lerobot="0.5.1")),
+        lambda _: checks.check_versions(version_of=installed(lerobot="0.5.1")),
         "`lerobot` is 0.5.1; asked for is <0.7,>=0.6.1",
     ),
     "package.extra": (
-        lambda _: doctor_checks.check_versions(version_of=installed(rosbags="0.9")),
+        lambda _: checks.check_versions(version_of=installed(rosbags="0.9")),
         "`rosbags` is 0.9; the extra ros2,test asks for >=0.11",
     ),
-    "plugins.error": (lambda _: doctor_checks.check_plugins(failed("error", "ImportError: no torch")), "no torch"),
+    "plugins.error": (lambda _: checks.check_plugins(failed("error", "ImportError: no torch")), "no torch"),
     "plugins.missing": (
-        lambda _: doctor_checks.check_plugins(value({"robots": ["ur5"], "teleoperators": []}, "ImportError: pin")),
+        lambda _: checks.check_plugins(value({"robots": ["ur5"], "teleoperators": []}, "ImportError: pin")),
         "the robot turtlebot3, the teleoperator bhd_brain: `lerobot_robot_bhd` is not installed, or its import failed. "
         "ImportError: pin",
     ),
-    "opengl.missing": (lambda _: doctor_checks.check_opengl(failed("error", "Tried egl: no display")), "Tried egl"),
+    "opengl.missing": (lambda _: checks.check_opengl(failed("error", "Tried egl: no display")), "Tried egl"),
     "opengl.crash": (
-        lambda _: doctor_checks.check_opengl(failed("crash", "ended by SIGSEGV", "libEGL warning")),
+        lambda _: checks.check_opengl(failed("crash", "ended by SIGSEGV", "libEGL warning")),
         "ended by SIGSEGV (libEGL warning)",
     ),
-    "opengl.blank": (lambda _: doctor_checks.check_opengl(value({"spread": 0, "driver": "odd"})), "odd"),
-    "ffmpeg": (lambda _: doctor_checks.check_ffmpeg(failed("error", "ImportError: av")), "ImportError: av"),
-    "scheduler.rights": (lambda _: doctor_checks.check_rights(grants(scheduler="ask")), "setcap"),
-    "scheduler.bandwidth": (lambda _: doctor_checks.check_rights(grants(scheduler=GRANT_BANDWIDTH)), "cgroup"),
-    "scheduler.error": (lambda _: doctor_checks.check_rights(failed("crash", "ended by SIGSYS")), "ended by SIGSYS"),
-    "memory": (lambda _: doctor_checks.check_rights(grants(memory_lock="ask")), "memlock"),
-    "latency": (lambda _: doctor_checks.check_rights(grants(cpu_latency="ask")), "udev"),
-    "kernel": (lambda _: doctor_checks.check_kernel("6.12", "#1 SMP PREEMPT_DYNAMIC Debian"), "PREEMPT_RT"),
-    "throttling.off": (lambda folder: doctor_checks.check_throttling(kernel_folder(folder, -1)), "-1"),
-    "throttling.low": (lambda folder: doctor_checks.check_throttling(kernel_folder(folder, 100_000)), "only 10% of"),
-    "clock": (lambda folder: doctor_checks.check_clock(clock_folder(folder, "hpet")), "with hpet"),
-    "shm.missing": (lambda folder: doctor_checks.check_shared_memory(folder / "none"), "No such file or directory"),
-    "shm.small": (lambda folder: doctor_checks.check_shared_memory(folder, lambda _: 64 * 2**20), "64 MiB"),
-    "disk.denied": (lambda folder: doctor_checks.check_disk(folder, full), "No space left on device"),
-    "disk.full": (lambda folder: doctor_checks.check_disk(folder, lambda _: 2**29), "512 MiB"),
-    "disk.low": (lambda folder: doctor_checks.check_disk(folder, lambda _: 2 * GIB, ticking(0.1)), "2.0 GiB"),
-    "disk.slow": (lambda folder: doctor_checks.check_disk(folder, lambda _: 50 * GIB, ticking(16.0)), "2 MB/s"),
-    "wakeup.late": (lambda _: doctor_checks.check_wakeups(wakeups(200e-6), {"ur5": 500}), "10% of the period"),
-    "wakeup.missed": (lambda _: doctor_checks.check_wakeups(wakeups(1e-3), {"ur5": 500}), "at 500 Hz ticks are missed"),
-    "wakeup.error": (lambda _: doctor_checks.check_wakeups(failed("timeout", "no answer in 70 s"), {}), "no answer"),
+    "opengl.blank": (lambda _: checks.check_opengl(value({"spread": 0, "driver": "odd"})), "odd"),
+    "ffmpeg": (lambda _: checks.check_ffmpeg(failed("error", "ImportError: av")), "ImportError: av"),
+    "scheduler.rights": (lambda _: checks.check_rights(grants(scheduler="ask")), "setcap"),
+    "scheduler.bandwidth": (lambda _: checks.check_rights(grants(scheduler=GRANT_BANDWIDTH)), "cgroup"),
+    "scheduler.error": (lambda _: checks.check_rights(failed("crash", "ended by SIGSYS")), "ended by SIGSYS"),
+    "memory": (lambda _: checks.check_rights(grants(memory_lock="ask")), "memlock"),
+    "cpu latency": (lambda _: checks.check_rights(grants(cpu_latency="ask")), "udev"),
+    "kernel": (lambda _: checks.check_kernel("6.12", "#1 SMP PREEMPT_DYNAMIC Debian"), "PREEMPT_RT"),
+    "throttling.off": (lambda folder: checks.check_throttling(kernel_folder(folder, -1)), "-1"),
+    "throttling.low": (lambda folder: checks.check_throttling(kernel_folder(folder, 100_000)), "only 10% of"),
+    "clock": (lambda folder: checks.check_clock(clock_folder(folder, "hpet")), "with hpet"),
+    "shm.missing": (lambda folder: checks.check_shared_memory(folder / "none"), "No such file or directory"),
+    "shm.small": (lambda folder: checks.check_shared_memory(folder, lambda _: 64 * 2**20), "64 MiB"),
+    "disk.denied": (lambda folder: checks.check_disk(folder, full), "No space left on device"),
+    "disk.full": (lambda folder: checks.check_disk(folder, lambda _: 2**29), "512 MiB"),
+    "disk.low": (lambda folder: checks.check_disk(folder, lambda _: 2 * GIB, ticking(0.1)), "2.0 GiB"),
+    "disk.slow": (lambda folder: checks.check_disk(folder, lambda _: 50 * GIB, ticking(16.0)), "2 MB/s"),
+    "latency.late": (lambda _: checks.check_latency(latency(200e-6), {"ur5": 500}), "10% of the period"),
+    "latency.missed": (lambda _: checks.check_latency(latency(1e-3), {"ur5": 500}), "at 500 Hz ticks are missed"),
+    "latency.error": (lambda _: checks.check_latency(failed("timeout", "no answer in 70 s"), {}), "no answer"),
 }
 
 
-def test_every_complaint_has_its_test() -> None:
-    assert set(BROKEN) == set(COMPLAINTS)
+def test_every_row_has_its_test() -> None:
+    assert set(BROKEN) == set(ROWS)
 
 
-@pytest.mark.parametrize("key", COMPLAINTS)
+@pytest.mark.parametrize("key", ROWS)
 def test_what_is_wrong_is_said_with_symptom_cause_and_remedy(key: str, tmp_path: Path) -> None:
     check, part = BROKEN[key]
     findings = [finding for finding in check(tmp_path) if finding.status is not Status.OK]
     [finding] = findings
-    complaint = COMPLAINTS[key]
-    assert (finding.check, finding.status) == (complaint.check, complaint.status)
+    row = ROWS[key]
+    assert (finding.check, finding.status) == (row.check, row.status)
     texts = (finding.symptom, finding.cause, finding.remedy)
-    for text, pattern in zip(texts, (complaint.symptom, complaint.cause, complaint.remedy), strict=True):
+    for text, pattern in zip(texts, (row.symptom, row.cause, row.remedy), strict=True):
         assert text.startswith(pattern.partition("{")[0])
         assert "{" not in text
         assert text
@@ -354,16 +320,16 @@ def test_what_is_wrong_is_said_with_symptom_cause_and_remedy(key: str, tmp_path:
 
 
 def test_variants_of_what_is_wrong(tmp_path: Path) -> None:
-    [none] = doctor_checks.check_kernel("6.1", "#1 SMP Debian")
+    [none] = checks.check_kernel("6.1", "#1 SMP Debian")
     assert none.found == "6.1 (no preemption)"
     assert none.status is Status.WARNING
-    [little] = doctor_checks.check_shared_memory(tmp_path, lambda _: 2**20)
+    [little] = checks.check_shared_memory(tmp_path, lambda _: 2**20)
     assert little.status is Status.PROBLEM
-    both = doctor_checks.check_disk(tmp_path, lambda _: 2 * GIB, ticking(16.0))
+    both = checks.check_disk(tmp_path, lambda _: 2 * GIB, ticking(16.0))
     assert [one.remedy for one in both] == [
-        complain(k, "", folder="", free="", speed="").remedy for k in ("disk.low", "disk.slow")
+        wrong(k, "", folder="", free="", speed="").remedy for k in ("disk.low", "disk.slow")
     ]
-    assert [one.check for one in doctor_checks.check_rights(grants(scheduler="ask"))] == [
+    assert [one.check for one in checks.check_rights(grants(scheduler="ask"))] == [
         "scheduler",
         "memory lock",
         "cpu latency",
@@ -371,8 +337,8 @@ def test_variants_of_what_is_wrong(tmp_path: Path) -> None:
 
 
 def test_our_own_package_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor_checks, "DISTRIBUTION", "no-such-distribution")
-    for findings in (doctor_checks.check_python(), doctor_checks.check_versions()):
+    monkeypatch.setattr(checks, "DISTRIBUTION", "no-such-distribution")
+    for findings in (checks.check_python(), checks.check_versions()):
         assert [one.cause for one in findings] == ["`no-such-distribution` is not installed in this environment"]
 
 
@@ -402,8 +368,8 @@ Provides-Extra: test
     (tmp_path / "fake_hand-1.dist-info").mkdir()
     (tmp_path / "fake_hand-1.dist-info" / "METADATA").write_text(text, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(doctor_checks, "DISTRIBUTION", "fake-hand")
-    findings = doctor_checks.check_versions(("brain",), installed(brain=version, absent=None))
+    monkeypatch.setattr(checks, "DISTRIBUTION", "fake-hand")
+    findings = checks.check_versions(("brain",), installed(brain=version, absent=None))
     assert [one.cause for one in findings if one.status is not Status.OK] == causes
     if not causes:
         assert [one.found for one in findings] == [f"brain {version}, asked for is <2,>=1"]
@@ -413,13 +379,13 @@ def test_the_documentation_has_the_same_table() -> None:
     text = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     begin, end = text.index("<!-- doctor: begin"), text.index("<!-- doctor: end -->")
     table = text[text.index("\n", begin) + 1 : end]
-    assert table == markdown_table(), "paste what bhd_lerobot.apps.doctor.findings.markdown_table() returns"
+    assert table == markdown_table(), "paste what bhd_lerobot.apps.doctor.checks.markdown_table() returns"
     assert all(line.count(" | ") == 4 for line in table.splitlines()[2:])
 
 
 def test_the_documentation_names_the_shares_and_rates() -> None:
     text = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
-    for share in (doctor_checks.FINE_SHARE, doctor_checks.LATE_SHARE):
+    for share in (checks.FINE_SHARE, checks.LATE_SHARE):
         assert f"| {share:.0%}".replace("%", " %") in text
     assert doctor.robot_rates() == {"turtlebot3": 200, "ur5": 500}
     assert "TurtleBot3 200 Hz, 5 ms; UR5 500 Hz, 2 ms" in text
@@ -428,39 +394,39 @@ def test_the_documentation_names_the_shares_and_rates() -> None:
 # --- the command -----------------------------------------------------------------------------------------------------
 
 
-class FakeChild:
-    """Answers instead of a process."""
+class FakeTrials:
+    """Answers instead of processes."""
 
-    def __init__(self, **answers: Outcome) -> None:
+    def __init__(self, answers: dict[str, Outcome] | None = None) -> None:
         self.answers = {
-            "list_plugins": PLUGINS,
-            "render": IMAGE,
-            "encode": VIDEO,
-            "ask_rights": grants(),
-            "measure": wakeups(50e-6),
-            **answers,
+            "rights": grants(),
+            "ffmpeg": VIDEO,
+            "opengl": IMAGE,
+            "plug-ins": PLUGINS,
+            "latency test": latency(50e-6),
+            **(answers or {}),
         }
         self.asked: list[str] = []
 
-    def __call__(self, function: Callable[..., Any], *arguments: Any, timeout_s: float = 1.0) -> Outcome:
-        self.asked.append(function.__name__)
-        return self.answers[function.__name__]
+    def __call__(self, asked: Sequence[Sequence[Any]], timeout_s: float) -> list[Outcome]:
+        self.asked += [one[0] for one in asked]
+        return [self.answers[one[0]] for one in asked]
 
 
 def run(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, *arguments: str, **answers: Outcome
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, *arguments: str, answers: dict[str, Outcome] | None = None
 ) -> tuple[int, dict[str, Any]]:
-    status = doctor.main(["--json", f"--root={tmp_path}", *arguments], FakeChild(**answers))
+    status = doctor.main(["--json", f"--root={tmp_path}", *arguments], FakeTrials(answers))
     return status, json.loads(capsys.readouterr().out)
 
 
 def test_every_check_reports_as_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     _, report = run(capsys, tmp_path)
-    checks = [one["check"] for one in report["findings"]]
-    for name in {one.check for one in COMPLAINTS.values()} - {"wake-up"}:
-        assert name in checks
-    assert report["wakeups"] is None
-    assert Finding(**report["findings"][0]).as_dict() == report["findings"][0]
+    found = [one["check"] for one in report["findings"]]
+    for name in {one.check for one in ROWS.values()} - {"latency test"}:
+        assert name in found
+    assert report["latency_test"] is None
+    assert asdict(Finding(**report["findings"][0])) == report["findings"][0]
 
 
 def test_a_problem_makes_the_exit_status_and_a_warning_does_not(
@@ -469,34 +435,34 @@ def test_a_problem_makes_the_exit_status_and_a_warning_does_not(
     def statuses(report: dict[str, Any], check: str) -> list[str]:
         return [one["status"] for one in report["findings"] if one["check"] == check]
 
-    status, report = run(capsys, tmp_path, render=failed("error", "no EGL"))
+    status, report = run(capsys, tmp_path, answers={"opengl": failed("error", "no EGL")})
     assert statuses(report, "OpenGL") == ["warning"]
     # This machine may have a problem of its own, such as a full disk.
     assert status == int(any(one["status"] == "problem" for one in report["findings"]))
-    status, report = run(capsys, tmp_path, render=failed("crash", "ended by SIGSEGV"))
+    status, report = run(capsys, tmp_path, answers={"opengl": failed("crash", "ended by SIGSEGV")})
     assert statuses(report, "OpenGL") == ["problem"]
     assert status == 1
 
 
 def test_the_measurement_is_compared_with_every_robot(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    status, report = run(capsys, tmp_path, "--realtime", measure=wakeups(1.2e-3))
-    found = [(one["status"], one["found"]) for one in report["findings"] if one["check"] == "wake-up"]
+    status, report = run(capsys, tmp_path, "--realtime", answers={"latency test": latency(1.2e-3)})
+    found = [(one["status"], one["found"]) for one in report["findings"] if one["check"] == "latency test"]
     assert found == [
         ("warning", "turtlebot3, 200 Hz: p99 1200 µs is 24.0% of 5 ms"),
         ("problem", "ur5, 500 Hz: p99 1200 µs is 60.0% of 2 ms"),
     ]
     assert status == 1
-    assert report["wakeups"]["p99"] == 1.2e-3
-    assert [grant["name"] for grant in report["wakeups"]["grants"]][-1] == "scheduler"
+    assert report["latency_test"]["p99"] == 1.2e-3
+    assert [grant["name"] for grant in report["latency_test"]["grants"]][-1] == "scheduler"
 
 
 def test_the_printed_report_has_findings_histogram_and_remedies(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    child = FakeChild(ask_rights=grants(scheduler="ask"), render=failed("crash", "[E] ended by SIGSEGV"))
-    assert doctor.main([f"--root={tmp_path}", "--realtime"], child) == 1
-    assert child.asked == ["measure", "list_plugins", "render", "encode", "ask_rights"]
+    fake = FakeTrials({"rights": grants(scheduler="ask"), "opengl": failed("crash", "[E] ended by SIGSEGV")})
+    assert doctor.main([f"--root={tmp_path}", "--realtime"], fake) == 1
+    assert fake.asked == ["latency test", "rights", "ffmpeg", "opengl", "plug-ins"]
     text = capsys.readouterr().out
     lines = text.splitlines()
     assert any("p99 50 µs" in line for line in lines)
@@ -509,10 +475,10 @@ def test_the_printed_report_has_findings_histogram_and_remedies(
 
 
 def test_a_measurement_that_fails_is_a_problem(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    status, report = run(capsys, tmp_path, "--realtime", measure=failed("crash", "ended by SIGKILL"))
+    status, report = run(capsys, tmp_path, "--realtime", answers={"latency test": failed("crash", "ended by SIGKILL")})
     assert status == 1
-    assert report["wakeups"] is None
-    assert [one["cause"] for one in report["findings"] if one["check"] == "wake-up"] == [
+    assert report["latency_test"] is None
+    assert [one["cause"] for one in report["findings"] if one["check"] == "latency test"] == [
         "the measuring process ends: ended by SIGKILL"
     ]
 
@@ -527,16 +493,16 @@ def test_a_measurement_that_fails_is_a_problem(capsys: pytest.CaptureFixture[str
     ],
 )
 def test_wrong_options_are_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    child = FakeChild()
-    assert doctor.main(["--realtime", *arguments], child) == 2
+    fake = FakeTrials()
+    assert doctor.main(["--realtime", *arguments], fake) == 2
     assert message in capsys.readouterr().err
-    assert child.asked == []
+    assert fake.asked == []
 
 
 def test_the_default_folder_is_lerobots(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "datasets"))
-    doctor.main(["--json"], FakeChild())
+    doctor.main(["--json"], FakeTrials())
     disk = next(one for one in json.loads(capsys.readouterr().out)["findings"] if one["check"] == "disk")
     assert str(tmp_path) in disk["found"] + disk["cause"]

@@ -1,6 +1,7 @@
 import io
 import json
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -22,12 +23,11 @@ from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
 from bhd_lerobot.training.rl import checkpoint
 from bhd_lerobot.training.rl import train as module
-from bhd_lerobot.training.rl.adapter import RlVecEnv
-from bhd_lerobot.training.rl.build import make_learner
 from bhd_lerobot.training.rl.config import RlConfig, is_rl, parse_rl
-from bhd_lerobot.training.rl.features import ActionUnits, FeatureStack
+from bhd_lerobot.training.rl.environment import RlVecEnv
+from bhd_lerobot.training.rl.features import in_units
+from bhd_lerobot.training.rl.learner import make_learner
 from bhd_lerobot.training.rl.parts import make_parts, single_action
-from bhd_lerobot.training.rl.shaping import Shaping
 from bhd_lerobot.training.rl.train import RlResult, main, train
 
 # How much the network's rows may differ when they are computed beside others, in m/s and rad/s.
@@ -136,17 +136,58 @@ def test_a_run_goes_on_where_it_was(finished: RlResult, tmp_path: Path) -> None:
     steps = [row["step"] for row in rows(second.output_dir)]
     assert steps == sorted(steps)
     assert steps[0] == 0
-    state = torch.load(second.checkpoint / "training_state" / "learner.pt", weights_only=True)  # type: ignore[operator]
-    assert state["step"] == 128
-    assert state["updates"] == 8  # two epochs in each of four updates
     assert json.loads((second.checkpoint / "training_state/run.json").read_text())["next_episode"] > 4  # type: ignore[operator]
 
 
-def test_a_checkpoint_with_other_widths_is_not_resumed(tmp_path: Path) -> None:
+def test_what_cannot_be_resumed_is_refused_and_a_torn_checkpoint_is_never_loaded(tmp_path: Path) -> None:
     run(tmp_path / "run", steps=32)
-    command = [f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=64", "--policy.critic_dims=[4]"]
+    command = [f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=64"]
+    with pytest.raises(ConfigError, match="cannot be resumed"):
+        train(parse_rl([*command, "--policy.critic_dims=[4]"]), Console(file=io.StringIO()))
+    state = tmp_path / "run" / "checkpoints" / "last" / "training_state"
+    whole = (state / "learner.zip").read_bytes()
+    (state / "learner.zip").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ConfigError, match="cannot be resumed"):
         train(parse_rl(command), Console(file=io.StringIO()))
+    (state / "learner.zip").rename(state / "learner.pt")
+    with pytest.raises(ConfigError, match=r"version 0\.1.*--start_from="):
+        train(parse_rl(command), Console(file=io.StringIO()))
+
+
+KILLED = """
+import os, signal, sys
+from bhd_lerobot.training import checkpoint
+from bhd_lerobot.training.rl.train import main
+
+name, calls = sys.argv[1], iter(range(int(sys.argv[2])))
+function = getattr(checkpoint, name)
+
+def dying(*arguments):
+    if next(calls, None) is None:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return function(*arguments)
+
+setattr(checkpoint, name, dying)
+main(sys.argv[3:])
+"""
+
+
+def test_a_run_that_is_killed_while_it_saves_goes_on_from_the_last_complete_checkpoint(tmp_path: Path) -> None:
+    script, folder = tmp_path / "killed.py", tmp_path / "run"
+    script.write_text(KILLED)
+    again = [f"--config_path={folder}", "--resume=true"]
+    # The second checkpoint first before it is renamed, then before `last` leads to it.
+    for name, calls, arguments in (("_flush", 1, options(folder)), ("point", 0, again)):
+        command = [sys.executable, script, name, str(calls), *arguments]
+        killed = subprocess.run(command, capture_output=True, check=False)
+        assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+        assert (folder / "checkpoints" / "last").readlink().name == "000000000"
+    assert main(again) == 0
+    assert {one.name for one in (folder / "checkpoints").iterdir()} == {
+        *("000000000", "000000064", "000000096"),
+        *("last", "best"),
+    }
+    assert [row["step"] for row in rows(folder) if "val_score" in row] == [0, 64, 96]
 
 
 @pytest.mark.parametrize("channels", [[], [4]])
@@ -154,8 +195,8 @@ def test_the_exported_policy_does_what_the_learners_actor_does(tmp_path: Path, c
     config = parse_rl(options(**{"policy.scan.channels": channels, "policy__layer_norm": "true"}))
     env = BhdVectorEnv(4, config.environment, config.robot, config.task, autoreset_mode="Disabled", threads=1)
     parts = make_parts(config, env)
-    stack, units = FeatureStack(parts.front, parts.before, 4), ActionUnits(parts.after)
-    adapter = RlVecEnv(env, stack, units, Shaping(config.reward, 0.99, 4))
+    adapter = RlVecEnv(env, parts, config.reward, 0.99)
+    stack = adapter.stack
     learner = make_learner(config, parts, adapter, lambda step: 0.0)
     learner.learn(64, log_interval=2**60)
     assert any(len(p) and p.grad is not None for p in parts.actor.net.parameters())
@@ -169,7 +210,7 @@ def test_the_exported_policy_does_what_the_learners_actor_does(tmp_path: Path, c
         else:
             stack.push(state)
         mean, _ = learner.predict(stack.features(), deterministic=True)
-        wanted.append(units(mean))
+        wanted.append(in_units(parts.after, mean))
     env.close()
     np.testing.assert_allclose(actions(tmp_path, states), wanted, rtol=0, atol=TOLERANCE)
 
@@ -179,8 +220,7 @@ def test_a_checkpoint_that_is_exported_without_training_does_the_same(finished: 
     config = parse_rl(options(start_from=finished.checkpoint, policy__hidden_dims=[3]))
     env = BhdVectorEnv(4, config.environment, config.robot, config.task, autoreset_mode="Disabled", threads=1)
     parts = make_parts(config, env)
-    stack = FeatureStack(parts.front, parts.before, 4)
-    adapter = RlVecEnv(env, stack, ActionUnits(parts.after), Shaping(config.reward, 0.99, 4))
+    adapter = RlVecEnv(env, parts, config.reward, 0.99)
     learner = make_learner(config, parts, adapter, lambda step: 0.0)
     checkpoint.export(tmp_path, parts, learner.policy.log_std)
     env.close()
@@ -242,40 +282,34 @@ def test_without_stable_baselines3_the_message_says_how_to_install_it(
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ({"steps": 0}, "steps is 0; it must be at least 1"),
-        ({"steps": -5}, "steps is -5"),
-        ({"max_minutes": 0}, "max_minutes is 0"),
-        ({"env__n_envs": 0}, "env.n_envs is 0"),
-        ({"reward__events": "{colision: -1}"}, "Did you mean 'collision'"),
-        ({"reward__events": "{collision: .nan}"}, "must be a finite number"),
-        ({"reward__potential": "pose"}, "only a task with a target pose"),
-        ({"algorithm": "sac"}, "Valid: ppo"),
-        ({"validation__seed": 0}, "judged on the episodes"),
-        ({"critic_warmup": 10}, "needs --start_from"),
-        ({"robot__type": "ur5", "robot__beams": None}, "this task is for 'turtlebot3'"),
-        ({"ppo__gamma": 1.5}, "between 0 and 1"),
-        ({"ppo__learning_rate": 1.0}, "Unknown option 'ppo.learning_rate'"),
-        ({"resume": "true"}, "resume needs --output_dir"),
-        ({"ppo.ent_coef": ".nan"}, "ppo.ent_coef is nan"),
-        ({"ppo.vf_coef": -1}, "ppo.vf_coef is -1"),
-        ({"ppo.max_grad_norm": ".nan"}, "ppo.max_grad_norm is nan"),
-        ({"ppo.target_kl": -1}, "ppo.target_kl is -1"),
-        ({"ppo.log_std_init": ".nan"}, "ppo.log_std_init is nan"),
-        ({"reward.frame": ".nan"}, "reward.frame is nan"),
-        ({"reward.events": "{collision: .inf}"}, "reward.events.collision is inf"),
-        ({"reward.per_m": ".nan"}, "reward.per_m is nan"),
-        ({"anchor.coef": ".nan"}, "anchor.coef is nan"),
-        ({"policy.critic_dims": [0]}, "policy.critic_dims is 0"),
-        ({"policy.activation": "gelul"}, "Did you mean 'gelu'"),
-        ({"policy.n_obs_steps": 0}, "policy.n_obs_steps is 0"),
-    ],
-)
-def test_wrong_values_are_named(overrides: dict, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        parse_rl(options(**overrides))
+WRONG: list[tuple[dict[str, object], str]] = [
+    ({"steps": 0}, "steps is 0; it must be at least 1"),
+    ({"max_minutes": 0}, "max_minutes is 0"),
+    ({"env__n_envs": 0}, "env.n_envs is 0"),
+    ({"reward__events": "{colision: -1}"}, "Did you mean 'collision'"),
+    ({"reward__potential": "pose"}, "only a task with a target pose"),
+    ({"algorithm": "sac"}, "Valid: ppo"),
+    ({"validation__seed": 0}, "judged on the episodes"),
+    ({"critic_warmup": 10}, "needs --start_from"),
+    ({"robot__type": "ur5", "robot__beams": None}, "this task is for 'turtlebot3'"),
+    ({"ppo__gamma": 1.5}, "between 0 and 1"),
+    ({"ppo__learning_rate": 1.0}, "Unknown option 'ppo.learning_rate'"),
+    ({"resume": "true"}, "resume needs --output_dir"),
+    ({"ppo.ent_coef": ".nan"}, "ppo.ent_coef is nan"),
+    ({"ppo.target_kl": -1}, "ppo.target_kl is -1"),
+    ({"reward.frame": ".nan"}, "reward.frame is nan"),
+    ({"reward.events": "{collision: .inf}"}, "reward.events.collision is inf"),
+    ({"anchor.coef": ".nan"}, "anchor.coef is nan"),
+    ({"policy.critic_dims": [0]}, "policy.critic_dims is 0"),
+    ({"policy.activation": "gelul"}, "Did you mean 'gelu'"),
+    ({"policy.n_obs_steps": 0}, "policy.n_obs_steps is 0"),
+]
+
+
+def test_wrong_values_are_named() -> None:
+    for overrides, message in WRONG:
+        with pytest.raises(ConfigError, match=message):
+            parse_rl(options(**overrides))
 
 
 def test_a_checkpoint_of_another_robot_is_refused(finished: RlResult, tmp_path: Path) -> None:
@@ -381,7 +415,7 @@ def test_weights_that_are_no_numbers_end_the_run(tmp_path: Path, monkeypatch: py
             one.data.fill_(float("nan"))
         raise ValueError("the distribution's mean is nan")
 
-    monkeypatch.setattr("bhd_lerobot.training.rl.build.learn", spoil)
+    monkeypatch.setattr("bhd_lerobot.training.rl.learner.learn", spoil)
     with pytest.raises(BhdError, match=r"weights are not finite .*000000000 is intact.*--ppo\.lr"):
         run(tmp_path / "run")
 

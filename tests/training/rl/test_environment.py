@@ -10,12 +10,11 @@ from bhd_lerobot.envs.course import STREAM
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.task import Event
-from bhd_lerobot.training.rl.adapter import RlVecEnv
-from bhd_lerobot.training.rl.build import make_learner
 from bhd_lerobot.training.rl.config import RewardConfig, RlConfig, parse_rl
-from bhd_lerobot.training.rl.features import ActionUnits, FeatureStack
+from bhd_lerobot.training.rl.environment import RlVecEnv, Shaping, pose_potential
+from bhd_lerobot.training.rl.features import FeatureStack
+from bhd_lerobot.training.rl.learner import make_learner
 from bhd_lerobot.training.rl.parts import RlParts, make_parts
-from bhd_lerobot.training.rl.shaping import Shaping, pose_potential
 
 N = 3
 
@@ -52,15 +51,14 @@ class Rig:
         self.config = configuration(duration_s)
         self.env = environment(self.config)
         self.parts: RlParts = make_parts(self.config, self.env)
-        self.stack = FeatureStack(self.parts.front, self.parts.before, N)
-        self.shaping = Shaping(reward or self.config.reward, self.config.ppo.gamma, N)
-        self.adapter = RlVecEnv(self.env, self.stack, ActionUnits(self.parts.after), self.shaping)
+        self.adapter = RlVecEnv(self.env, self.parts, reward or self.config.reward, self.config.ppo.gamma)
         self.episodes: list[dict] = []
-        self.adapter.on_episode = self.episodes.append
 
     def step(self, forward: float = 0.0) -> tuple:
         self.adapter.step_async(np.tile(np.float32([forward, 0.0]), (N, 1)))
-        return self.adapter.step_wait()
+        result = self.adapter.step_wait()
+        self.episodes += [info for info in result[3] if info]
+        return result
 
 
 @pytest.fixture
@@ -89,13 +87,13 @@ def test_a_vector_is_what_the_policy_sees_of_the_frames_that_its_configuration_n
 
 def test_at_an_episodes_start_nothing_was_before_its_first_frame(rig: Rig) -> None:
     rows = {"observation.state": np.arange(N * 38, dtype=np.float32).reshape(N, 38) + 1}
-    rig.stack.restart(np.arange(N), rows)
-    rig.stack.push({"observation.state": rows["observation.state"] * 2})
-    rig.stack.restart(np.array([1]), rows)
+    rig.adapter.stack.restart(np.arange(N), rows)
+    rig.adapter.stack.push({"observation.state": rows["observation.state"] * 2})
+    rig.adapter.stack.restart(np.array([1]), rows)
     batch = {"observation.state": torch.from_numpy(np.stack([rows["observation.state"]] * 3, axis=1))}
     wanted = rig.parts.front.features(rig.parts.before(batch)).detach().numpy()
-    np.testing.assert_array_equal(rig.stack.features()[1], wanted[1])
-    assert not np.array_equal(rig.stack.features()[0], wanted[0])
+    np.testing.assert_array_equal(rig.adapter.stack.features()[1], wanted[1])
+    assert not np.array_equal(rig.adapter.stack.features()[0], wanted[0])
 
 
 def test_an_episode_whose_time_is_over_is_truncated_and_the_next_begins_in_the_same_step(rig: Rig) -> None:
@@ -139,14 +137,14 @@ def test_a_collision_is_no_truncation_and_costs_what_the_configuration_says() ->
 
 
 def test_what_is_reported_is_the_tasks_own_return_whatever_the_learner_gets() -> None:
-    told = []
+    reported = []
     for reward in (RewardConfig(), RewardConfig(scale=100.0, frame=-1.0, events={"collision": -9.0, "stuck": -9.0})):
         rig = Rig(60, reward=reward)
         collide(rig)
         rig.adapter.close()
-        told.append([{key: one[key] for key in ("return", "score", "event", "length")} for one in rig.episodes])
-    assert told[0] == told[1]
-    assert told[0][0]["return"] >= 0
+        reported.append([{key: one[key] for key in ("episode", "score", "event")} for one in rig.episodes])
+    assert reported[0] == reported[1]
+    assert reported[0][0]["episode"]["r"] >= 0
 
 
 @pytest.mark.parametrize(("truncated", "factor"), [(True, 1.0), (False, 0.0)])
@@ -201,5 +199,5 @@ def test_the_potential_is_zero_at_the_target_and_falls_with_distance_and_angle()
 def test_the_adapter_refuses_an_environment_that_begins_anew_by_itself(rig: Rig) -> None:
     env = BhdVectorEnv(1, rig.config.environment, rig.config.robot, autoreset_mode="SameStep", threads=1)
     with pytest.raises(ConfigError, match="Disabled"):
-        RlVecEnv(env, rig.stack, ActionUnits(rig.parts.after), rig.shaping)
+        RlVecEnv(env, rig.parts, rig.config.reward, 0.99)
     env.close()

@@ -9,7 +9,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
-from bhd_lerobot.apps.demo import demo, lessons
+from bhd_lerobot.apps import demo
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.policies.learned.contract import PolicyContract
@@ -18,25 +18,24 @@ from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.signals import StopRequest
 from bhd_lerobot.training.arguments import parse_train
 
-SMALL = {"episodes": 2, "steps": 4, "trials": 2, "film": False}  # films are the slowest part, and tested elsewhere
+SMALL = {"episodes": 2, "steps": 4, "trials": 2, "video": False}  # videos are the slowest part, and tested elsewhere
 AVOID = replace(
-    lessons.AVOID,
+    demo.AVOID,
     **SMALL,
     world=("--robot.type=turtlebot3", "--robot.beams=36", "--task.type=avoid", "--task.duration_s=2", "--threads=1"),
 )
 REACH = replace(
-    lessons.REACH,
+    demo.REACH,
     **SMALL,
     early_steps=2,
-    world=(*lessons.REACH.world, "--threads=1"),
+    world=(*demo.REACH.world, "--threads=1"),
 )
-PICK = replace(lessons.PICK, episodes=1, film=False, options=("--threads=1",))
+PICK = replace(demo.PICK, episodes=1, video=False, options=("--threads=1",))
 
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(demo, "LESSONS", (AVOID, REACH))
-    monkeypatch.setattr(demo, "PICK", PICK)
+    monkeypatch.setattr(demo, "LESSONS", (AVOID, REACH, PICK))
     monkeypatch.setenv("COLUMNS", "160")
 
 
@@ -45,8 +44,7 @@ def done(tmp_path_factory):
     """Return the folder of a small demo, and what it printed."""
     folder = tmp_path_factory.mktemp("demo") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "LESSONS", (AVOID, REACH))
-        patch.setattr(demo, "PICK", PICK)
+        patch.setattr(demo, "LESSONS", (AVOID, REACH, PICK))
         patch.setenv("COLUMNS", "160")
         printed: list[str] = []
         patch.setattr("sys.stdout", _Kept(printed))
@@ -122,20 +120,15 @@ def test_replays_are_the_recorded_ones(done):
     assert done[1].count("same bits") == 4  # two robots, two modes
 
 
-def test_a_folder_in_use_is_refused_and_nothing_in_it_changes(small, tmp_path, capsys):
+def test_a_folder_in_use_or_a_file_in_its_place_is_refused_and_nothing_changes(small, tmp_path, capsys):
     (tmp_path / "mine.txt").write_text("precious")
-    assert demo.main([str(tmp_path)]) == 2
-    assert "mine.txt" in (said := capsys.readouterr().err)
-    assert str(tmp_path) in said
+    for place, message in ((tmp_path, "mine.txt"), (tmp_path / "mine.txt", "cannot be used")):
+        assert demo.main([str(place)]) == 2
+        printed = capsys.readouterr().err
+        assert message in printed
+        assert str(place) in printed
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     assert (tmp_path / "mine.txt").read_text() == "precious"
-
-
-def test_a_file_in_place_of_the_folder_is_refused(small, tmp_path, capsys):
-    (tmp_path / "file").write_text("precious")
-    assert demo.main([str(tmp_path / "file")]) == 2
-    assert "cannot be used" in capsys.readouterr().err
-    assert (tmp_path / "file").read_text() == "precious"
 
 
 def test_unknown_options_end_with_status_2(capsys):
@@ -157,13 +150,12 @@ def test_a_signal_in_a_step_ends_the_demo_with_its_status(small, tmp_path, monke
 
 
 def test_a_failure_in_a_step_gives_its_message_and_status_2(small, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(demo, "PICK", replace(PICK, options=("--task.max_objects=0",)))
-    monkeypatch.setattr(demo, "LESSONS", ())
+    monkeypatch.setattr(demo, "LESSONS", (replace(PICK, options=("--task.max_objects=0",)),))
     assert demo.main([str(tmp_path / "run")]) == 2
     assert "max_objects" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("one", lessons.LESSONS, ids=lambda one: one.name)
+@pytest.mark.parametrize("one", [demo.AVOID, demo.REACH], ids=lambda one: one.name)
 def test_whole_size_command_lines_are_valid(one, tmp_path):
     recorded = parse(RecordConfig, one.recorded(tmp_path))
     assert recorded.dataset.num_episodes == one.episodes
@@ -171,7 +163,7 @@ def test_whole_size_command_lines_are_valid(one, tmp_path):
     assert trained.steps == one.steps
     assert trained.dataset.root == recorded.dataset.root
     assert not one.early_steps or one.steps % one.early_steps == 0
-    assert (Path(demo.__file__).parents[3] / one.recipe).is_file()
+    assert (Path(demo.__file__).parents[2] / one.recipe).is_file()
     rule = replace(one, early_steps=0)
     options = [text for text in rule.evaluated(tmp_path, tmp_path / "none", None) if "learned" not in text]
     assert parse(EvalConfig, options).split != recorded.split

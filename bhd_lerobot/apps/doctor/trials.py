@@ -1,0 +1,172 @@
+"""What the doctor tries out in a process of its own, where a crash is a finding and not the end.
+
+The latency test runs here, too: nothing at the top of this module imports torch, LeRobot or MuJoCo.
+"""
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from bhd_lerobot.apps.doctor.latency_test import measure
+from bhd_lerobot.errors import BhdError
+from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
+
+TIMEOUT_S = 180.0
+_RESULT = "\0result "  # begins the line that a trial's result stands in, among what libraries print
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a trial ended.
+
+    Attributes:
+        kind: a value was returned, an exception raised, the process died, or did not answer.
+        value: what was returned.
+        error: what went wrong, in one line; empty for a value.
+        output: the last line that was printed meanwhile.
+    """
+
+    kind: Literal["value", "error", "crash", "timeout"]
+    value: Any = None
+    error: str = ""
+    output: str = ""
+
+
+def run_trials(trials: Sequence[Sequence[Any]], timeout_s: float = TIMEOUT_S) -> list[Outcome]:
+    """Try things out in one process, and those after a crash in another; nothing is printed on our terminal.
+
+    Args:
+        trials: name, one of `TRIALS`, and arguments of each.
+        timeout_s: after this time a process is killed [s].
+    """
+    outcomes: list[Outcome] = []
+    while len(outcomes) < len(trials):
+        outcomes += _run_process(trials[len(outcomes) :], timeout_s)
+    return outcomes
+
+
+def _run_process(trials: Sequence[Sequence[Any]], timeout_s: float) -> list[Outcome]:
+    """Return the outcomes of all trials, or of those up to the first that ended the process."""
+    command = [sys.executable, "-P", "-m", __name__, *map(json.dumps, trials)]
+    kind: Literal["crash", "timeout"] = "crash"
+    try:
+        done = subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=timeout_s,
+            check=False,
+        )
+        printed, end = done.stdout, _describe_end(done.returncode)
+    except subprocess.TimeoutExpired as error:
+        kind, printed, end = "timeout", error.stdout or b"", f"no answer in {timeout_s:g} s"
+    outcomes, last = [], ""
+    for line in printed.decode(errors="replace").split("\n"):
+        if line.startswith(_RESULT):
+            outcomes.append(Outcome(**json.loads(line.removeprefix(_RESULT)), output=last))
+            last = ""
+        else:
+            last = line.strip() or last
+    return outcomes if len(outcomes) == len(trials) else [*outcomes, Outcome(kind, error=end, output=last)]
+
+
+def _describe_end(status: int) -> str:
+    if status >= 0:
+        return f"ended with status {status}"
+    names = {one.value: one.name for one in signal.Signals}
+    return f"ended by {names.get(-status, f'signal {-status}')}"
+
+
+def main(trials: Sequence[str]) -> None:
+    """Run trials in this process; print a line with the result of each."""
+    for trial in trials:
+        name, *arguments = json.loads(trial)
+        try:
+            result = {"kind": "value", "value": TRIALS[name](*arguments)}
+        except BhdError as error:
+            result = {"kind": "error", "error": str(error)}
+        except Exception as error:
+            result = {"kind": "error", "error": f"{type(error).__name__}: {error}"}
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        os.write(1, f"\n{_RESULT}{json.dumps(result)}\n".encode())
+
+
+def ask_rights() -> list[dict[str, Any]]:
+    """Ask for real-time privileges; return what became of each request, as the fields of a `Grant`."""
+    with Privileges() as privileges:
+        return [grant.as_dict() for grant in privileges.acquire(RealtimeSettings())]
+
+
+def encode() -> dict[str, Any]:
+    """Encode one image as H.264 into memory; return versions and whether torchcodec could find FFmpeg's libraries."""
+    import io
+    from ctypes.util import find_library
+
+    import av
+    import numpy as np
+
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("h264", 10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    version = ".".join(map(str, av.library_versions["libavcodec"]))
+    return {
+        "bytes": len(file.getvalue()),
+        "pyav": av.__version__,
+        "libavcodec": version,
+        "shared": find_library("avutil"),
+    }
+
+
+def render() -> dict[str, Any]:
+    """Render one image of a simulation; return the driver's name and how far apart its brightest and darkest are.
+
+    Raises:
+        RenderingError: no OpenGL works here.
+    """
+    from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+    from bhd_lerobot.sim.camera import Camera
+    from bhd_lerobot.sim.world import World
+
+    camera = Camera(World(turtlebot3_burger()), 64, 48)
+    image = camera.render(0, "front")
+    gl = importlib.import_module("OpenGL.GL")
+    name = gl.glGetString(gl.GL_RENDERER)
+    camera.close()
+    return {"spread": int(image.max()) - int(image.min()), "driver": name.decode(errors="replace") if name else "?"}
+
+
+def list_plugins() -> dict[str, list[str]]:
+    """Return the types of robots and teleoperators that LeRobot knows after it has looked for plug-ins."""
+    from lerobot.robots.config import RobotConfig
+    from lerobot.teleoperators.config import TeleoperatorConfig
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    return {
+        "robots": sorted(RobotConfig.get_known_choices()),
+        "teleoperators": sorted(TeleoperatorConfig.get_known_choices()),
+    }
+
+
+TRIALS: dict[str, Callable[..., Any]] = {
+    "rights": ask_rights,  # first: it locks the memory of its process, which is small then
+    "ffmpeg": encode,
+    "opengl": render,
+    "plug-ins": list_plugins,
+    "latency test": measure,
+}
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,327 @@
+"""PPO on a `bhd_mlp`: actor and critic, the learner, and its loop. Import this only where stable-baselines3 is there.
+
+The actor's modules are those of a `bhd_mlp`, so that exporting it is exact.
+"""
+
+import copy
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import Tensor, nn
+
+from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
+from bhd_lerobot.training.rl.config import AnchorConfig, RlConfig
+from bhd_lerobot.training.rl.environment import RlVecEnv
+from bhd_lerobot.training.rl.log import Row
+from bhd_lerobot.training.rl.parts import RlParts
+
+_LOGGED = {
+    "train/approx_kl": "kl",
+    "train/clip_fraction": "clip_fraction",
+    "train/explained_variance": "explained_variance",
+    "train/value_loss": "value_loss",
+    "train/policy_gradient_loss": "policy_loss",
+    "train/std": "std",
+    "train/learning_rate": "lr",
+    "train/anchor_kl": "anchor_kl",
+}
+_NEVER = 2**62  # updates between two outputs of stable-baselines3's own log
+
+
+_ACTIVATIONS: dict[str, type[nn.Module]] = {
+    "relu": nn.ReLU,
+    "tanh": nn.Tanh,
+    "gelu": nn.GELU,
+    "silu": nn.SiLU,
+    "elu": nn.ELU,
+}
+
+
+class ActorHead(nn.Module):
+    """From a feature vector, whose beams are not convolved yet, to the last hidden layer of a `bhd_mlp`.
+
+    Args:
+        policy: the `bhd_mlp`; its modules are shared, not copied.
+    """
+
+    def __init__(self, policy: MlpPolicy) -> None:
+        super().__init__()
+        scan, steps = policy.config.scan, policy.config.n_obs_steps
+        self.encoder = policy.scan_encoder
+        self.hidden = nn.Sequential(*list(policy.net)[:-1])
+        self._beams = steps * scan.beams if self.encoder is not None else 0
+        self._shape = (steps, scan.beams)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return the hidden layer, shape (n, width), of vectors, shape (n, size)."""
+        if self.encoder is not None:
+            numbers, scan = features[:, : -self._beams], features[:, -self._beams :]
+            features = torch.cat([numbers, self.encoder(scan.unflatten(1, self._shape))], dim=-1)
+        return self.hidden(features)
+
+
+class Networks(nn.Module):
+    """The hidden layers of actor and critic, in the form that `ActorCriticPolicy` asks for.
+
+    Args:
+        policy: the actor.
+        size: width of a feature vector.
+        critic_dims: widths of the critic's hidden layers.
+    """
+
+    def __init__(self, policy: MlpPolicy, size: int, critic_dims: list[int]) -> None:
+        super().__init__()
+        self.policy_net = ActorHead(policy)
+        self.latent_dim_pi = int(policy.net[-1].in_features)  # type: ignore[arg-type]
+        layers: list[nn.Module] = []
+        width = size
+        for dim in critic_dims:
+            layers += [nn.Linear(width, dim), _ACTIVATIONS[policy.config.activation]()]
+            width = dim
+        self.value_net = nn.Sequential(*layers)
+        self.latent_dim_vf = width
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the last hidden layers of both."""
+        return self.forward_actor(features), self.forward_critic(features)
+
+    def forward_actor(self, features: Tensor) -> Tensor:
+        """Return the actor's last hidden layer."""
+        return self.policy_net(features)
+
+    def forward_critic(self, features: Tensor) -> Tensor:
+        """Return the critic's last hidden layer."""
+        return self.value_net(features)
+
+
+class MlpActorCritic(ActorCriticPolicy):
+    """A `bhd_mlp` as actor, and a critic of its own.
+
+    Attributes:
+        actor: the `bhd_mlp`, which shares its parameters with this.
+
+    Args:
+        observation_space: vectors of a `FeatureStack`.
+        action_space: normalised actions.
+        lr_schedule: of the learning rate.
+        actor: the `bhd_mlp`, with a chunk of one action.
+        critic_dims: widths of the critic's hidden layers.
+        fresh: initialise the actor's linear layers; otherwise they stay as they are.
+        kwargs: what stable-baselines3 passes besides.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Any,
+        *,
+        actor: MlpPolicy,
+        critic_dims: list[int],
+        fresh: bool,
+        **kwargs: Any,
+    ) -> None:
+        # nn.Module wants to be initialised before it gets modules, and SB3 builds the networks while it does so.
+        self._ingredients: tuple[MlpPolicy, list[int], bool] = (actor, critic_dims, fresh)
+        super().__init__(observation_space, action_space, lr_schedule, ortho_init=False, **kwargs)
+
+    @property
+    def actor(self) -> MlpPolicy:
+        """The `bhd_mlp`, which shares its parameters with this."""
+        return self._ingredients[0]
+
+    def actor_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters of the actor, its exploration noise included."""
+        return [*self.mlp_extractor.policy_net.parameters(), *self.action_net.parameters(), self.log_std]
+
+    def _build_mlp_extractor(self) -> None:
+        actor, critic_dims, _ = self._ingredients
+        self.mlp_extractor = Networks(actor, self.features_dim, critic_dims)  # type: ignore[assignment]
+
+    def _build(self, lr_schedule: Any) -> None:
+        super()._build(lr_schedule)
+        actor, _, fresh = self._ingredients
+        self.action_net = actor.net[-1]
+        parts: list[tuple[nn.Module, float]] = [(self.mlp_extractor.value_net, 2**0.5), (self.value_net, 1.0)]
+        if fresh:
+            parts += [(self.mlp_extractor.policy_net, 2**0.5), (self.action_net, 0.01)]
+        for module, gain in parts:
+            for one in module.modules():
+                if isinstance(one, nn.Linear):
+                    nn.init.orthogonal_(one.weight, gain=gain)
+                    nn.init.zeros_(one.bias)
+        kwargs: dict[str, Any] = {**self.optimizer_kwargs, "lr": lr_schedule(1)}
+        self.optimizer = self.optimizer_class(self.parameters(), **kwargs)
+
+
+class AnchoredPPO(PPO):
+    """Stable-baselines3's PPO; its actor can be frozen at first, and be kept near the one that it started as.
+
+    The anchor is a pass of gradient steps over the samples of an update, after PPO's own: it lowers the divergence
+    KL(first, policy) times the weight.
+
+    Args:
+        args: see `stable_baselines3.PPO`.
+        critic_warmup: environment steps in which the actor is frozen.
+        anchor: the anchor's weight.
+        done: how much of the run is done after an environment step, from 0 to 1.
+        kwargs: see `stable_baselines3.PPO`.
+    """
+
+    policy: MlpActorCritic
+
+    def __init__(
+        self, *args: Any, critic_warmup: int, anchor: AnchorConfig, done: Callable[[int], float], **kwargs: Any
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self._warmup, self._anchor, self._done = critic_warmup, anchor, done
+        self._first: tuple[nn.Module, nn.Module, Tensor] | None = None
+        if anchor.coef:
+            self._first = copy.deepcopy(
+                (self.policy.mlp_extractor.policy_net, self.policy.action_net, self.policy.log_std.detach())
+            )
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # Stable-baselines3 counts steps; here the time may be up first.
+        self._current_progress_remaining = 1 - self._done(num_timesteps)
+
+    def train(self) -> None:
+        """Learn from the samples that were gathered."""
+        frozen = self.num_timesteps <= self._warmup
+        for one in self.policy.actor_parameters():
+            one.requires_grad_(not frozen)
+        super().train()
+        if self._first is not None and not frozen:
+            self._pull(self._anchor.coef * (self._current_progress_remaining if self._anchor.decay else 1.0))
+
+    def _pull(self, coef: float) -> None:
+        assert self._first is not None
+        hidden, output, log_std = self._first
+        total, count = 0.0, 0
+        for samples in self.rollout_buffer.get(self._anchor.batch_size):
+            features: Any = samples.observations
+            with torch.no_grad():
+                target = torch.distributions.Normal(output(hidden(features)), log_std.exp())
+            mean = self.policy.action_net(self.policy.mlp_extractor.forward_actor(features))
+            distribution = torch.distributions.Normal(mean, self.policy.log_std.exp())
+            divergence = torch.distributions.kl_divergence(target, distribution).sum(1).mean()
+            self.policy.optimizer.zero_grad()
+            (coef * divergence).backward()
+            nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+            self.policy.optimizer.step()
+            total, count = total + float(divergence.detach()), count + 1
+        self.logger.record("train/anchor_kl", total / max(count, 1))
+
+
+def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv, done: Callable[[int], float]) -> AnchoredPPO:
+    """Return PPO on an actor.
+
+    Args:
+        config: of the run.
+        parts: the actor and what belongs to it.
+        env: the environments.
+        done: how much of the run is done after a step, from 0 to 1.
+    """
+    options = asdict(config.ppo)
+    lr, schedule, log_std = (options.pop(name) for name in ("lr", "lr_schedule", "log_std_init"))
+    options["batch_size"] = min(options["batch_size"], options["n_steps"] * env.num_envs)
+    if log_std is None:
+        own = parts.actor.log_std
+        log_std = 0.0 if own is None or parts.fresh else float(own.detach().mean())
+    learner = AnchoredPPO(
+        MlpActorCritic,
+        env,
+        learning_rate=lr if schedule == "constant" else lambda remaining: lr * remaining,
+        **options,
+        seed=config.seed,
+        device="cpu",
+        policy_kwargs={
+            "actor": parts.actor,
+            "critic_dims": list(config.policy.critic_dims),
+            "fresh": parts.fresh,
+            "log_std_init": log_std,
+        },
+        critic_warmup=config.critic_warmup,
+        anchor=config.anchor,
+        done=done,
+    )
+    learner.set_logger(Logger(None, []))
+    return learner
+
+
+def learn(learner: AnchoredPPO, steps: int, updated: Callable[[Any, Row], None], is_over: Callable[[], bool]) -> None:
+    """Learn until a number of environment steps is done, or until it is over.
+
+    Args:
+        learner: what learns.
+        steps: environment steps in all.
+        updated: called with the learner and what it measured, after each update.
+        is_over: asked after each frame.
+    """
+    watcher = _Watcher(updated, is_over)
+    learner.learn(
+        max(0, steps - learner.num_timesteps), callback=watcher, log_interval=_NEVER, reset_num_timesteps=False
+    )
+    watcher.report()
+
+
+class _Watcher(BaseCallback):
+    """Reports after each update, which is before the next samples are gathered."""
+
+    def __init__(self, updated: Callable[[Any, Row], None], is_over: Callable[[], bool]) -> None:
+        super().__init__()
+        self._updated, self._is_over = updated, is_over
+        self._gathered, self._since, self._gathering_s = 0, time.perf_counter(), 0.0
+        self._episodes: list[dict[str, Any]] = []
+
+    def _on_rollout_start(self) -> None:
+        self.report()
+        self._start = time.perf_counter()
+
+    def _on_rollout_end(self) -> None:
+        self._gathering_s = time.perf_counter() - self._start
+
+    def _on_step(self) -> bool:
+        self._episodes += [info for info in self.locals["infos"] if "episode" in info]
+        return not self._is_over()
+
+    def report(self) -> None:
+        """Report the last update, if there was one since the last report."""
+        frames = self.model.num_timesteps - self._gathered
+        values = self.model.logger.name_to_value
+        if frames and self._gathering_s:
+            took = time.perf_counter() - self._since
+            row = _means(self._episodes)
+            row |= {name: float(values[key]) for key, name in _LOGGED.items() if key in values}
+            row |= {
+                "frames_per_s": frames / took,
+                "gathering_s": self._gathering_s,
+                "update_s": took - self._gathering_s,
+            }
+            self._episodes = []
+            self._updated(self.model, row)
+        self._gathered, self._since, self._gathering_s = self.model.num_timesteps, time.perf_counter(), 0.0
+
+
+def _means(episodes: list[dict[str, Any]]) -> Row:
+    """Return the means of episodes that ended, and the share of each failure; nothing if none did."""
+    if not episodes:
+        return {}
+    values = {
+        "return": [one["episode"]["r"] for one in episodes],
+        "success": [one["is_success"] for one in episodes],
+        "score": [one["score"] for one in episodes],
+        "length": [one["episode"]["l"] for one in episodes],
+    }
+    row: Row = {"episodes": len(episodes)} | {key: float(np.mean(each)) for key, each in values.items()}
+    failures = [one["event"] for one in episodes if not one["is_success"]]
+    return row | {cause: failures.count(cause) / len(episodes) for cause in sorted(set(failures))}
