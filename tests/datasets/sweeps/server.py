@@ -72,7 +72,7 @@ class Fault:
 def record(root: Path, episodes: int) -> int:
     """Record episodes, printing which are saved; go on with what is there."""
     try:
-        publish.complete_interrupted(root)  # or creating it says that it exists, and to resume it
+        atomic.complete_interrupted(root)  # or creating it says that it exists, and to resume it
         recorder = support.resume(root) if (root / "meta/info.json").exists() else support.create(root)
         with recorder:
             while recorder.num_episodes < episodes:
