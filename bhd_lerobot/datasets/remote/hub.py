@@ -1,6 +1,5 @@
 """A dataset on the Hub, through its own client: one commit for all that changed, and the tag that LeRobot looks for."""
 
-import glob
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from bhd_lerobot.datasets.remote.hub_errors import hub_errors, require_token
 from bhd_lerobot.datasets.remote.listing import (
-    WORKERS,
     Item,
     RemoteFile,
     check_repo_id,
@@ -104,21 +102,16 @@ class HubDataset:
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Download files of the listed commit, and compare them with their checksums."""
-        from huggingface_hub import snapshot_download
+        from huggingface_hub import hf_hub_download
+
+        def fetch_one(path: str) -> None:
+            # What `snapshot_download` does, but each file is verified while others are on their way. By the commit's
+            # hash: with a name, the client would fall back to what it has if the Hub cannot be reached.
+            hf_hub_download(self.name, path, repo_type="dataset", revision=self.commit, local_dir=folder)
+            refuse_damaged(folder / path, self._listed[path], self.name, path)
 
         with hub_errors(self.name, "download", revision=self.revision):
-            snapshot_download(
-                self.name,
-                repo_type="dataset",
-                revision=self.commit,
-                local_dir=folder,
-                allow_patterns=[glob.escape(path) for path in paths],
-                max_workers=WORKERS,
-            )
-            run_all(
-                lambda path: refuse_damaged(folder / path, self._listed[path], self.name, path),
-                largest_first(paths, self._listed),
-            )
+            run_all(fetch_one, largest_first(paths, self._listed))
 
     def send(self, source: LocalDataset, items: Sequence[Item], deleted: Sequence[str]) -> None:
         """Upload files and remove others in one commit, and set the tags."""
