@@ -1,29 +1,23 @@
-"""The card and the picture that go with a dataset to the Hub."""
+"""The card of a dataset: `README.md` beside it, by which people and the Hub's viewer know what it is."""
 
-import tempfile
+import json
+import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+import yaml
 
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.format.columns import read_episode
-from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
+from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
-from bhd_lerobot.datasets.remote.card import CardFacts, compose
 from bhd_lerobot.datasets.remote.listing import PICTURE
-from bhd_lerobot.datasets.remote.push import Card
-from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import BhdError
+from bhd_lerobot.datasets.remote.push import Card, sign
+from bhd_lerobot.hub.picture import draw
 
-SHOWN = 12  # episodes in a picture from above
-FRAMES = 6  # of an episode, in a picture from a camera
-LINES = 8  # curves in a panel
+LEROBOT_TAG = "LeRobot"
+"""By this tag LeRobot's viewer finds datasets."""
 
 _UNITS = ((".pos", "m or rad"), (".vel", "m/s or rad/s"))
 
@@ -51,45 +45,77 @@ def make_card(state: DatasetState, options: CardOptions, *, has_picture: bool = 
     Args:
         state: the dataset.
         options: what it says besides.
-        has_picture: a person put a picture beside the dataset: the card shows that one, and none is drawn.
+        has_picture: the user has put a picture beside the dataset: the card shows that one, and none is drawn.
     """
+    summary, identity = dataset_info(state.root), state.identity or {}
+    drawn = (None, "A picture of the dataset") if has_picture else draw(summary, state)
+    rows = [
+        (f"`{key}`", str(feature["dtype"]), " x ".join(map(str, feature["shape"])), _meaning(key, feature))
+        for key, feature in summary.features.items()
+    ]
+    parts = [
+        _front_matter(summary, identity, options),
+        f"# {(options.repo_id or options.url).rstrip('/').rpartition('/')[2]}",
+        _introduction(summary, options),
+        f"![{drawn[1]}]({PICTURE})\n\n{drawn[1]}." if drawn else "",
+        _overview(summary),
+        _outcomes(summary),
+        "## Columns\n\n" + _table(("key", "type", "shape", "meaning and unit"), rows),
+        "## Loading it\n\n" + _loading(options),
+        _origin(identity),
+    ]
+    return Card(sign("\n\n".join(part for part in parts if part) + "\n"), drawn[0] if drawn else None)
+
+
+def _front_matter(summary: DatasetSummary, identity: Mapping[str, Any], options: CardOptions) -> str:
+    task = summary.recording.get("task", {}).get("type")
+    named = [name for name in ("bhd_lerobot" if identity else None, summary.robot_type, task) if name]
+    tags = list(dict.fromkeys([LEROBOT_TAG, *named, *options.tags]))
+    values = {
+        "license": options.licence,
+        "task_categories": ["robotics"],
+        "tags": tags,
+        "configs": [{"config_name": "default", "data_files": "data/*/*.parquet"}],
+    }
+    return f"---\n{yaml.safe_dump(values, sort_keys=False, allow_unicode=True)}---"
+
+
+def _introduction(summary: DatasetSummary, options: CardOptions) -> str:
     from huggingface_hub import constants
 
-    summary = dataset_info(state.root)
-    picture = (b"", "A picture of the dataset") if has_picture else draw(summary, state)
-    facts = CardFacts(
-        title=(options.repo_id or options.url).rstrip("/").rpartition("/")[2],
-        summary=summary,
-        features=[
-            (f"`{key}`", str(feature["dtype"]), _shape(feature), _meaning(key, feature))
-            for key, feature in summary.features.items()
-        ],
-        outcomes=dict(Counter(str(one.metadata["outcome"]) for one in summary.episodes if one.metadata.get("outcome"))),
-        success=_success(summary),
-        picture=None if picture is None else (PICTURE, picture[1]),
-        repo_id=options.repo_id,
-        url=options.url,
-        hub=constants.ENDPOINT,
-        identity=state.identity or {},
-        licence=options.licence,
-        tags=options.tags,
-    )
-    return Card(compose(facts), None if picture is None or has_picture else picture[0])
+    robot = f" of the robot `{summary.robot_type}`" if summary.robot_type else ""
+    text = f"{_some(len(summary.episodes), 'episode')}{robot}, a LeRobotDataset of format v3.0."
+    if options.repo_id:
+        viewer = f"{constants.ENDPOINT}/spaces/lerobot/visualize_dataset?path={options.repo_id}"
+        text += f" [View it in LeRobot's viewer]({viewer})."
+    return text
 
 
-def draw(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, str] | None:
-    """Return a picture of a dataset as PNG, and what it shows; None if there is nothing that could be drawn.
+def _overview(summary: DatasetSummary) -> str:
+    rows = [
+        ("robot", summary.robot_type or "not said"),
+        ("frames a second", str(summary.fps)),
+        ("episodes", str(len(summary.episodes))),
+        ("frames", f"{summary.frames}, {summary.frames / summary.fps:.0f} s"),
+    ]
+    for part in ("task", "brain"):
+        if isinstance(chosen := summary.recording.get(part), Mapping):
+            rows.append((part, str(chosen.get("type") or chosen.get("name") or "")))
+    cameras = [key for key, feature in summary.features.items() if feature["dtype"] in ("video", "image")]
+    rows.append(("cameras", ", ".join(f"`{key}`" for key in cameras) or "none"))
+    shown = [_cell(task) for task in summary.tasks[:10]]
+    more = f", and {len(summary.tasks) - 10} more" if len(summary.tasks) > 10 else ""
+    rows.append(("instructions" if len(summary.tasks) > 1 else "instruction", "; ".join(shown) + more))
+    rows.append(("size", f"{summary.size / 1e6:.1f} MB in {_some(summary.files, 'file')}"))
+    return _table(("", ""), rows)
 
-    What a camera saw, or else the ways of robot or tool from above, or else the curves of an episode.
-    """
-    for picture in (_camera, _ways, _curves):
-        try:
-            drawn = picture(summary, state)
-        except (BhdError, KeyError, IndexError, ValueError):
-            continue  # of a robot that this version does not know, or knows otherwise: the next kind of picture
-        if drawn is not None:
-            return drawn
-    return None
+
+def _outcomes(summary: DatasetSummary) -> str:
+    counts = Counter(str(one.metadata["outcome"]) for one in summary.episodes if one.metadata.get("outcome"))
+    if not counts:
+        return ""
+    rows = [(name, str(count), f"{count / len(summary.episodes):.0%}") for name, count in counts.items()]
+    return "\n\n".join(filter(None, ["## Outcomes", _table(("outcome", "episodes", "share"), rows), _success(summary)]))
 
 
 def _success(summary: DatasetSummary) -> str:
@@ -100,8 +126,8 @@ def _success(summary: DatasetSummary) -> str:
 
     low, high = binomtest(sum(known), len(known)).proportion_ci(method="wilson")
     return (
-        f"{sum(known)} of {len(known)} episodes succeeded: {np.mean(known):.1%}; 95 % interval of the share (Wilson): "
-        f"{low:.1%} to {high:.1%}."
+        f"{sum(known)} of {len(known)} episodes succeeded: {sum(known) / len(known):.1%}; 95 % interval of the share "
+        f"(Wilson): {low:.1%} to {high:.1%}."
     )
 
 
@@ -116,89 +142,45 @@ def _meaning(key: str, feature: dict[str, Any]) -> str:
     return said + (f" ({', '.join(units)})" if units else "")
 
 
-def _shown(state: DatasetState) -> Row:
-    """Return the first successful episode, or the first one."""
-    return next((row for row in state.rows if row.get("bhd/success")), state.rows[0])
+def _loading(options: CardOptions) -> str:
+    if options.repo_id is None:
+        return (
+            f"```\nbhd-data pull {options.url} --root=data/here\n```\n\n"
+            "fetches it; then stock LeRobot loads it:\n\n```python\n"
+            "from lerobot.datasets.lerobot_dataset import LeRobotDataset\n\n"
+            'dataset = LeRobotDataset("me/here", root="data/here")\n```'
+        )
+    return (
+        "With LeRobot alone:\n\n```python\nfrom lerobot.datasets.lerobot_dataset import LeRobotDataset\n\n"
+        f'dataset = LeRobotDataset("{options.repo_id}")\n```\n\n'
+        f"Train on it:\n\n```\nlerobot-train --dataset.repo_id={options.repo_id} --policy.type=act "
+        "--policy.push_to_hub=false\n```\n\n"
+        f"With bhd_lerobot, all of it or some episodes:\n\n```\nbhd-data pull {options.repo_id} --root=data/here\n"
+        f"bhd-data pull {options.repo_id} --root=data/good --outcome=success\n"
+        f"bhd-train --dataset.repo_id={options.repo_id} --policy.type=bhd_mlp\n```"
+    )
 
 
-def _camera(_: DatasetSummary, state: DatasetState) -> tuple[bytes, str] | None:
-    if not state.video_keys:
-        return None
-    import av
-
-    key, row = state.video_keys[0], _shown(state)
-    path = state.root / layout.video_file(key, slot_of(row, f"videos/{key}"))
-    first = round(row[f"videos/{key}/from_timestamp"] * state.info["fps"])
-    wanted = {first + int(one) for one in np.linspace(0, row["length"] - 1, FRAMES).round()}
-    images = []
-    try:
-        with av.open(str(path)) as container:
-            for index, frame in enumerate(container.decode(video=0)):
-                if index in wanted:
-                    images.append(frame.to_ndarray(format="rgb24"))
-                if index >= max(wanted):
-                    break
-    except av.FFmpegError as error:
-        raise BhdError(f"{path} cannot be read: {error}") from error
-    images += images[-1:] * (-len(images) % 3)
-    rows = [np.concatenate(images[at : at + 3], axis=1) for at in range(0, len(images), 3)]
-    if not rows:
-        return None
-    return _png(np.concatenate(rows)), f"Episode {row['episode_index']} as `{key}` saw it"
+def _origin(identity: Mapping[str, Any]) -> str:
+    if not identity:
+        return ""
+    text = json.dumps(identity, indent=1, ensure_ascii=False)
+    fence = "`" * max(3, 1 + max((len(run) for run in re.findall("`+", text)), default=0))
+    return (
+        "## What made it\n\nRobot, task and brain with all their parameters, seed and video settings, from "
+        f"`meta/bhd.json`:\n\n<details>\n<summary>configuration</summary>\n\n{fence}json\n{text}\n{fence}\n\n</details>"
+    )
 
 
-def _ways(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, str] | None:
-    if keys.PHYSICS_STATE not in summary.features or "robot" not in summary.recording:
-        return None
-    from bhd_lerobot.rollout.plots import Trajectory, draw_trajectories
-    from bhd_lerobot.rollout.provenance import scene_from_json
-    from bhd_lerobot.rollout.replay import Replay
-
-    simulation = Replay(state.root, 0).simulation
-    ways = []
-    for episode in summary.episodes[:SHOWN]:
-        states = np.asarray(read_episode(state.root, episode.index)[keys.PHYSICS_STATE], np.float64)
-        about = episode.metadata
-        title = f"{episode.index}: {about.get('outcome', '')}, score {about.get('score') or 0.0:.2f}"
-        success = bool(about.get("success"))
-        ways.append(Trajectory(title, scene_from_json(about["scene"]), simulation.track(states)[:, :2], success))
-    what = f"The first {len(ways)} episodes from above" if len(ways) > 1 else "The episode from above"
-    with tempfile.TemporaryDirectory() as folder:
-        path = draw_trajectories(ways, Path(folder) / "ways.png", what)[0]
-        return path.read_bytes(), f"{what}: the way of {'the tool' if _is_arm(summary) else 'the base'}"
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [headings, ["---"] * len(headings), *[[_cell(one) for one in row] for row in rows]]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _is_arm(summary: DatasetSummary) -> bool:
-    return summary.robot_type == "ur5"
+def _cell(text: str) -> str:
+    """Return text that neither ends a cell nor starts a tag."""
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
 
 
-def _curves(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, str] | None:
-    shown = [key for key in (keys.OBSERVATION_STATE, keys.ACTION) if key in summary.features]
-    if not shown:
-        return None
-    from matplotlib.figure import Figure
-
-    index = _shown(state)["episode_index"]
-    columns = read_episode(state.root, index)
-    figure = Figure(figsize=(9, 2.6 * len(shown)), layout="constrained")
-    for axes, key in zip(np.atleast_1d(figure.subplots(len(shown), 1, sharex=True)), shown, strict=True):
-        values: NDArray[Any] = np.asarray(columns[key], np.float64).reshape(len(columns[key]), -1)
-        names = summary.features[key].get("names")
-        named = names if isinstance(names, list) and len(names) == values.shape[1] else range(values.shape[1])
-        for column, name in list(zip(values.T, named, strict=True))[:LINES]:
-            axes.plot(np.arange(len(column)) / summary.fps, column, linewidth=1.0, label=str(name))
-        axes.set_ylabel(key)
-        axes.grid(alpha=0.3)
-        axes.legend(frameon=False, fontsize=7, ncols=2, loc="upper right")
-    axes.set_xlabel("time [s]")
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue(), f"Episode {index}: what was observed, and the actions"
-
-
-def _png(image: NDArray[np.uint8]) -> bytes:
-    from matplotlib.image import imsave
-
-    buffer = BytesIO()
-    imsave(buffer, image, format="png")
-    return buffer.getvalue()
+def _some(count: int, name: str) -> str:
+    return f"{count} {name}{'' if count == 1 else 's'}"

@@ -78,7 +78,7 @@ def folder_of(text: str) -> Path:
     return folder
 
 
-def tell_of_folder(name: str, root: Path) -> None:
+def warn_of_folder(name: str, root: Path) -> None:
     """Say that a name is one on the Hub if it looks like a folder here, because folders are written the same way.
 
     Args:
@@ -134,8 +134,8 @@ def prompt_interrupt(stopped: str) -> Iterator[None]:
     so that the process may end at any.
 
     Args:
-        stopped: what is left, and how to go on; told if the process ends here. Whoever catches the `KeyboardInterrupt`
-            tells it otherwise.
+        stopped: what is left, and how to go on; printed if the process ends here, else by whoever
+            catches the `KeyboardInterrupt`.
     """
     is_hosted = hasattr(sys, "ps1") or "ipykernel" in sys.modules  # by a shell or a notebook, which goes on
     if is_hosted or threading.current_thread() is not threading.main_thread():

@@ -22,7 +22,7 @@ from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetEditedError, RealtimeError, RenderingError
-from bhd_lerobot.hub.push import check_pushable, left_by_interrupt, push_command, push_dataset, tell
+from bhd_lerobot.hub.push import check_pushable, format_push_report, left_by_interrupt, push_command, push_dataset
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.recording.config import RecordConfig
@@ -330,7 +330,8 @@ def _push(config: RecordConfig, result: RecordResult, console: Console) -> None:
         left = left_by_interrupt(result.root, again)
         try:
             with prompt_interrupt(left):
-                said = tell(push_dataset(result.root, dataset.repo_id, private=private, tags=dataset.tags))
+                report = push_dataset(result.root, dataset.repo_id, private=private, tags=dataset.tags)
+                said = format_push_report(report)
         except KeyboardInterrupt:
             console.print(escape(f"Stopped; {left}"), soft_wrap=True, highlight=False)
             raise

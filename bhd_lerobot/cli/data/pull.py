@@ -13,7 +13,6 @@ from bhd_lerobot.datasets.remote.listing import check_repo_id, counted, is_url, 
 from bhd_lerobot.datasets.remote.url import check_url, shown
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetWriteError, TransferError
 from bhd_lerobot.hub.transfer import (
-    command_line,
     folder_of,
     for_urls,
     prompt_interrupt,
@@ -22,7 +21,7 @@ from bhd_lerobot.hub.transfer import (
     repeat_line,
     split_list,
     storage_options,
-    tell_of_folder,
+    warn_of_folder,
 )
 
 if TYPE_CHECKING:
@@ -48,67 +47,31 @@ def add_to(commands: Commands) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    source, root = _places(options)
-    again = repeat_line(options, source, root=root)
-    options.stopped = f"{root} is as it was, and what arrived is not fetched again. Go on with:\n  {again}"
-    with prompt_interrupt(options.stopped):
-        report = pull_dataset(
-            source,
-            root,
-            revision=options.revision,
-            select=_selection(options),
-            replace=options.replace,
-            verify=options.verify,
-            storage=options.storage_options,
-            again=again,
-        )
-    print(tell(report, source))
-    return 1 if report.problem else 0
-
-
-def pull_dataset(
-    source: str,
-    root: Path,
-    *,
-    revision: str | None = None,
-    select: "Select | None" = None,
-    replace: bool = False,
-    verify: bool = False,
-    storage: str | None = None,
-    again: str | None = None,
-) -> "PullReport":
-    """Download a dataset, or some episodes of it.
-
-    Args:
-        source: name on the Hub, or a URL.
-        root: where to.
-        revision: branch, tag or commit of the Hub; the one that stock LeRobot takes if None.
-        select: chooses the episodes, given a folder with the metadata; None means all.
-        replace: give up another or a changed dataset that is there.
-        verify: read what lies below a URL also of files that are here, and compare contents.
-        storage: options of the URL's file system, JSON.
-        again: the command to repeat.
-
-    Raises:
-        BhdError: it is not there; the message says why, and how to repeat.
-    """
     from bhd_lerobot.datasets.remote.hub import HubDataset
     from bhd_lerobot.datasets.remote.pull import pull
     from bhd_lerobot.datasets.remote.store import StoreDataset
 
+    source, root = _places(options)
+    again = repeat_line(options, source, root=root)
+    kept = f"{root} is as it was, and what arrived is not fetched again."
+    options.stopped = f"{kept} Go on with:\n  {again}"
+    select = _selection(options)
     quiet_bars()
-    remote = StoreDataset(source, storage_options(storage)) if is_url(source) else HubDataset(source, revision)
-    try:
-        return pull(remote, root, select=select, replace=replace, verify=verify)
-    except (TransferError, DatasetWriteError) as error:
-        again = again or command_line("pull", [source], root=root, revision=revision)
-        raise type(error)(
-            f"{error}\n{root} is as it was, and what arrived is not fetched again. When that is mended, repeat:\n"
-            f"  {again}"
-        ) from error
+    with prompt_interrupt(options.stopped):
+        remote = (
+            StoreDataset(source, storage_options(options.storage_options))
+            if is_url(source)
+            else HubDataset(source, options.revision)
+        )
+        try:
+            report = pull(remote, root, select=select, replace=options.replace, verify=options.verify)
+        except (TransferError, DatasetWriteError) as error:
+            raise type(error)(f"{error}\n{kept} When that is resolved, repeat:\n  {again}") from error
+    print(format_report(report, source))
+    return 1 if report.problem else 0
 
 
-def tell(report: "PullReport", source: str) -> str:
+def format_report(report: "PullReport", source: str) -> str:
     """Return a report for a terminal."""
     lines = [f"{report.root}: {report.total_episodes} episodes"]
     if report.fetched:
@@ -134,7 +97,7 @@ def tell(report: "PullReport", source: str) -> str:
             f'    {shlex.join(words)} --dataset.episodes="{report.episodes}"',
         ]
     if report.problem:
-        lines.append(f"  it came as it is there, and is not sound: {report.problem}")
+        lines.append(f"  it is a copy of what is there, and is not valid: {report.problem}")
     return "\n".join(lines)
 
 
@@ -163,7 +126,7 @@ def _selection(options: argparse.Namespace) -> "Select | None":
         except Exception as error:  # LeRobot believes what it reads, whoever wrote it
             raise DatasetError(
                 f"The metadata of the dataset cannot be read, so no episode can be chosen ({error!r}). Pull all of "
-                "it, without --outcome and --min_score, and look at it with bhd-data check."
+                "it, without --outcome and --min_score, and run bhd-data check on it."
             ) from error
 
     return select
@@ -184,5 +147,5 @@ def _places(options: argparse.Namespace) -> tuple[str, Path]:
     check_repo_id(source)
     for_urls(options)
     root = folder_of(options.root) if options.root else default_root(source)
-    tell_of_folder(source, root)
+    warn_of_folder(source, root)
     return source, root

@@ -8,7 +8,7 @@ from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.remote.listing import check_repo_id, is_url
 from bhd_lerobot.datasets.remote.url import check_url
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.hub.push import left_by_interrupt, push_dataset, tell
+from bhd_lerobot.hub.push import format_push_report, left_by_interrupt, push_dataset
 from bhd_lerobot.hub.transfer import (
     folder_of,
     for_urls,
@@ -16,7 +16,7 @@ from bhd_lerobot.hub.transfer import (
     refuse_empty,
     repeat_line,
     split_list,
-    tell_of_folder,
+    warn_of_folder,
 )
 
 
@@ -38,13 +38,10 @@ def add_to(commands: Commands) -> None:
         "--no_card", "--no-card", action="store_true", help="send no card but one that lies in the folder"
     )
     command.add_argument(
-        "--replace_card", "--replace-card", action="store_true", help="overwrite a card there that somebody edited"
-    )
-    command.add_argument(
         "--replace", action="store_true", help="overwrite a dataset there that is another one, or has more episodes"
     )
     command.add_argument(
-        "--verify", action="store_true", help="of a URL: read what is there, and compare that instead of the list of it"
+        "--verify", action="store_true", help="of a URL: read what is there, and compare that instead of the manifest"
     )
     command.add_argument("--storage_options", help="options of the URL's file system, JSON")
 
@@ -63,13 +60,12 @@ def _run(options: argparse.Namespace) -> int:
             tags=split_list(options.tags),
             licence=options.licence,
             card=not options.no_card,
-            replace_card=options.replace_card,
             replace=options.replace,
             verify=options.verify,
             storage=options.storage_options,
             again=again,
         )
-    print(tell(report))
+    print(format_push_report(report))
     return 0
 
 
@@ -102,5 +98,5 @@ def _places(options: argparse.Namespace) -> tuple[Path, str]:
     check_repo_id(target)
     for_urls(options)
     root = folder_of(options.root) if options.root else default_root(target)
-    tell_of_folder(target, root)
+    warn_of_folder(target, root)
     return root, target

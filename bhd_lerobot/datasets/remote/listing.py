@@ -7,28 +7,32 @@ import hashlib
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from bhd_lerobot.datasets.format.info import InfoError, checked_info, parse_object
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, DatasetError, TransferError
 
+if TYPE_CHECKING:
+    from bhd_lerobot.datasets.remote.local import LocalDataset
+
 CARD = "README.md"
 PICTURE = "preview.png"
 SUBSET = "meta/bhd_subset.json"
-"""Says which episodes of a dataset were asked for, and whether the folder holds all files. It is never uploaded."""
+"""Says which episodes of a dataset were asked for, if files of it are missing. It is never uploaded."""
 
 MANIFEST = "bhd_files.json"
-"""The list of files with size and checksum beside a dataset below a URL; no part of the dataset."""
+"""Size and checksum of every file, beside a dataset below a URL; no part of the dataset."""
 
 LISTED = "xxh128"
-"""How the checksums in that list are made."""
+"""How the checksums in the manifest are made."""
 
-_CHUNK = 1 << 20
-"""Bytes that are read at once: they stay in the processor's cache until their checksum is made, which with larger
-pieces takes twice as long."""
+WORKERS = 4
+"""Files that are moved at a time. With more of them the threads of a fast connection mostly wait for each other."""
 
 _REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 
@@ -41,12 +45,20 @@ class RemoteFile:
         size: its bytes.
         digest: its checksum in hexadecimal; None if the place knows none.
         algorithm: how the checksum is made: `sha256`; `git`, the name that git gives to the content; or `xxh128`, which
-            takes a tenth of the time and finds damage, though no malice: of files that a push noted in its own list.
+            takes a tenth of the time and finds damage, though no malice: of files in the manifest of a push.
     """
 
     size: int
     digest: str | None
     algorithm: str = "sha256"
+
+    def matches(self, content: Path | bytes) -> bool:
+        """Return whether a file on this machine, or its bytes, are this file; without a checksum, its size decides."""
+        if isinstance(content, Path) and not content.is_file():
+            return False
+        if self.size != (len(content) if isinstance(content, bytes) else content.stat().st_size):
+            return False
+        return self.digest is None or self.digest == digest(content, self.size, self.algorithm)
 
 
 @dataclass(frozen=True)
@@ -63,15 +75,9 @@ class Item:
     content: Path | bytes
     size: int
 
-    def is_like(self, file: RemoteFile | None) -> bool:
-        """Return whether the remote file has this content; false where that cannot be known."""
-        if file is None or file.size != self.size or file.digest is None:
-            return False
-        return digest(self.content, file.algorithm) == file.digest
-
 
 class Remote(Protocol):
-    """A place that a dataset is copied to or from.
+    """A place that a dataset is copied to or from. Every method raises `TransferError` if the place refuses it.
 
     Attributes:
         name: what the user calls it.
@@ -82,81 +88,72 @@ class Remote(Protocol):
     folder: Path | None
 
     def files(self) -> dict[str, RemoteFile]:
-        """Return all files by path; none if there is nothing yet.
-
-        Raises:
-            TransferError: the place cannot be asked, or does not let this user in.
-        """
+        """Return all files by path; none if there is nothing yet."""
 
     def read(self, path: str) -> bytes | None:
-        """Return the content of a small file; None if there is none."""
+        """Return the content of a small file; None if there is none.
 
-    def former_info(self) -> bytes | None:
-        """Return the `meta/info.json` that a push took away which did not end; None if nothing is known of one."""
+        Of `meta/info.json`, after a push that did not end, the one from before that push if it is known.
+        """
 
     def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
         """Return listed files with the checksum of what lies there now, which is read for it.
 
         Raises:
             ConfigError: the place makes the checksums from the contents itself, so there is nothing to verify.
-            TransferError: a file cannot be read.
         """
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Copy files into a folder, each of which is then the listed one, to the last byte.
 
         Raises:
-            TransferError: not all of them came, or one came otherwise; those that came well are kept.
+            TransferError: not all of them arrived, or one differs; those that arrived intact are kept.
         """
 
-    def send(self, items: Sequence[Item], deleted: Sequence[str], check: Callable[[], None]) -> None:
+    def send(self, source: "LocalDataset", items: Sequence[Item], deleted: Sequence[str]) -> None:
         """Put files there and remove others, so that a reader never takes a part for the whole.
 
         Args:
+            source: the dataset, which is checked for changes before anything becomes visible.
             items: what is to be written.
-            deleted: paths that are to go.
-            check: raises if the dataset on this machine changed meanwhile; called before anything becomes visible.
+            deleted: paths that are to be removed.
 
         Raises:
+            DatasetError: the dataset was changed meanwhile.
             TransferError: not all was sent; what was need not be sent again.
         """
 
 
-def digest(content: Path | bytes, algorithm: str) -> str:
-    """Return the checksum of some content, as `RemoteFile` names them."""
-    if isinstance(content, bytes):
-        hasher = _hasher(algorithm, len(content))
-        hasher.update(content)
-        return str(hasher.hexdigest())
-    size = content.stat().st_size
-    with open(content, "rb", buffering=0) as file:
-        return stream_digest(file, size, algorithm)
+def digest(content: Path | bytes | Any, size: int, algorithm: str) -> str:
+    """Return the checksum of a file, of bytes or of an open file of that size; see `RemoteFile`."""
+
+    def hasher() -> Any:
+        if algorithm == "git":
+            return hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
+        if algorithm == LISTED:
+            import xxhash
+
+            return xxhash.xxh3_128()
+        return hashlib.sha256()
+
+    if isinstance(content, Path):
+        with open(content, "rb", buffering=0) as file:
+            return str(hashlib.file_digest(file, hasher).hexdigest())
+    return str(hashlib.file_digest(BytesIO(content) if isinstance(content, bytes) else content, hasher).hexdigest())
 
 
-class Readable(Protocol):
-    """An open file."""
+def run_all[T](work: Callable[[T], None], items: Sequence[T], workers: int = WORKERS) -> None:
+    """Do something for every item, in threads; none is begun after one has failed.
 
-    def readinto(self, buffer: memoryview, /) -> int | None:
-        """Read what comes next into a buffer; return how many bytes that was."""
-
-
-def stream_digest(file: Readable, size: int, algorithm: str) -> str:
-    """Return the checksum of an open file of so many bytes, which are read in pieces."""
-    hasher = _hasher(algorithm, size)
-    buffer = memoryview(bytearray(max(1, min(_CHUNK, size))))
-    while count := file.readinto(buffer):
-        hasher.update(buffer[:count])
-    return str(hasher.hexdigest())
-
-
-def _hasher(algorithm: str, size: int) -> Any:
-    if algorithm == "git":
-        return hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
-    if algorithm == LISTED:
-        import xxhash
-
-        return xxhash.xxh3_128()
-    return hashlib.sha256()
+    Raises:
+        Exception: of the first that failed.
+    """
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            for future in as_completed([pool.submit(work, item) for item in items]):
+                future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def refuse_overlap(root: Path, remote: Remote) -> None:
@@ -173,24 +170,17 @@ def refuse_overlap(root: Path, remote: Remote) -> None:
         raise ConfigError(f"{remote.name} and {root} are the same folder, or one lies in the other. Name another one.")
 
 
-def is_whole(path: Path, file: RemoteFile) -> bool:
-    """Return whether a file on this machine is the listed one; where no checksum is listed, its size decides."""
-    if not path.is_file() or path.stat().st_size != file.size:
-        return False
-    return file.digest is None or digest(path, file.algorithm) == file.digest
-
-
 def refuse_damaged(path: Path, file: RemoteFile, place: str, name: str) -> None:
-    """Remove a file that came otherwise than it was listed, and say so.
+    """Remove a file that is not the listed one, and say so.
 
     Raises:
-        TransferError: it did.
+        TransferError: it is not.
     """
-    if not is_whole(path, file):
+    if not file.matches(path):
         path.unlink(missing_ok=True)
         raise TransferError(
-            f"Could not download {place}: {name} came otherwise than it was listed. It was changed meanwhile, or "
-            "damaged on the way."
+            f"Could not download {place}: {name} differs from what is listed. It was changed meanwhile, or damaged on "
+            "the way."
         )
 
 
@@ -244,14 +234,9 @@ def listed(names: Iterable[str], at_most: int = 3) -> str:
     return f"{', '.join(names[:at_most])}{more}"
 
 
-def largest_first(paths: Iterable[str], files: Mapping[str, RemoteFile]) -> list[str]:
+def largest_first(paths: Iterable[str], files: Mapping[str, Item | RemoteFile]) -> list[str]:
     """Return paths so that no large file is left for the end, when the other threads have nothing to do."""
     return sorted(paths, key=lambda path: (-files[path].size, path))
-
-
-def in_order(paths: Iterable[str]) -> list[str]:
-    """Return paths so that what makes the others count comes last: `meta/info.json`."""
-    return sorted(paths, key=lambda path: (path.startswith("meta/"), path == layout.INFO, path))
 
 
 def parse_info(content: bytes | None, place: str) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """The dataset on this machine while it is copied: whole, finalised, and the same until the copy is complete."""
 
+import contextlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,19 +10,19 @@ from typing import Any
 
 from bhd_lerobot.datasets.format.state import DatasetState, load_state
 from bhd_lerobot.datasets.remote.listing import MANIFEST, SUBSET, Item, is_recorded, listed
-from bhd_lerobot.datasets.remote.subset import read_subset
+from bhd_lerobot.datasets.remote.subset import is_subset
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted, has_unfinished_episodes
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.datasets.storage.places import check_inside
 from bhd_lerobot.errors import DatasetError, DatasetLockedError, quoted
 
-_TEMPORARY = ("images",)  # LeRobot's own, of frames whose film is not encoded yet
+_TEMPORARY = ("images",)  # LeRobot's own, of frames whose video is not encoded yet
 
 
 @dataclass(frozen=True)
 class LocalDataset:
-    """A sound dataset on this machine.
+    """A valid dataset on this machine.
 
     Attributes:
         root: its folder.
@@ -35,6 +36,11 @@ class LocalDataset:
     items: list[Item]
     left_out: list[str]
     _stamps: dict[str, tuple[int, ...]]
+
+    @property
+    def info(self) -> Item:
+        """Return its `meta/info.json`."""
+        return next(item for item in self.items if item.path == layout.INFO)
 
     def check_unchanged(self) -> None:
         """Check that nothing was written since the dataset was opened.
@@ -81,7 +87,7 @@ def open_local(root: Path) -> Iterator[LocalDataset]:
 
 
 def _refuse_subset(root: Path) -> None:
-    if (root / SUBSET).exists() and not read_subset(root).is_whole:
+    if is_subset(root):
         raise DatasetError(
             f"{root} holds some episodes of a dataset only: it was pulled with --episodes or --outcome. Pull all of "
             "it first, or make a dataset of its own of these episodes."
@@ -119,19 +125,11 @@ def _files(state: DatasetState, stamps: dict[str, Any]) -> tuple[list[str], list
 def _stamps(root: Path) -> dict[str, tuple[int, ...]]:
     """Return size, time of change and inode of every file that is not hidden, by its path."""
     found: dict[str, tuple[int, ...]] = {}
-    pending = [""]
-    while pending:
-        prefix = pending.pop()
-        try:
-            with os.scandir(root / prefix) as entries:
-                for entry in entries:
-                    if entry.name.startswith("."):
-                        continue
-                    if entry.is_dir(follow_symlinks=False):
-                        pending.append(f"{prefix}{entry.name}/")
-                    elif entry.is_file():
-                        stat = entry.stat()
-                        found[f"{prefix}{entry.name}"] = (stat.st_size, stat.st_mtime_ns, stat.st_ino)
-        except FileNotFoundError:
-            continue  # it went just now: whoever compares notices
+    for folder, folders, names in os.walk(root):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for path in (Path(folder, name) for name in names if not name.startswith(".")):
+            if path.is_file():
+                with contextlib.suppress(FileNotFoundError):  # it was removed just now: whoever compares notices
+                    stat = path.stat()
+                    found[path.relative_to(root).as_posix()] = (stat.st_size, stat.st_mtime_ns, stat.st_ino)
     return found

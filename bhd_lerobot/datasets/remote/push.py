@@ -1,6 +1,8 @@
 """Copy a dataset to the Hub or below a URL: what differs, and nothing else."""
 
+import hashlib
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,10 +11,8 @@ from typing import Any
 from bhd_lerobot.datasets.assembly.assemble import EDITS
 from bhd_lerobot.datasets.edit.edits import edits_of
 from bhd_lerobot.datasets.format.state import DatasetState
-from bhd_lerobot.datasets.remote.card import is_generated
 from bhd_lerobot.datasets.remote.listing import (
     CARD,
-    LISTED,
     MANIFEST,
     PICTURE,
     Item,
@@ -21,12 +21,14 @@ from bhd_lerobot.datasets.remote.listing import (
     is_recorded,
     parse_info,
     refuse_overlap,
+    run_all,
     total,
 )
 from bhd_lerobot.datasets.remote.local import LocalDataset, open_local
-from bhd_lerobot.datasets.remote.pool import run_all
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError, DatasetExistsError
+
+_SIGNATURE = re.compile(r"\n<!-- bhd-card ([0-9a-f]{64}) -->\n\Z")
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Card:
     """A generated card.
 
     Attributes:
-        text: Markdown, signed.
+        text: Markdown, signed by `sign`.
         picture: a PNG file's bytes; None if there is none.
     """
 
@@ -43,7 +45,7 @@ class Card:
 
 
 type MakeCard = Callable[[DatasetState, bool], Card]
-"""Makes a card of a dataset, given whether there is a picture already that a person put there."""
+"""Makes a card of a dataset, given whether the user has put a picture beside it."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,7 @@ class PushReport:
         kept: files that were there already.
         deleted: files that belonged to no episode any more and were removed there.
         left_out: files on this machine that belong to no episode and were not sent.
-        kept_card: whether a card that somebody edited was left as it is.
-        kept_picture: whether a picture that somebody put there was left as it is.
+        kept_card: whether a card there that was not generated is left as it is.
     """
 
     name: str
@@ -70,7 +71,6 @@ class PushReport:
     deleted: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     kept_card: bool = False
-    kept_picture: bool = False
 
 
 def push(
@@ -78,27 +78,24 @@ def push(
     remote: Remote,
     *,
     make_card: MakeCard | None = None,
-    replace_card: bool = False,
     replace: bool = False,
     verify: bool = False,
 ) -> PushReport:
-    """Make a remote dataset the same as the one on this machine.
+    """Make a remote dataset the same as the one on this machine, which is not changed.
 
-    The dataset on this machine is not changed. A card that a person wrote is kept: one beside the dataset on this
-    machine is sent instead of the generated one, and one at the remote place is left as it is.
+    A `README.md` in the folder is its card. Without one a card is generated, unless there is one that was not.
 
     Args:
         root: the dataset.
         remote: where to.
-        make_card: generates a card; None sends none but the user's own.
-        replace_card: overwrite a card at the remote place that a person wrote.
+        make_card: generates a card; None generates none.
         replace: overwrite a dataset at the remote place that is another one, or has more episodes.
         verify: read what lies at the remote place and compare that, instead of what is listed about it.
 
     Raises:
         DatasetExistsError: there is another dataset, or one with more episodes, and `replace` is false.
         ConfigError: both are the same folder, or the place needs no verifying.
-        DatasetError: the dataset is not whole and finalised, is in use, or was changed meanwhile.
+        DatasetError: the dataset is not complete and finalised, is in use, or was changed meanwhile.
         TransferError: the place cannot be reached or does not let this user write; what was sent is not sent again.
     """
     refuse_overlap(Path(root), remote)
@@ -106,18 +103,19 @@ def push(
         there = remote.files()
         if not replace:
             _refuse_another(local, remote, there)
-        cards, kept = _cards(local, remote, make_card, replace_card, there)
+        cards, kept_card = _cards(local, remote, make_card, there)
         items = [item for item in local.items if item.path not in (CARD, PICTURE)] + cards
         try:
             if verify:
-                there |= remote.verified([one.path for one in items if _may_be(one, there.get(one.path))])
+                sizes = {item.path: item.size for item in items}
+                there |= remote.verified([path for path, file in there.items() if file.size == sizes.get(path)])
             changed = _changed(items, there)
         except OSError as error:
             raise DatasetError(f"{root} cannot be read: {error}.") from error
         wanted = {item.path for item in items}
         ours = (layout.STATS, layout.TASKS, layout.IDENTITY, EDITS, MANIFEST)
         deleted = sorted(path for path in there if path not in wanted and (is_recorded(path) or path in ours))
-        remote.send(changed, deleted, local.check_unchanged)
+        remote.send(local, changed, deleted)
         return PushReport(
             name=remote.name,
             episodes=local.state.num_episodes,
@@ -126,13 +124,38 @@ def push(
             kept=len(items) - len(changed),
             deleted=deleted,
             left_out=local.left_out,
-            kept_card=CARD in kept,
-            kept_picture=PICTURE in kept,
+            kept_card=kept_card,
         )
 
 
-def _may_be(item: Item, file: RemoteFile | None) -> bool:
-    return file is not None and file.size == item.size
+def sign(text: str) -> str:
+    """Return the text of a generated card with the checksum of itself at its end."""
+    return f"{text}\n<!-- bhd-card {hashlib.sha256(text.encode()).hexdigest()} -->\n"
+
+
+def is_generated(content: bytes | None) -> bool:
+    """Return whether a card was signed by `sign`, and not edited since."""
+    text = (content or b"").decode(errors="replace").replace("\r\n", "\n")
+    found = _SIGNATURE.search(text)
+    return found is not None and hashlib.sha256(text[: found.start()].encode()).hexdigest() == found[1]
+
+
+def _cards(
+    local: LocalDataset, remote: Remote, make_card: MakeCard | None, there: Mapping[str, RemoteFile]
+) -> tuple[list[Item], bool]:
+    """Return the card and its picture as files to send, and whether a card there is not generated, and so kept."""
+    own = {item.path: item for item in local.items if item.path in (CARD, PICTURE)}
+    if CARD in own:
+        if not is_generated((local.root / CARD).read_bytes()):
+            return list(own.values()), False
+        own = {}  # both were generated, and came with a pull
+    if CARD in there and not is_generated(remote.read(CARD)):
+        return [], True
+    if make_card is not None:
+        card = make_card(local.state, PICTURE in own)
+        content = {CARD: card.text.encode(), PICTURE: card.picture}
+        own = {path: Item(path, one, len(one)) for path, one in content.items() if one is not None} | own
+    return list(own.values()), False
 
 
 def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, RemoteFile]) -> None:
@@ -143,32 +166,31 @@ def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, Rem
             were deleted here since; or it is no dataset of this format at all. If a push to there did not end, what was
             there before it counts.
     """
-    is_shown = layout.INFO in there
-    if is_shown and next(item for item in local.items if item.path == layout.INFO).is_like(there[layout.INFO]):
+    name, info = remote.name, there.get(layout.INFO)
+    if info is None:
+        name = f"{name}, before a push to it that did not end,"
+    elif info.digest is not None and info.matches(local.root / layout.INFO):
         return  # whatever became of it there since: this dataset is what was put there
-    content = remote.read(layout.INFO) if is_shown else remote.former_info()
-    if content is None and not is_shown:
+    content = remote.read(layout.INFO)
+    if content is None and info is None:
         return
-    name = remote.name if is_shown else f"{remote.name}, before a push to it that did not end,"
+    remedy = "or give up what lies there with --replace."
     try:
         found = parse_info(content, name)
     except DatasetError as error:
-        raise DatasetExistsError(f"{error} Choose another place, or give up what lies there with --replace.") from error
+        raise DatasetExistsError(f"{error} Choose another place, {remedy}") from error
     if _kind(found) != _kind(local.state.info):
         raise DatasetExistsError(
-            f"{name} {'is' if is_shown else 'was'} another dataset: it has other columns, another rate, robot or "
-            f"format than {local.root}. Choose another place, or give up what lies there with --replace."
+            f"{name} is another dataset: it has other columns, another rate, robot or format than {local.root}. Choose "
+            f"another place, {remedy}"
         )
     here, episodes = local.state.num_episodes, found["total_episodes"]
-    if episodes <= here:
-        return
-    deleted = _deleted_since(local.root, remote.read(EDITS) if EDITS in there else b"")
+    deleted = _deleted_since(local.root, remote.read(EDITS) if episodes > here and EDITS in there else b"")
     if episodes > here + deleted:
-        has, remedy = ("has", "Pull that one") if is_shown else ("had", "Repeat that push")
         since = f"{deleted} {'were' if deleted > 1 else 'was'}" if deleted else "none was"
         raise DatasetExistsError(
-            f"{name} {has} {episodes} episodes, {local.root} has {here} and {since} deleted from it since: it is an "
-            f"older one, or another. {remedy}, or give it up with --replace."
+            f"{name} has {episodes} episodes, {local.root} has {here} and {since} deleted from it since: it is an "
+            f"older one, or another. Pull that one, or complete that push, {remedy}"
         )
 
 
@@ -193,48 +215,13 @@ def _kind(info: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _changed(items: Sequence[Item], there: Mapping[str, RemoteFile]) -> list[Item]:
+    """Return the files that are not there, or whose content there is another or unknown."""
     same: set[str] = set()
 
     def compare(item: Item) -> None:
-        if item.is_like(there.get(item.path)):
+        file = there.get(item.path)
+        if file is not None and file.digest is not None and file.matches(item.content):
             same.add(item.path)
 
     run_all(compare, items)
     return [item for item in items if item.path not in same]
-
-
-def _cards(
-    local: LocalDataset,
-    remote: Remote,
-    make_card: MakeCard | None,
-    replace: bool,
-    there: Mapping[str, RemoteFile],
-) -> tuple[list[Item], set[str]]:
-    """Return the card and its picture as files to send, and which of both are a person's there and left as they are."""
-    own = {item.path: item for item in local.items if item.path in (CARD, PICTURE)}
-    mine = (local.root / CARD).read_bytes() if CARD in own else b""
-    is_mine = bool(mine) and not is_generated(_text(mine))
-    theirs = remote.read(CARD) if CARD in there and not replace else None
-    if theirs is not None and not is_generated(_text(theirs)) and not (is_mine and theirs == mine):
-        return [], {CARD}
-    if is_mine:
-        return list(own.values()), set()
-    # A generated card and its picture come together. A picture alone is a person's, at either end.
-    picture = own.get(PICTURE) if CARD not in own else None
-    is_theirs = PICTURE in there and CARD not in there and not replace and there[PICTURE].algorithm != LISTED
-    kept = {PICTURE} if is_theirs and not (picture and picture.is_like(there[PICTURE])) else set()
-    if make_card is None:
-        return [picture] if picture and not kept else [], kept if picture else set()
-    card = make_card(local.state, picture is not None or bool(kept))
-    items = [Item(CARD, text := card.text.encode(), len(text))]
-    if kept:
-        return items, kept
-    if picture is not None:
-        return [*items, picture], set()
-    if card.picture is not None:
-        items.append(Item(PICTURE, card.picture, len(card.picture)))
-    return items, set()
-
-
-def _text(content: bytes) -> str:
-    return content.decode("utf-8", errors="replace")

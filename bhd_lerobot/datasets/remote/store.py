@@ -1,31 +1,34 @@
 """A dataset below a URL: an object store, a folder, anything that fsspec knows.
 
-Beside the dataset lies a list of its files with their checksums, because object stores keep none that all of them mean
-the same by. `meta/info.json` is written last and removed first, so that there is either all of a dataset or none.
+Beside the dataset lies a manifest of its files with their checksums, because object stores keep none that all of them
+mean the same by. `meta/info.json` is removed first and written after all other files, so that a reader finds either all
+of a dataset or none; the manifest is written last.
 """
 
 import contextlib
 import errno
 import json
 import threading
-import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.datasets.remote.listing import (
+    CARD,
     LISTED,
     MANIFEST,
+    PICTURE,
+    WORKERS,
     Item,
     RemoteFile,
     digest,
     largest_first,
     refuse_damaged,
-    stream_digest,
+    run_all,
 )
-from bhd_lerobot.datasets.remote.pool import WORKERS, run_all
+from bhd_lerobot.datasets.remote.local import LocalDataset
 from bhd_lerobot.datasets.remote.url import LOCAL, open_place, shown
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import BhdError, TransferError
@@ -34,41 +37,10 @@ _FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", 
 """Where folders must be made first. To make the folder of an object store's object may mean to make a bucket."""
 
 _NOTED_BYTES = 64e6
-"""Bytes that are sent before the list is written: about as much is sent again after a kill."""
+"""Bytes that are sent before the manifest is written: about as much is sent again after a kill."""
 
 _PART = ".bhd-part"
-"""Ends the temporary names of files that are being written, and no other."""
-
-
-@dataclass
-class Manifest:
-    """What the list says.
-
-    Attributes:
-        files: files that are known, by path.
-        info: the `meta/info.json` that was shown last, while another one is on its way; empty if none is known.
-        push: stands for the push that wrote the list last. Each push writes it before anything else and looks at it
-            again before it shows what it sent, so that two at once notice each other.
-    """
-
-    files: dict[str, RemoteFile] = field(default_factory=dict)
-    info: str = ""
-    push: str = ""
-
-    def to_json(self) -> bytes:
-        """Return it as it is stored."""
-        files = {path: {"size": one.size, LISTED: one.digest} for path, one in sorted(self.files.items())}
-        return json.dumps({"format": 1, "push": self.push, "info": self.info, "files": files}, indent=1).encode()
-
-
-def parse_manifest(content: bytes) -> Manifest:
-    """Return what a list says; nothing if it cannot be read, as after a kill: then all is compared by sending it."""
-    try:
-        found = json.loads(content)
-        files = {path: RemoteFile(int(one["size"]), str(one[LISTED]), LISTED) for path, one in found["files"].items()}
-        return Manifest(files, str(found.get("info", "")), str(found.get("push", "")))
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-        return Manifest()
+"""Ends the temporary names of files that are being written to a folder, and no other."""
 
 
 class StoreDataset:
@@ -97,19 +69,13 @@ class StoreDataset:
         self.folder: Path | None = Path(self._root) if not LOCAL.isdisjoint(kinds) else None
         # Others, such as FTP, have one connection for all threads.
         self._workers = WORKERS if self._fs.async_impl or not {*LOCAL, "memory"}.isdisjoint(kinds) else 1
-        # Those that are asynchronous do all downloads in one thread: ours wait for it, or make checksums meanwhile.
-        self._fetchers = 2 * WORKERS if self._fs.async_impl else self._workers
-        self._list = Manifest()
-        self._push = uuid.uuid4().hex
-        self._is_noted = True  # whether the list there says what is known
         self._there: dict[str, RemoteFile] = {}
+        self._known: dict[str, RemoteFile] = {}  # what the manifest says, or is going to
+        self._noted: dict[str, RemoteFile] = {}  # what the manifest says
+        self._former_info = ""  # of a push that has not ended: what it took away
 
     def files(self) -> dict[str, RemoteFile]:
-        """Return all files by path; those that another program put there have no checksum.
-
-        Raises:
-            TransferError: the place does not exist, or no permission.
-        """
+        """Return all files by path; those that another program put there have no checksum."""
         with store_errors(self.name, "read"):
             self._fs.invalidate_cache()
             try:
@@ -127,13 +93,11 @@ class StoreDataset:
             sizes = {
                 path: size for path, size in sizes.items() if path[-1:] not in ("", "/") and not path.endswith(_PART)
             }
-            self._list = self._read_manifest() if MANIFEST in sizes else Manifest()
-        sizes.pop(MANIFEST, None)
-        self._there = {}
-        for path, size in sizes.items():
-            known = self._list.files.get(path)
-            # Where the size is not the one that was written, the checksum will not be either: that is told.
-            self._there[path] = RemoteFile(size, None) if known is None else replace(known, size=size)
+            self._read_manifest(exists=sizes.pop(MANIFEST, None) is not None)
+        # Where the size is not the one that was written, the checksum will not be either: that is reported.
+        self._there = {
+            path: replace(self._known.get(path, RemoteFile(size, None)), size=size) for path, size in sizes.items()
+        }
         return dict(self._there)
 
     def read(self, path: str) -> bytes | None:
@@ -142,38 +106,25 @@ class StoreDataset:
             try:
                 return bytes(self._fs.cat_file(self._at(path)))
             except FileNotFoundError:
-                return None
-
-    def former_info(self) -> bytes | None:
-        """Return the `meta/info.json` that was shown last, by the list."""
-        return self._list.info.encode() or None
+                return (self._former_info.encode() or None) if path == layout.INFO else None
 
     def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
-        """Return listed files with the checksum of what lies there now, which is read for it.
-
-        Raises:
-            TransferError: a file cannot be read.
-        """
+        """Return listed files with the checksum of what lies there now, which is read for it."""
         found: dict[str, RemoteFile] = {}
 
         def read(path: str) -> None:
             size = self._there[path].size
             with self._fs.open(self._at(path), "rb") as file:
-                found[path] = RemoteFile(size, stream_digest(file, size, LISTED), LISTED)
+                found[path] = RemoteFile(size, digest(file, size, LISTED), LISTED)
 
         with store_errors(self.name, "read"):
             run_all(read, largest_first(paths, self._there), self._workers)
         self._there |= found
-        self._is_noted = self._is_noted and all(self._list.files.get(path) == file for path, file in found.items())
-        self._list.files |= found
+        self._known |= found
         return found
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
-        """Copy files into a folder.
-
-        Raises:
-            TransferError: not all of them came, or one came otherwise; those that came well are kept.
-        """
+        """Copy files into a folder, and compare them with their checksums."""
 
         def fetch_one(path: str) -> None:
             part = folder / f"{path}.part"
@@ -182,154 +133,101 @@ class StoreDataset:
             refuse_damaged(part, self._there[path], self.name, path)
             part.replace(folder / path)
 
+        # A file system that is asynchronous does all downloads in one thread: ours wait for it, or make checksums.
+        workers = 2 * WORKERS if self._fs.async_impl else self._workers
         with store_errors(self.name, "download"):
-            run_all(fetch_one, largest_first(paths, self._there), self._fetchers)
+            run_all(fetch_one, largest_first(paths, self._there), workers)
 
-    def send(self, items: Sequence[Item], deleted: Sequence[str], check: Callable[[], None]) -> None:
-        """Write files and remove others; the list of files after each batch, and `meta/info.json` last.
+    def send(self, source: LocalDataset, items: Sequence[Item], deleted: Sequence[str]) -> None:
+        """Remove `meta/info.json`, write files and remove others, then write it again, and the manifest last.
 
-        Raises:
-            TransferError: not all was written, or another push came between. What was written is not sent again; there
-                is no `meta/info.json` then.
+        The manifest is also written before and in between, so that a push that is repeated knows what has arrived.
         """
-        if not items and not deleted and self._is_noted:
+        sent = {item.path: item for item in items}
+        changes_data = any(path not in (CARD, PICTURE) for path in (*sent, *deleted))
+        if not sent and not deleted and self._known == self._noted:
             return
-        by_path = {item.path: item for item in items}
-        info = by_path.pop(layout.INFO, None)
-        touched = {*by_path, *deleted}
         with store_errors(self.name, "upload the dataset to"):
-            if self._read_manifest().push != self._list.push:
-                raise TransferError(f"Another push wrote to {self.name} since this one looked at it. Nothing was sent.")
-            is_shown = layout.INFO in self._there
-            if is_shown and (deleted or any(path in self._there and _matters(path) for path in by_path)):
-                # A reader who comes now finds no dataset; better than one of two versions.
-                there = bytes(self._fs.cat_file(self._at(layout.INFO)))
-                info = info or self._unchanged(Item(layout.INFO, there, len(there)))
-                self._list.info = there.decode(errors="replace")
-                self._fs.rm_file(self._at(layout.INFO))
-                del self._there[layout.INFO]
-            for path in touched & self._list.files.keys():
-                del self._list.files[path]  # before it is overwritten: it must never be taken for what it was
-            for folder in {self._at(path).rpartition("/")[0] for path in (MANIFEST, layout.INFO, *by_path)}:
-                if self._has_folders:
-                    self._fs.makedirs(folder, exist_ok=True)
+            if changes_data:
+                sent[layout.INFO] = source.info
+                self._former_info = (self.read(layout.INFO) or b"").decode(errors="replace")
+            for path in (*sent, *deleted):
+                self._known.pop(path, None)  # before it is overwritten: it must never be taken for what it was
             self._write_manifest()
+            info = sent.pop(layout.INFO, None)
+            if info is not None:
+                self._remove(layout.INFO)  # a reader who comes now finds no dataset; better than one of two versions
+            run_all(self._remove, deleted, self._workers)
             try:
-                if deleted:
-                    run_all(self._remove, deleted, self._workers)
-                if by_path:
-                    self._put(list(by_path.values()))
-                check()
-                self._refuse_overtaken()
+                self._put(sent)
+                source.check_unchanged()
             except BaseException:  # Ctrl-C as well
-                with contextlib.suppress(Exception):  # the first one tells more
-                    self._leave(touched)
+                with contextlib.suppress(Exception):  # the first error says more
+                    self._write_manifest()
                 raise
             if info is not None:
-                content = info.content if isinstance(info.content, bytes) else info.content.read_bytes()
-                self._list.files[layout.INFO], self._list.info = _about(info), content.decode(errors="replace")
-                self._write_manifest()
-                self._put_one(info)
+                self._put({layout.INFO: info})
+            self._former_info = ""
+            self._write_manifest()
 
-    def _refuse_overtaken(self) -> None:
-        """Check that no other push wrote the list since this one did.
+    def _put(self, items: dict[str, Item]) -> None:
+        """Write files, and note now and then those that have arrived."""
+        lock, unnoted = threading.Lock(), 0
 
-        Raises:
-            TransferError: one did.
-        """
-        if self._read_manifest().push != self._push:
-            raise TransferError(
-                f"Another push wrote to {self.name} at the same time, so what lies there now may be of both. There is "
-                "no meta/info.json, so nobody takes it for a dataset. Push again, one after the other."
-            )
+        def put(path: str) -> None:
+            nonlocal unnoted
+            item = items[path]
+            about = RemoteFile(item.size, digest(item.content, item.size, LISTED), LISTED)
+            self._write(path, item.content)
+            with lock:
+                self._known[path] = about
+                unnoted += item.size
+                if unnoted > _NOTED_BYTES:
+                    unnoted = 0
+                    self._write_manifest()
 
-    def _leave(self, touched: set[str]) -> None:
-        """Note what arrived; or, where another push came, let that one notice, and no file be taken for its own."""
-        found = self._read_manifest()
-        if found.push != self._push:
-            self._remove(layout.INFO)
-            unclear = {*touched, layout.INFO}
-            files = {path: file for path, file in found.files.items() if path not in unclear}
-            self._list, self._push = replace(found, files=files), uuid.uuid4().hex
-        self._write_manifest()
+        run_all(put, largest_first(items, items), self._workers)
+
+    def _write(self, path: str, content: Path | bytes) -> None:
+        target = part = self._at(path)
+        if self._has_folders:
+            self._fs.makedirs(target.rpartition("/")[0], exist_ok=True)
+        if self.folder is not None:  # a snapshot of hard links keeps what the file was
+            folder, _, name = target.rpartition("/")
+            part = f"{folder}/.{name}{_PART}"
+        if isinstance(content, Path):
+            self._fs.put_file(str(content), part)
+        else:
+            self._fs.pipe_file(part, content)
+        if part != target:
+            Path(part).replace(target)
 
     def _remove(self, path: str) -> None:
         # One by one: `rm` takes brackets and stars in a name for a pattern, and removes what it fits.
         with contextlib.suppress(FileNotFoundError):
             self._fs.rm_file(self._at(path))
 
-    def _put(self, items: Sequence[Item]) -> None:
-        """Write files, and note now and then those that arrived."""
-        lock, unnoted = threading.Lock(), 0
-
-        def put(item: Item) -> None:
-            nonlocal unnoted
-            about = _about(item)
-            self._put_one(item)
-            with lock:
-                self._list.files[item.path] = about
-                unnoted += item.size
-                if unnoted > _NOTED_BYTES:
-                    unnoted = 0
-                    self._refuse_overtaken()
-                    self._write_manifest()
-
-        run_all(put, sorted(items, key=lambda item: (-item.size, item.path)), self._workers)
-        self._refuse_overtaken()
-        self._write_manifest()
-
-    def _put_one(self, item: Item) -> None:
-        if self.folder is not None:
-            self._replace_file(Path(self._at(item.path)), item.content)
-        elif isinstance(item.content, Path):
-            self._fs.put_file(str(item.content), self._at(item.path))
-        else:
-            self._fs.pipe_file(self._at(item.path), item.content)
-
-    def _replace_file(self, target: Path, content: Path | bytes) -> None:
-        """Write a file beside its place, and let it take the place: another name that the old one has keeps that."""
-        part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}{_PART}")
+    def _read_manifest(self, *, exists: bool) -> None:
+        """Read what the manifest says; nothing if it cannot be read: then all is sent again."""
         try:
-            if isinstance(content, Path):
-                self._fs.put_file(str(content), str(part))
-            else:
-                self._fs.pipe_file(str(part), content)
-            part.replace(target)
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
-
-    def _unchanged(self, info: Item) -> Item:
-        if not info.is_like(self._there[layout.INFO]):
-            raise TransferError(
-                f"Could not upload the dataset to {self.name}: its {layout.INFO} is not what was written there. "
-                "Something else wrote it, or it was damaged: push with --verify, which mends that."
-            )
-        return info
-
-    def _read_manifest(self) -> Manifest:
-        try:
-            return parse_manifest(self._fs.cat_file(self._at(MANIFEST)))
-        except FileNotFoundError:
-            return Manifest()
+            found = json.loads(self._fs.cat_file(self._at(MANIFEST)) if exists else "{}")
+            self._former_info = str(found.get("info", ""))
+            self._known = {
+                path: RemoteFile(int(one["size"]), str(one[LISTED]), LISTED)
+                for path, one in found.get("files", {}).items()
+            }
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+            self._known, self._former_info = {}, ""
+        self._noted = dict(self._known)
 
     def _write_manifest(self) -> None:
-        self._list.push = self._push
-        content = self._list.to_json()
-        self._put_one(Item(MANIFEST, content, len(content)))
-        self._is_noted = True
+        files = {path: {"size": one.size, LISTED: one.digest} for path, one in sorted(self._known.items())}
+        content = json.dumps({"format": 1, "info": self._former_info, "files": files}, indent=1).encode()
+        self._write(MANIFEST, content)
+        self._noted = dict(self._known)
 
     def _at(self, path: str) -> str:
         return f"{self._root.rstrip('/')}/{path}"
-
-
-def _matters(path: str) -> bool:
-    """Return whether a file decides what the dataset is: not its card."""
-    return path.startswith(("data/", "videos/", "meta/"))
-
-
-def _about(item: Item) -> RemoteFile:
-    return RemoteFile(item.size, digest(item.content, LISTED), LISTED)
 
 
 @contextmanager

@@ -2,31 +2,16 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.format.state import corrupt
+from bhd_lerobot.datasets.format.state import UNREADABLE, corrupt
 from bhd_lerobot.datasets.remote.listing import SUBSET, parse_info
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import to_json
 from bhd_lerobot.errors import DatasetError
-
-
-@dataclass(frozen=True)
-class Subset:
-    """Some episodes of a dataset.
-
-    Attributes:
-        episodes: their numbers, ascending.
-        files: the data and video files that hold them, relative to the dataset.
-    """
-
-    episodes: list[int]
-    files: set[str]
 
 
 def files_of(root: Path, episodes: Sequence[int]) -> set[str]:
@@ -36,17 +21,13 @@ def files_of(root: Path, episodes: Sequence[int]) -> set[str]:
         DatasetError: there is no such episode.
         DatasetCorruptError: the metadata cannot be read.
     """
-    try:
-        info = parse_info((root / layout.INFO).read_bytes(), str(root))
-        rows = [row for path in _tables(root) for row in _rows(path)]
-        by_index = {row["episode_index"]: row for row in rows}
-    except (OSError, ValueError, KeyError) as error:
-        raise corrupt(root / layout.INFO, error) from error
-    unknown = [episode for episode in episodes if episode not in by_index]
-    if lost := [episode for episode in unknown if 0 <= episode < info["total_episodes"]]:
-        reason = f"info.json counts {info['total_episodes']} episodes, but episode {lost[0]} is not described"
-        raise corrupt(root / "meta/episodes", reason)
-    if unknown:
+    info = parse_info((root / layout.INFO).read_bytes(), str(root))
+    by_index = _rows(root)
+    for episode in episodes:
+        if episode not in by_index and 0 <= episode < info["total_episodes"]:
+            reason = f"info.json counts {info['total_episodes']} episodes, but episode {episode} is not described"
+            raise corrupt(root / "meta/episodes", reason)
+    if unknown := [episode for episode in episodes if episode not in by_index]:
         raise DatasetError(
             f"There is no episode {', '.join(map(str, unknown[:5]))}; the dataset has {len(by_index)}, from 0 to "
             f"{len(by_index) - 1}."
@@ -65,45 +46,42 @@ def files_of(root: Path, episodes: Sequence[int]) -> set[str]:
         raise corrupt(root / "meta/episodes", f"it does not say which files hold an episode ({error!r})") from error
 
 
-@dataclass(frozen=True)
-class SubsetNote:
-    """What `SUBSET` says.
-
-    Attributes:
-        episodes: the episodes that were asked for, ascending.
-        is_whole: whether the folder holds all files of the dataset nevertheless.
-    """
-
-    episodes: list[int]
-    is_whole: bool
+def is_subset(root: Path) -> bool:
+    """Return whether a folder has only some files of a dataset. The note of version 0.1 may say that it has all."""
+    return (root / SUBSET).exists() and _read(root).get("whole") is not True
 
 
-def read_subset(root: Path) -> SubsetNote:
-    """Return what `SUBSET` says; no episode and not whole if it is not there or cannot be read."""
+def subset_episodes(root: Path) -> list[int]:
+    """Return the episodes that were asked for, ascending; none if no note says so, or it cannot be read."""
+    try:
+        return sorted(int(one) for one in _read(root)["episodes"])
+    except (ValueError, KeyError, TypeError, OverflowError):
+        return []
+
+
+def subset_note(source: str, episodes: Sequence[int]) -> bytes:
+    """Return the content of `SUBSET` for some episodes of a dataset that came from somewhere."""
+    return to_json({"source": source, "episodes": list(episodes)})
+
+
+def _read(root: Path) -> dict[str, Any]:
     try:
         note = json.loads((root / SUBSET).read_bytes())
-        return SubsetNote(sorted(int(one) for one in note["episodes"]), note.get("whole") is True)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-        return SubsetNote([], False)
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return note if isinstance(note, dict) else {}
 
 
-def subset_note(source: str, note: SubsetNote) -> bytes:
-    """Return the content of `SUBSET` for a dataset that came from somewhere."""
-    return to_json({"source": source, "episodes": note.episodes, "whole": note.is_whole})
-
-
-def _tables(root: Path) -> list[Path]:
-    return sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet"))
-
-
-def _rows(path: Path) -> list[dict[str, Any]]:
-    try:
-        names = [
-            name
-            for name in pq.read_schema(path).names
-            if name == "episode_index" or name.endswith(("/chunk_index", "/file_index"))
-        ]
-        rows: list[dict[str, Any]] = pq.read_table(path, columns=names).to_pylist()
-    except (OSError, pa.ArrowException) as error:
-        raise corrupt(path, error) from error
+def _rows(root: Path) -> dict[int, dict[str, Any]]:
+    rows: dict[int, dict[str, Any]] = {}
+    for path in sorted((root / "meta/episodes").glob("chunk-*/file-*.parquet")):
+        try:
+            names = [
+                name
+                for name in pq.read_schema(path).names
+                if name == "episode_index" or name.endswith(("/chunk_index", "/file_index"))
+            ]
+            rows |= {row["episode_index"]: row for row in pq.read_table(path, columns=names).to_pylist()}
+        except (*UNREADABLE, KeyError) as error:
+            raise corrupt(path, error) from error
     return rows

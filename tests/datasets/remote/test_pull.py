@@ -13,7 +13,7 @@ from bhd_lerobot.datasets.remote import pull as remote_pull
 from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.listing import SUBSET
 from bhd_lerobot.datasets.remote.pull import pull
-from bhd_lerobot.datasets.remote.subset import files_of, read_subset
+from bhd_lerobot.datasets.remote.subset import files_of, is_subset
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.errors import (
@@ -94,16 +94,6 @@ def test_folders_that_are_no_place_for_a_dataset(hub: HubServer, root: Path, tmp
         pull(HubDataset("me/d"), tmp_path / "file" / "below")
 
 
-def test_a_kill_of_version_0_1_between_its_renames_is_repaired(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    send(root)
-    target = tmp_path / "e"
-    pull(HubDataset("me/d"), target)
-    (target / ".bhd-pull").touch()
-    target.rename(tmp_path / ".e.old")
-    assert pull(HubDataset("me/d"), target).fetched == []
-    assert content(target) == content(root)
-
-
 def test_a_folder_of_somebody_else_in_its_way_is_left_alone(hub: HubServer, root: Path, tmp_path: Path) -> None:
     name = ".e.pull"
     send(root)
@@ -135,7 +125,7 @@ def test_a_full_disk_is_seen_before_and_during(hub: HubServer, root: Path, tmp_p
     assert content(tmp_path / "e") == content(root)
 
 
-def test_what_is_not_sound_there_comes_as_it_is_and_that_is_said(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_what_is_not_valid_there_comes_as_it_is_and_is_reported(hub: HubServer, root: Path, tmp_path: Path) -> None:
     send(root)
     files = dict(hub.dataset("me/d").files())
     lost = next(path for path in files if path.startswith("videos/"))
@@ -184,30 +174,32 @@ def test_a_folder_that_is_no_dataset_is_never_replaced(hub: HubServer, root: Pat
     assert (tmp_path / "e/data/chunk-000/file-777.parquet").read_text() == "mine"
 
 
-def test_some_episodes_whose_files_hold_all_are_noted_all_the_same(
-    hub: HubServer, tmp_path: Path, root: Path, many_files: Path
-) -> None:
-    """How episodes are packed into files is no business of who asks for some."""
-    packed = tmp_path / "packed"
+def test_files_that_hold_all_episodes_are_the_dataset(hub: HubServer, tmp_path: Path) -> None:
+    """A note is there if and only if files are missing; that of version 0.1 says whether they are."""
+    packed, target = tmp_path / "packed", tmp_path / "e"
     with support.create(packed) as recorder:
         for _ in range(3):
             support.record(recorder)
     send(packed)
-    target = tmp_path / "e"
     report = pull(HubDataset("me/d"), target, select=lambda folder: [1])
-    assert (report.episodes, report.is_whole, report.is_noted) == ([1], True, True)
-    assert json.loads((target / SUBSET).read_bytes()) == {"source": "me/d", "episodes": [1], "whole": True}
-    hub.reset()
+    assert (report.episodes, report.is_whole) == ([1], True)
+    assert content(target) == content(packed)
+    (target / SUBSET).write_text(json.dumps({"source": "me/d", "episodes": [1], "whole": True}))
+    assert not is_subset(target)
     assert not send(target).sent  # all of it is there, so it may be pushed; the note stays here
-    assert not pull(HubDataset("me/d"), target, select=lambda folder: [1]).fetched
     assert pull(HubDataset("me/d"), target, select=lambda folder: [2]).episodes == [1, 2]
-    assert read_subset(target).episodes == [1, 2]
-    report = pull(HubDataset("me/d"), target)
-    assert (report.fetched, report.is_noted) == ([], False)
     assert content(target) == content(packed)
-    # What is whole stays so, whatever is asked for.
-    assert not pull(HubDataset("me/d"), target, select=lambda folder: [0]).is_noted
-    assert content(target) == content(packed)
+
+
+def test_another_pull_of_the_same_folder_is_refused(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    (tmp_path / ".e.pull").mkdir()
+    lock = RootLock(tmp_path / ".e.pull")
+    with pytest.raises(DatasetLockedError):
+        pull(HubDataset("me/d"), tmp_path / "e")
+    lock.release()
+    pull(HubDataset("me/d"), tmp_path / "e")
+    assert content(tmp_path / "e") == content(root)
 
 
 def test_episodes_whose_files_nobody_names_are_told(hub: HubServer, root: Path, tmp_path: Path) -> None:
@@ -271,17 +263,3 @@ def test_a_folder_named_by_dots_is_the_folder(hub: HubServer, root: Path, tmp_pa
     monkeypatch.chdir(tmp_path / "e/meta")
     assert pull(HubDataset("me/d"), "..", replace=True).fetched == [layout.STATS]
     assert content(tmp_path / "e") == content(root)
-
-
-def test_a_pull_does_not_mend_what_another_one_is_at(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    """Between its two renames there is no folder at the target."""
-    send(root)
-    for name in (".e.pull", ".e.old"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / ".bhd-pull").touch()
-    lock = RootLock(tmp_path / ".e.pull")
-    with pytest.raises(DatasetLockedError):
-        pull(HubDataset("me/d"), tmp_path / "e")
-    lock.release()
-    assert not (tmp_path / "e").exists()
-    assert (tmp_path / ".e.old").is_dir()

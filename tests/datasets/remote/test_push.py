@@ -1,4 +1,4 @@
-"""What is pushed and what is not: the dataset that is looked at before, and its card. To a Hub on this machine."""
+"""What is pushed and what is not: the dataset that is checked before, and its card. To a Hub on this machine."""
 
 import shutil
 import threading
@@ -6,12 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from bhd_lerobot.datasets.format.state import DatasetState
-from bhd_lerobot.datasets.remote.card import is_generated, sign
 from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.listing import MANIFEST
 from bhd_lerobot.datasets.remote.pull import pull
-from bhd_lerobot.datasets.remote.push import Card, push
+from bhd_lerobot.datasets.remote.push import Card, MakeCard, is_generated, push, sign
 from bhd_lerobot.datasets.remote.store import StoreDataset
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import RootLock
@@ -101,32 +99,43 @@ def card(text: str = "# made\n") -> Card:
     return Card(sign(text), b"picture")
 
 
-def test_a_generated_card_is_renewed_and_a_persons_is_kept(hub: HubServer, root: Path) -> None:
-    send(root, make_card=lambda state, has_picture: card())
+def made(text: str = "# made\n") -> MakeCard:
+    return lambda state, has_picture: card(f"{text}{has_picture}")
+
+
+def test_a_generated_card_is_renewed_and_another_one_is_kept(hub: HubServer, root: Path) -> None:
+    send(root, make_card=made())
     assert stored(hub)["preview.png"] == b"picture"
-    assert not send(root, make_card=lambda state, has_picture: card("# made anew\n")).kept_card
-    assert b"anew" in stored(hub)["README.md"]
+    assert not send(root, make_card=made("# made anew\n")).kept_card
     edited = stored(hub)["README.md"].replace(b"anew", b"by hand")
-    assert not is_generated(edited.decode())
-    hub.dataset("me/d").objects.clear()
-    files = hub.dataset("me/d").files()
-    files["README.md"].content = edited
-    report = send(root, make_card=lambda state, has_picture: card("# third\n"))
-    assert report.kept_card
-    assert stored(hub)["README.md"] == edited
-    assert not send(root, make_card=lambda state, has_picture: card("# third\n"), replace_card=True).kept_card
-    assert b"third" in stored(hub)["README.md"]
+    assert not is_generated(edited)
+    hub.dataset("me/d").files()["README.md"].content = edited
+    for make in (made("# third\n"), None):
+        assert send(root, make_card=make).kept_card
+        assert stored(hub)["README.md"] == edited
 
 
-def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path) -> None:
-    send(root, make_card=lambda state, has_picture: card())
-    (root / "README.md").write_text("# my own\n")
-    assert not send(root, make_card=lambda state, has_picture: card("# second\n")).kept_card
-    assert stored(hub)["README.md"] == b"# my own\n"
-    assert not send(root, make_card=lambda state, has_picture: card("# third\n")).kept_card  # it is the same
-    (root / "README.md").write_text("# my own, newer\n")
-    assert send(root).kept_card  # the one there is a person's, too
-    assert stored(hub)["README.md"] == b"# my own\n"
+def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    for text, theirs in (("# my own\n", card().text), ("# newer\n", "# my own\n"), ("# newer\n", "# of somebody\n")):
+        if hub.repositories:
+            hub.dataset("me/d").files()["README.md"].content = theirs.encode()
+        (root / "README.md").write_text(text)
+        assert not send(root, make_card=made()).kept_card
+        assert stored(hub)["README.md"] == text.encode()
+        assert "preview.png" not in stored(hub)
+    # One that was generated and came with a pull is generated anew.
+    (root / "README.md").write_text(card().text)
+    hub.dataset("me/d").files()["README.md"].content = card().text.encode()
+    assert "README.md" in send(root, make_card=made("# anew\n")).sent
+    assert b"anew" in stored(hub)["README.md"]
+
+
+def test_a_picture_beside_the_dataset_is_the_picture(hub: HubServer, root: Path) -> None:
+    (root / "preview.png").write_bytes(b"mine")
+    send(root, make_card=made())
+    assert stored(hub)["preview.png"] == b"mine"
+    assert b"True" in stored(hub)["README.md"]
+    assert not send(root, make_card=made()).sent
 
 
 def test_a_folder_behind_a_link_is_not_taken_for_gone(
@@ -186,25 +195,3 @@ def test_the_list_of_files_of_a_url_is_not_sent(hub: HubServer, root: Path, tmp_
     pull(HubDataset("me/d"), tmp_path / "e")
     assert content(tmp_path / "e") == content(root)
     assert send(root).deleted == [MANIFEST]
-
-
-def test_a_picture_of_the_users_is_kept_at_either_end(hub: HubServer, root: Path) -> None:
-    told = []
-
-    def make(state: DatasetState, has_picture: bool) -> Card:
-        told.append(has_picture)
-        return card()
-
-    (root / "preview.png").write_bytes(b"mine")
-    assert not send(root, make_card=make).kept_picture
-    assert stored(hub)["preview.png"] == b"mine"
-    assert not send(root, make_card=make).sent
-    (root / "preview.png").unlink()
-    hub.dataset("me/d").files().pop("README.md")
-    report = send(root, make_card=make)
-    assert report.kept_picture
-    assert stored(hub)["preview.png"] == b"mine"
-    assert told == [True, True, True]
-    assert not send(root, make_card=make, replace_card=True).kept_picture
-    assert stored(hub)["preview.png"] == b"picture"
-    assert told[-1] is False
