@@ -1,7 +1,7 @@
 """Messages a second of `bhd-data export` and `bhd-data import`: `python -m benchmarks.bags`.
 
 A dataset of TurtleBot3 episodes as `bhd-record` writes it (360 beams, no camera) becomes a bag, and the bag a dataset
-again, once bit by bit and once resampled as if it were a real robot's. Beside it the `mcap` library writes the same
+again. Beside it the `mcap` library writes the same
 messages, serialised already, into a file, and reads them without decoding them: what a bag costs at the least in that
 library. They run in turns; the first of each is not counted.
 """
@@ -25,8 +25,6 @@ from bhd_lerobot.cli.data.export import robot_view
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.rosbag.exporter.export import ExportOptions, export_bags
-from bhd_lerobot.rosbag.importer.restore import restore
-from bhd_lerobot.rosbag.storage.find import find_bags
 
 FPS = 10
 
@@ -89,9 +87,9 @@ def bare_read(path: Path) -> tuple[dict[str, bytes], list[tuple[str, str, int, b
     return schemas, messages
 
 
-def resample(bag: Path, root: Path) -> None:
-    """Import a bag as if it were a real robot's."""
-    arguments = ["import", str(bag), "--resample", "--repo_id=bench/bags", f"--root={root}", "--task=drive"]
+def import_bag(bag: Path, root: Path) -> None:
+    """Import a bag."""
+    arguments = ["import", str(bag), "--repo_id=bench/bags", f"--root={root}"]
     if data.main(arguments):
         raise AssertionError("The import failed.")
 
@@ -105,7 +103,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the numbers to this file as well")
     options = parser.parse_args()
     view, how = robot_view("turtlebot3"), ExportOptions(one_bag=True)
-    turns: dict[str, list[float]] = {name: [] for name in ("export", "restore", "resample", "bare_write", "bare_read")}
+    turns: dict[str, list[float]] = {name: [] for name in ("export", "import", "bare_write", "bare_read")}
     with tempfile.TemporaryDirectory() as folder:
         root, bag, back, file = (Path(folder) / name for name in ("data", "bag", "back", "bare.mcap"))
         record(root, options.episodes, options.frames)
@@ -116,9 +114,7 @@ def main() -> int:
             schemas, messages = bare_read(bag / "bag.mcap")
             turns["bare_write"].append(timed(lambda s=schemas, m=messages: bare_write(file, s, m)))
             turns["bare_read"].append(timed(lambda: bare_read(file)))
-            turns["restore"].append(timed(lambda: restore(find_bags(bag), back, "bench/bags")))
-            shutil.rmtree(back)
-            turns["resample"].append(timed(lambda: resample(bag, back)))
+            turns["import"].append(timed(lambda: import_bag(bag, back)))
         size = (bag / "bag.mcap").stat().st_size
     count = len(messages)
     speeds = {name: [count / took for took in values[1:]] for name, values in turns.items()}
@@ -128,13 +124,12 @@ def main() -> int:
         "messages_per_s": {name: spread(values) for name, values in speeds.items()},
         "of_the_bare_library": {
             "export": spread(ratios(speeds["export"], speeds["bare_write"])),
-            "restore": spread(ratios(speeds["restore"], speeds["bare_read"])),
-            "resample": spread(ratios(speeds["resample"], speeds["bare_read"])),
+            "import": spread(ratios(speeds["import"], speeds["bare_read"])),
         },
     }
     write(options.json, results)
     print(f"{count:,} messages, {size / 1e6:.1f} MB")
-    for name, beside in (("export", "bare_write"), ("restore", "bare_read"), ("resample", "bare_read")):
+    for name, beside in (("export", "bare_write"), ("import", "bare_read")):
         ours, theirs = results["messages_per_s"][name], results["messages_per_s"][beside]
         share = results["of_the_bare_library"][name]
         print(

@@ -29,7 +29,6 @@ from bhd_lerobot.rosbag.messages.parts import (
     stamp_tree,
 )
 from bhd_lerobot.rosbag.messages.split import check_topics, parts_of
-from bhd_lerobot.rosbag.storage import checksum
 from bhd_lerobot.rosbag.storage.write import Stream
 
 _PLAIN = (arrow.is_string, arrow.is_boolean, arrow.is_integer, arrow.is_floating, arrow.is_list, arrow.is_null)
@@ -118,7 +117,7 @@ class EpisodeTopics:
         self._next_start = int(ended[-1]) + _PAUSE_NS
         index = np.arange(n)
         at_start, at_end = Frames(episode, index, observed), Frames(episode, index, ended)
-        streams = [Stream(EPISODE_TOPIC, types.EPISODE, [(start, self._episode(row, columns, start))], latched=True)]
+        streams = [Stream(EPISODE_TOPIC, types.EPISODE, [(start, self._episode(row, start))], latched=True)]
         motion = views.Motion.of(self._view, self._features, columns)
         if still := views.static_transforms(views.still_frames(self._view, motion), start):
             streams.append(Stream("/tf_static", views.TF, [(start, still[0])], latched=True))
@@ -180,7 +179,7 @@ class EpisodeTopics:
             streams.append(_stream(f"/{camera}/camera_info", views.CAMERA_INFO, frames, told))
         return streams
 
-    def _episode(self, row: Row, columns: Mapping[str, NDArray[Any]], start: int) -> bytes:
+    def _episode(self, row: Row, start: int) -> bytes:
         identity = self._state.identity or {}
         metadata = {name.removeprefix(PREFIX): value for name, value in row.items() if name.startswith(PREFIX)}
         topics = [
@@ -201,11 +200,8 @@ class EpisodeTopics:
             "metadata": json.dumps(metadata),
             "metadata_types": json.dumps({name: str(kind) for name, kind in self._state.metadata_types.items()}),
             "recording": json.dumps(identity.get("recording", {})),
-            "video": json.dumps(identity.get("video", {})),
             "topics": json.dumps(topics),
-            "checksums": json.dumps({key: checksum.of_column(values) for key, values in columns.items()}),
         }
-        fields["checksum"] = checksum.of_texts(fields)
         return encode(types.EPISODE, fields, 1)[0]
 
 

@@ -1,6 +1,6 @@
 """Where a bag's recording breaks off and begins anew: silences, clocks that go back, drivers that restart."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -40,12 +40,19 @@ class Stretch(NamedTuple):
 
 
 def stretches(
-    tracks: Mapping[str, Track], *, stamps: str, max_speed: tuple[float, ...] | None, max_gap_s: float, notes: list[str]
+    tracks: Mapping[str, Track],
+    starts: Iterable[int],
+    *,
+    stamps: str,
+    max_speed: tuple[float, ...] | None,
+    max_gap_s: float,
+    notes: list[str],
 ) -> list[Stretch]:
     """Return the parts of a bag between its breaks, in order.
 
     Args:
         tracks: by role.
+        starts: places at which an exported bag says that an episode begins.
         stamps: whose time counts, see `TrackOptions.stamps`.
         max_speed: of the robot forward [m/s] and turning [rad/s], if its pose matters; None if it does not.
         max_gap_s: silence that ends an episode anyway.
@@ -59,7 +66,8 @@ def stretches(
     jumps = clock_jumps([track.times for track in every], [track.order for track in every], step)
     if len(jumps):
         notes.append(f"the clock jumped back {len(jumps)} times; each time a new episode begins")
-    found = _cut([Stretch(0, np.iinfo(np.int64).max, "start")], dict.fromkeys(jumps.tolist(), "clock"))
+    found = _cut([Stretch(0, np.iinfo(np.int64).max, "start")], dict.fromkeys(starts, "start"))
+    found = _cut(found, dict.fromkeys(jumps.tolist(), "clock"))
     for role, track in tracks.items():
         if role != "cmd" and track.stamps is not None and track.stamps is not track.times:
             found = _cut(found, dict.fromkeys(_restarts(track, track.stamps, found, notes), "clock"))

@@ -4,16 +4,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.exporter.episode import EPISODE_TOPIC
-from bhd_lerobot.rosbag.importer.headers import is_ours
-from bhd_lerobot.rosbag.messages import types
 from bhd_lerobot.rosbag.messages.base import BareTwistPart, GyroPart, OdometryPart, ScanPart, TwistPart
 from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE
+from bhd_lerobot.rosbag.messages.parts import Part
 from bhd_lerobot.rosbag.messages.views import JOINT_STATE
 from bhd_lerobot.rosbag.storage.read import Bag, Topic
 
-_ROBOT = "turtlebot3"
 _BASE = (ScanPart.msgtype, OdometryPart.msgtype)
 _NAMED = 6  # joints
 
@@ -26,14 +23,6 @@ def told_other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
         topics: what it has.
     """
     only = "is for bags of a TurtleBot3: it needs scans, odometry and speed commands"
-    if is_ours(topics):
-        robot = _first(bag, EPISODE_TOPIC, types.EPISODE, "robot_type")
-        if robot in (None, _ROBOT):
-            return None
-        return (
-            f"{bag.path} is of the robot {str(robot)!r}, as {EPISODE_TOPIC} says; --resample {only}. Leave --resample "
-            "out: the bag then comes back as the dataset that it was exported from."
-        )
     if any(topic.msgtype in _BASE and topic.count for topic in topics.values()):
         return None
     for topic in topics.values():
@@ -100,7 +89,7 @@ def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) ->
         what = "no message of" if name in topics else "no topic"
         raise DatasetError(
             f"{bag.path} has {what} {name}, which {_MEANING[role]} is read from. Name another one with {option}."
-            f"{hint} The bag has: {there}." + "".join(f" Damaged: {problem}." for problem in bag.problems)
+            f"{hint} The bag has: {there}.{_damage(bag)}"
         )
     if topics[name].msgtype not in types:
         raise DatasetError(
@@ -114,6 +103,30 @@ def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) ->
     if (serialisation := topics[name].serialisation) != "cdr":
         raise DatasetError(f"{name} in {bag.path} is serialised as {serialisation!r}; only cdr can be read.")
     return topics[name]
+
+
+def exported_topic(bag: Bag, topics: Mapping[str, Topic], role: str, part: Part) -> Topic:
+    """Return the topic of an exported bag that carries numbers of a feature.
+
+    Raises:
+        DatasetError: it is missing, empty or of another type.
+    """
+    topic = topics.get(part.topic)
+    if topic is None or not topic.count:
+        raise DatasetError(
+            f"{bag.path} has no message of {part.topic}, which carries {role.removesuffix(part.topic)}, as "
+            f"/bhd/episode says.{_damage(bag)} Export the dataset again."
+        )
+    if topic.msgtype != part.msgtype or topic.others:
+        raise DatasetError(
+            f"{part.topic} in {bag.path} is of type {', '.join((topic.msgtype, *topic.others))}, not {part.msgtype} "
+            "alone, as /bhd/episode says. Export the dataset again."
+        )
+    return topic
+
+
+def _damage(bag: Bag) -> str:
+    return "".join(f" Damaged: {problem}." for problem in bag.problems)
 
 
 def static_topics(scan: str) -> set[str]:
@@ -142,8 +155,8 @@ def told_publishers(topics: Mapping[str, Topic], wanted: Mapping[str, Topic]) ->
                 f"{topic.name} had {topic.publishers} publishers when the recording began. Which of them sent a "
                 f"message is not in the bag; the {counts}, whoever sent it"
             )
-    if is_ours(topics):
-        return notes  # what else there is is known
+    if "cmd" not in wanted:
+        return notes  # an exported bag, whose other topics are known
     read = wanted["cmd"].name
     others = [one for one in topics.values() if one.msgtype in TYPES["cmd"] and one.count and one.name != read]
     if others:

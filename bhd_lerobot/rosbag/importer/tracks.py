@@ -1,7 +1,7 @@
 """The topics of a robot's bag as tracks: when something was measured, and what; sorted by time, judged one by one."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,11 @@ from bhd_lerobot.rosbag.importer import frames
 from bhd_lerobot.rosbag.importer.decodable import sound_messages
 from bhd_lerobot.rosbag.importer.resample import Times, apart, message_times, sane
 from bhd_lerobot.rosbag.importer.scan import resampled_scans
-from bhd_lerobot.rosbag.importer.topics import TYPES, static_topics, told_publishers, wanted_topic
+from bhd_lerobot.rosbag.importer.topics import TYPES, exported_topic, static_topics, told_publishers, wanted_topic
 from bhd_lerobot.rosbag.importer.warnings import pace, told_pace, told_speeds
-from bhd_lerobot.rosbag.messages.base import BareTwistPart, GyroPart, TwistPart, odometry
+from bhd_lerobot.rosbag.messages.base import GYRO, ODOMETRY, TWIST, BareTwistPart, GyroPart, TwistPart, odometry
 from bhd_lerobot.rosbag.messages.cdr_read import decode
-from bhd_lerobot.rosbag.messages.parts import NANO, head_stamps, header_stamps
+from bhd_lerobot.rosbag.messages.parts import NANO, Part, head_stamps, header_stamps
 from bhd_lerobot.rosbag.storage.read import Bag, Messages, Topic
 
 Array = NDArray[np.float64]
@@ -32,6 +32,7 @@ class TrackOptions:
     Attributes:
         topics: role (``scan``, ``odom``, ``cmd``, ``imu``) -> topic; only roles that are wanted.
         cameras: name of a camera -> topic.
+        parts: role -> what carries numbers, of exported bags; the role begins with the feature and a slash.
         beams: that a scan has in the dataset.
         lidar: the scanner that the dataset is of.
         stamps: ``"auto"``, ``"header"`` or ``"receive"``.
@@ -49,6 +50,7 @@ class TrackOptions:
     odom_frame: str | None = None
     scan_yaw: float | None = None
     pose: bool = False
+    parts: Mapping[str, Part] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Track:
         order: their places in the bag, shape (n,).
         values: numbers of each, shape (n, d); of a camera, its place in the bag, shape (n, 1).
         stamps: of their headers [ns], shape (n,); None if they have none.
+        names: of the numbers in the dataset, in order.
     """
 
     topic: str
@@ -70,6 +73,7 @@ class Track:
     order: Times
     values: Array
     stamps: Times | None
+    names: tuple[str, ...] = ()
 
     def part(self, mask: NDArray[np.bool_]) -> "Track":
         """Return some of its messages, sorted by time; those of the same time stay in their order."""
@@ -80,7 +84,7 @@ class Track:
         """Return some of its messages, in this order."""
         times = self.times[rows]
         stamps = times if self.stamps is self.times else None if self.stamps is None else self.stamps[rows]
-        return Track(self.topic, self.msgtype, times, self.order[rows], self.values[rows], stamps)
+        return replace(self, times=times, order=self.order[rows], values=self.values[rows], stamps=stamps)
 
 
 def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, Track]:
@@ -96,13 +100,13 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
     """
     topics = bag.topics()
     wanted = {role: wanted_topic(bag, topics, role, name) for role, name in options.topics.items()}
+    wanted |= {role: exported_topic(bag, topics, role, part) for role, part in options.parts.items()}
     cameras = {f"camera/{name}": wanted_topic(bag, topics, "camera", topic) for name, topic in options.cameras.items()}
     notes += told_publishers(topics, {**wanted, **cameras})
-    names = {topic.name for topic in wanted.values()} | (static_topics(options.topics["scan"]) & topics.keys())
+    latched = sorted(static_topics(options.topics["scan"]) & topics.keys()) if "scan" in options.topics else []
+    names = {topic.name for topic in wanted.values()} | {*latched}
     messages = bag.read(names, {topic.name for topic in cameras.values()})
-    static, lost = frames.static_frames(
-        [one for name in sorted(static_topics(options.topics["scan"]) & names) for one in messages[name].data]
-    )
+    static, lost = frames.static_frames([one for name in latched for one in messages[name].data])
     if lost:
         bag.problems.append(f"{bag.path.name}: {lost} messages of /tf_static cannot be read, and are left out")
     tracks, paces, clocks = {}, {}, {}
@@ -127,12 +131,13 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
         if not finite.all():
             what = "are no scan of a whole turn" if role == "scan" else "with values that are not finite"
             notes.append(f"{topic.name}: {int((~finite).sum())} of {len(finite)} messages {what}, left out")
-        track = Track(topic.name, topic.msgtype, times, found.order, values, stamps).rows(np.flatnonzero(finite))
+        track = Track(topic.name, topic.msgtype, times, found.order, values, stamps, _names(role, options))
+        track = track.rows(np.flatnonzero(finite))
         if not len(track.times):
             raise DatasetError(f"{bag.path}: no message of {topic.name} has finite values.")
         tracks[role] = track
     notes += told_pace(paces)
-    _check_one_time(bag, wanted["odom"].name, clocks)
+    _check_one_time(bag, wanted["odom" if "odom" in wanted else next(iter(wanted))].name, clocks)
     return tracks
 
 
@@ -150,6 +155,13 @@ def _check_one_time(bag: Bag, reference: str, clocks: Mapping[str, tuple[Times, 
                 f"{'ahead of' if ahead > 0 else 'behind'} {reference}. Their stamps are of different clocks, so "
                 "nothing says which command belongs to which scan; --stamps=receive takes the recorder's for all."
             )
+
+
+def _names(role: str, options: TrackOptions) -> tuple[str, ...]:
+    if role in options.parts:
+        return options.parts[role].names
+    scan = tuple(f"scan_{beam:03d}.pos" for beam in range(options.beams))
+    return {"scan": scan, "odom": TWIST + ODOMETRY * options.pose, "imu": GYRO, "cmd": TWIST}.get(role, ())
 
 
 def _stamps(topic: Topic, messages: Messages) -> Times | None:
@@ -172,6 +184,8 @@ class _Reading:
 
 def _values(role: str, topic: Topic, messages: Messages, reading: _Reading) -> Array:
     data = messages.data
+    if role in reading.options.parts:
+        return reading.options.parts[role].decode(data)
     if role == "scan":
         return _scans(topic, data, reading)
     if role == "odom":
