@@ -16,8 +16,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError, UnsupportedDatasetError
 from bhd_lerobot.rosbag.messages import types, views
 from bhd_lerobot.rosbag.messages.base import OdometryPart, ScanPart
-from bhd_lerobot.rosbag.messages.cdr import encode
-from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, encode_image, film_frames
+from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, encode_image, video_frames
 from bhd_lerobot.rosbag.messages.parts import (
     NANO,
     Frames,
@@ -28,6 +27,7 @@ from bhd_lerobot.rosbag.messages.parts import (
     own_topic,
     stamp_tree,
 )
+from bhd_lerobot.rosbag.messages.serialize import encode
 from bhd_lerobot.rosbag.messages.split import check_topics, parts_of
 from bhd_lerobot.rosbag.storage.write import Stream
 
@@ -135,7 +135,7 @@ class EpisodeTopics:
                 streams += self._looks(at_start, columns, motion)
         for key, feature in self._features.items():
             if feature["dtype"] == "video":
-                streams += self._film(key, row, at_start)
+                streams += self._video(key, row, at_start)
             elif feature["dtype"] in ("string", "language") and key != keys.SUBTASK:
                 streams.append(_texts(key, at_start, columns[key]))
         streams.append(_stream(STATE_TOPIC, types.STATE, at_end, _states(at_end, observed, columns)))
@@ -159,11 +159,11 @@ class EpisodeTopics:
             streams.append(_stream("/tf", views.TF, frames, links))
         return streams
 
-    def _film(self, key: str, row: Row, frames: Frames) -> list[Stream]:
+    def _video(self, key: str, row: Row, frames: Frames) -> list[Stream]:
         camera, compressed = camera_name(key), self._compressed
         optical = f"{camera}_optical_frame"
         path = self._state.root / layout.video_file(key, slot_of(row, f"videos/{key}"))
-        images = film_frames(path, row[f"videos/{key}/from_timestamp"], row["length"])
+        images = video_frames(path, row[f"videos/{key}/from_timestamp"], row["length"])
         topic = image_topic(key, compressed=compressed)
 
         def messages() -> Iterator[tuple[int, bytes]]:
@@ -272,20 +272,14 @@ def _states(frames: Frames, observed: NDArray[np.int64], columns: Mapping[str, N
 
 def _outcomes(frames: Frames, columns: Mapping[str, NDArray[Any]]) -> list[bytes]:
     n = len(frames.stamps)
-    texts = columns.get(keys.SUBTASK, np.full(n, "", object))
-    result = [b""] * n
-    for text in set(texts.tolist()):
-        rows = np.flatnonzero(texts == text)
-        fields: dict[str, Any] = {
-            "header": header(frames.stamps[rows]),
-            "episode_index": frames.episode,
-            "frame_index": frames.index[rows],
-            "subtask": text,
-        }
-        fields |= {key.removeprefix("next."): columns[key][rows] for key in OUTCOME_COLUMNS if key in columns}
-        for row, message in zip(rows, encode(types.OUTCOME, fields, len(rows)), strict=True):
-            result[row] = message
-    return result
+    fields: dict[str, Any] = {
+        "header": header(frames.stamps),
+        "episode_index": frames.episode,
+        "frame_index": frames.index,
+        "subtask": columns.get(keys.SUBTASK, ""),
+    }
+    fields |= {key.removeprefix("next."): columns[key] for key in OUTCOME_COLUMNS if key in columns}
+    return encode(types.OUTCOME, fields, n)
 
 
 def _texts(key: str, frames: Frames, values: NDArray[Any]) -> Stream:

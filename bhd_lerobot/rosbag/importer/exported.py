@@ -9,14 +9,12 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import DatasetError, DatasetMismatchError
 from bhd_lerobot.rosbag.exporter.episode import EPISODE_TOPIC, image_topic
 from bhd_lerobot.rosbag.messages import types
-from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.parts import NANO, Part
+from bhd_lerobot.rosbag.messages.serialize import decode
 from bhd_lerobot.rosbag.messages.split import PARTS
 from bhd_lerobot.rosbag.storage.read import Bag, Topic
 
 _REMEDY = "Export the dataset again, or import a TurtleBot3's bag as a real robot's with --robot=turtlebot3."
-_TEXTS = ("robot_type", "task", "features", "metadata", "metadata_types", "topics")
-_NUMBERS = ("format", "fps", "frames", "stamp.sec", "stamp.nanosec")
 _VECTORS = (keys.OBSERVATION_STATE, keys.ENVIRONMENT_STATE, keys.ACTION)
 _MOST_FPS = 10_000  # more is damage, and would be frames without end
 _SAME = ("robot_type", "fps", "features", "metadata_types")
@@ -95,25 +93,25 @@ def _episodes(bag: Bag) -> list[ExportedEpisode]:
 
 
 def _episode(message: bytes, received: int, place: int) -> ExportedEpisode:
-    found = {path: values[0] for path, values in decode(types.EPISODE, [message], (*_TEXTS, *_NUMBERS)).items()}
-    if found["format"] != types.FORMAT:
-        raise ValueError(f"it is of version {found['format']}")
-    features, metadata, kinds, topics = (json.loads(found[name]) for name in _TEXTS[2:])
+    found = decode(types.EPISODE, message)
+    if found.format != types.FORMAT:
+        raise ValueError(f"it is of version {found.format}")
+    features, metadata = json.loads(found.features), json.loads(found.metadata)
+    kinds, topics = json.loads(found.metadata_types), json.loads(found.topics)
     parts: dict[str, list[Part]] = {}
     for one in topics:
         part = PARTS[one["kind"]](one["topic"], tuple(one["names"]))
         parts.setdefault(one["feature"], []).append(part)
-    fps, frames = int(found["fps"]), int(found["frames"])
-    if not 1 <= fps <= _MOST_FPS:
-        raise ValueError(f"it has {fps} frames a second")
+    if not 1 <= found.fps <= _MOST_FPS:
+        raise ValueError(f"it has {found.fps} frames a second")
     episode = ExportedEpisode(
         place=place,
-        start=(received, int(found["stamp.sec"]) * NANO + int(found["stamp.nanosec"])),
-        duration=frames * NANO // fps,
-        robot_type=found["robot_type"],
-        fps=fps,
+        start=(received, found.stamp.sec * NANO + found.stamp.nanosec),
+        duration=found.frames * NANO // found.fps,
+        robot_type=found.robot_type,
+        fps=found.fps,
         features={str(key): {**feature} for key, feature in features.items()},
-        task=found["task"],
+        task=found.task,
         metadata=_complete(metadata, kinds),
         metadata_types=kinds,
         parts=parts,

@@ -1,13 +1,12 @@
 """Which topics of a bag are read for what, and who published them."""
 
 from collections.abc import Mapping
-from typing import Any
 
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages.base import BareTwistPart, GyroPart, OdometryPart, ScanPart, TwistPart
-from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE
 from bhd_lerobot.rosbag.messages.parts import Part
+from bhd_lerobot.rosbag.messages.serialize import decode
 from bhd_lerobot.rosbag.messages.views import JOINT_STATE
 from bhd_lerobot.rosbag.storage.read import Bag, Topic
 
@@ -26,9 +25,9 @@ def told_other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
     if any(topic.msgtype in _BASE and topic.count for topic in topics.values()):
         return None
     for topic in topics.values():
-        joints = _first(bag, topic.name, JOINT_STATE, "name") if topic.msgtype == JOINT_STATE and topic.count else None
+        joints = _joints(bag, topic.name) if topic.msgtype == JOINT_STATE and topic.count else []
         # A base has the joints of its wheels.
-        if joints is not None and len(joints) and not any("wheel" in joint for joint in joints):
+        if joints and not any("wheel" in joint for joint in joints):
             more = ", …" if len(joints) > _NAMED else ""
             return (
                 f"{bag.path} seems to be of an arm: {topic.name} has the joints {', '.join(joints[:_NAMED])}{more}, "
@@ -38,14 +37,14 @@ def told_other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
     return None
 
 
-def _first(bag: Bag, topic: str, msgtype: str, field: str) -> Any:
-    """Return a field of the first message of a topic; None if that cannot be read."""
+def _joints(bag: Bag, topic: str) -> list[str]:
+    """Return the joints of the first message of a topic; none if that cannot be read."""
     try:
         for _, payload in bag.payloads(topic):
-            return decode(msgtype, [payload], (field,))[field][0]
+            return list(decode(JOINT_STATE, payload).name)
     except DatasetError:
         pass
-    return None
+    return []
 
 
 TYPES = {

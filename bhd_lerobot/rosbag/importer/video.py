@@ -6,9 +6,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.writer.episode import EpisodeWriter
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.importer.decodable import MOST
 from bhd_lerobot.rosbag.importer.resample import Times, newest
-from bhd_lerobot.rosbag.importer.tracks import Track
+from bhd_lerobot.rosbag.importer.tracks import MOST_LOST, Track
 from bhd_lerobot.rosbag.messages.images import decode_image
 from bhd_lerobot.rosbag.storage.read import Bag, Picker
 
@@ -102,10 +101,10 @@ class Film:
                 except DatasetError as error:
                     broken += 1
                     reason = reason or str(error)
-                    if image is None or broken > max(1, MOST * total):
+                    if image is None or broken > max(1, MOST_LOST * total):
                         raise DatasetError(
                             f"{broken} of {total} pictures of an episode cannot be decoded, which is more than "
-                            f"{MOST:.0%}: too many to go on without them. The first: {reason}"
+                            f"{MOST_LOST:.0%}: too many to go on without them. The first: {reason}"
                         ) from error
                 before = row
             assert image is not None
