@@ -132,7 +132,7 @@ class EpisodeTopics:
                     moved = views.base_transforms(part, frames, values)
                     streams.append(_stream("/tf", views.TF, frames, moved))
             if key == keys.OBSERVATION_STATE:
-                streams += self._looks(at_start, columns, motion)
+                streams += self._viewer_streams(at_start, columns, motion)
         for key, feature in self._features.items():
             if feature["dtype"] == "video":
                 streams += self._video(key, row, at_start)
@@ -151,7 +151,9 @@ class EpisodeTopics:
                     f"{wrong[0]}, so its messages have no time. Leave the episode out (--episodes)."
                 )
 
-    def _looks(self, frames: Frames, columns: Mapping[str, NDArray[Any]], motion: views.Motion) -> list[Stream]:
+    def _viewer_streams(
+        self, frames: Frames, columns: Mapping[str, NDArray[Any]], motion: views.Motion
+    ) -> list[Stream]:
         streams = []
         if wheels := views.wheel_states(self._view, frames, self._features, columns):
             streams.append(_stream("/joint_states", views.JOINT_STATE, frames, wheels))

@@ -64,7 +64,7 @@ def frame_columns(
     }
 
 
-def told_silence(wanted: RobotImport, columns: Mapping[str, NDArray[Any]]) -> str | None:
+def command_note(wanted: RobotImport, columns: Mapping[str, NDArray[Any]]) -> str | None:
     """Return how many frames have no command, and whether the robot drove in them; None if all have one."""
     silent = columns[keys.MODE] == int(Mode.HOLD)
     if not silent.any():

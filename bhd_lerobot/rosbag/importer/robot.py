@@ -14,17 +14,17 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.importer.breaks import stretches, told_silences
-from bhd_lerobot.rosbag.importer.columns import frame_columns, told_silence
+from bhd_lerobot.rosbag.importer.breaks import segments, silence_notes
+from bhd_lerobot.rosbag.importer.columns import command_note, frame_columns
 from bhd_lerobot.rosbag.importer.dataset import ImportReport, RobotImport, all_or_nothing
 from bhd_lerobot.rosbag.importer.exported import ExportedEpisode
 from bhd_lerobot.rosbag.importer.resample import NANO, Grid, grids
 from bhd_lerobot.rosbag.importer.tracks import Track, read_tracks, seconds
-from bhd_lerobot.rosbag.importer.video import CAMERA, Film
+from bhd_lerobot.rosbag.importer.video import CAMERA, CameraImages
 from bhd_lerobot.rosbag.storage.read import Bag
 from bhd_lerobot.tasks.task import Event
 
-_TOLD = 8  # sentences in an error; a damaged bag may give hundreds
+_LISTED = 8  # sentences in an error; a damaged bag may give hundreds
 
 
 def import_bags(
@@ -74,7 +74,7 @@ def import_bags(
             late += [(count, bag.path.name) for count in robot_bag.late if count]
         if recorder is None:
             sensors = ", ".join(topic for role, topic in wanted.topics.items() if role != "cmd")
-            told = "; ".join([*report.problems, *report.notes][:_TOLD])
+            told = "; ".join([*report.problems, *report.notes][:_LISTED])
             raise DatasetError(
                 f"No episode of {wanted.min_episode_s:g} s or more came out of {', '.join(str(b.path) for b in bags)}: "
                 f"there is no such time in which {sensors} were heard at least every {wanted.max_gap_s:g} s. {told}"
@@ -99,7 +99,7 @@ def _features(wanted: RobotImport, images: Mapping[str, tuple[int, int, int]]) -
 
 @dataclass(frozen=True)
 class _Episode:
-    """Frames, and the tracks of the stretch of the bag in which they lie, sorted by time.
+    """Frames, and the tracks of the segment of the bag in which they lie, sorted by time.
 
     Attributes:
         exported: what the bag says of it, if `bhd-data export` wrote the bag.
@@ -126,8 +126,10 @@ class _RobotBag:
         self._bag, self._wanted = bag, wanted
         self._exported = exported
         self._tracks = read_tracks(bag, wanted.tracks, self.notes)
-        self._films = [
-            Film(bag, role, track, self.notes) for role, track in self._tracks.items() if role.startswith(CAMERA)
+        self._cameras = [
+            CameraImages(bag, role, track, self.notes)
+            for role, track in self._tracks.items()
+            if role.startswith(CAMERA)
         ]
         self._begin = min(int(track.times.min()) for track in self._tracks.values())
         self._check_clocks()
@@ -158,7 +160,7 @@ class _RobotBag:
             DatasetError: the pose that is to be observed jumps all the time.
         """
         wanted = self._wanted
-        parts = stretches(
+        parts = segments(
             self._tracks,
             [one.place for one in self._exported],
             stamps=wanted.tracks.stamps,
@@ -177,7 +179,7 @@ class _RobotBag:
                 for role, track in self._tracks.items()
             }
             sensors = {role: track for role, track in tracks.items() if role != "cmd"}
-            self.notes += told_silences(sensors, self._begin, round(wanted.max_gap_s * NANO))
+            self.notes += silence_notes(sensors, self._begin, round(wanted.max_gap_s * NANO))
             for grid in grids(
                 [track.times for track in sensors.values()],
                 wanted.fps,
@@ -190,13 +192,13 @@ class _RobotBag:
                     yield _Episode(grid, tracks, begun[-1] if begun else None)
                 else:
                     self.notes.append(
-                        f"a stretch of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
+                        f"a segment of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
                         "was left out"
                     )
 
     def image_shapes(self) -> dict[str, tuple[int, int, int]]:
         """Return the shapes of the cameras' pictures by name."""
-        return {film.name: film.shape() for film in self._films}
+        return {camera.name: camera.shape() for camera in self._cameras}
 
     def save(self, episode: _Episode, recorder: DatasetRecorder) -> int:
         """Save an episode and return its number of frames.
@@ -208,8 +210,8 @@ class _RobotBag:
         times, ages = episode.grid.times, episode.grid.ages.max(axis=0)
         writer = recorder.begin_episode()
         try:
-            for film in self._films:
-                shown = film.write(episode.tracks[film.role], times, writer)
+            for camera in self._cameras:
+                shown = camera.write(episode.tracks[camera.role], times, writer)
                 ages = np.maximum(ages, times - shown)
             task, metadata = self._described(episode)
             columns = frame_columns(self._wanted, episode.tracks, times, ages, metadata.get("outcome"))
@@ -220,7 +222,7 @@ class _RobotBag:
             writer.discard()
             raise
         begin = self._after_start(episode.grid)
-        if silence := told_silence(self._wanted, columns):
+        if silence := command_note(self._wanted, columns):
             self.notes.append(f"{begin}: {silence}")
         self.late.append(int(columns[keys.LATE].sum()))
         return len(times)
@@ -228,7 +230,7 @@ class _RobotBag:
     def _with_pictures(self, episode: _Episode) -> _Episode:
         """Return an episode from the frame on at which every camera has a picture that can be decoded."""
         grid = episode.grid
-        blind = max((film.blind(episode.tracks[film.role], grid.times) for film in self._films), default=0)
+        blind = max((camera.blind(episode.tracks[camera.role], grid.times) for camera in self._cameras), default=0)
         if blind:
             self.notes.append(
                 f"{self._after_start(grid)}: the episode begins {blind} frames later, with the first picture that can "

@@ -14,7 +14,7 @@ _BASE = (ScanPart.msgtype, OdometryPart.msgtype)
 _NAMED = 6  # joints
 
 
-def told_other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
+def other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
     """Return, in sentences, that a bag is not of a TurtleBot3 and what can be done; None if nothing says so.
 
     Args:
@@ -80,7 +80,7 @@ def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) ->
     """
     option, types = (f"--{role}", TYPES[role])
     if name not in topics or not topics[name].count:
-        if (other := told_other_robot(bag, topics)) is not None:
+        if (other := other_robot(bag, topics)) is not None:
             raise DatasetError(other)
         there = ", ".join(f"{one.name} ({one.msgtype}, {one.count})" for one in topics.values()) or "none"
         fitting = [one.name for one in topics.values() if one.msgtype in types and one.count]
@@ -133,7 +133,7 @@ def static_topics(scan: str) -> set[str]:
     return {"/tf_static", f"{scan.rpartition('/')[0]}/tf_static"}
 
 
-def told_publishers(topics: Mapping[str, Topic], wanted: Mapping[str, Topic]) -> list[str]:
+def publisher_notes(topics: Mapping[str, Topic], wanted: Mapping[str, Topic]) -> list[str]:
     """Return, in sentences, where more than one publisher may have been at work.
 
     Args:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.importer import frames
+from bhd_lerobot.rosbag.importer.diagnostics import pace, pace_warnings, speed_warnings
 from bhd_lerobot.rosbag.importer.resample import Times, apart, message_times, sane
 from bhd_lerobot.rosbag.importer.scan import GEOMETRY, resampled_scans
-from bhd_lerobot.rosbag.importer.topics import TYPES, exported_topic, static_topics, told_publishers, wanted_topic
-from bhd_lerobot.rosbag.importer.warnings import pace, told_pace, told_speeds
+from bhd_lerobot.rosbag.importer.topics import TYPES, exported_topic, publisher_notes, static_topics, wanted_topic
 from bhd_lerobot.rosbag.messages.base import GYRO, ODOMETRY, TWIST, BareTwistPart, GyroPart, TwistPart, odometry
 from bhd_lerobot.rosbag.messages.parts import NANO, Part, head_stamps, header_stamps
 from bhd_lerobot.rosbag.messages.serialize import decode
@@ -105,7 +105,7 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
     wanted = {role: wanted_topic(bag, topics, role, name) for role, name in options.topics.items()}
     wanted |= {role: exported_topic(bag, topics, role, part) for role, part in options.parts.items()}
     cameras = {f"camera/{name}": wanted_topic(bag, topics, "camera", topic) for name, topic in options.cameras.items()}
-    notes += told_publishers(topics, {**wanted, **cameras})
+    notes += publisher_notes(topics, {**wanted, **cameras})
     latched = sorted(static_topics(options.topics["scan"]) & topics.keys()) if "scan" in options.topics else []
     names = {topic.name for topic in wanted.values()} | {*latched}
     messages = bag.read(names, {topic.name for topic in cameras.values()})
@@ -139,7 +139,7 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
         if not len(track.times):
             raise DatasetError(f"{bag.path}: no message of {topic.name} has finite values.")
         tracks[role] = track
-    notes += told_pace(paces)
+    notes += pace_warnings(paces)
     _check_one_time(bag, wanted["odom" if "odom" in wanted else next(iter(wanted))].name, clocks)
     return tracks
 
@@ -227,7 +227,7 @@ def _values(role: str, topic: Topic, messages: Messages, decoded: list[Any], rea
         speeds, pose = odometry(decoded)
         stamps = header_stamps(decoded)  # by which they were measured; of some drivers they are not set
         measured = stamps if (np.diff(stamps) > 0).all() else messages.received
-        reading.notes.extend(told_speeds(topic.name, measured, speeds, pose))
+        reading.notes.extend(speed_warnings(topic.name, measured, speeds, pose))
         return np.concatenate([speeds, pose], axis=1) if reading.options.pose else speeds
     if role == "cmd":
         kind = BareTwistPart if topic.msgtype == BareTwistPart.msgtype else TwistPart

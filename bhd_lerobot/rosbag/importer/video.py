@@ -17,7 +17,7 @@ CAMERA = "camera/"
 _TRIED = 10  # pictures at the beginning, of which one must be readable
 
 
-class Film:
+class CameraImages:
     """One camera.
 
     Attributes:
@@ -57,7 +57,7 @@ class Film:
         """Return how many frames at the beginning of an episode have no picture that can be decoded.
 
         Args:
-            track: the camera's messages in the stretch in which the episode lies, sorted by time.
+            track: the camera's messages in the segment in which the episode lies, sorted by time.
             times: of the frames [ns].
 
         Raises:

@@ -1,6 +1,7 @@
 """Messages to bytes and back, by `rosbags`: ROS 2's serialisation, CDR."""
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -50,11 +51,16 @@ def decode(msgtype: str, data: bytes) -> Any:
 
 
 def _message(msgtype: str, fields: Tree, row: int) -> Any:
-    store = type_store()
-    known = store.fielddefs[msgtype][1]
-    if unknown := fields.keys() - {name for name, _ in known}:
-        raise KeyError(f"{msgtype} has no field {sorted(unknown)}")
-    return store.types[msgtype](**{name: _value(kind, fields.get(name), row) for name, kind in known})
+    made, known = _definition(msgtype)
+    if not fields.keys() <= known.keys():
+        raise KeyError(f"{msgtype} has no field {sorted(fields.keys() - known.keys())}")
+    return made(*[_value(kind, fields.get(name), row) for name, kind in known.items()])
+
+
+@cache
+def _definition(msgtype: str) -> tuple[Any, dict[str, Any]]:
+    """Return a type's class, and the descriptions of its fields in order."""
+    return type_store().types[msgtype], dict(type_store().fielddefs[msgtype][1])
 
 
 def _value(description: Any, value: Any, row: int) -> Any:
@@ -63,7 +69,7 @@ def _value(description: Any, value: Any, row: int) -> Any:
         return _message(inner, value or {}, row)
     if kind == _BASE:
         value = value[row] if isinstance(value, np.ndarray) else value
-        return (value or "") if inner[0] == "string" else np.dtype(inner[0]).type(value or 0)
+        return (value or "") if inner[0] == "string" else (value or 0)
     (element, count) = inner
     if int(element[0]) == _BASE and element[1][0] != "string":
         values = (np.zeros(count if kind == _ARRAY else 0)) if value is None else np.asarray(value)
