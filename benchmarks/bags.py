@@ -1,7 +1,7 @@
 """Messages a second of `bhd-data export` and `bhd-data import`: `python -m benchmarks.bags`.
 
 A dataset of TurtleBot3 episodes as `bhd-record` writes it (360 beams, no camera) becomes a bag, and the bag a dataset
-again, once bit by bit and once resampled as if it were a real robot's. Beside it the `mcap` library writes the same
+again. Beside it the `mcap` library writes the same
 messages, serialised already, into a file, and reads them without decoding them: what a bag costs at the least in that
 library. They run in turns; the first of each is not counted.
 """
@@ -25,8 +25,6 @@ from bhd_lerobot.cli.data.export import robot_view
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.rosbag.exporter.export import ExportOptions, export_bags
-from bhd_lerobot.rosbag.importer.restore import restore
-from bhd_lerobot.rosbag.storage.find import find_bags
 
 FPS = 10
 
@@ -82,9 +80,9 @@ def bare_read(path: Path) -> tuple[dict[str, bytes], list[tuple[str, str, int, b
     return schemas, messages
 
 
-def resample(bag: Path, root: Path) -> None:
-    """Import a bag as if it were a real robot's."""
-    arguments = ["import", str(bag), "--resample", "--repo_id=bench/bags", f"--root={root}", "--task=drive"]
+def import_bag(bag: Path, root: Path) -> None:
+    """Import a bag."""
+    arguments = ["import", str(bag), "--repo_id=bench/bags", f"--root={root}"]
     if data.main(arguments):
         raise AssertionError("The import failed.")
 
@@ -108,10 +106,9 @@ def main() -> int:
             "export": lambda: export_bags(root, bag, view=view, options=how),
             "bare_write": lambda: bare_write(file, schemas, messages),
             "bare_read": lambda: bare_read(file),
-            "restore": lambda: restore(find_bags(bag), back, "bench/bags"),
-            "resample": lambda: resample(bag, back),
+            "import": lambda: import_bag(bag, back),
         }
-        made = {"export": bag, "restore": back, "resample": back}
+        made = {"export": bag, "import": back}
 
         def anew(name: str, run: Callable[[], float]) -> float:
             if name in made:
@@ -120,7 +117,7 @@ def main() -> int:
 
         parts = {name: partial(anew, name, run) for name, run in rates(works, len(messages)).items()}
         speeds = in_turns(parts, options.turns)
-    peers = {"export": "bare_write", "restore": "bare_read", "resample": "bare_read"}
+    peers = {"export": "bare_write", "import": "bare_read"}
     results: dict[str, Any] = {
         "messages": len(messages),
         "megabytes": size / 1e6,

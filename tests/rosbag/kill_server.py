@@ -1,5 +1,7 @@
 """Exports and imports bags in forked processes that kill themselves; see `kill_server`, whose jobs it does as well."""
 
+import contextlib
+import io
 import itertools
 import os
 import signal
@@ -9,13 +11,12 @@ from typing import Any
 import mcap.writer  # noqa: F401  as kill_server says
 import rosbags.rosbag2  # noqa: F401
 
+from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.storage import disk
 from bhd_lerobot.rosbag.exporter.export import ExportOptions, export_bags
-from bhd_lerobot.rosbag.importer.restore import restore
 from bhd_lerobot.rosbag.messages.types import type_store
 from bhd_lerobot.rosbag.messages.views import RobotView
 from bhd_lerobot.rosbag.storage import write
-from bhd_lerobot.rosbag.storage.find import find_bags
 from tests.datasets import kill_server
 
 type_store()
@@ -40,7 +41,8 @@ def run(job: dict[str, Any]) -> None:
     if job["edit"] == "export":
         export_bags(source, target, view=RobotView(), options=ExportOptions(one_bag=job["one_bag"]))
     else:
-        restore(find_bags(source), target, "t/t")
+        with contextlib.redirect_stdout(io.StringIO()):  # the server answers on the real one
+            assert main.main(["import", str(source), "--repo_id=t/t", f"--root={target}"]) == 0
 
 
 def stepped(name: str, before_step: Any) -> None:

@@ -3,25 +3,37 @@
 import argparse
 import math
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.cli.data.command import Commands, add_command
+from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.errors import ConfigError, quoted, unknown_name
 from bhd_lerobot.rosbag.importer.dataset import ImportReport, RobotImport
-from bhd_lerobot.rosbag.importer.headers import is_ours
-from bhd_lerobot.rosbag.importer.restore import restore
-from bhd_lerobot.rosbag.importer.robot import import_robot
+from bhd_lerobot.rosbag.importer.exported import (
+    ExportedEpisode,
+    exported_cameras,
+    exported_episodes,
+    exported_parts,
+    is_exported,
+    names_of,
+)
+from bhd_lerobot.rosbag.importer.robot import import_bags
 from bhd_lerobot.rosbag.importer.tracks import TrackOptions
 from bhd_lerobot.rosbag.messages.types import require_rosbags
 from bhd_lerobot.rosbag.storage.find import check_distinct, find_bags
 from bhd_lerobot.rosbag.storage.place import refuse_existing
-from bhd_lerobot.rosbag.storage.read import Bag
+from bhd_lerobot.rosbag.storage.read import Bag, Topic
 from bhd_lerobot.tasks.task import OUTCOMES
 
 ROBOTS = ("turtlebot3",)
 _STAMPS = ("auto", "header", "receive")
+_TOPICS = {"scan": "/scan", "odom": "/odom", "cmd": "/cmd_vel"}
+_REAL = (
+    *(*_TOPICS, "imu", "camera", "odometry", "beams", "scan_frame", "scan_yaw", "odom_frame", "command_timeout"),
+)  # options for bags of a real robot
 
 
 def add_to(commands: Commands) -> None:
@@ -32,32 +44,34 @@ def add_to(commands: Commands) -> None:
     command.add_argument("bags", nargs="+", type=Path, help="bags: folders, .mcap or .db3 files, or a folder of bags")
     command.add_argument("--repo_id", required=True, help="name of the dataset, user/name")
     command.add_argument("--root", type=Path, help="where to put it; LeRobot's default place if left out")
+    command.add_argument("--task", help="the instruction, a sentence; exported bags say it themselves")
+    command.add_argument("--fps", type=int, help="frames a second (default: 10, or that of the exported dataset)")
+    command.add_argument("--stamps", default="receive", help="whose time counts: receive (default), header or auto")
+    command.add_argument("--max_age", type=float, metavar="S", help="age of a reading that makes a frame late")
+    command.add_argument("--max_gap", type=float, default=1.0, metavar="S", help="silence that ends an episode (1.0)")
+    command.add_argument(
+        "--min_episode_s", type=float, metavar="S",
+        help="shorter ones are left out (default: 1.0, or 0 for exported bags)",
+    )  # fmt: skip
+    command.add_argument("--outcome", help=f"what the episodes ended with: {', '.join(OUTCOMES)}; nothing if left out")
     real = command.add_argument_group("bags of a real robot")
-    real.add_argument("--resample", action="store_true", help="treat bags of bhd-data export as those of a real robot")
-    real.add_argument("--robot", default="turtlebot3", help=f"valid: {', '.join(ROBOTS)} (default)")
-    real.add_argument("--task", help="the instruction, a sentence; needed")
-    real.add_argument("--fps", type=int, default=10, help="frames a second (default: 10)")
-    real.add_argument("--scan", default="/scan", help="topic of the scans (default: /scan)")
-    real.add_argument("--odom", default="/odom", help="topic of the odometry (default: /odom)")
-    real.add_argument("--cmd", default="/cmd_vel", help="topic of the commands (default: /cmd_vel)")
-    real.add_argument("--imu", help="topic of the IMU, to observe the gyroscope; not observed if left out")
     real.add_argument(
-        "--camera", action="append", default=[], metavar="NAME=TOPIC", help="a camera to record, such as front=/image"
+        "--robot", help=f"valid: {', '.join(ROBOTS)} (default); given, exported bags are read as a real robot's, too"
     )
-    real.add_argument("--odometry", action="store_true", help="observe x.pos, y.pos and theta.pos, too")
-    real.add_argument("--beams", type=int, default=360, help="beams of a scan in the dataset (default: 360)")
-    real.add_argument("--stamps", default="receive", help="whose time counts: receive (default), header or auto")
+    real.add_argument("--scan", help=f"topic of the scans (default: {_TOPICS['scan']})")
+    real.add_argument("--odom", help=f"topic of the odometry (default: {_TOPICS['odom']})")
+    real.add_argument("--cmd", help=f"topic of the commands (default: {_TOPICS['cmd']})")
+    real.add_argument("--imu", help="topic of the IMU, to observe the gyroscope; not observed if left out")
+    real.add_argument("--camera", action="append", metavar="NAME=TOPIC", help="a camera to record: front=/image")
+    real.add_argument("--odometry", action="store_true", default=None, help="observe x.pos, y.pos and theta.pos, too")
+    real.add_argument("--beams", type=int, help="beams of a scan in the dataset (default: 360)")
     real.add_argument("--scan_frame", metavar="FRAME", help="name of the scanner's frame, if it is not base_scan")
     real.add_argument("--scan_yaw", type=float, metavar="RAD", help="where its zero points; 0 is straight ahead")
     real.add_argument("--odom_frame", metavar="FRAME", help="name of the base's frame, if it is not base_footprint")
-    real.add_argument("--max_age", type=float, metavar="S", help="age of a reading that makes a frame late")
-    real.add_argument("--max_gap", type=float, default=1.0, metavar="S", help="silence that ends an episode (1.0)")
     real.add_argument(
         "--command_timeout", type=float, metavar="S",
         help="silence after which the robot stands; inf: it goes on (default: that of our robot)",
     )  # fmt: skip
-    real.add_argument("--min_episode_s", type=float, default=1.0, metavar="S", help="shorter ones are left out (1.0)")
-    real.add_argument("--outcome", help=f"what the episodes ended with: {', '.join(OUTCOMES)}; nothing if left out")
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -66,102 +80,146 @@ def _run(options: argparse.Namespace) -> int:
     check_distinct(bags)
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()
     refuse_existing(root, "--root")  # before the bags are read, which may take long
-    ours = [is_ours(bag.topics()) for bag in bags]
-    if any(ours) and not all(ours) and not options.resample:
-        raise ConfigError(
-            f"{bags[ours.index(True)].path} was written by bhd-data export, {bags[ours.index(False)].path} was not. "
-            "Import them one after the other into two datasets, or all of them as a robot's with --resample."
+    topics = [bag.topics() for bag in bags]
+    exported = [options.robot is None and is_exported(one) for one in topics]
+    if all(exported):
+        episodes = exported_episodes(bags)
+        report = import_bags(
+            bags, root, options.repo_id, _wanted_of_exported(options, episodes[0][0], topics[0]), episodes
         )
-    if all(ours) and not options.resample:
-        _refuse_options(options)
-        report = restore(bags, root, options.repo_id)
+    elif any(exported):
+        raise ConfigError(
+            f"{bags[exported.index(True)].path} was written by bhd-data export, {bags[exported.index(False)].path} was "
+            "not. Import them one after the other into two datasets, or all of them as a real robot's with "
+            f"--robot={ROBOTS[0]}."
+        )
     else:
-        report = import_robot(bags, root, options.repo_id, _wanted(options))
-    _tell(report, bags)
+        report = import_bags(bags, root, options.repo_id, _wanted(options))
+    _print(report, bags)
     return 0
 
 
-_PLAIN = ("task", "imu", "scan_frame", "scan_yaw", "odom_frame", "max_age", "command_timeout", "outcome")
-
-
-def _refuse_options(options: argparse.Namespace) -> None:
-    given = [name for name in _PLAIN if getattr(options, name) is not None]
-    given += ["camera"] * bool(options.camera) + ["odometry"] * options.odometry
-    for name, default in (("fps", 10), ("beams", 360), ("stamps", "receive"), ("max_gap", 1.0)):
-        given += [name] * (getattr(options, name) != default)
-    if given:
-        raise ConfigError(
-            f"--{given[0]} is for bags of a real robot; this one was written by bhd-data export, and comes back as it "
-            "was. Leave the option out, or resample the bag as if it were a robot's, with --resample."
-        )
-
-
-def _wanted(options: argparse.Namespace) -> RobotImport:
-    """Return what the options ask for.
+def _wanted_of_exported(
+    options: argparse.Namespace, episode: ExportedEpisode, topics: Mapping[str, Topic]
+) -> RobotImport:
+    """Return what the options ask for of exported bags.
 
     Raises:
-        ConfigError: a value that cannot be honoured.
+        ConfigError: a value that cannot be honoured, or an option for bags of a real robot.
     """
-    if options.robot not in ROBOTS:
-        raise ConfigError(f"{unknown_name('robot', options.robot, ROBOTS)} Only its bags can be resampled.")
-    if not options.task:
-        raise ConfigError("Say what the robot was to do: --task='Drive around without touching anything.'")
+    if given := [name for name in _REAL if getattr(options, name) is not None]:
+        raise ConfigError(
+            f"--{given[0]} is for bags of a real robot; this one was written by bhd-data export, and says itself what "
+            f"is in it. Leave the option out, or read the bag as a real robot's with --robot={ROBOTS[0]}."
+        )
+    fps = episode.fps if options.fps is None else options.fps
+    body = turtlebot3_burger()
+    assert body.lidar is not None
+    limits = body.limits if episode.robot_type in ROBOTS else None
+    actions = names_of(episode, keys.ACTION)
+    return RobotImport(
+        robot_type=episode.robot_type,
+        task=options.task,
+        fps=fps,
+        observation_names=names_of(episode, keys.OBSERVATION_STATE),
+        environment_names=names_of(episode, keys.ENVIRONMENT_STATE),
+        action_names=actions,
+        tracks=TrackOptions(
+            topics={},
+            cameras=exported_cameras(episode, topics),
+            beams=0,
+            lidar=body.lidar,
+            stamps=options.stamps,
+            parts=exported_parts(episode),
+        ),
+        max_speed=limits.velocity if limits is not None and limits.names == actions else None,
+        command_timeout_s=math.inf,
+        outcome=options.outcome,
+        **_times(options, fps, least=0.0),
+    )
+
+
+def _times(options: argparse.Namespace, fps: int, least: float) -> dict[str, float]:
+    """Return the times that frames and episodes keep to, by their names in `RobotImport`.
+
+    Raises:
+        ConfigError: one, or another option that all bags have, cannot be honoured.
+    """
+    if options.task == "":
+        raise ConfigError("--task is empty; it must be a sentence.")
     if options.stamps not in _STAMPS:
         raise ConfigError(unknown_name("stamps", options.stamps, _STAMPS))
     if options.outcome is not None and options.outcome not in OUTCOMES:
         raise ConfigError(unknown_name("outcome", options.outcome, OUTCOMES))
-    if options.fps < 1:
-        raise ConfigError(f"--fps is {options.fps}; it must be a whole number of at least 1.")
+    if fps < 1:
+        raise ConfigError(f"--fps is {fps}; it must be a whole number of at least 1.")
+    lidar = turtlebot3_burger().lidar
+    assert lidar is not None
+    # As `bhd-record` judges it: a frame, and a period of the slowest sensor.
+    max_age = 1 / fps + 1 / lidar.rate_hz if options.max_age is None else options.max_age
+    for name, value, at_least in (("max_age", max_age, 0.0), ("max_gap", options.max_gap, max_age)):
+        if not value > 0 or value < at_least or math.isinf(value):
+            raise ConfigError(
+                f"--{name} is {value}; it must be positive" + (f", {at_least:g} at least." if at_least else ".")
+            )
+    shortest = least if options.min_episode_s is None else options.min_episode_s
+    if not 0 <= shortest < math.inf:
+        raise ConfigError(f"--min_episode_s is {shortest}; it must be 0 or positive.")
+    return {"max_age_s": max_age, "max_gap_s": options.max_gap, "min_episode_s": shortest}
+
+
+def _wanted(options: argparse.Namespace) -> RobotImport:
+    """Return what the options ask for of a real robot's bags.
+
+    Raises:
+        ConfigError: a value that cannot be honoured.
+    """
+    robot = options.robot or ROBOTS[0]
+    if robot not in ROBOTS:
+        raise ConfigError(f"{unknown_name('robot', robot, ROBOTS)} Only bags of this robot can be imported.")
+    if not options.task:
+        raise ConfigError("Say what the robot was to do: --task='Drive around without touching anything.'")
+    fps = 10 if options.fps is None else options.fps
+    times = _times(options, fps, least=1.0)
     body = turtlebot3_burger()
     assert body.lidar is not None
-    # As `bhd-record` judges it: a frame, and a period of the slowest sensor.
-    max_age = 1 / options.fps + 1 / body.lidar.rate_hz if options.max_age is None else options.max_age
     timeout = body.limits.command_timeout_s if options.command_timeout is None else options.command_timeout
-    for name, value, least in (
-        ("max_age", max_age, 0.0),
-        ("max_gap", options.max_gap, max_age),
-        ("command_timeout", timeout, 0.0),
-    ):
-        if not value > 0 or value < least or (math.isinf(value) and name != "command_timeout"):
-            raise ConfigError(
-                f"--{name} is {value}; it must be positive" + (f", {least:g} at least." if least else ".")
-            )
-    if not 0 <= options.min_episode_s < math.inf:
-        raise ConfigError(f"--min_episode_s is {options.min_episode_s}; it must be 0 or positive.")
+    if not timeout > 0:
+        raise ConfigError(f"--command_timeout is {timeout}; it must be positive.")
     if options.scan_yaw is not None and not math.isfinite(options.scan_yaw):
         raise ConfigError(f"--scan_yaw is {options.scan_yaw}; it must be an angle in rad.")
     from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config  # seconds to import
     from bhd_lerobot.robots.turtlebot3_simulation import observation_names
 
+    beams, pose = 360 if options.beams is None else options.beams, bool(options.odometry)
     config = TurtleBot3Config(
-        fps=10, beams=options.beams, odometry=options.odometry, imu=options.imu is not None
+        fps=10, beams=beams, odometry=pose, imu=options.imu is not None
     )  # refuses numbers of beams that do not divide a turn
-    topics = {"scan": options.scan, "odom": options.odom, "cmd": options.cmd}
+    topics = {role: getattr(options, role) or topic for role, topic in _TOPICS.items()}
     if options.imu is not None:
         topics["imu"] = options.imu
     return RobotImport(
-        robot_type=options.robot,
+        robot_type=robot,
         task=options.task,
-        fps=options.fps,
+        fps=fps,
         observation_names=observation_names(config),
+        environment_names=(),
         action_names=body.limits.names,
         tracks=TrackOptions(
             topics=topics,
-            cameras=_cameras(options.camera),
-            beams=options.beams,
+            cameras=_cameras(options.camera or []),
+            beams=beams,
             lidar=body.lidar,
             stamps=options.stamps,
             scan_frame=options.scan_frame,
             odom_frame=options.odom_frame,
             scan_yaw=options.scan_yaw,
-            pose=options.odometry,
+            pose=pose,
         ),
         max_speed=body.limits.velocity,
-        max_age_s=max_age,
-        max_gap_s=options.max_gap,
         command_timeout_s=timeout,
-        min_episode_s=options.min_episode_s,
         outcome=options.outcome,
+        **times,
     )
 
 
@@ -175,7 +233,7 @@ def _cameras(texts: list[str]) -> dict[str, str]:
     return cameras
 
 
-def _tell(report: ImportReport, bags: list[Bag]) -> None:
+def _print(report: ImportReport, bags: list[Bag]) -> None:
     for problem in report.problems:
         print(f"damaged: {problem}", file=sys.stderr)
     for note in report.notes:

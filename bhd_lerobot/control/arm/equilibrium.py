@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.geometry.poses import rotation_vectors, turned
+from bhd_lerobot.control.arm.rotations import rotation_vectors, turned
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]

@@ -6,10 +6,11 @@ from numpy.typing import ArrayLike, NDArray
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
 from bhd_lerobot.control.arm.equilibrium import Equilibrium, EquilibriumLimits
+from bhd_lerobot.control.arm.rotations import rotation_matrices, rotation_vectors
 from bhd_lerobot.control.arm.wrench import OBSERVER_GAIN, ContactObserver
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics, DynamicsTerms, product
-from bhd_lerobot.control.geometry.poses import pose_vectors, rotation_matrices, rotation_vectors
+from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Limit, Mode
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError

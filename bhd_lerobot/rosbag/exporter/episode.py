@@ -16,8 +16,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError, UnsupportedDatasetError
 from bhd_lerobot.rosbag.messages import types, views
 from bhd_lerobot.rosbag.messages.base import OdometryPart, ScanPart
-from bhd_lerobot.rosbag.messages.cdr import encode
-from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, encode_image, film_frames
+from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, encode_image, video_frames
 from bhd_lerobot.rosbag.messages.parts import (
     NANO,
     Frames,
@@ -28,8 +27,8 @@ from bhd_lerobot.rosbag.messages.parts import (
     own_topic,
     stamp_tree,
 )
+from bhd_lerobot.rosbag.messages.serialize import encode
 from bhd_lerobot.rosbag.messages.split import check_topics, parts_of
-from bhd_lerobot.rosbag.storage import checksum
 from bhd_lerobot.rosbag.storage.write import Stream
 
 _PLAIN = (arrow.is_string, arrow.is_boolean, arrow.is_integer, arrow.is_floating, arrow.is_list, arrow.is_null)
@@ -118,7 +117,7 @@ class EpisodeTopics:
         self._next_start = int(ended[-1]) + _PAUSE_NS
         index = np.arange(n)
         at_start, at_end = Frames(episode, index, observed), Frames(episode, index, ended)
-        streams = [Stream(EPISODE_TOPIC, types.EPISODE, [(start, self._episode(row, columns, start))], latched=True)]
+        streams = [Stream(EPISODE_TOPIC, types.EPISODE, [(start, self._episode(row, start))], latched=True)]
         motion = views.Motion.of(self._view, self._features, columns)
         if still := views.static_transforms(views.still_frames(self._view, motion), start):
             streams.append(Stream("/tf_static", views.TF, [(start, still[0])], latched=True))
@@ -133,10 +132,10 @@ class EpisodeTopics:
                     moved = views.base_transforms(part, frames, values)
                     streams.append(_stream("/tf", views.TF, frames, moved))
             if key == keys.OBSERVATION_STATE:
-                streams += self._looks(at_start, columns, motion)
+                streams += self._viewer_streams(at_start, columns, motion)
         for key, feature in self._features.items():
             if feature["dtype"] == "video":
-                streams += self._film(key, row, at_start)
+                streams += self._video(key, row, at_start)
             elif feature["dtype"] in ("string", "language") and key != keys.SUBTASK:
                 streams.append(_texts(key, at_start, columns[key]))
         streams.append(_stream(STATE_TOPIC, types.STATE, at_end, _states(at_end, observed, columns)))
@@ -152,7 +151,9 @@ class EpisodeTopics:
                     f"{wrong[0]}, so its messages have no time. Leave the episode out (--episodes)."
                 )
 
-    def _looks(self, frames: Frames, columns: Mapping[str, NDArray[Any]], motion: views.Motion) -> list[Stream]:
+    def _viewer_streams(
+        self, frames: Frames, columns: Mapping[str, NDArray[Any]], motion: views.Motion
+    ) -> list[Stream]:
         streams = []
         if wheels := views.wheel_states(self._view, frames, self._features, columns):
             streams.append(_stream("/joint_states", views.JOINT_STATE, frames, wheels))
@@ -160,11 +161,11 @@ class EpisodeTopics:
             streams.append(_stream("/tf", views.TF, frames, links))
         return streams
 
-    def _film(self, key: str, row: Row, frames: Frames) -> list[Stream]:
+    def _video(self, key: str, row: Row, frames: Frames) -> list[Stream]:
         camera, compressed = camera_name(key), self._compressed
         optical = f"{camera}_optical_frame"
         path = self._state.root / layout.video_file(key, slot_of(row, f"videos/{key}"))
-        images = film_frames(path, row[f"videos/{key}/from_timestamp"], row["length"])
+        images = video_frames(path, row[f"videos/{key}/from_timestamp"], row["length"])
         topic = image_topic(key, compressed=compressed)
 
         def messages() -> Iterator[tuple[int, bytes]]:
@@ -180,7 +181,7 @@ class EpisodeTopics:
             streams.append(_stream(f"/{camera}/camera_info", views.CAMERA_INFO, frames, told))
         return streams
 
-    def _episode(self, row: Row, columns: Mapping[str, NDArray[Any]], start: int) -> bytes:
+    def _episode(self, row: Row, start: int) -> bytes:
         identity = self._state.identity or {}
         metadata = {name.removeprefix(PREFIX): value for name, value in row.items() if name.startswith(PREFIX)}
         topics = [
@@ -201,11 +202,8 @@ class EpisodeTopics:
             "metadata": json.dumps(metadata),
             "metadata_types": json.dumps({name: str(kind) for name, kind in self._state.metadata_types.items()}),
             "recording": json.dumps(identity.get("recording", {})),
-            "video": json.dumps(identity.get("video", {})),
             "topics": json.dumps(topics),
-            "checksums": json.dumps({key: checksum.of_column(values) for key, values in columns.items()}),
         }
-        fields["checksum"] = checksum.of_texts(fields)
         return encode(types.EPISODE, fields, 1)[0]
 
 
@@ -276,20 +274,14 @@ def _states(frames: Frames, observed: NDArray[np.int64], columns: Mapping[str, N
 
 def _outcomes(frames: Frames, columns: Mapping[str, NDArray[Any]]) -> list[bytes]:
     n = len(frames.stamps)
-    texts = columns.get(keys.SUBTASK, np.full(n, "", object))
-    result = [b""] * n
-    for text in set(texts.tolist()):
-        rows = np.flatnonzero(texts == text)
-        fields: dict[str, Any] = {
-            "header": header(frames.stamps[rows]),
-            "episode_index": frames.episode,
-            "frame_index": frames.index[rows],
-            "subtask": text,
-        }
-        fields |= {key.removeprefix("next."): columns[key][rows] for key in OUTCOME_COLUMNS if key in columns}
-        for row, message in zip(rows, encode(types.OUTCOME, fields, len(rows)), strict=True):
-            result[row] = message
-    return result
+    fields: dict[str, Any] = {
+        "header": header(frames.stamps),
+        "episode_index": frames.episode,
+        "frame_index": frames.index,
+        "subtask": columns.get(keys.SUBTASK, ""),
+    }
+    fields |= {key.removeprefix("next."): columns[key] for key in OUTCOME_COLUMNS if key in columns}
+    return encode(types.OUTCOME, fields, n)
 
 
 def _texts(key: str, frames: Frames, values: NDArray[Any]) -> Stream:

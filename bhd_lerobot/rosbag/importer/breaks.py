@@ -1,6 +1,6 @@
 """Where a bag's recording breaks off and begins anew: silences, clocks that go back, drivers that restart."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,8 +11,8 @@ from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.importer.resample import CLOCK_STEP_NS, NANO, STEP_BACK_NS, Times, clock_jumps
 from bhd_lerobot.rosbag.importer.tracks import Array, Track, seconds
 
-_TOLD = 5  # of the same kind, one by one
-_MIXED = 0.01  # share of messages whose stamps go back, beyond which (and beyond `_TOLD`) no restart explains it
+_LISTED = 5  # of the same kind, one by one
+_MIXED = 0.01  # share of messages whose stamps go back, beyond which (and beyond `_LISTED`) no restart explains it
 _ODD = 0.05  # the same of poses that jump
 
 POSE_FACTOR, POSE_SLACK = 1.5, (0.1, 0.3)
@@ -22,7 +22,7 @@ Wheels slip, times of reception jitter by some messages, and a filter corrects w
 """
 
 
-class Stretch(NamedTuple):
+class Segment(NamedTuple):
     """A part of a bag through which an episode can go on, if nothing is silent: places in the bag's order.
 
     Attributes:
@@ -39,13 +39,20 @@ class Stretch(NamedTuple):
         return (track.order >= self.first) & (track.order < self.end)
 
 
-def stretches(
-    tracks: Mapping[str, Track], *, stamps: str, max_speed: tuple[float, ...] | None, max_gap_s: float, notes: list[str]
-) -> list[Stretch]:
+def segments(
+    tracks: Mapping[str, Track],
+    starts: Iterable[int],
+    *,
+    stamps: str,
+    max_speed: tuple[float, ...] | None,
+    max_gap_s: float,
+    notes: list[str],
+) -> list[Segment]:
     """Return the parts of a bag between its breaks, in order.
 
     Args:
         tracks: by role.
+        starts: places at which an exported bag says that an episode begins.
         stamps: whose time counts, see `TrackOptions.stamps`.
         max_speed: of the robot forward [m/s] and turning [rad/s], if its pose matters; None if it does not.
         max_gap_s: silence that ends an episode anyway.
@@ -59,7 +66,8 @@ def stretches(
     jumps = clock_jumps([track.times for track in every], [track.order for track in every], step)
     if len(jumps):
         notes.append(f"the clock jumped back {len(jumps)} times; each time a new episode begins")
-    found = _cut([Stretch(0, np.iinfo(np.int64).max, "start")], dict.fromkeys(jumps.tolist(), "clock"))
+    found = _cut([Segment(0, np.iinfo(np.int64).max, "start")], dict.fromkeys(starts, "start"))
+    found = _cut(found, dict.fromkeys(jumps.tolist(), "clock"))
     for role, track in tracks.items():
         if role != "cmd" and track.stamps is not None and track.stamps is not track.times:
             found = _cut(found, dict.fromkeys(_restarts(track, track.stamps, found, notes), "clock"))
@@ -68,18 +76,18 @@ def stretches(
     return found
 
 
-def _cut(parts: list[Stretch], places: Mapping[int, str]) -> list[Stretch]:
-    """Return stretches that also begin at some places."""
+def _cut(parts: list[Segment], places: Mapping[int, str]) -> list[Segment]:
+    """Return segments that also begin at some places."""
     result = []
     for part in parts:
         inside = {place: why for place, why in sorted(places.items()) if part.first < place < part.end}
         reasons = [part.why, *inside.values()]
         bounds = pairwise([part.first, *inside, part.end])
-        result += [Stretch(first, end, why) for (first, end), why in zip(bounds, reasons, strict=True)]
+        result += [Segment(first, end, why) for (first, end), why in zip(bounds, reasons, strict=True)]
     return result
 
 
-def _restarts(track: Track, stamps: Times, parts: list[Stretch], notes: list[str]) -> list[int]:
+def _restarts(track: Track, stamps: Times, parts: list[Segment], notes: list[str]) -> list[int]:
     """Return where the clock of a topic's headers begins anew though the recorder's goes on.
 
     So it is when a simulation is restarted. Two clocks in one topic, or stamps that are sometimes unset, go back all
@@ -89,7 +97,7 @@ def _restarts(track: Track, stamps: Times, parts: list[Stretch], notes: list[str
     for part in parts:
         mask = part.mask(track)
         places += clock_jumps([stamps[mask]], [track.order[mask]], STEP_BACK_NS).tolist()
-    if len(places) > max(_TOLD, _MIXED * len(stamps)):
+    if len(places) > max(_LISTED, _MIXED * len(stamps)):
         notes.append(f"{track.topic}: its header stamps go back {len(places)} times, which no restart explains; unused")
         return []
     if places:
@@ -101,7 +109,7 @@ def _restarts(track: Track, stamps: Times, parts: list[Stretch], notes: list[str
 
 
 def _resets(
-    tracks: Mapping[str, Track], max_speed: tuple[float, ...], max_gap_s: float, parts: list[Stretch], notes: list[str]
+    tracks: Mapping[str, Track], max_speed: tuple[float, ...], max_gap_s: float, parts: list[Segment], notes: list[str]
 ) -> list[int]:
     """Return where the odometry's pose jumps."""
     track = tracks["odom"]
@@ -119,22 +127,22 @@ def _resets(
                 f"{took[row]:.3f} s, {seconds(int(track.times[rows[row + 1]]) - begin)} after the start: farther than "
                 "the robot drives, as when its driver or a filter is restarted; a new episode begins"
             )
-    if len(places) > max(_TOLD, _ODD * len(track.times)):
+    if len(places) > max(_LISTED, _ODD * len(track.times)):
         raise DatasetError(
             f"The pose of {track.topic} jumps {len(places)} times in {len(track.times)} messages, farther than a robot "
             f"with the limits {max_speed[0]:g} m/s and {max_speed[1]:g} rad/s drives. Is it another robot, or are "
             f"there two publishers? The first: {told[0].partition(': ')[2]}. Leave out --odometry, or name another "
             "topic with --odom."
         )
-    notes += told[:_TOLD] + [f"{track.topic}: {len(told) - _TOLD} more such jumps"] * (len(told) > _TOLD)
+    notes += told[:_LISTED] + [f"{track.topic}: {len(told) - _LISTED} more such jumps"] * (len(told) > _LISTED)
     return places
 
 
-def told_silences(sensors: Mapping[str, Track], start: int, gap: int) -> list[str]:
-    """Return, in sentences, where a sensor was silent in a stretch: at its beginning, within it, or at its end.
+def silence_notes(sensors: Mapping[str, Track], start: int, gap: int) -> list[str]:
+    """Return, in sentences, where a sensor was silent in a segment: at its beginning, within it, or at its end.
 
     Args:
-        sensors: tracks of the stretch, sorted by time.
+        sensors: tracks of the segment, sorted by time.
         start: of the bag [ns].
         gap: silence that is told [ns].
     """
@@ -158,13 +166,13 @@ def told_silences(sensors: Mapping[str, Track], start: int, gap: int) -> list[st
                 "which other sensors were heard are left out"
             )
         silent = np.flatnonzero(steps > gap)
-        for place in silent[:_TOLD].tolist():
+        for place in silent[:_LISTED].tolist():
             after = seconds(int(track.times[place]) - start)
             notes.append(
                 f"{track.topic} was silent for {seconds(int(steps[place]))} ({after} after the start), or the clock "
                 "jumped ahead; a new episode begins"
             )
-        notes += [f"{track.topic}: {len(silent) - _TOLD} more such silences"] * (len(silent) > _TOLD)
+        notes += [f"{track.topic}: {len(silent) - _LISTED} more such silences"] * (len(silent) > _LISTED)
         if end - last > gap:
             notes.append(
                 f"{track.topic} was last heard {seconds(last - start)} after the start; {seconds(end - last)} in which "

@@ -11,15 +11,15 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.rosbag.importer.dataset import RobotImport
 from bhd_lerobot.rosbag.importer.resample import NANO, Times, newest
 from bhd_lerobot.rosbag.importer.tracks import Array, Track
-from bhd_lerobot.rosbag.messages.base import GYRO, ODOMETRY, TWIST
-from bhd_lerobot.tasks.task import Event
+from bhd_lerobot.rosbag.messages.base import ODOMETRY, TWIST
+from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 _MOVES = 0.01
 """[m/s, rad/s] A robot that is slower stands."""
 
 
 def frame_columns(
-    wanted: RobotImport, tracks: Mapping[str, Track], times: Times, ages: Times
+    wanted: RobotImport, tracks: Mapping[str, Track], times: Times, ages: Times, outcome: str | None
 ) -> dict[str, NDArray[Any]]:
     """Return the columns of an episode.
 
@@ -28,18 +28,24 @@ def frame_columns(
         tracks: by role, each sorted by time.
         times: of the frames [ns], shape (n,).
         ages: of the oldest of each frame's newest readings [ns], shape (n,).
+        outcome: what the episode ended with, if that is known.
     """
     n = len(times)
-    asked, command_age = _commands(wanted, tracks["cmd"], times)
+    asked, command_age = _commands(wanted, tracks, times)
     heard = command_age >= 0
-    applied = np.clip(asked, -np.array(wanted.max_speed), wanted.max_speed)
+    limits = np.inf if wanted.max_speed is None else np.array(wanted.max_speed)
+    applied = np.clip(asked, -limits, limits)
     over = (applied != asked).any(axis=1)
     done = np.arange(n) == n - 1
-    ended = Event.NOTHING if wanted.outcome is None else Event[wanted.outcome.upper()]
-    return {
+    ended = Event[outcome.upper()] if outcome in OUTCOMES else Event.NOTHING
+    vectors = {
         keys.OBSERVATION_STATE: _state(wanted, tracks, times),
-        keys.ACTION: asked.astype(np.float32),
-        keys.APPLIED_ACTION: applied.astype(np.float32),
+        keys.ENVIRONMENT_STATE: _vector(wanted.environment_names, keys.ENVIRONMENT_STATE, tracks, times),
+        keys.ACTION: asked,
+        keys.APPLIED_ACTION: applied,
+    }
+    return {
+        **{key: values.astype(np.float32) for key, values in vectors.items() if values.shape[1]},
         keys.TIME: (times - times[0]) / NANO,
         keys.AGE: (ages / NANO).astype(np.float32),
         keys.COMMAND_AGE: (np.where(heard, command_age, 0) / NANO).astype(np.float32),
@@ -58,7 +64,7 @@ def frame_columns(
     }
 
 
-def told_silence(wanted: RobotImport, columns: Mapping[str, NDArray[Any]]) -> str | None:
+def command_note(wanted: RobotImport, columns: Mapping[str, NDArray[Any]]) -> str | None:
     """Return how many frames have no command, and whether the robot drove in them; None if all have one."""
     silent = columns[keys.MODE] == int(Mode.HOLD)
     if not silent.any():
@@ -76,14 +82,20 @@ def told_silence(wanted: RobotImport, columns: Mapping[str, NDArray[Any]]) -> st
     return f"{int(silent.sum())} of {len(silent)} frames of the episode {lacking}; their action is 0{drove}"
 
 
-def _commands(wanted: RobotImport, track: Track, times: Times) -> tuple[Array, Times]:
-    """Return the command in force at the end of each frame, shape (n, 2), and its age then [ns]; 0 and -1 if none.
+def _commands(wanted: RobotImport, tracks: Mapping[str, Track], times: Times) -> tuple[Array, Times]:
+    """Return the command in force at the end of each frame, shape (n, d), and its age then [ns]; 0 and -1 if none.
 
     An action is what was asked for over the frame that an observation begins. What answers the observation comes after
     it: the command in force when the observation was taken is the answer to the one before.
     """
     ends = times + round(NANO / wanted.fps)
-    place = np.searchsorted(track.times, ends, side="left") - 1
+    if "cmd" not in tracks:
+        parts = [track for role, track in tracks.items() if role.startswith(f"{keys.ACTION}/")]
+        ages = [ends - track.times[newest(track.times, ends - 1)] for track in parts]
+        oldest = np.maximum.reduce(ages) if ages else np.zeros_like(ends)
+        return _vector(wanted.action_names, keys.ACTION, tracks, ends - 1), oldest
+    track = tracks["cmd"]
+    place = newest(track.times, ends - 1)
     known = np.maximum(place, 0)
     if not len(track.times):
         return np.zeros((len(times), len(TWIST))), np.full(len(times), -1, np.int64)
@@ -94,18 +106,25 @@ def _commands(wanted: RobotImport, track: Track, times: Times) -> tuple[Array, T
     return np.where(age[:, None] >= 0, track.values[known], 0.0)[:, order], age
 
 
-def _state(wanted: RobotImport, tracks: Mapping[str, Track], times: Times) -> NDArray[np.float32]:
-    def at(role: str) -> Array:
-        return tracks[role].values[newest(tracks[role].times, times)]
+def _state(wanted: RobotImport, tracks: Mapping[str, Track], times: Times) -> Array:
+    state = _vector(wanted.observation_names, keys.OBSERVATION_STATE, tracks, times)
+    names = list(wanted.observation_names)
+    if "odom" in tracks and wanted.tracks.pose:
+        pose = [names.index(name) for name in ODOMETRY]
+        state[:, pose] = _since_start(state[:, pose])
+    elif ODOMETRY[2] in names:  # unwrapped over a bag, which may hold several episodes
+        yaw = state[:, names.index(ODOMETRY[2])]
+        yaw -= 2 * np.pi * np.round(yaw[0] / (2 * np.pi))
+    return state
 
-    scan, odom = at("scan"), at("odom")
-    columns = dict(zip(TWIST, odom[:, :2].T, strict=True))
-    if wanted.tracks.pose:
-        columns |= dict(zip(ODOMETRY, _since_start(odom[:, 2:]).T, strict=True))
-    columns |= {f"scan_{beam:03d}.pos": scan[:, beam] for beam in range(scan.shape[1])}
-    if "imu" in tracks:
-        columns |= dict(zip(GYRO, at("imu").T, strict=True))
-    return np.stack([columns[name] for name in wanted.observation_names], axis=1).astype(np.float32)
+
+def _vector(names: tuple[str, ...], feature: str, tracks: Mapping[str, Track], at: Times) -> Array:
+    """Return what the newest messages at some times say of a feature, shape (n, len(names))."""
+    columns: dict[str, Array] = {}
+    for role, track in tracks.items():
+        if role.startswith(f"{feature}/") or (feature == keys.OBSERVATION_STATE and role in ("scan", "odom", "imu")):
+            columns |= dict(zip(track.names, track.values[newest(track.times, at)].T, strict=True))
+    return np.stack([columns[name] for name in names], axis=1) if names else np.zeros((len(at), 0))
 
 
 def _since_start(pose: Array) -> Array:

@@ -38,11 +38,11 @@ class RobotImport:
 
     Attributes:
         robot_type: of the dataset.
-        task: the instruction.
+        task: the instruction; None if exported bags say it of each episode.
         fps: frames a second.
-        observation_names, action_names: of the dataset's numbers, in order.
+        observation_names, action_names, environment_names: of the dataset's numbers, in order.
         tracks: how the bag is read.
-        max_speed: largest of each action [m/s, rad/s]; what is applied keeps to it.
+        max_speed: largest of each action [m/s, rad/s]; what is applied keeps to it. None if that is not known.
         max_age_s: age of the oldest reading beyond which a frame is late.
         max_gap_s: silence of a sensor that ends an episode.
         command_timeout_s: silence after which a command is no longer in force and the robot stands.
@@ -51,23 +51,24 @@ class RobotImport:
     """
 
     robot_type: str
-    task: str
+    task: str | None
     fps: int
     observation_names: tuple[str, ...]
     action_names: tuple[str, ...]
     tracks: TrackOptions
-    max_speed: tuple[float, ...]
+    max_speed: tuple[float, ...] | None
     max_age_s: float
     max_gap_s: float
     command_timeout_s: float
     min_episode_s: float
     outcome: str | None = None
+    environment_names: tuple[str, ...] = ()
 
     @property
     def topics(self) -> dict[str, str]:
         """Topics by what they are read for."""
         cameras = {f"camera/{name}": topic for name, topic in self.tracks.cameras.items()}
-        return {**self.tracks.topics, **cameras}
+        return {**self.tracks.topics, **{role: part.topic for role, part in self.tracks.parts.items()}, **cameras}
 
     def identity(self) -> dict[str, Any]:
         """Return what decides the episodes, JSON values. What a recording says of a simulation is not in it."""

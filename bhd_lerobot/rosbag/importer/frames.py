@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages.base import FOOTPRINT_FRAME, SCAN_FRAME
-from bhd_lerobot.rosbag.messages.types import type_store
+from bhd_lerobot.rosbag.messages.serialize import decode
+from bhd_lerobot.rosbag.messages.views import TF
 
 Array = NDArray[np.float64]
 Static = Mapping[str, tuple[str, Array]]
@@ -25,8 +26,8 @@ def static_frames(messages: Sequence[bytes]) -> tuple[Static, int]:
     lost = 0
     for message, times in Counter(messages).items():  # a latched message may be there many times
         try:
-            transforms = type_store().deserialize_cdr(message, "tf2_msgs/msg/TFMessage").transforms
-        except Exception:  # whatever a parser of damaged bytes raises
+            transforms = decode(TF, message).transforms
+        except DatasetError:
             transforms = None
         if transforms is None or not np.isfinite([_quaternion(one) for one in transforms]).all():
             lost += times

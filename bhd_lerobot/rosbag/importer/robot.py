@@ -1,10 +1,11 @@
-"""From the bag of a real robot on wheels to episodes with the columns that our recordings of that robot have."""
+"""From bags to episodes with the columns that our own recordings of the robot have."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,27 +14,34 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.importer.breaks import stretches, told_silences
-from bhd_lerobot.rosbag.importer.columns import frame_columns, told_silence
+from bhd_lerobot.rosbag.importer.breaks import segments, silence_notes
+from bhd_lerobot.rosbag.importer.columns import command_note, frame_columns
 from bhd_lerobot.rosbag.importer.dataset import ImportReport, RobotImport, all_or_nothing
+from bhd_lerobot.rosbag.importer.exported import ExportedEpisode
 from bhd_lerobot.rosbag.importer.resample import NANO, Grid, grids
 from bhd_lerobot.rosbag.importer.tracks import Track, read_tracks, seconds
-from bhd_lerobot.rosbag.importer.video import CAMERA, Film
-from bhd_lerobot.rosbag.storage import checksum
+from bhd_lerobot.rosbag.importer.video import CAMERA, CameraImages
 from bhd_lerobot.rosbag.storage.read import Bag
 from bhd_lerobot.tasks.task import Event
 
-_TOLD = 8  # sentences in an error; a damaged bag may give hundreds
+_LISTED = 8  # sentences in an error; a damaged bag may give hundreds
 
 
-def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wanted: RobotImport) -> ImportReport:
-    """Make a dataset of bags of a robot; the whole of it, or nothing.
+def import_bags(
+    bags: Sequence[Bag],
+    root: Path | str | None,
+    repo_id: str,
+    wanted: RobotImport,
+    exported: Sequence[Sequence[ExportedEpisode]] = (),
+) -> ImportReport:
+    """Make a dataset of bags of a robot, or of exported ones; the whole of it, or nothing.
 
     Args:
         bags: in order; each gives one episode, or several where it has gaps.
         root: where to put it; LeRobot's default place if None.
         repo_id: its name.
         wanted: what becomes of them.
+        exported: what each bag says of its episodes, if `bhd-data export` wrote it.
 
     Raises:
         DatasetError: a bag does not have what is needed.
@@ -44,8 +52,8 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
     seen: dict[tuple[int, ...], Path] = {}
     late: list[tuple[int, str]] = []
     with all_or_nothing(report.root) as (folder, made):
-        for bag in bags:
-            robot_bag = _RobotBag(bag, wanted, seen)
+        for place, bag in enumerate(bags):
+            robot_bag = _RobotBag(bag, wanted, seen, exported[place] if exported else ())
             for episode in robot_bag.episodes():
                 if recorder is None:
                     features = _features(wanted, robot_bag.image_shapes())
@@ -66,7 +74,7 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
             late += [(count, bag.path.name) for count in robot_bag.late if count]
         if recorder is None:
             sensors = ", ".join(topic for role, topic in wanted.topics.items() if role != "cmd")
-            told = "; ".join([*report.problems, *report.notes][:_TOLD])
+            told = "; ".join([*report.problems, *report.notes][:_LISTED])
             raise DatasetError(
                 f"No episode of {wanted.min_episode_s:g} s or more came out of {', '.join(str(b.path) for b in bags)}: "
                 f"there is no such time in which {sensors} were heard at least every {wanted.max_gap_s:g} s. {told}"
@@ -83,30 +91,45 @@ def import_robot(bags: Sequence[Bag], root: Path | str | None, repo_id: str, wan
 
 
 def _features(wanted: RobotImport, images: Mapping[str, tuple[int, int, int]]) -> dict[str, dict[str, Any]]:
-    features = keys.dataset_features(wanted.observation_names, wanted.action_names, images, ("none",))
-    del features[keys.PHYSICS_STATE]  # nobody knows it of a real robot
-    return features
+    features = keys.dataset_features(
+        wanted.observation_names, wanted.action_names, images, (), wanted.environment_names
+    )  # nobody knows the state of a real robot's physics
+    return {key: feature for key, feature in features.items() if feature["shape"] != (0,)}
 
 
 @dataclass(frozen=True)
 class _Episode:
-    """Frames, and the tracks of the stretch of the bag in which they lie, sorted by time."""
+    """Frames, and the tracks of the segment of the bag in which they lie, sorted by time.
+
+    Attributes:
+        exported: what the bag says of it, if `bhd-data export` wrote the bag.
+    """
 
     grid: Grid
     tracks: Mapping[str, Track]
+    exported: ExportedEpisode | None
 
 
 class _RobotBag:
     """One bag, all of it but pictures in memory."""
 
-    def __init__(self, bag: Bag, wanted: RobotImport, seen: dict[tuple[int, ...], Path]) -> None:
+    def __init__(
+        self,
+        bag: Bag,
+        wanted: RobotImport,
+        seen: dict[tuple[int, ...], Path],
+        exported: Sequence[ExportedEpisode],
+    ) -> None:
         self.notes: list[str] = []
         self.late: list[int] = []  # frames of each episode that was saved
         self._seen = seen
         self._bag, self._wanted = bag, wanted
+        self._exported = exported
         self._tracks = read_tracks(bag, wanted.tracks, self.notes)
-        self._films = [
-            Film(bag, role, track, self.notes) for role, track in self._tracks.items() if role.startswith(CAMERA)
+        self._cameras = [
+            CameraImages(bag, role, track, self.notes)
+            for role, track in self._tracks.items()
+            if role.startswith(CAMERA)
         ]
         self._begin = min(int(track.times.min()) for track in self._tracks.values())
         self._check_clocks()
@@ -117,6 +140,8 @@ class _RobotBag:
         Raises:
             DatasetError: they are not: a bare Twist has the recorder's time, and headers may have a simulation's.
         """
+        if "cmd" not in self._tracks:
+            return
         cmd = self._tracks["cmd"].times
         sensors = [track.times for role, track in self._tracks.items() if role != "cmd"]
         begin, end = min(int(one.min()) for one in sensors), max(int(one.max()) for one in sensors)
@@ -135,10 +160,11 @@ class _RobotBag:
             DatasetError: the pose that is to be observed jumps all the time.
         """
         wanted = self._wanted
-        parts = stretches(
+        parts = segments(
             self._tracks,
+            [one.place for one in self._exported],
             stamps=wanted.tracks.stamps,
-            max_speed=wanted.max_speed if wanted.tracks.pose else None,
+            max_speed=wanted.max_speed if "odom" in self._tracks and wanted.tracks.pose else None,
             max_gap_s=wanted.max_gap_s,
             notes=self.notes,
         )
@@ -146,13 +172,14 @@ class _RobotBag:
         for part in parts:
             # The pose began anew, not the clock: a command from before is still in force.
             begin = begin if part.why == "reset" else part.first
+            begun = [one for one in self._exported if one.place <= part.first] or self._exported[:1]
             of_commands = part._replace(first=begin)
             tracks = {
                 role: track.part((of_commands if role == "cmd" else part).mask(track))
                 for role, track in self._tracks.items()
             }
             sensors = {role: track for role, track in tracks.items() if role != "cmd"}
-            self.notes += told_silences(sensors, self._begin, round(wanted.max_gap_s * NANO))
+            self.notes += silence_notes(sensors, self._begin, round(wanted.max_gap_s * NANO))
             for grid in grids(
                 [track.times for track in sensors.values()],
                 wanted.fps,
@@ -162,16 +189,16 @@ class _RobotBag:
             ):
                 lasts = (len(grid.times) - 1) / wanted.fps
                 if lasts >= wanted.min_episode_s:
-                    yield _Episode(grid, tracks)
+                    yield _Episode(grid, tracks, begun[-1] if begun else None)
                 else:
                     self.notes.append(
-                        f"a stretch of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
+                        f"a segment of {lasts:.2f} s, {self._after_start(grid)}, is shorter than --min_episode_s and "
                         "was left out"
                     )
 
     def image_shapes(self) -> dict[str, tuple[int, int, int]]:
         """Return the shapes of the cameras' pictures by name."""
-        return {film.name: film.shape() for film in self._films}
+        return {camera.name: camera.shape() for camera in self._cameras}
 
     def save(self, episode: _Episode, recorder: DatasetRecorder) -> int:
         """Save an episode and return its number of frames.
@@ -183,18 +210,19 @@ class _RobotBag:
         times, ages = episode.grid.times, episode.grid.ages.max(axis=0)
         writer = recorder.begin_episode()
         try:
-            for film in self._films:
-                shown = film.write(episode.tracks[film.role], times, writer)
+            for camera in self._cameras:
+                shown = camera.write(episode.tracks[camera.role], times, writer)
                 ages = np.maximum(ages, times - shown)
-            columns = frame_columns(self._wanted, episode.tracks, times, ages)
+            task, metadata = self._described(episode)
+            columns = frame_columns(self._wanted, episode.tracks, times, ages, metadata.get("outcome"))
             self._refuse_again(int(times[0]), columns)
             writer.set_columns(columns)
-            recorder.save(writer, task=self._wanted.task, metadata=self._metadata(episode, columns))
+            recorder.save(writer, task=task, metadata={**metadata, "source": self._source(episode, columns)})
         except BaseException:
             writer.discard()
             raise
         begin = self._after_start(episode.grid)
-        if silence := told_silence(self._wanted, columns):
+        if silence := command_note(self._wanted, columns):
             self.notes.append(f"{begin}: {silence}")
         self.late.append(int(columns[keys.LATE].sum()))
         return len(times)
@@ -202,13 +230,13 @@ class _RobotBag:
     def _with_pictures(self, episode: _Episode) -> _Episode:
         """Return an episode from the frame on at which every camera has a picture that can be decoded."""
         grid = episode.grid
-        blind = max((film.blind(episode.tracks[film.role], grid.times) for film in self._films), default=0)
+        blind = max((camera.blind(episode.tracks[camera.role], grid.times) for camera in self._cameras), default=0)
         if blind:
             self.notes.append(
                 f"{self._after_start(grid)}: the episode begins {blind} frames later, with the first picture that can "
                 "be decoded"
             )
-        return _Episode(Grid(grid.times[blind:], grid.ages[:, blind:], grid.why), episode.tracks)
+        return replace(episode, grid=Grid(grid.times[blind:], grid.ages[:, blind:], grid.why))
 
     def _refuse_again(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
         """Refuse a drive that is in another bag, too: one that was copied, or converted to another storage.
@@ -216,7 +244,8 @@ class _RobotBag:
         Raises:
             DatasetError: it is. No two drives have the same numbers at the same nanosecond.
         """
-        numbers = (start, *(checksum.of_column(columns[key]) for key in (keys.OBSERVATION_STATE, keys.ACTION)))
+        vectors = (columns[key] for key in (keys.OBSERVATION_STATE, keys.ACTION) if key in columns)
+        numbers = (start, *(crc32(values.tobytes()) for values in vectors))
         if numbers in self._seen:
             raise DatasetError(
                 f"{self._seen[numbers]} and {self._bag.path} hold the same drive: the same numbers at "
@@ -224,8 +253,27 @@ class _RobotBag:
             )
         self._seen[numbers] = self._bag.path
 
-    def _metadata(self, episode: _Episode, columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        outcome = self._wanted.outcome
+    def _described(self, episode: _Episode) -> tuple[str, dict[str, Any]]:
+        """Return the task of an episode, and what is known of it: what the user says, or else the bag."""
+        wanted, exported = self._wanted, episode.exported
+        said = {} if wanted.outcome is None else {
+            "outcome": wanted.outcome, "success": wanted.outcome == Event.SUCCESS.cause
+        }  # fmt: skip
+        if exported is None:
+            assert wanted.task is not None
+            return wanted.task, said
+        metadata = {**exported.metadata}
+        end = exported.start[wanted.tracks.stamps == "header"] + exported.duration
+        if int(episode.grid.times[-1]) + 2 * NANO // wanted.fps < end and metadata.get("outcome"):
+            self.notes.append(
+                f"{self._after_start(episode.grid)}: the episode ends before the one that was exported, so that its "
+                f"outcome, {metadata['outcome']}, is left out"
+            )
+            metadata |= {"outcome": ""} | ({"success": False} if "success" in metadata else {})
+        return wanted.task or exported.task, metadata | said
+
+    def _source(self, episode: _Episode, columns: Mapping[str, NDArray[Any]]) -> str:
+        """Return where an episode is from, JSON."""
         source = {
             "bag": self._bag.path.name,
             "start_ns": int(episode.grid.times[0]),
@@ -233,8 +281,7 @@ class _RobotBag:
             "late_frames": int(columns[keys.LATE].sum()),
             "problems": self._bag.problems,
         }
-        told = {} if outcome is None else {"outcome": outcome, "success": outcome == Event.SUCCESS.cause}
-        return {"source": json.dumps(source), **told}
+        return json.dumps(source)
 
     def _after_start(self, grid: Grid) -> str:
         return f"{seconds(int(grid.times[0]) - self._begin)} after the start"

@@ -1,6 +1,6 @@
 """From the beams of some scanner to ours: evenly spaced, the first straight ahead, counter-clockwise."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import DatasetError
 
 Array = NDArray[np.float64]
-_GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max")
+GEOMETRY = ("angle_min", "angle_increment", "range_min", "range_max")
 _MOST = 1.5 * 2 * np.pi  # [rad] of a scan; drivers go on a little after a whole turn, and nothing turns twice
 _WIDEST = np.radians(10.0)  # between a beam of ours and the one it is made of; a few beams are no view all around
 
@@ -87,7 +87,7 @@ def nearest_beams(sweep: Sweep, beams: int, rotation: tuple[float, ...], topic: 
 
 
 def resampled_scans(
-    ranges: NDArray[np.object_] | Array,
+    ranges: Sequence[NDArray[np.floating]],
     geometry: Mapping[str, Array],
     *,
     lidar: LidarSpec,
@@ -98,7 +98,7 @@ def resampled_scans(
     """Return scans with our beams, shape (n, beams) [m]; not a number where a scan is none: without beams or angles.
 
     Args:
-        ranges: of n scans, shape (n, m), or n arrays of different lengths.
+        ranges: of n scans, each of any length.
         geometry: ``angle_min``, ``angle_increment`` [rad], ``range_min`` and ``range_max`` [m] of each, shape (n,).
         lidar: the scanner that the dataset is of.
         beams: how many are wanted.
@@ -111,7 +111,7 @@ def resampled_scans(
     n = len(ranges)
     result = np.empty((n, beams))
     lengths = np.array([len(one) for one in ranges], np.int64)
-    keys = np.stack([lengths, *(geometry[name] for name in _GEOMETRY)], axis=1)
+    keys = np.stack([lengths, *(geometry[name] for name in GEOMETRY)], axis=1)
     turn = tuple(rotation.reshape(-1).tolist())
     kinds, which = np.unique(keys, axis=0, return_inverse=True)
     partial = 0

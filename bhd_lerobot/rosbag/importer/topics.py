@@ -1,24 +1,20 @@
 """Which topics of a bag are read for what, and who published them."""
 
 from collections.abc import Mapping
-from typing import Any
 
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.exporter.episode import EPISODE_TOPIC
-from bhd_lerobot.rosbag.importer.headers import is_ours
-from bhd_lerobot.rosbag.messages import types
 from bhd_lerobot.rosbag.messages.base import BareTwistPart, GyroPart, OdometryPart, ScanPart, TwistPart
-from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE
+from bhd_lerobot.rosbag.messages.parts import Part
+from bhd_lerobot.rosbag.messages.serialize import decode
 from bhd_lerobot.rosbag.messages.views import JOINT_STATE
 from bhd_lerobot.rosbag.storage.read import Bag, Topic
 
-_ROBOT = "turtlebot3"
 _BASE = (ScanPart.msgtype, OdometryPart.msgtype)
 _NAMED = 6  # joints
 
 
-def told_other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
+def other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
     """Return, in sentences, that a bag is not of a TurtleBot3 and what can be done; None if nothing says so.
 
     Args:
@@ -26,20 +22,12 @@ def told_other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
         topics: what it has.
     """
     only = "is for bags of a TurtleBot3: it needs scans, odometry and speed commands"
-    if is_ours(topics):
-        robot = _first(bag, EPISODE_TOPIC, types.EPISODE, "robot_type")
-        if robot in (None, _ROBOT):
-            return None
-        return (
-            f"{bag.path} is of the robot {str(robot)!r}, as {EPISODE_TOPIC} says; --resample {only}. Leave --resample "
-            "out: the bag then comes back as the dataset that it was exported from."
-        )
     if any(topic.msgtype in _BASE and topic.count for topic in topics.values()):
         return None
     for topic in topics.values():
-        joints = _first(bag, topic.name, JOINT_STATE, "name") if topic.msgtype == JOINT_STATE and topic.count else None
+        joints = _joints(bag, topic.name) if topic.msgtype == JOINT_STATE and topic.count else []
         # A base has the joints of its wheels.
-        if joints is not None and len(joints) and not any("wheel" in joint for joint in joints):
+        if joints and not any("wheel" in joint for joint in joints):
             more = ", …" if len(joints) > _NAMED else ""
             return (
                 f"{bag.path} seems to be of an arm: {topic.name} has the joints {', '.join(joints[:_NAMED])}{more}, "
@@ -49,14 +37,14 @@ def told_other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
     return None
 
 
-def _first(bag: Bag, topic: str, msgtype: str, field: str) -> Any:
-    """Return a field of the first message of a topic; None if that cannot be read."""
+def _joints(bag: Bag, topic: str) -> list[str]:
+    """Return the joints of the first message of a topic; none if that cannot be read."""
     try:
         for _, payload in bag.payloads(topic):
-            return decode(msgtype, [payload], (field,))[field][0]
+            return list(decode(JOINT_STATE, payload).name)
     except DatasetError:
         pass
-    return None
+    return []
 
 
 TYPES = {
@@ -92,7 +80,7 @@ def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) ->
     """
     option, types = (f"--{role}", TYPES[role])
     if name not in topics or not topics[name].count:
-        if (other := told_other_robot(bag, topics)) is not None:
+        if (other := other_robot(bag, topics)) is not None:
             raise DatasetError(other)
         there = ", ".join(f"{one.name} ({one.msgtype}, {one.count})" for one in topics.values()) or "none"
         fitting = [one.name for one in topics.values() if one.msgtype in types and one.count]
@@ -100,7 +88,7 @@ def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) ->
         what = "no message of" if name in topics else "no topic"
         raise DatasetError(
             f"{bag.path} has {what} {name}, which {_MEANING[role]} is read from. Name another one with {option}."
-            f"{hint} The bag has: {there}." + "".join(f" Damaged: {problem}." for problem in bag.problems)
+            f"{hint} The bag has: {there}.{_damage(bag)}"
         )
     if topics[name].msgtype not in types:
         raise DatasetError(
@@ -116,12 +104,36 @@ def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) ->
     return topics[name]
 
 
+def exported_topic(bag: Bag, topics: Mapping[str, Topic], role: str, part: Part) -> Topic:
+    """Return the topic of an exported bag that carries numbers of a feature.
+
+    Raises:
+        DatasetError: it is missing, empty or of another type.
+    """
+    topic = topics.get(part.topic)
+    if topic is None or not topic.count:
+        raise DatasetError(
+            f"{bag.path} has no message of {part.topic}, which carries {role.removesuffix(part.topic)}, as "
+            f"/bhd/episode says.{_damage(bag)} Export the dataset again."
+        )
+    if topic.msgtype != part.msgtype or topic.others:
+        raise DatasetError(
+            f"{part.topic} in {bag.path} is of type {', '.join((topic.msgtype, *topic.others))}, not {part.msgtype} "
+            "alone, as /bhd/episode says. Export the dataset again."
+        )
+    return topic
+
+
+def _damage(bag: Bag) -> str:
+    return "".join(f" Damaged: {problem}." for problem in bag.problems)
+
+
 def static_topics(scan: str) -> set[str]:
     """Return the topics that may say how the scanner is mounted: of all robots, and of the scan's namespace."""
     return {"/tf_static", f"{scan.rpartition('/')[0]}/tf_static"}
 
 
-def told_publishers(topics: Mapping[str, Topic], wanted: Mapping[str, Topic]) -> list[str]:
+def publisher_notes(topics: Mapping[str, Topic], wanted: Mapping[str, Topic]) -> list[str]:
     """Return, in sentences, where more than one publisher may have been at work.
 
     Args:
@@ -142,8 +154,8 @@ def told_publishers(topics: Mapping[str, Topic], wanted: Mapping[str, Topic]) ->
                 f"{topic.name} had {topic.publishers} publishers when the recording began. Which of them sent a "
                 f"message is not in the bag; the {counts}, whoever sent it"
             )
-    if is_ours(topics):
-        return notes  # what else there is is known
+    if "cmd" not in wanted:
+        return notes  # an exported bag, whose other topics are known
     read = wanted["cmd"].name
     others = [one for one in topics.values() if one.msgtype in TYPES["cmd"] and one.count and one.name != read]
     if others:

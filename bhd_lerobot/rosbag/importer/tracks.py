@@ -1,7 +1,7 @@
 """The topics of a robot's bag as tracks: when something was measured, and what; sorted by time, judged one by one."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,18 +10,21 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.importer import frames
-from bhd_lerobot.rosbag.importer.decodable import sound_messages
+from bhd_lerobot.rosbag.importer.diagnostics import pace, pace_warnings, speed_warnings
 from bhd_lerobot.rosbag.importer.resample import Times, apart, message_times, sane
-from bhd_lerobot.rosbag.importer.scan import resampled_scans
-from bhd_lerobot.rosbag.importer.topics import TYPES, static_topics, told_publishers, wanted_topic
-from bhd_lerobot.rosbag.importer.warnings import pace, told_pace, told_speeds
-from bhd_lerobot.rosbag.messages.base import BareTwistPart, GyroPart, TwistPart, odometry
-from bhd_lerobot.rosbag.messages.cdr_read import decode
-from bhd_lerobot.rosbag.messages.parts import NANO, head_stamps, header_stamps
+from bhd_lerobot.rosbag.importer.scan import GEOMETRY, resampled_scans
+from bhd_lerobot.rosbag.importer.topics import TYPES, exported_topic, publisher_notes, static_topics, wanted_topic
+from bhd_lerobot.rosbag.messages.base import GYRO, ODOMETRY, TWIST, BareTwistPart, GyroPart, TwistPart, odometry
+from bhd_lerobot.rosbag.messages.parts import NANO, Part, head_stamps, header_stamps
+from bhd_lerobot.rosbag.messages.serialize import decode
 from bhd_lerobot.rosbag.storage.read import Bag, Messages, Topic
 
 Array = NDArray[np.float64]
 
+MOST_LOST = 0.1
+"""Share of a topic's messages that may be unreadable. Beyond it is no accident, and what is left is no record."""
+
+_HEADER_BYTES = 12  # of a message: what it is serialised as, and the stamp
 _APART_NS = NANO // 2  # of two topics' clocks: a scan is stamped at its first ray, and a network delays
 
 
@@ -32,6 +35,7 @@ class TrackOptions:
     Attributes:
         topics: role (``scan``, ``odom``, ``cmd``, ``imu``) -> topic; only roles that are wanted.
         cameras: name of a camera -> topic.
+        parts: role -> what carries numbers, of exported bags; the role begins with the feature and a slash.
         beams: that a scan has in the dataset.
         lidar: the scanner that the dataset is of.
         stamps: ``"auto"``, ``"header"`` or ``"receive"``.
@@ -49,6 +53,7 @@ class TrackOptions:
     odom_frame: str | None = None
     scan_yaw: float | None = None
     pose: bool = False
+    parts: Mapping[str, Part] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,7 @@ class Track:
         order: their places in the bag, shape (n,).
         values: numbers of each, shape (n, d); of a camera, its place in the bag, shape (n, 1).
         stamps: of their headers [ns], shape (n,); None if they have none.
+        names: of the numbers in the dataset, in order.
     """
 
     topic: str
@@ -70,6 +76,7 @@ class Track:
     order: Times
     values: Array
     stamps: Times | None
+    names: tuple[str, ...] = ()
 
     def part(self, mask: NDArray[np.bool_]) -> "Track":
         """Return some of its messages, sorted by time; those of the same time stay in their order."""
@@ -80,7 +87,7 @@ class Track:
         """Return some of its messages, in this order."""
         times = self.times[rows]
         stamps = times if self.stamps is self.times else None if self.stamps is None else self.stamps[rows]
-        return Track(self.topic, self.msgtype, times, self.order[rows], self.values[rows], stamps)
+        return replace(self, times=times, order=self.order[rows], values=self.values[rows], stamps=stamps)
 
 
 def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, Track]:
@@ -96,13 +103,13 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
     """
     topics = bag.topics()
     wanted = {role: wanted_topic(bag, topics, role, name) for role, name in options.topics.items()}
+    wanted |= {role: exported_topic(bag, topics, role, part) for role, part in options.parts.items()}
     cameras = {f"camera/{name}": wanted_topic(bag, topics, "camera", topic) for name, topic in options.cameras.items()}
-    notes += told_publishers(topics, {**wanted, **cameras})
-    names = {topic.name for topic in wanted.values()} | (static_topics(options.topics["scan"]) & topics.keys())
+    notes += publisher_notes(topics, {**wanted, **cameras})
+    latched = sorted(static_topics(options.topics["scan"]) & topics.keys()) if "scan" in options.topics else []
+    names = {topic.name for topic in wanted.values()} | {*latched}
     messages = bag.read(names, {topic.name for topic in cameras.values()})
-    static, lost = frames.static_frames(
-        [one for name in sorted(static_topics(options.topics["scan"]) & names) for one in messages[name].data]
-    )
+    static, lost = frames.static_frames([one for name in latched for one in messages[name].data])
     if lost:
         bag.problems.append(f"{bag.path.name}: {lost} messages of /tf_static cannot be read, and are left out")
     tracks, paces, clocks = {}, {}, {}
@@ -110,8 +117,8 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
         if not len(messages[topic.name].data):
             damage = "".join(f" Damaged: {problem}." for problem in bag.problems)
             raise DatasetError(f"{bag.path} has no readable message of {topic.name}.{damage}")
-        found = sound_messages(bag.path, topic, messages[topic.name], bag.problems)
-        stamps = _stamps(topic, found)
+        found, decoded = _decoded(bag, topic, messages[topic.name])
+        stamps = _stamps(topic, found, decoded)
         if stamps is not None and role != "cmd":
             paces[topic.name] = pace(found.received, stamps)
         times = message_times(found.received, stamps, options.stamps)
@@ -121,18 +128,19 @@ def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, 
                 f"{'headers were' if times is stamps else 'times of reception were'} taken for all of them"
             )
         clocks[topic.name] = (found.received, times)
-        values = _values(role, topic, found, _Reading(options, static, lost > 0, notes))
+        values = _values(role, topic, found, decoded, _Reading(options, static, lost > 0, notes))
         fits = np.abs(values) < np.finfo(np.float32).max  # the dataset's numbers are float32
         finite = np.logical_and.reduce(fits, axis=1)
         if not finite.all():
             what = "are no scan of a whole turn" if role == "scan" else "with values that are not finite"
             notes.append(f"{topic.name}: {int((~finite).sum())} of {len(finite)} messages {what}, left out")
-        track = Track(topic.name, topic.msgtype, times, found.order, values, stamps).rows(np.flatnonzero(finite))
+        track = Track(topic.name, topic.msgtype, times, found.order, values, stamps, _names(role, options))
+        track = track.rows(np.flatnonzero(finite))
         if not len(track.times):
             raise DatasetError(f"{bag.path}: no message of {topic.name} has finite values.")
         tracks[role] = track
-    notes += told_pace(paces)
-    _check_one_time(bag, wanted["odom"].name, clocks)
+    notes += pace_warnings(paces)
+    _check_one_time(bag, wanted["odom" if "odom" in wanted else next(iter(wanted))].name, clocks)
     return tracks
 
 
@@ -152,12 +160,50 @@ def _check_one_time(bag: Bag, reference: str, clocks: Mapping[str, tuple[Times, 
             )
 
 
-def _stamps(topic: Topic, messages: Messages) -> Times | None:
+def _names(role: str, options: TrackOptions) -> tuple[str, ...]:
+    if role in options.parts:
+        return options.parts[role].names
+    scan = tuple(f"scan_{beam:03d}.pos" for beam in range(options.beams))
+    return {"scan": scan, "odom": TWIST + ODOMETRY * options.pose, "imu": GYRO, "cmd": TWIST}.get(role, ())
+
+
+def _decoded(bag: Bag, topic: Topic, messages: Messages) -> tuple[Messages, list[Any]]:
+    """Return the messages of a topic that can be read, and what is in them; of cameras, nothing is.
+
+    The others are as if they had been lost, and are counted. An image that is cut off is found when it is decoded.
+
+    Raises:
+        DatasetError: too many cannot be read.
+    """
+    is_camera = topic.msgtype in TYPES["camera"]
+    decoded: list[Any] = []
+    mask = np.ones(len(messages.data), np.bool_)
+    reason = ""
+    for place, data in enumerate(messages.data):
+        try:
+            if is_camera and len(data) < _HEADER_BYTES:
+                raise DatasetError(f"An image's message ends after {len(data)} bytes.")
+            decoded += [] if is_camera else [decode(topic.msgtype, data)]
+        except DatasetError as error:
+            mask[place] = False
+            reason = reason or str(error)
+    lost, total = int((~mask).sum()), len(mask)
+    if not lost:
+        return messages, decoded
+    what = f"{lost} of the {total} messages of {topic.name} cannot be read"
+    if lost > MOST_LOST * total:
+        raise DatasetError(
+            f"{bag.path}: {what}, which is more than {MOST_LOST:.0%}: too many to go on without them. The first: "
+            f"{reason}"
+        )
+    bag.problems.append(f"{bag.path.name}: {what}, and are left out as if they had been lost; the first: {reason}")
+    return messages.part(mask), decoded
+
+
+def _stamps(topic: Topic, messages: Messages, decoded: Sequence[Any]) -> Times | None:
     if topic.msgtype == BareTwistPart.msgtype:
         return None
-    if topic.msgtype in TYPES["camera"]:
-        return head_stamps(topic.name, messages.data)
-    return header_stamps(topic.msgtype, messages.data)
+    return head_stamps(messages.data) if topic.msgtype in TYPES["camera"] else header_stamps(decoded)
 
 
 @dataclass(frozen=True)
@@ -170,31 +216,30 @@ class _Reading:
     notes: list[str]
 
 
-def _values(role: str, topic: Topic, messages: Messages, reading: _Reading) -> Array:
-    data = messages.data
+def _values(role: str, topic: Topic, messages: Messages, decoded: list[Any], reading: _Reading) -> Array:
+    if role in reading.options.parts:
+        return reading.options.parts[role].decode(decoded)
     if role == "scan":
-        return _scans(topic, data, reading)
+        return _scans(topic, decoded, reading)
     if role == "odom":
-        children = decode(topic.msgtype, data, ("child_frame_id",))["child_frame_id"].tolist()
+        children = [one.child_frame_id for one in decoded]
         frames.check_base_frame(topic.name, frames.the_frame(topic.name, children), reading.options.odom_frame)
-        speeds, pose = odometry(data)
-        stamps = header_stamps(topic.msgtype, data)  # by which they were measured; of some drivers they are not set
+        speeds, pose = odometry(decoded)
+        stamps = header_stamps(decoded)  # by which they were measured; of some drivers they are not set
         measured = stamps if (np.diff(stamps) > 0).all() else messages.received
-        reading.notes.extend(told_speeds(topic.name, measured, speeds, pose))
+        reading.notes.extend(speed_warnings(topic.name, measured, speeds, pose))
         return np.concatenate([speeds, pose], axis=1) if reading.options.pose else speeds
     if role == "cmd":
         kind = BareTwistPart if topic.msgtype == BareTwistPart.msgtype else TwistPart
-        return kind(topic.name, ()).decode(data)
+        return kind(topic.name, ()).decode(decoded)
     if role == "imu":
-        return GyroPart(topic.name, ()).decode(data)
+        return GyroPart(topic.name, ()).decode(decoded)
     return messages.order.astype(np.float64)[:, None]
 
 
-def _scans(topic: Topic, data: Sequence[bytes], reading: _Reading) -> Array:
+def _scans(topic: Topic, scans: Sequence[Any], reading: _Reading) -> Array:
     options, notes = reading.options, reading.notes
-    geometry = ("angle_min", "angle_increment", "range_min", "range_max")
-    found: dict[str, Any] = decode(topic.msgtype, data, ("ranges", "header.frame_id", *geometry))
-    frame = frames.the_frame(topic.name, found["header.frame_id"].tolist())
+    frame = frames.the_frame(topic.name, [one.header.frame_id for one in scans])
     rotation, source = frames.scanner_rotation(topic.name, frame, reading.static, options.scan_frame, options.scan_yaw)
     if reading.static_lost and source not in ("/tf_static", "--scan_yaw"):
         raise DatasetError(
@@ -205,19 +250,19 @@ def _scans(topic: Topic, data: Sequence[bytes], reading: _Reading) -> Array:
         ahead = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
         over = ", upside down" if rotation[2, 2] < 0 else ""
         notes.append(f"{topic.name}: the scanner is turned by {ahead:.1f} degrees{over}, from {source}")
-    counts = {len(one) for one in found["ranges"]}
+    counts = {len(one.ranges) for one in scans}
     if counts != {options.beams}:
         few = f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
         notes.append(f"{topic.name}: scans of {few} beams became {options.beams}, each the nearest by angle")
-    reach = found["range_max"][found["range_max"] > 0]
-    if len(reach) and float(reach.min()) < options.lidar.range_max * (1 - 1e-6):
+    reach = min((one.range_max for one in scans if one.range_max > 0), default=np.inf)
+    if reach < options.lidar.range_max * (1 - 1e-6):
         notes.append(
-            f"{topic.name}: the scanner sees to {reach.min():.2f} m (range_max); where nothing came back, the dataset "
+            f"{topic.name}: the scanner sees to {reach:.2f} m (range_max); where nothing came back, the dataset "
             f"has {options.lidar.range_max:g} m all the same"
         )
     return resampled_scans(
-        found["ranges"],
-        {name: found[name] for name in geometry},
+        [one.ranges for one in scans],
+        {name: np.array([getattr(one, name) for one in scans]) for name in GEOMETRY},
         lidar=options.lidar,
         beams=options.beams,
         rotation=rotation,

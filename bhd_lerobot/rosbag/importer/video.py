@@ -6,9 +6,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.writer.episode import EpisodeWriter
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.importer.decodable import MOST
 from bhd_lerobot.rosbag.importer.resample import Times, newest
-from bhd_lerobot.rosbag.importer.tracks import Track
+from bhd_lerobot.rosbag.importer.tracks import MOST_LOST, Track
 from bhd_lerobot.rosbag.messages.images import decode_image
 from bhd_lerobot.rosbag.storage.read import Bag, Picker
 
@@ -18,7 +17,7 @@ CAMERA = "camera/"
 _TRIED = 10  # pictures at the beginning, of which one must be readable
 
 
-class Film:
+class CameraImages:
     """One camera.
 
     Attributes:
@@ -58,7 +57,7 @@ class Film:
         """Return how many frames at the beginning of an episode have no picture that can be decoded.
 
         Args:
-            track: the camera's messages in the stretch in which the episode lies, sorted by time.
+            track: the camera's messages in the segment in which the episode lies, sorted by time.
             times: of the frames [ns].
 
         Raises:
@@ -102,10 +101,10 @@ class Film:
                 except DatasetError as error:
                     broken += 1
                     reason = reason or str(error)
-                    if image is None or broken > max(1, MOST * total):
+                    if image is None or broken > max(1, MOST_LOST * total):
                         raise DatasetError(
                             f"{broken} of {total} pictures of an episode cannot be decoded, which is more than "
-                            f"{MOST:.0%}: too many to go on without them. The first: {reason}"
+                            f"{MOST_LOST:.0%}: too many to go on without them. The first: {reason}"
                         ) from error
                 before = row
             assert image is not None

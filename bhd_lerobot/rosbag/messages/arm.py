@@ -6,9 +6,8 @@ from typing import Any, override
 import numpy as np
 
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.messages.cdr import encode
-from bhd_lerobot.rosbag.messages.cdr_read import decode
-from bhd_lerobot.rosbag.messages.parts import WXYZ, XYZ, Array, Frames, Part, header
+from bhd_lerobot.rosbag.messages.parts import WXYZ, XYZ, Array, Frames, Part, header, numbers
+from bhd_lerobot.rosbag.messages.serialize import encode
 
 TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 ARM_FRAME, TOOL_FRAME = "base", "tool"
@@ -33,14 +32,11 @@ class JointsPart(Part):
         return encode(self.msgtype, fields, len(values))
 
     @override
-    def decode(self, messages: Sequence[bytes]) -> Array:
-        found = decode(self.msgtype, messages, ("name", "position", "velocity"))
-        if any(list(names) != self.joints for names in found["name"]):
+    def decode(self, messages: Sequence[Any]) -> Array:
+        if any(one.name != self.joints for one in messages):
             raise DatasetError(f"The joints of {self.topic} are not {', '.join(self.joints)}.")
-        blocks = [found["position"]] + [found["velocity"]] * (len(self.names) > len(self.joints))
-        if any(block.ndim != 2 or block.shape[1] != len(self.joints) for block in blocks):
-            raise DatasetError(f"{self.topic} has not as many numbers as joints.")
-        return np.concatenate(blocks, axis=1)
+        with_speeds = len(self.names) > len(self.joints)
+        return self.table([[*one.position, *(one.velocity if with_speeds else ())] for one in messages])
 
 
 class PosePart(Part):
@@ -54,9 +50,14 @@ class PosePart(Part):
         return encode(self.msgtype, fields, len(values))
 
     @override
-    def decode(self, messages: Sequence[bytes]) -> Array:
-        paths = [f"pose.position.{axis}" for axis in XYZ] + [f"pose.orientation.{axis}" for axis in WXYZ]
-        return np.stack(list(decode(self.msgtype, messages, paths).values()), axis=1)
+    def decode(self, messages: Sequence[Any]) -> Array:
+        return np.concatenate(
+            [
+                numbers([one.pose.position for one in messages], XYZ),
+                numbers([one.pose.orientation for one in messages], WXYZ),
+            ],
+            axis=1,
+        )
 
 
 def pose_tree(values: Array) -> dict[str, Any]:

@@ -7,10 +7,8 @@ from typing import Any, override
 import numpy as np
 
 from bhd_lerobot.bodies.body import LidarSpec
-from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.messages.cdr import encode
-from bhd_lerobot.rosbag.messages.cdr_read import decode
-from bhd_lerobot.rosbag.messages.parts import NANO, WXYZ, XYZ, Array, Frames, Part, header
+from bhd_lerobot.rosbag.messages.parts import NANO, WXYZ, XYZ, Array, Frames, Part, header, numbers
+from bhd_lerobot.rosbag.messages.serialize import encode
 
 TWIST = ("x.vel", "theta.vel")
 ODOMETRY = ("x.pos", "y.pos", "theta.pos")
@@ -49,8 +47,8 @@ class TwistPart(Part):
         return encode(self.msgtype, {"header": header(frames.stamps, FOOTPRINT_FRAME), **fields}, len(values))
 
     @override
-    def decode(self, messages: Sequence[bytes]) -> Array:
-        return np.stack(list(decode(self.msgtype, messages, ("twist.linear.x", "twist.angular.z")).values()), axis=1)
+    def decode(self, messages: Sequence[Any]) -> Array:
+        return twists([one.twist for one in messages])
 
 
 class BareTwistPart(Part):
@@ -63,8 +61,13 @@ class BareTwistPart(Part):
         return encode(self.msgtype, twist_tree(values), len(values))
 
     @override
-    def decode(self, messages: Sequence[bytes]) -> Array:
-        return np.stack(list(decode(self.msgtype, messages, ("linear.x", "angular.z")).values()), axis=1)
+    def decode(self, messages: Sequence[Any]) -> Array:
+        return twists(messages)
+
+
+def twists(messages: Sequence[Any]) -> Array:
+    """Return the forward speeds and yaw rates in `geometry_msgs/msg/Twist`, shape (n, 2)."""
+    return np.array([(one.linear.x, one.angular.z) for one in messages], np.float64).reshape(-1, 2)
 
 
 def twist_tree(values: Array) -> dict[str, Any]:
@@ -103,7 +106,7 @@ class OdometryPart(Part):
         return encode(self.msgtype, fields, len(values))
 
     @override
-    def decode(self, messages: Sequence[bytes]) -> Array:
+    def decode(self, messages: Sequence[Any]) -> Array:
         speeds, pose = odometry(messages)
         return np.concatenate([speeds, pose], axis=1)[:, : len(self.names)]
 
@@ -127,22 +130,19 @@ def _pose_covariance(noise: BaseNoise, yaw: Array) -> Array:
     return covariance.reshape(len(yaw), 36)
 
 
-def odometry(messages: Sequence[bytes]) -> tuple[Array, Array]:
+def odometry(messages: Sequence[Any]) -> tuple[Array, Array]:
     """Return forward speeds and yaw rates, shape (n, 2), and x, y and unwrapped yaw, shape (n, 3).
 
     The yaw of a quaternion that was never set, all zeros, is not a number.
     """
-    pose, twist = "pose.pose.", "twist.twist."
-    paths = [f"{twist}linear.x", f"{twist}angular.z", f"{pose}position.x", f"{pose}position.y"]
-    turns = [f"{pose}orientation.{axis}" for axis in WXYZ]
-    found = decode(OdometryPart.msgtype, messages, [*paths, *turns])
-    w, x, y, z = (found[path] for path in turns)
+    poses = [one.pose.pose for one in messages]
+    w, x, y, z = numbers([one.orientation for one in poses], WXYZ).T
     flat = (x == 0) & (y == 0)
     # Half the angle is precise also where a yaw of exactly zero, or one with its sign, has to come back.
     yaw = np.where(flat, 2 * np.arctan2(z, w), np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
     yaw[(w == 0) & flat & (z == 0)] = np.nan
-    speed, turn, east, north = (found[path] for path in paths)
-    return np.stack([speed, turn], axis=1), np.stack([east, north, _unwrapped(yaw)], axis=1)
+    place = numbers([one.position for one in poses], XYZ)
+    return twists([one.twist.twist for one in messages]), np.stack([*place[:, :2].T, _unwrapped(yaw)], axis=1)
 
 
 def _unwrapped(yaw: Array) -> Array:
@@ -185,9 +185,8 @@ class GyroPart(Part):
         return encode(self.msgtype, fields, len(values))
 
     @override
-    def decode(self, messages: Sequence[bytes]) -> Array:
-        paths = [f"angular_velocity.{axis}" for axis in XYZ]
-        return np.stack(list(decode(self.msgtype, messages, paths).values()), axis=1)
+    def decode(self, messages: Sequence[Any]) -> Array:
+        return numbers([one.angular_velocity for one in messages], XYZ)
 
 
 @dataclass(frozen=True)
@@ -221,9 +220,6 @@ class ScanPart(Part):
         return encode(self.msgtype, fields, len(values))
 
     @override
-    def decode(self, messages: Sequence[bytes]) -> Array:
-        found = decode(self.msgtype, messages, ("ranges", "range_max"))
-        ranges = found["ranges"]
-        if ranges.ndim != 2 or ranges.shape[1] != len(self.names):
-            raise DatasetError(f"The scans of {self.topic} do not have {len(self.names)} beams each.")
-        return np.where(np.isposinf(ranges), found["range_max"][:, None], ranges).astype(np.float64)
+    def decode(self, messages: Sequence[Any]) -> Array:
+        ranges = self.table([one.ranges for one in messages])
+        return np.where(np.isposinf(ranges), np.array([[one.range_max] for one in messages]), ranges)

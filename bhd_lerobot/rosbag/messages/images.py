@@ -1,4 +1,4 @@
-"""Pictures in bags: out of a dataset's films, into `sensor_msgs/Image` or `CompressedImage`, and back."""
+"""Images in bags: out of a dataset's videos, into `sensor_msgs/Image` or `CompressedImage`, and back."""
 
 import io
 from collections.abc import Iterator
@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format.state import corrupt
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.messages.cdr import encode
-from bhd_lerobot.rosbag.messages.cdr_read import decode
 from bhd_lerobot.rosbag.messages.parts import Frames, header
+from bhd_lerobot.rosbag.messages.serialize import decode, encode
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _JPEG_QUALITY = 95
@@ -30,16 +29,16 @@ _RAW = {
 }
 
 
-def film_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.uint8]]:
-    """Yield pictures of a film, each of shape (H, W, 3).
+def video_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.uint8]]:
+    """Yield images of a video, each of shape (H, W, 3).
 
     Args:
-        path: the film.
+        path: the video.
         start_s: time of the first one [s].
         count: how many.
 
     Raises:
-        DatasetCorruptError: the film cannot be read, or ends before.
+        DatasetCorruptError: the video cannot be read, or ends before.
     """
     import av
 
@@ -85,30 +84,28 @@ def decode_image(topic: str, msgtype: str, message: bytes) -> NDArray[np.uint8]:
     Raises:
         DatasetError: it has an encoding that is not known, or is damaged.
     """
+    found = decode(msgtype, message)
     if msgtype == COMPRESSED:
-        return _decompressed(topic, message)
-    found = {path: values[0] for path, values in decode(msgtype, [message], _FIELDS).items()}
-    encoding = found["encoding"]
+        return _decompressed(topic, found.format, found.data)
+    encoding = found.encoding
     if encoding not in _RAW:
         raise DatasetError(
             f"The pictures of {topic} have the encoding {encoding!r}; valid: {', '.join(_RAW)}, or a CompressedImage."
         )
     dtype, channels, order = _RAW[encoding]
-    height, width, step = int(found["height"]), int(found["width"]), int(found["step"])
-    data = found["data"]
+    height, width, step, data = found.height, found.width, found.step, found.data
     if not height * width or len(data) != height * step or step < width * channels:
         raise DatasetError(f"A picture of {topic} has {len(data)} bytes, which is not {height} x {width} {encoding}.")
     rows = data.view(dtype).reshape(height, step)[:, : width * channels].reshape(height, width, channels)
     return np.ascontiguousarray(rows[:, :, order])
 
 
-def _decompressed(topic: str, message: bytes) -> NDArray[np.uint8]:
+def _decompressed(topic: str, form: str, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     from PIL import Image
 
-    found = {path: values[0] for path, values in decode(COMPRESSED, [message], ("format", "data")).items()}
-    what = f"{found['format']!r}, {len(found['data'])} bytes"
+    what = f"{form!r}, {len(data)} bytes"
     try:
-        image = Image.open(io.BytesIO(found["data"].tobytes()))
+        image = Image.open(io.BytesIO(data.tobytes()))
         if image.mode in _COLOURS:
             return np.asarray(image.convert("RGB"))
     except Image.UnidentifiedImageError as error:
@@ -122,6 +119,3 @@ def _decompressed(topic: str, message: bytes) -> NDArray[np.uint8]:
         f"The pictures of {topic} ({what}) have more than 8 bits (mode {image.mode}), as of a depth camera; valid: "
         "JPEG and PNG in colour or grey."
     )
-
-
-_FIELDS = ("encoding", "height", "width", "step", "data")

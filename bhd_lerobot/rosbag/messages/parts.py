@@ -15,15 +15,12 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages import types
-from bhd_lerobot.rosbag.messages.cdr import encode
-from bhd_lerobot.rosbag.messages.cdr_read import decode
+from bhd_lerobot.rosbag.messages.serialize import encode
 
 Array = NDArray[np.float64]
 NANO = 1_000_000_000
 
 XYZ, WXYZ = ("x", "y", "z"), ("w", "x", "y", "z")
-
-_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 
 
 @dataclass(frozen=True)
@@ -51,20 +48,13 @@ def header(stamps: NDArray[np.int64], frame: str = "") -> dict[str, Any]:
     return {"stamp": stamp_tree(stamps), "frame_id": frame}
 
 
-def header_stamps(msgtype: str, messages: Sequence[bytes]) -> NDArray[np.int64]:
+def header_stamps(messages: Sequence[Any]) -> NDArray[np.int64]:
     """Return the stamps [ns] of messages with a header, shape (n,)."""
-    seconds, nanoseconds = decode(msgtype, messages, _STAMP).values()
-    return seconds.astype(np.int64) * NANO + nanoseconds
+    return np.array([one.header.stamp.sec * NANO + one.header.stamp.nanosec for one in messages], np.int64)
 
 
-def head_stamps(topic: str, heads: Sequence[bytes]) -> NDArray[np.int64]:
-    """Return the stamps [ns] of messages of which only the beginning is there, and which begin with a header.
-
-    Raises:
-        DatasetError: one is too short.
-    """
-    if any(len(head) < 12 for head in heads):
-        raise DatasetError(f"A message of {topic} is too short for a header.")
+def head_stamps(heads: Sequence[bytes]) -> NDArray[np.int64]:
+    """Return the stamps [ns] of messages of which only the first 12 bytes or more are there, with a header's stamp."""
     pairs = [struct.unpack_from("<iI" if head[1] else ">iI", head, 4) for head in heads]
     return np.array([seconds * NANO + nanoseconds for seconds, nanoseconds in pairs], np.int64)
 
@@ -88,12 +78,22 @@ class Part(ABC):
         """Return messages of values, shape (n, len(names))."""
 
     @abstractmethod
-    def decode(self, messages: Sequence[bytes]) -> Array:
-        """Return the values in messages, shape (n, len(names)).
+    def decode(self, messages: Sequence[Any]) -> Array:
+        """Return the values in deserialised messages, shape (n, len(names)).
 
         Raises:
             DatasetError: they are not what this part writes.
         """
+
+    def table(self, rows: Sequence[Sequence[float]]) -> Array:
+        """Return rows of numbers as an array, shape (n, len(names)).
+
+        Raises:
+            DatasetError: one has another length.
+        """
+        if any(len(row) != len(self.names) for row in rows):
+            raise DatasetError(f"{self.topic} does not have {len(self.names)} numbers in each message.")
+        return np.array(rows, np.float64).reshape(-1, len(self.names))
 
     def __len__(self) -> int:
         """Return how many numbers it carries."""
@@ -117,17 +117,19 @@ class NumbersPart(Part):
         return encode(self.msgtype, fields, len(values))
 
     @override
-    def decode(self, messages: Sequence[bytes]) -> Array:
-        values = decode(self.msgtype, messages, ("values",))["values"]
-        if values.ndim != 2 or values.shape[1] != len(self.names):
-            raise DatasetError(f"{self.topic} does not have {len(self.names)} numbers in each message.")
-        return values
+    def decode(self, messages: Sequence[Any]) -> Array:
+        return self.table([one.values for one in messages])
 
 
 class IntegersPart(NumbersPart):
     """Whole numbers, or truths."""
 
     msgtype = types.INTEGERS
+
+
+def numbers(parts: Sequence[Any], names: Sequence[str]) -> Array:
+    """Return attributes of parts of messages, such as of vectors, shape (n, len(names))."""
+    return np.array([[getattr(one, name) for name in names] for one in parts], np.float64).reshape(-1, len(names))
 
 
 def own_topic(key: str) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from bhd_lerobot.errors import ConfigError, install_extra
 
-FORMAT = 1
+FORMAT = 2
 """Version of the messages below; an `Episode` of another one is refused."""
 
 EPISODE = "bhd_msgs/msg/Episode"
@@ -21,7 +21,7 @@ TEXT = "bhd_msgs/msg/Text"
 DEFINITIONS = {
     EPISODE: """
 # An episode of a LeRobotDataset. Sent once, before its frames; transient local.
-int64 FORMAT=1
+int64 FORMAT=2
 builtin_interfaces/Time stamp   # when it started, by the bag's clock
 int64 format                    # version of these messages
 string repo_id                  # name of the dataset
@@ -34,9 +34,6 @@ string features                 # LeRobot's feature dictionaries, JSON
 string metadata                 # what is recorded of the episode, without the prefix bhd/, JSON
 string metadata_types           # type of each of these values, JSON
 string recording                # identity of the recording, JSON
-string video                    # settings of the video encoder, JSON
-int64 checksum                  # CRC-32 of task to topics
-string checksums                # CRC-32 of each column's bytes as the dataset has them, JSON
 string topics                   # which topic carries which numbers of which feature, JSON
 """,
     STATE: """

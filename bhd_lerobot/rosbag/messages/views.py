@@ -11,8 +11,8 @@ from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.rosbag.messages.arm import ARM_FRAME, TOOL, TOOL_FRAME
 from bhd_lerobot.rosbag.messages.base import FOOTPRINT_FRAME, ODOM_FRAME, BaseNoise, OdometryPart
-from bhd_lerobot.rosbag.messages.cdr import encode
 from bhd_lerobot.rosbag.messages.parts import Array, Frames, header
+from bhd_lerobot.rosbag.messages.serialize import encode
 
 TF = "tf2_msgs/msg/TFMessage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"

@@ -431,13 +431,17 @@ def test_an_outcome_is_taken_or_marked_later(tmp_path, plain):
     assert dataset_info(tmp_path / "e").episodes[0].metadata["outcome"] == "collision"
 
 
-def test_an_exported_bag_can_be_treated_as_a_robots(tmp_path, plain):
+def test_an_exported_bag_can_be_read_as_a_robots(tmp_path, plain, capsys):
     imported(plain, tmp_path / "d")
-    assert main.main(["export", str(tmp_path / "d"), f"--output={tmp_path / 'bags'}"]) == 0
-    assert run(tmp_path / "bags", tmp_path / "back", "--resample") == 0
+    bags = tmp_path / "bags"
+    assert main.main(["export", str(tmp_path / "d"), f"--output={bags}"]) == 0
+    assert run(bags, tmp_path / "back", "--robot=turtlebot3") == 0
     ours, theirs = read_episode(tmp_path / "d", 0), read_episode(tmp_path / "back", 0)
     for key in ("observation.state", "action"):
         assert np.array_equal(ours[key], theirs[key]), key
+    arguments = ["import", str(bags), str(plain), "--repo_id=t/t", f"--root={tmp_path / 'e'}", TASK]
+    assert main.main(arguments) == 2
+    assert "--robot=turtlebot3" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

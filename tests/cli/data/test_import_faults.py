@@ -73,7 +73,7 @@ def test_a_topic_that_is_mostly_unreadable_is_refused_with_the_numbers(tmp_path,
     total = shorten(bag, "/odom", range(0, 60, 3))
     error = refused(bag, tmp_path / "d", capsys)
     assert f"20 of the {total} messages of /odom cannot be read, which is more than 10%" in error
-    assert "nav_msgs/msg/Odometry: it ends after 40 bytes" in error
+    assert "of 40 bytes cannot be read as nav_msgs/msg/Odometry" in error
 
 
 def test_a_row_without_bytes_or_time_does_not_end_the_bag(tmp_path, messages, capsys):

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.arm.compliance import Compliance, critical_damping
 from bhd_lerobot.control.arm.equilibrium import Equilibrium, EquilibriumLimits
+from bhd_lerobot.control.arm.rotations import rotation_matrices, rotation_vectors
 from bhd_lerobot.control.arm.wrench import ContactObserver, tool_wrench
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
-from bhd_lerobot.control.geometry.poses import rotation_matrices, rotation_vectors
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]

@@ -30,8 +30,8 @@ from bhd_lerobot.datasets.storage.places import (
     wrong_path,
 )
 from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, DatasetError
-from bhd_lerobot.rosbag.importer.restore import _create
 from tests.datasets import support
 from tests.datasets.edit_support import content, record
 
@@ -101,9 +101,8 @@ def test_names_are_refused_by_all_who_read_them(root: Path, tmp_path: Path) -> N
                 with pytest.raises(BhdError):
                     reader()
             assert {path for path in tmp_path.rglob("*") if root not in path.parents} <= before | {tmp_path / "work"}
-        episode = {"features": features, "fps": 10, "robot_type": "t", "recording": {}, "video": None}
-        with pytest.raises(BhdError, match="name"):  # as a bag says it
-            _create(episode, tmp_path / "new", "t/t")
+        with pytest.raises(BhdError, match="name"):  # as an exported bag may say it
+            DatasetRecorder.create("t/t", 10, features, robot_type="t", root=tmp_path / "new")
 
 
 def test_filter_writes_to_its_output_only(root: Path, tmp_path: Path) -> None:

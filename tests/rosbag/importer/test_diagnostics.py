@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from bhd_lerobot.rosbag.importer.diagnostics import pace, pace_warnings, speed_warnings
 from bhd_lerobot.rosbag.importer.resample import NANO
-from bhd_lerobot.rosbag.importer.warnings import pace, told_pace, told_speeds
 
 RECEIVED = np.arange(300) * NANO // 5  # a minute at 5 Hz
 
@@ -18,7 +18,7 @@ def test_the_pace_of_a_simulation_is_seen_through_delays_gaps_and_restarts(rate)
     received[100:106] = received[106]  # the network stalls, and several come at once
     received[150:] += 300 * NANO  # a silence, of which the headers know nothing
     assert pace(received, stamps) == pytest.approx(rate, rel=0.03)
-    assert bool(told_pace({"/scan": pace(received, stamps)})) == (rate != 1.0)
+    assert bool(pace_warnings({"/scan": pace(received, stamps)})) == (rate != 1.0)
 
 
 @pytest.mark.parametrize("stamps", [np.zeros(300, np.int64), np.full(300, 7 * NANO), RECEIVED[::-1]])
@@ -54,15 +54,15 @@ def test_speeds_that_are_not_those_of_the_pose_are_told(factors, told):
     pose = pose + np.random.default_rng(0).normal(0, 0.002, pose.shape)
     pose[400:] += [5.0, -3.0, 0.0]  # a reset
     pose[7] = np.nan
-    notes = told_speeds("/odom", times, speeds * factors, pose)
+    notes = speed_warnings("/odom", times, speeds * factors, pose)
     assert len(notes) == len(told)
     assert all(part in note for part, note in zip(told, notes, strict=True))
 
 
 def test_where_the_pose_says_nothing_nothing_is_told():
     times, speeds, pose = drive()
-    assert told_speeds("/odom", times, speeds, np.zeros_like(pose)) == []  # never filled in
-    assert told_speeds("/odom", times, speeds, np.full_like(pose, np.nan)) == []
-    assert told_speeds("/odom", times[::-1], speeds * 0, pose) == []
+    assert speed_warnings("/odom", times, speeds, np.zeros_like(pose)) == []  # never filled in
+    assert speed_warnings("/odom", times, speeds, np.full_like(pose, np.nan)) == []
+    assert speed_warnings("/odom", times[::-1], speeds * 0, pose) == []
     far = times + np.where(np.arange(len(times)) > 400, 50 * 365 * 86_400 * NANO, 0)  # years cost nothing
-    assert told_speeds("/odom", far, speeds, pose) == []
+    assert speed_warnings("/odom", far, speeds, pose) == []

@@ -1,6 +1,6 @@
-"""What is doubtful in a robot's bag although every message can be read: clocks of another pace, speeds in other units.
+"""Suspicious things in a robot's bag whose messages can all be read: clocks of another pace, speeds in other units.
 
-A dataset can be made of it all the same, so it is told, not refused.
+A dataset can be made of it all the same, so it is printed, not refused.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ def pace(received: Times, stamps: Times) -> float:
     return told / whole if whole >= _LONG_NS and told > 0 else 1.0
 
 
-def told_pace(paces: Mapping[str, float]) -> list[str]:
+def pace_warnings(paces: Mapping[str, float]) -> list[str]:
     """Return, in sentences, which topics' headers are of a clock that is slower or faster than the recorder's.
 
     Args:
@@ -52,7 +52,7 @@ def told_pace(paces: Mapping[str, float]) -> list[str]:
     ]
 
 
-def told_speeds(topic: str, times: Times, speeds: Array, pose: Array) -> list[str]:
+def speed_warnings(topic: str, times: Times, speeds: Array, pose: Array) -> list[str]:
     """Return, in sentences, which of the odometry's speeds are not those at which its pose moves.
 
     So it is if a driver fills in the pose alone, or writes degrees.
@@ -63,8 +63,8 @@ def told_speeds(topic: str, times: Times, speeds: Array, pose: Array) -> list[st
         speeds: forward and turning [m/s, rad/s], shape (n, 2).
         pose: x, y and unwrapped yaw [m, m, rad], shape (n, 3).
     """
-    sound = np.isfinite(np.concatenate([speeds, pose], axis=1)).all(axis=1)
-    times, speeds, pose = times[sound], speeds[sound], pose[sound]
+    finite = np.isfinite(np.concatenate([speeds, pose], axis=1)).all(axis=1)
+    times, speeds, pose = times[finite], speeds[finite], pose[finite]
     steps = np.diff(times)
     if not len(steps) or (steps < 0).any():
         return []  # a clock that went back
