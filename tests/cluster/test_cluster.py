@@ -362,7 +362,7 @@ def test_what_a_worker_raises_ends_the_run_after_what_comes_before(cluster):
     assert type(error) is RuntimeError
     assert "UnpicklableError: no way" in str(error)
     assert any("episode 5" in note for note in error.__notes__)
-    assert any("cluster_fakes.py" in note for note in error.__notes__)
+    assert any("fakes.py" in note for note in error.__notes__)
 
 
 def test_an_episode_that_kills_every_worker_is_given_up(cluster):
