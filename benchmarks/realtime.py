@@ -357,6 +357,7 @@ def make_recorder(simulation: Any, task: Any, config: Any, folder: Path) -> Data
 
 _BUSY_CHILD = """
 import os, sys
+os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # the AV1 encoder of a parent that is root raises it
 os.sched_setaffinity(0, {int(sys.argv[1])})
 while os.getppid() == int(sys.argv[2]):
     sum(range(9999))

@@ -386,7 +386,7 @@ def test_a_new_scene_forgets_a_stop(kind: str) -> None:
 
 
 def test_the_process_needs_neither_torch_nor_lerobot() -> None:
-    modules = ("plant_process", "turtlebot3_simulation", "ur5_simulation")
+    modules = ("host.plant_process", "turtlebot3_simulation", "ur5_simulation")
     code = "".join(f"import bhd_lerobot.robots.{module}\n" for module in modules)
     code += "import sys; print(sorted({'torch', 'lerobot'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
