@@ -104,7 +104,7 @@ class States:
 
 CHILD = """
 import json, sys, time
-from live_support import drive, turtlebot
+from tests.robots.host.support import drive, turtlebot
 robot = turtlebot({name!r}, **{options!r})
 robot.connect()
 drive(robot)
@@ -128,7 +128,7 @@ def driving_child(name: str, **options: Any) -> Iterator[tuple[subprocess.Popen,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(str(Path(__file__).parents[k]) for k in (0, 2))},
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
     )
     try:
         assert process.stdout is not None
