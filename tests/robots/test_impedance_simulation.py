@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.control.arm.compliance import Compliance
-from bhd_lerobot.control.geometry.poses import rotation_vectors
+from bhd_lerobot.control.arm.rotations import rotation_vectors
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.sim.world import World
