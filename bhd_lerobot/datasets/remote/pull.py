@@ -112,6 +112,7 @@ class _Pull:
     def run(self, select: Select | None, verify: bool) -> PullReport:
         locks = [RootLock(self._staging.folder, self._root)]
         try:
+            self._staging.recover()
             if self._root.is_dir():
                 locks.append(RootLock(self._root))
                 clean(self._root)

@@ -51,6 +51,13 @@ class Staging:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _MARKER).touch()
 
+    def recover(self) -> None:
+        """Undo what version 0.1 left when it was killed between two renames; the caller has locked the folder."""
+        old = self._root.with_name(f".{self._root.name}.old")
+        if (old / _MARKER).is_file() and not self._root.exists() and _is_ours(old):
+            old.rename(self._root)
+            (self._root / _MARKER).unlink(missing_ok=True)
+
     def link(self, path: str) -> None:
         """Link a file of the dataset into the folder, in the place of what an attempt for another version left."""
         (self.folder / path).unlink(missing_ok=True)

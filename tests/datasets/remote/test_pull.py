@@ -105,6 +105,16 @@ def test_a_folder_of_somebody_else_in_its_way_is_left_alone(hub: HubServer, root
     assert not (tmp_path / "e").exists()
 
 
+def test_a_kill_of_version_0_1_between_its_renames_is_repaired(hub: HubServer, root: Path, tmp_path: Path) -> None:
+    send(root)
+    target = tmp_path / "e"
+    pull(HubDataset("me/d"), target)
+    (target / ".bhd-pull").touch()
+    target.rename(tmp_path / ".e.old")
+    assert pull(HubDataset("me/d"), target).fetched == []
+    assert content(target) == content(root)
+
+
 def test_a_full_disk_is_seen_before_and_during(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:
     send(root)
     usage = shutil.disk_usage(tmp_path)
