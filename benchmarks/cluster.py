@@ -22,8 +22,8 @@ from rich.console import Console
 
 from benchmarks._turns import in_turns, ratios, shown, spread, write
 from bhd_lerobot.cluster.config import RayConfig
-from bhd_lerobot.cluster.crew import Crew
-from bhd_lerobot.cluster.loop import ClusterLoop, open_crew
+from bhd_lerobot.cluster.loop import ClusterLoop, open_pool
+from bhd_lerobot.cluster.pool import WorkerPool
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import open_recorder, save_episode
@@ -53,14 +53,14 @@ def configuration(root: Path, episode_s: float) -> RecordConfig:
     )
 
 
-def record(config: RecordConfig, crew: Crew | None, episodes: int) -> float:
+def record(config: RecordConfig, pool: WorkerPool | None, episodes: int) -> float:
     """Record into a new dataset; return how long it took to run and save all episodes [s]."""
     simulation = make_robot(config.robot, 1, 1)
     task, brain = make_task(config.task, 1, config.dataset.fps), make_brain(config.brain)
     loop = EpisodeLoop(simulation, task, brain)
-    if crew is not None:
+    if pool is not None:
         loop = ClusterLoop(
-            simulation, task, brain, TimingTolerance(), crew=crew, config=config, brain_config=config.brain
+            simulation, task, brain, TimingTolerance(), pool=pool, config=config, brain_config=config.brain
         )
     specs = [EpisodeSpec(index, episode_seed(0, index, "train")) for index in range(episodes)]
     with tempfile.TemporaryDirectory() as folder:
@@ -92,21 +92,21 @@ def main() -> int:
     quiet = Console(quiet=True)
     started = time.perf_counter()
     shared = {"num_workers": 2, "address": "local"}
-    with open_crew(RayConfig(**shared), quiet) as two, Crew(RayConfig(num_workers=1), quiet) as one:
+    with open_pool(RayConfig(**shared), quiet) as two, WorkerPool(RayConfig(num_workers=1), quiet) as one:
 
-        def turn(crew: Crew | None) -> float:
-            if crew is None:
+        def turn(pool: WorkerPool | None) -> float:
+            if pool is None:
                 return record(config, None, options.episodes)
-            record(config, crew, 4)  # its workers are there, and have imported everything
-            took = record(config, crew, options.episodes)
-            crew.__exit__()  # the other's workers need the processors
+            record(config, pool, 4)  # its workers are there, and have imported everything
+            took = record(config, pool, options.episodes)
+            pool.__exit__()  # the other's workers need the processors
             return took
 
         record(config, two, 2)
         start_s = time.perf_counter() - started
         two.__exit__()
-        crews = {"alone": None, "one": one, "two": two}
-        times = in_turns({name: partial(turn, crew) for name, crew in crews.items()}, options.turns)
+        pools = {"alone": None, "one": one, "two": two}
+        times = in_turns({name: partial(turn, pool) for name, pool in pools.items()}, options.turns)
     speeds = {name: [options.episodes / took for took in values] for name, values in times.items()}
     gain = spread(ratios(speeds["two"], speeds["one"]))
     pairs = zip(times["one"], times["alone"], strict=True)

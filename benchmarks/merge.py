@@ -33,12 +33,12 @@ def record_video(root: Path, episodes: int, frames: int) -> None:
         CAMERA: {"dtype": "video", "shape": (96, 96, 3), "names": ["height", "width", "channels"]},
     }
     recorder = DatasetRecorder.create("bench/merge", 25, features, robot_type="ur5", root=root, recording={"seed": 0})
-    picture = np.random.default_rng(0).integers(0, 255, (96, 96, 3), np.uint8)
+    image = np.random.default_rng(0).integers(0, 255, (96, 96, 3), np.uint8)
     for episode in range(episodes):
         writer = recorder.begin_episode()
         writer.set_columns({"observation.state": np.full((frames, 2), episode, np.float32)})
         for frame in range(frames):
-            writer.add_image(CAMERA, np.roll(picture, frame, axis=0))
+            writer.add_image(CAMERA, np.roll(image, frame, axis=0))
         recorder.save(writer, task="move", metadata={"outcome": "success"})
     recorder.finalize()
 

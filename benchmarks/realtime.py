@@ -283,7 +283,7 @@ def run_robot(robot: str, seconds: float, load: Load, folder: Path | None = None
     refused = tuple(f"{one['name']}: {one['detail']}" for one in grants if not one["granted"])
     if len(states) < 2 or episode.outcome.event.cause not in ("timeout", "success"):
         raise NotMeasuredError(f"the episode of {robot} ended with {episode.outcome.event.cause}, {len(states)} ticks")
-    # The loop's warm-up, before the episode, was a stretch of its own.
+    # The loop's warm-up, before the episode, was a segment of its own.
     due, started, ended, executed, _ = np.array([one for one in states if one[-1] == states[-1][-1]], np.int64).T
     if np.any(np.diff(executed) != 1):
         raise NotMeasuredError("states of the loop were overwritten before they were read")
@@ -305,7 +305,7 @@ def watch(block: Any) -> Iterator[list[tuple[int, ...]]]:
             is_last = stop.wait(0.05)
             while (state := reader.read()) is not None:
                 if state["tick"] >= 0:
-                    names = ("due_ns", "start_ns", "ended_ns", "executed", "stretch")
+                    names = ("due_ns", "start_ns", "ended_ns", "executed", "segment")
                     states.append(tuple(int(state[name]) for name in names))
 
     thread = threading.Thread(target=drain)

@@ -74,15 +74,15 @@ def images(length: int, camera: tuple[int, int]) -> np.ndarray:
     return np.array(frames, dtype=np.uint8)
 
 
-def record_with_lerobot(root: Path, data: list, pictures: np.ndarray | None, settings: VideoSettings) -> None:
+def record_with_lerobot(root: Path, data: list, camera_frames: np.ndarray | None, settings: VideoSettings) -> None:
     """Record with LeRobot's own writer."""
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     options: dict[str, Any] = {}
     camera = None
-    if pictures is not None:
-        camera = pictures.shape[1:3]
+    if camera_frames is not None:
+        camera = camera_frames.shape[1:3]
         recorded = settings.recorded()
         encoder = RGBEncoderConfig(**{**recorded, "extra_options": {**recorded["extra_options"], "bf": 0}})
         options = {"rgb_encoder": encoder, "streaming_encoding": True, "encoder_queue_maxsize": 10_000}
@@ -93,18 +93,18 @@ def record_with_lerobot(root: Path, data: list, pictures: np.ndarray | None, set
     for columns in data:
         for i in range(len(columns["action"])):
             frame = {key: values[i] if values.ndim == 2 else values[i : i + 1] for key, values in columns.items()}
-            if pictures is not None:
-                frame[CAMERA] = pictures[i]
+            if camera_frames is not None:
+                frame[CAMERA] = camera_frames[i]
             dataset.add_frame({**frame, "task": "avoid"})
         dataset.save_episode()
     dataset.finalize()
 
 
 def record_with_ours(
-    root: Path, data: list, pictures: np.ndarray | None, settings: VideoSettings, by_frame: bool
+    root: Path, data: list, camera_frames: np.ndarray | None, settings: VideoSettings, by_frame: bool
 ) -> None:
     """Record with this package, by frames or by columns."""
-    camera = pictures.shape[1:3] if pictures is not None else None
+    camera = camera_frames.shape[1:3] if camera_frames is not None else None
     with DatasetRecorder.create(
         "bench/ours", FPS, features(camera), robot_type="bench", root=root, recording={}, video=settings
     ) as recorder:
@@ -115,8 +115,8 @@ def record_with_ours(
             for i in range(len(columns["action"])):
                 if by_frame:
                     episode.add_frame({key: values[i] for key, values in columns.items()})
-                if pictures is not None:
-                    episode.add_image(CAMERA, pictures[i])
+                if camera_frames is not None:
+                    episode.add_image(CAMERA, camera_frames[i])
             recorder.save(episode, task="avoid", metadata=METADATA)
 
 
@@ -133,7 +133,7 @@ def write_with_pyarrow(root: Path, data: list, options: dict[str, Any]) -> None:
         start += len(frames)
 
 
-def check(root: Path, data: list, pictures: np.ndarray | None) -> None:
+def check(root: Path, data: list, camera_frames: np.ndarray | None) -> None:
     """Read a dataset with stock LeRobot and compare every value with what was recorded."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -147,10 +147,10 @@ def check(root: Path, data: list, pictures: np.ndarray | None) -> None:
         assert np.array_equal(values.to_numpy(zero_copy_only=False).reshape(wanted.shape), wanted), key
     assert dataset[0]["observation.state"].numpy().tobytes() == data[0]["observation.state"][0].tobytes()
     assert set(dataset.meta.stats["observation.state"]) >= {"min", "max", "mean", "std", "count", "q01", "q99"}
-    if pictures is not None:
+    if camera_frames is not None:
         for i in (0, len(dataset) - 1):
             decoded = dataset[i][CAMERA].permute(1, 2, 0).numpy() * 255
-            difference = np.abs(decoded - pictures[i % len(pictures)]).mean()
+            difference = np.abs(decoded - camera_frames[i % len(camera_frames)]).mean()
             assert difference < 12, f"frame {i} differs by {difference:.1f} grey levels"
 
 
@@ -163,17 +163,19 @@ def main() -> None:
     parser.add_argument("--video", action="store_true", help="add a 320 x 240 camera")
     arguments = parser.parse_args()
     data = episodes(arguments.episodes, arguments.length)
-    pictures = images(arguments.length, (240, 320)) if arguments.video else None
+    camera_frames = images(arguments.length, (240, 320)) if arguments.video else None
     settings = VideoSettings()
     logging.disable(logging.WARNING)
 
     plain = {"use_dictionary": False}
     contestants: dict[str, Callable[[Path], None]] = {
-        "LeRobot add_frame + save_episode + finalize": lambda root: record_with_lerobot(root, data, pictures, settings),
-        "ours, set_columns": lambda root: record_with_ours(root, data, pictures, settings, by_frame=False),
-        "ours, add_frame": lambda root: record_with_ours(root, data, pictures, settings, by_frame=True),
+        "LeRobot add_frame + save_episode + finalize": lambda root: record_with_lerobot(
+            root, data, camera_frames, settings
+        ),
+        "ours, set_columns": lambda root: record_with_ours(root, data, camera_frames, settings, by_frame=False),
+        "ours, add_frame": lambda root: record_with_ours(root, data, camera_frames, settings, by_frame=True),
     }
-    if pictures is None:
+    if camera_frames is None:
         contestants[PYARROW] = lambda root: write_with_pyarrow(root, data, {})
         contestants[PYARROW_PLAIN] = lambda root: write_with_pyarrow(root, data, plain)
     done = set()
@@ -186,7 +188,7 @@ def main() -> None:
             with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
                 took = seconds(lambda: contestants[name](folder / "dataset"))
                 if name not in done and "pyarrow" not in name:
-                    check(folder / "dataset", data, pictures)
+                    check(folder / "dataset", data, camera_frames)
             done.add(name)
             return took
         finally:
@@ -196,7 +198,7 @@ def main() -> None:
     frames = arguments.episodes * arguments.length
     rates = {name: frames / statistics.median(took) for name, took in times.items()}
     shape = f"{arguments.episodes} episodes of {arguments.length} frames, {STATE} floats"
-    print(f"{shape}{', camera 320x240' if pictures is not None else ''}; median of {arguments.repeats}")
+    print(f"{shape}{', camera 320x240' if camera_frames is not None else ''}; median of {arguments.repeats}")
     references = {"x LeRobot": next(iter(rates)), "x pyarrow": PYARROW, "x pyarrow plain": PYARROW_PLAIN}
     print(f"{'':44} {'frames/s':>10} {'ms/episode':>11}" + "".join(f"{title:>17}" for title in references))
     for name, rate in rates.items():

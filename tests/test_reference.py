@@ -76,7 +76,7 @@ def anchors(text: str) -> set[str]:
 
 
 def broken_references(document: Path) -> list[str]:
-    """Return every relative link, picture and file name in a document that leads nowhere."""
+    """Return every relative link, image and file name in a document that leads nowhere."""
     text = document.read_text(encoding="utf-8")
     prose = without_code(text)
     broken = []

@@ -1,4 +1,4 @@
-"""What a section of the results consists of: commands, numbers with their goals, and a picture or two."""
+"""What a section of the results consists of: commands, numbers with their goals, and an image or two."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

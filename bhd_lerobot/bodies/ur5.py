@@ -13,9 +13,9 @@ Sources:
 Estimates of ours: link inertias, from solid cylinders of the links' outlines, because the wrist inertias that circulate
 are an order of magnitude too large for 1.2 kg; the gripper's inertia, from a cylinder and two bars; the capsules of the
 collision checks, from the arm's outlines; the reflected rotor inertias: 0.5 kg m^2 on the first three joints, 0.15 on
-the wrists, 0.3 kg on each finger; the servos' gains, with which 1 kg in the gripper at full stretch lowers the tool by
+the wrists, 0.3 kg on each finger; the servos' gains, with which 1 kg in the gripper at full reach lowers the tool by
 0.4 mm, and a joint is where a small step commands it after 60 ms, with 4 % overshoot at the most; accelerations and
-jerks, which Universal Robots does not publish: with the payload at full stretch they need less than the joints' torque
+jerks, which Universal Robots does not publish: with the payload at full reach they need less than the joints' torque
 limits.
 """
 

@@ -179,7 +179,7 @@ def free_places(config: RayConfig) -> int:
     return total
 
 
-def tell_crowd(config: RayConfig, workers: int) -> str:
+def describe_crowding(config: RayConfig, workers: int) -> str:
     """Return what a user should know who asked for more workers than there are processors; empty if not.
 
     Args:
@@ -190,7 +190,7 @@ def tell_crowd(config: RayConfig, workers: int) -> str:
     if workers > places:
         return (
             f"ray.num_workers is {config.num_workers}, and the cluster has room for {places} of {size_of(config)}: "
-            f"{places} run at a time. The others start if there is more room. There is: {tell_machines()}."
+            f"{places} run at a time. The others start if there is more room. There is: {describe_machines()}."
         )
     address = config.address or os.environ.get("RAY_ADDRESS") or _LOCAL
     needed, there = workers * config.cpus_per_worker, len(os.sched_getaffinity(0))
@@ -205,7 +205,7 @@ def size_of(config: RayConfig) -> str:
     return f"{cpus} CPU{'' if cpus == 1 else 's'}" + (f" and {gpus:g} GPU{'' if gpus == 1 else 's'}" if gpus else "")
 
 
-def tell_machines() -> str:
+def describe_machines() -> str:
     """Return the machines of the cluster in words, for a message."""
     told = [f"{name} with {r.get('CPU', 0):g} CPUs and {r.get('GPU', 0):g} GPUs" for name, r in _machines().items()]
     return "; ".join(told[:8] + (["…"] if len(told) > 8 else [])) or "none"

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from bhd_lerobot.cluster.cluster import connected
 from bhd_lerobot.cluster.config import RayConfig
-from bhd_lerobot.cluster.crew import Crew
 from bhd_lerobot.cluster.job import Job, fingerprint, histograms_of, read_checkpoints, unpack
+from bhd_lerobot.cluster.pool import WorkerPool
 from bhd_lerobot.cluster.task import Task as ClusterTask
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.video import VideoSettings
@@ -23,14 +23,14 @@ from bhd_lerobot.tasks.task import Task
 
 
 @contextmanager
-def open_crew(config: RayConfig, console: Console) -> Iterator[Crew]:
+def open_pool(config: RayConfig, console: Console) -> Iterator[WorkerPool]:
     """Join a cluster, or start one, and give those who will work there.
 
     Raises:
         ClusterError: it cannot be reached.
     """
-    with connected(config), Crew(config, console) as crew:
-        yield crew
+    with connected(config), WorkerPool(config, console) as pool:
+        yield pool
 
 
 class ClusterLoop(EpisodeLoop):
@@ -41,7 +41,7 @@ class ClusterLoop(EpisodeLoop):
         task: what is to be achieved.
         brain: what drives the robots; made here too, so that what does not fit fails before a dataset exists.
         tolerance: see `EpisodeLoop`.
-        crew: the workers.
+        pool: the workers.
         config: of the recording or the evaluation.
         brain_config: of the brain.
     """
@@ -53,12 +53,12 @@ class ClusterLoop(EpisodeLoop):
         brain: Brain,
         tolerance: TimingTolerance | None = None,
         *,
-        crew: Crew,
+        pool: WorkerPool,
         config: Any,
         brain_config: Any,
     ) -> None:
         super().__init__(simulation, task, brain, tolerance)
-        self._crew, self._config, self._brain_config = crew, config, brain_config
+        self._pool, self._config, self._brain_config = pool, config, brain_config
 
     def run(
         self,
@@ -88,7 +88,7 @@ class ClusterLoop(EpisodeLoop):
             writer.discard()
         job = self._job(min(self._config.n_envs, per_task), video)
         ours = fingerprint(job.robot, job.task, job.fps)
-        for result in self._crew.run(job, ours, tasks, lambda: stop() or self._is_stopped()):
+        for result in self._pool.run(job, ours, tasks, lambda: stop() or self._is_stopped()):
             if job.is_timed:
                 self.brain.times.extend(result["times"])  # type: ignore[attr-defined]
             for content in result["episodes"]:
@@ -111,7 +111,7 @@ class ClusterLoop(EpisodeLoop):
         if wanted is not None:
             return int(wanted)
         # Twice as many as run side by side: one that is over early makes room for another. Two turns for each worker.
-        fair = -(-episodes // (2 * self._crew.workers_for(episodes)))
+        fair = -(-episodes // (2 * self._pool.workers_for(episodes)))
         return 1 if n == 1 else max(1, min(2 * n, fair))
 
     def _job(self, n: int, video: VideoSettings | None) -> Job:

@@ -170,7 +170,7 @@ class Cerebellum:
             np.copyto(self.requested, self._popped, where=take[:, None])
             self.setpoints_taken += int(np.count_nonzero(take))
             self._by_goal &= ~take
-            self.controller.head_for(self._popped, take)
+            self.controller.set_setpoint(self._popped, take)
             self._update_deadline()
             due = self.fifo.next_due()
 

@@ -34,7 +34,7 @@ class Controller(ABC):
     blocked: NDArray[np.bool_]
 
     @abstractmethod
-    def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
+    def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
         """Head for new setpoints, in normal motion.
 
         Args:

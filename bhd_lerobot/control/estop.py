@@ -83,19 +83,19 @@ class EstopInputs:
     Args:
         press: what presses: sets the word of the emergency stop. Called from any thread and from a signal handler, as
             often as it likes; must neither block nor raise.
-        hear: gets the terminal's keys that do not press, from the thread that waits for them; must not block either.
+        on_key: gets the terminal's keys that do not press, from the thread that waits for them; must not block either.
 
     Attributes:
         causes: what has pressed so far, in words, each once, in the order of the first time.
     """
 
-    def __init__(self, press: Callable[[], None], hear: Callable[[bytes], None] = lambda keys: None) -> None:
+    def __init__(self, press: Callable[[], None], on_key: Callable[[bytes], None] = lambda keys: None) -> None:
         self.causes: list[str] = []
-        self._hear_others = hear
+        self._on_other_keys = on_key
         self._press_word = press
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._hear: dict[int, Callable[[bytes], None]] = {}  # what is to be done with the bytes of each descriptor
+        self._handlers: dict[int, Callable[[bytes], None]] = {}  # what is to be done with the bytes of each descriptor
         self._broken: list[str] = []  # inputs that can press no more, and therefore stay pressed
         self._silence: dict[str, int] = {}  # rounds of the thread that a callable may still be silent for
         self._signals: dict[signal.Signals, Any] = {}
@@ -121,9 +121,9 @@ class EstopInputs:
             ConfigError: it is neither, the descriptor is not open, or the period is not positive.
         """
         descriptor = check_source(source, period_s)
-        name = name or f"input {len(self._hear) + len(self._silence)}"
+        name = name or f"input {len(self._handlers) + len(self._silence)}"
         if descriptor is not None:
-            self._watch(descriptor, partial(self._hear_button, descriptor, name))
+            self._watch(descriptor, partial(self._on_button, descriptor, name))
             return
         name = name if name not in self._silence else f"{name} ({len(self._silence)})"
         rounds = math.ceil((_SILENCE_S + period_s) / _ROUND_S)
@@ -143,7 +143,7 @@ class EstopInputs:
         if descriptor is None or self._terminal is not None or not KeyTerminal.usable(descriptor):
             return False
         self._terminal = KeyTerminal(descriptor)
-        self._watch(descriptor, self._hear_keys)
+        self._watch(descriptor, self._on_terminal_keys)
         return True
 
     def add_signal(self, number: signal.Signals = signal.SIGUSR1) -> None:
@@ -176,7 +176,7 @@ class EstopInputs:
             os.close(writer)
             return
         self._pipe = reader, writer
-        self._watch(reader, self._hear_signals)
+        self._watch(reader, self._on_signals)
 
     # --- pressing ----------------------------------------------------------------------------------------------------
 
@@ -190,19 +190,19 @@ class EstopInputs:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self._press(f"signal {signal.Signals(number).name}")
 
-    def _hear_signals(self, said: bytes) -> None:
+    def _on_signals(self, said: bytes) -> None:
         for number in said:
             if number in self._signals:
                 self._press(f"signal {signal.Signals(number).name}")
 
-    def _hear_keys(self, said: bytes) -> None:
+    def _on_terminal_keys(self, said: bytes) -> None:
         if any(key in said for key in KEYS):
             self._press("key")
-        self._hear_others(bytes(key for key in said if key not in KEYS))
+        self._on_other_keys(bytes(key for key in said if key not in KEYS))
         if not said and self._terminal is not None:  # it is gone; that is a SIGHUP, which ends a run
             self._poll.unregister(self._terminal.descriptor)
 
-    def _hear_button(self, descriptor: int, name: str, said: bytes) -> None:
+    def _on_button(self, descriptor: int, name: str, said: bytes) -> None:
         if said:
             self._press(name)
         else:
@@ -219,8 +219,8 @@ class EstopInputs:
                 self._press(f"{name} failed: {type(error).__name__}: {error}")
             self._silence[name] = rounds
 
-    def _watch(self, descriptor: int, hear: Callable[[bytes], None]) -> None:
-        self._hear[descriptor] = hear
+    def _watch(self, descriptor: int, handler: Callable[[bytes], None]) -> None:
+        self._handlers[descriptor] = handler
         self._poll.register(descriptor, select.POLLIN)
         self._start()
 
@@ -260,7 +260,7 @@ class EstopInputs:
             return
         except OSError:
             said = b""
-        self._hear[descriptor](said)
+        self._handlers[descriptor](said)
 
     def _count_silence(self) -> None:
         for name in list(self._silence):

@@ -20,7 +20,7 @@ class KeyTerminal:
     """A terminal that gives keys at once and does not show them, until `restore` or the end of the program.
 
     Signals of the keyboard (Ctrl-C, Ctrl-Z) stay signals. What kills the program without its knowledge leaves the
-    terminal as it is; `stty sane` mends that.
+    terminal as it is; `stty sane` repairs that.
 
     Args:
         descriptor: a terminal in whose foreground this process is; see `usable`.

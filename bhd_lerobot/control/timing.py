@@ -183,7 +183,7 @@ class TimingStatistics:
         cells[_ELAPSED] += ticks * self.period_ns
 
     def merge(self, other: Self) -> None:
-        """Add the ticks of another loop, or of another stretch of this one; the time between is not counted.
+        """Add the ticks of another loop, or of another segment of this one; the time between is not counted.
 
         Raises:
             ConfigError: it has another period.

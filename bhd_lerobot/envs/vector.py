@@ -13,7 +13,7 @@ from bhd_lerobot.envs.gym_env import RENDER_MODES, batched, check_render_mode, e
 from bhd_lerobot.envs.settings import make_settings
 from bhd_lerobot.envs.spaces import ActionScale, observation_space
 from bhd_lerobot.envs.stage import EVENT_NAMES, ClosedError, ResetNeededError, Stage
-from bhd_lerobot.envs.vector_member import Member, Pictures
+from bhd_lerobot.envs.vector_member import Images, Member
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.tasks.task import Event, Split
 
@@ -204,7 +204,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         """Call a method of each environment, or get an attribute; see `Member`."""
         self._check_open()
         if name == "render" and not args and not kwargs and self.render_mode is not None:
-            return Pictures(self.stage)  # LeRobot takes the first few of them only
+            return Images(self.stage)  # LeRobot takes the first few of them only
         values = [getattr(member, name) for member in self.members]
         return tuple(value(*args, **kwargs) if callable(value) else value for value in values)
 

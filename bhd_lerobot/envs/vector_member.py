@@ -105,7 +105,7 @@ class Member:
         self.course.episode = course.episode
 
 
-class Pictures(Sequence[NDArray[np.uint8]]):
+class Images(Sequence[NDArray[np.uint8]]):
     """Renderings of all simulations, each made when it is asked for."""
 
     def __init__(self, stage: Stage) -> None:

@@ -49,7 +49,7 @@ class EvalConfig:
         threads: threads that step the physics; all processors if nothing.
         engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes the speed, nothing else.
         ray: which cluster, and how much of it.
-        videos: how many failures of each brain are filmed, the first ones; of a brain without failures its first
+        videos: how many failures of each brain get a video, the first ones; of a brain without failures its first
             episode. If nothing, 2 where images can be rendered, and none elsewhere.
         record: where the runs are recorded, if they are.
         fail_below: end with exit status 1 if the lower end of a brain's 95 % interval of success is below this. Nothing

@@ -1,4 +1,4 @@
-"""`bhd-eval`: brains beside each other on the same held-out episodes, with intervals, a report and films."""
+"""`bhd-eval`: brains beside each other on the same held-out episodes, with intervals, a report and videos."""
 
 import os
 import platform
@@ -18,16 +18,16 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from bhd_lerobot.cluster.loop import open_crew
+from bhd_lerobot.cluster.loop import open_pool
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.errors import BhdError, ConfigError, RenderingError
 from bhd_lerobot.evaluation.config import YARDSTICKS, EvalConfig
 from bhd_lerobot.evaluation.metrics import JerkMeasure
-from bhd_lerobot.evaluation.report import Film, ReportInput, write_report
+from bhd_lerobot.evaluation.report import ReportInput, Video, write_report
 from bhd_lerobot.evaluation.results import EvalResults, summarise, write_json, write_table
 from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
 from bhd_lerobot.evaluation.text import number, percent
-from bhd_lerobot.recording.report import ESTOP_STATUS, tell_refusals
+from bhd_lerobot.recording.report import ESTOP_STATUS, print_refusals
 from bhd_lerobot.robots.host.simulation import Simulation, describe
 from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.preview import Preview
@@ -37,7 +37,7 @@ from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 
 
-def tell_summary(console: Console, config: EvalConfig, result: "EvalResult") -> None:
+def print_summary(console: Console, config: EvalConfig, result: "EvalResult") -> None:
     """Print what was found out, and where it is."""
     results = result.results
     baseline = config.reference
@@ -128,11 +128,11 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     simulation = make_robot(config.robot, n, config.threads)
     pressed = EstopInputs(simulation.bridge.estop)
     with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
-        crew = None if config.engine == "local" else cluster.enter_context(open_crew(config.ray, console))
-        runs = [prepare(config, label, simulation, crew) for label in config.chosen]
-        tell_refusals(simulation, console)
+        pool = None if config.engine == "local" else cluster.enter_context(open_pool(config.ray, console))
+        runs = [prepare(config, label, simulation, pool) for label in config.chosen]
+        print_refusals(simulation, console)
         if (
-            crew is None
+            pool is None
             and simulation.camera_names
             and (config.record.repo_id or any(one.timed.uses_images for one in runs))
         ):
@@ -142,7 +142,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
             pressed.add_signal(number)
             key = "space or e, or " if pressed.add_key() else ""
             console.print(f"Emergency stop: {key}kill -{number.name.removeprefix('SIG')} this process")
-        preview, no_films = _make_preview(config, console)
+        preview, no_videos = _make_preview(config, console)
         with run_folder(config, "eval") as output_dir:
             facts = _facts(config, simulation, runs)
         with _progress(console) as progress:
@@ -166,14 +166,14 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     result = EvalResult(output_dir, results, timing, output_dir / "report.html", stopped_by=stop, estop=estop)
     result.missed = _missed(config, results)
     try:
-        _write(config, result, runs, preview, no_films)
+        _write(config, result, runs, preview, no_videos)
     except OSError as error:
-        tell_summary(console, config, result)  # so that the numbers, at least, are not lost
+        print_summary(console, config, result)  # so that the numbers, at least, are not lost
         raise BhdError(
             f"The results cannot be written to {output_dir}: {error.strerror or error}. What is printed above is "
             "complete. Make room, or set another --output_dir, and run it again: the numbers will be the same."
         ) from error
-    tell_summary(console, config, result)
+    print_summary(console, config, result)
     return result
 
 
@@ -214,7 +214,7 @@ def _missed(config: EvalConfig, results: EvalResults) -> list[str]:
 
 
 def _write(
-    config: EvalConfig, result: EvalResult, runs: Sequence[BrainRun], preview: Preview | None, no_films: str
+    config: EvalConfig, result: EvalResult, runs: Sequence[BrainRun], preview: Preview | None, no_videos: str
 ) -> None:
     folder = result.output_dir
     write_json(folder / RESULTS_NAME, result.results.plain())
@@ -223,36 +223,36 @@ def _write(
     states: dict[str, Any] = {f"state_{one.label}": np.array(one.initial_states) for one in runs}
     states |= {f"episode_{one.label}": np.array([m.episode for m in one.episodes], np.int64) for one in runs}
     np.savez_compressed(folder / "initial_states.npz", **states)
-    films = _film(config, runs, preview, folder) if preview is not None else []
+    videos = _video(config, runs, preview, folder) if preview is not None else []
     write_report(
         ReportInput(
             config=config,
             results=result.results,
             timing=result.timing,
             trajectories={one.label: one.trajectories for one in runs},
-            films=films,
-            no_films=no_films,
+            videos=videos,
+            no_videos=no_videos,
             folder=folder,
         ),
         result.report,
     )
 
 
-def _film(config: EvalConfig, runs: Sequence[BrainRun], preview: Preview, folder: Path) -> list[Film]:
-    films = []
+def _video(config: EvalConfig, runs: Sequence[BrainRun], preview: Preview, folder: Path) -> list[Video]:
+    videos = []
     robot: Any = config.robot
     with closing(preview):
         for one in runs:
-            for metrics, scene, states in one.films:
+            for metrics, scene, states in one.videos:
                 path = folder / "videos" / f"{one.label}_{metrics.episode:04d}.mp4"
                 path.parent.mkdir(exist_ok=True)
                 preview.write(scene, states, robot.fps, path)
-                films.append(Film(one.label, metrics, path))
-    return films
+                videos.append(Video(one.label, metrics, path))
+    return videos
 
 
 def _make_preview(config: EvalConfig, console: Console) -> tuple[Preview | None, str]:
-    """Return what makes films, or None and why not."""
+    """Return what makes videos, or None and why not."""
     if config.videos == 0:
         return None, "videos was 0."
     try:
@@ -260,7 +260,7 @@ def _make_preview(config: EvalConfig, console: Console) -> tuple[Preview | None,
     except RenderingError as error:
         if config.videos:
             raise
-        console.print(f"No films: {escape(str(error))}")
+        console.print(f"No videos: {escape(str(error))}")
         return None, str(error)
 
 

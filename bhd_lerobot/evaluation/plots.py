@@ -141,7 +141,7 @@ def distributions(episodes: Mapping[str, Sequence[EpisodeMetrics]], jerk_unit: s
 
 def trajectory_grid(trajectories: Mapping[str, Mapping[int, Trajectory]]) -> str:
     """Return trajectories from above: a row for each brain, a column for each of some episodes."""
-    chosen = telling_episodes(trajectories)
+    chosen = notable_episodes(trajectories)
     rows, columns = len(trajectories), len(chosen)
     figure = Figure(figsize=(1.9 * max(columns, 3) + 0.5, 2.15 * rows + 0.1), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
@@ -157,7 +157,7 @@ def trajectory_grid(trajectories: Mapping[str, Mapping[int, Trajectory]]) -> str
     return _png(figure)
 
 
-def telling_episodes(trajectories: Mapping[str, Mapping[int, Trajectory]], shown: int = SHOWN) -> list[int]:
+def notable_episodes(trajectories: Mapping[str, Mapping[int, Trajectory]], shown: int = SHOWN) -> list[int]:
     """Return the episodes that tell most, in order: those that ended unlike most of a brain's, and the first ones."""
     numbers = sorted({number for ran in trajectories.values() for number in ran})
     unusual = dict.fromkeys(numbers, 0)

@@ -1,4 +1,4 @@
-"""The report of an evaluation: one HTML file that holds everything it shows, charts and films included."""
+"""The report of an evaluation: one HTML file that holds everything it shows, charts and videos included."""
 
 import base64
 import hashlib
@@ -24,13 +24,13 @@ from bhd_lerobot.evaluation.text import number, percent, sentences
 from bhd_lerobot.rollout.configuration import encode
 from bhd_lerobot.rollout.plots import Trajectory
 
-FILM_BYTES = 12_000_000  # films in the page; those beyond stay files beside it
+VIDEO_BYTES = 12_000_000  # videos in the page; those beyond stay files beside it
 LISTED = 100  # failed episodes of a brain that are listed
 
 
 @dataclass(frozen=True)
-class Film:
-    """A film of an episode.
+class Video:
+    """A video of an episode.
 
     Attributes:
         label: the brain's name in the evaluation.
@@ -52,8 +52,8 @@ class ReportInput:
         results: what was found out.
         timing: what was measured on the wall clock.
         trajectories: the episodes from above, by brain and number.
-        films: films of episodes.
-        no_films: why there are none.
+        videos: videos of episodes.
+        no_videos: why there are none.
         folder: where results and configuration lie.
     """
 
@@ -61,8 +61,8 @@ class ReportInput:
     results: EvalResults
     timing: dict[str, Any]
     trajectories: Mapping[str, Mapping[int, Trajectory]]
-    films: list[Film]
-    no_films: str
+    videos: list[Video]
+    no_videos: str
     folder: Path
 
 
@@ -94,14 +94,14 @@ def _sections(given: ReportInput) -> list[tuple[str, str, str]]:
         ("Distributions", "distributions", _distributions(given)),
         ("Limits and stops", "safety", _safety(given)),
         ("From above", "trajectories", _trajectories(given)),
-        ("Films", "films", _films(given)),
+        ("Videos", "videos", _videos(given)),
         ("Failed episodes", "failures", _failures(given)),
         ("Time to decide", "latency", _latency(given)),
     ]
 
 
 def replay_command(config: EvalConfig, folder: Path, one: EpisodeMetrics) -> str:
-    """Return the command that runs a single episode again, and films it where films can be made."""
+    """Return the command that runs a single episode again, and videos it where videos can be made."""
     options = [
         f"--config_path={folder / 'config.yaml'}",
         f"--only=[{one.brain}]",
@@ -226,38 +226,38 @@ def _trajectories(given: ReportInput) -> str:
     return f'<p class="note">{note}</p>' + chart(plots.trajectory_grid(ran), "Trajectories from above")
 
 
-def _films(given: ReportInput) -> str:
-    if not given.films:
-        return f'<p class="note">No films: {escape(given.no_films or "no episode was finished.")}</p>'
-    room, figures = FILM_BYTES, []
-    for film in given.films:
-        content = film.path.read_bytes()
+def _videos(given: ReportInput) -> str:
+    if not given.videos:
+        return f'<p class="note">No videos: {escape(given.no_videos or "no episode was finished.")}</p>'
+    room, figures = VIDEO_BYTES, []
+    for video in given.videos:
+        content = video.path.read_bytes()
         room -= len(content)
         data = base64.b64encode(content).decode("ascii") if room >= 0 else ""
         player = (
-            f'<video controls muted playsinline preload="metadata" poster="{_last_picture(film.path)}" '
+            f'<video controls muted playsinline preload="metadata" poster="{_last_image(video.path)}" '
             f'src="data:video/mp4;base64,{data}"></video>'
         )
-        name = escape(str(film.path.relative_to(given.folder)))
-        ended = film.metrics.outcome.replace("_", " ")
+        name = escape(str(video.path.relative_to(given.folder)))
+        ended = video.metrics.outcome.replace("_", " ")
         figures.append(
-            f"<figure>{player if data else ''}<figcaption><b>{escape(film.label)}</b>, episode {film.metrics.episode}: "
-            f"{ended}, after {film.metrics.length_s:.1f} s. File {name}{'' if data else ', too large for this page'}."
-            "</figcaption></figure>"
+            f"<figure>{player if data else ''}<figcaption><b>{escape(video.label)}</b>, "
+            f"episode {video.metrics.episode}: {ended}, after {video.metrics.length_s:.1f} s. "
+            f"File {name}{'' if data else ', too large for this page'}.</figcaption></figure>"
         )
-    note = "The first failures of each brain; of a brain without failures its first episode. The picture is the end."
-    return f'<p class="note">{note}</p><div class="films">{"".join(figures)}</div>'
+    note = "The first failures of each brain; of a brain without failures its first episode. The image is the end."
+    return f'<p class="note">{note}</p><div class="videos">{"".join(figures)}</div>'
 
 
-def _last_picture(film: Path) -> str:
-    """Return how a film ends, as a JPEG for a page."""
+def _last_image(video: Path) -> str:
+    """Return how a video ends, as a JPEG for a page."""
     import av
 
-    with av.open(str(film)) as container:
+    with av.open(str(video)) as container:
         *_, last = container.decode(video=0)
-        picture = io.BytesIO()
-        last.to_image().save(picture, format="JPEG", quality=80)
-    return f"data:image/jpeg;base64,{base64.b64encode(picture.getvalue()).decode('ascii')}"
+        image = io.BytesIO()
+        last.to_image().save(image, format="JPEG", quality=80)
+    return f"data:image/jpeg;base64,{base64.b64encode(image.getvalue()).decode('ascii')}"
 
 
 def _failures(given: ReportInput) -> str:

@@ -8,8 +8,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.cluster.crew import Crew
 from bhd_lerobot.cluster.loop import ClusterLoop
+from bhd_lerobot.cluster.pool import WorkerPool
 from bhd_lerobot.datasets.format.features import PHYSICS_STATE
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.evaluation.config import EvalConfig
@@ -24,7 +24,7 @@ from bhd_lerobot.rollout.registry import make_brain, make_task
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import episode_seed
 
-FILMS = 2  # failures of each brain that are filmed, unless said otherwise
+VIDEOS = 2  # failures of each brain of which videos are made, unless said otherwise
 
 
 @dataclass
@@ -37,7 +37,7 @@ class BrainRun:
         timed: its clock.
         episodes: the numbers of its episodes.
         trajectories: its episodes from above, by number.
-        films: what is to be filmed: episode, scene and recorded physics states.
+        videos: of what videos are to be made: episode, scene and recorded physics states.
         initial_states: the simulator's complete states at the episodes' starts.
         wall_s: duration of the run [s].
     """
@@ -47,7 +47,7 @@ class BrainRun:
     timed: TimedBrain
     episodes: list[EpisodeMetrics] = field(default_factory=list)
     trajectories: dict[int, Trajectory] = field(default_factory=dict)
-    films: list[tuple[EpisodeMetrics, Any, NDArray[np.float64]]] = field(default_factory=list)
+    videos: list[tuple[EpisodeMetrics, Any, NDArray[np.float64]]] = field(default_factory=list)
     initial_states: list[NDArray[np.float64]] = field(default_factory=list)
     wall_s: float = 0.0
 
@@ -66,14 +66,14 @@ class BrainRun:
         }
 
 
-def prepare(config: EvalConfig, label: str, simulation: Simulation, crew: Crew | None = None) -> BrainRun:
+def prepare(config: EvalConfig, label: str, simulation: Simulation, pool: WorkerPool | None = None) -> BrainRun:
     """Make a brain and what runs it: one that does not fit fails here, before any episode.
 
     Args:
         config: the evaluation.
         label: the brain's name in it.
         simulation: the robots.
-        crew: who runs the episodes, if not this process.
+        pool: who runs the episodes, if not this process.
 
     Raises:
         BhdError: the message names the brain.
@@ -83,9 +83,9 @@ def prepare(config: EvalConfig, label: str, simulation: Simulation, crew: Crew |
         timed = TimedBrain(make_brain(config.brains[label]))
         task = make_task(config.task, simulation.n, robot.fps)
         brain = cast(Brain, timed)
-        if crew is None:
+        if pool is None:
             return BrainRun(label, EpisodeLoop(simulation, task, brain), timed)
-        loop = ClusterLoop(simulation, task, brain, crew=crew, config=config, brain_config=config.brains[label])
+        loop = ClusterLoop(simulation, task, brain, pool=pool, config=config, brain_config=config.brains[label])
         return BrainRun(label, loop, timed)
     except BhdError as error:
         raise type(error)(f"brains.{label}: {error}") from error
@@ -118,8 +118,8 @@ def _keep(
         title, episode.scene, track[:, :2].astype(np.float32), metrics.success
     )
     failures = sum(not other.success for other in one.episodes)
-    wanted = FILMS if config.videos is None else config.videos
+    wanted = VIDEOS if config.videos is None else config.videos
     if not metrics.success and failures == 1:
-        one.films.clear()  # the first episode, kept in case that no one fails
+        one.videos.clear()  # the first episode, kept in case that no one fails
     if (not metrics.success and failures <= wanted) or (len(one.episodes) == 1 and wanted):
-        one.films.append((metrics, episode.scene, episode.columns[PHYSICS_STATE]))
+        one.videos.append((metrics, episode.scene, episode.columns[PHYSICS_STATE]))

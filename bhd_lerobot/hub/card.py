@@ -12,9 +12,9 @@ import yaml
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
-from bhd_lerobot.datasets.remote.listing import PICTURE
+from bhd_lerobot.datasets.remote.listing import PREVIEW
 from bhd_lerobot.datasets.remote.push import Card, sign
-from bhd_lerobot.hub.picture import draw
+from bhd_lerobot.hub.preview import draw
 
 LEROBOT_TAG = "LeRobot"
 """By this tag LeRobot's viewer finds datasets."""
@@ -39,16 +39,16 @@ class CardOptions:
     tags: Sequence[str] = ()
 
 
-def make_card(state: DatasetState, options: CardOptions, *, has_picture: bool = False) -> Card:
+def make_card(state: DatasetState, options: CardOptions, *, has_image: bool = False) -> Card:
     """Return the card of a dataset; the same one whenever it is asked for the same dataset.
 
     Args:
         state: the dataset.
         options: what it says besides.
-        has_picture: the user has put a picture beside the dataset: the card shows that one, and none is drawn.
+        has_image: the user has put an image beside the dataset: the card shows that one, and none is drawn.
     """
     summary, identity = dataset_info(state.root), state.identity or {}
-    drawn = (None, "A picture of the dataset") if has_picture else draw(summary, state)
+    drawn = (None, "An image of the dataset") if has_image else draw(summary, state)
     rows = [
         (f"`{key}`", str(feature["dtype"]), " x ".join(map(str, feature["shape"])), _meaning(key, feature))
         for key, feature in summary.features.items()
@@ -57,7 +57,7 @@ def make_card(state: DatasetState, options: CardOptions, *, has_picture: bool = 
         _front_matter(summary, identity, options),
         f"# {(options.repo_id or options.url).rstrip('/').rpartition('/')[2]}",
         _introduction(summary, options),
-        f"![{drawn[1]}]({PICTURE})\n\n{drawn[1]}." if drawn else "",
+        f"![{drawn[1]}]({PREVIEW})\n\n{drawn[1]}." if drawn else "",
         _overview(summary),
         _outcomes(summary),
         "## Columns\n\n" + _table(("key", "type", "shape", "meaning and unit"), rows),

@@ -52,13 +52,11 @@ def push_dataset(
     from bhd_lerobot.datasets.remote.store import StoreDataset
     from bhd_lerobot.datasets.remote.url import shown
 
-    def make(state: DatasetState, has_picture: bool) -> Card:
+    def make(state: DatasetState, has_image: bool) -> Card:
         from bhd_lerobot.hub.card import CardOptions, make_card
 
         named = None if is_url(target) else target
-        return make_card(
-            state, CardOptions(named, "" if named else shown(target), licence, tags), has_picture=has_picture
-        )
+        return make_card(state, CardOptions(named, "" if named else shown(target), licence, tags), has_image=has_image)
 
     again = again or push_command(root, target, private=private is True, tags=tags)
     quiet_bars()

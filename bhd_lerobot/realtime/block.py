@@ -22,8 +22,8 @@ class Word(IntEnum):
     """Where each word is."""
 
     START = 0
-    """Monotonic time of tick 0 of the present stretch [ns]; the cerebellum's time counts from there."""
-    STRETCH = 1
+    """Monotonic time of tick 0 of the present segment [ns]; the cerebellum's time counts from there."""
+    SEGMENT = 1
     """How often the loop has been started."""
     PHASE = 2
     """A `Phase`."""
@@ -42,7 +42,7 @@ class Word(IntEnum):
     PLANT_ALIVE = 11
     """The same of the plant's process."""
     EXECUTED = 16
-    """Ticks executed in the present stretch."""
+    """Ticks executed in the present segment."""
     SKIPPED = 17
     """Ticks skipped in it."""
     OVERRUNS = 18
@@ -50,7 +50,7 @@ class Word(IntEnum):
     CATCH_UP_LOST = 19
     """Ticks of it by which the simulation fell behind, beyond what it may catch up at once."""
     RECORDER_DROPS = 24
-    """States that the recorder did not get before they were overwritten, in the present stretch."""
+    """States that the recorder did not get before they were overwritten, in the present segment."""
 
 
 class Phase(IntEnum):

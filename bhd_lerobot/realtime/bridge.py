@@ -69,7 +69,7 @@ class LiveBridge:
         return state
 
     def begin(self) -> None:
-        """Forget what was sent in another stretch."""
+        """Forget what was sent in another segment."""
         self._last_due = -(1 << 62)
         self._client.take_results()
 

@@ -1,7 +1,7 @@
 """The recorder of a running robot: takes every state from the ring and keeps those that frames begin and end with.
 
 Runs in a process of its own, so that nothing that happens in the brain's process (inference, the saving of an episode,
-the encoding of a film) keeps it from the ring. What it keeps lies in shared memory: no frame is ever pickled.
+the encoding of a video) keeps it from the ring. What it keeps lies in shared memory: no frame is ever pickled.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ from bhd_lerobot.control.fifo import RingReader, StateRing
 class FrameLog:
     """The states at the boundaries of frames, for one writer and one reader; overwriting.
 
-    Boundary k of a stretch is the first state at or after tick k F - 1, where F is the number of ticks in a frame: the
+    Boundary k of a segment is the first state at or after tick k F - 1, where F is the number of ticks in a frame: the
     state that a frame's ticks end with, and its successor begins with.
 
     Args:
@@ -35,7 +35,7 @@ class FrameLog:
         """Return the dtype of an entry.
 
         Beside the state: ``frame``, the number of the boundary; ``lateness_ns``, the latest start of a tick since the
-        last boundary; ``drops``, states of the stretch that were lost so far.
+        last boundary; ``drops``, states of the segment that were lost so far.
         """
         counts = [(name, np.int64) for name in ("frame", "lateness_ns", "drops")]
         return np.dtype([*counts, ("state", state)])
@@ -58,8 +58,8 @@ class FrameCollector:
     """Turns the states of a ring into boundaries of frames.
 
     Attributes:
-        states: states taken in the present stretch.
-        drops: states of the present stretch that were overwritten before they could be taken.
+        states: states taken in the present segment.
+        drops: states of the present segment that were overwritten before they could be taken.
 
     Args:
         ring: the states.
@@ -70,7 +70,7 @@ class FrameCollector:
     def __init__(self, ring: StateRing, log: FrameLog, frame_ticks: int) -> None:
         self._reader, self._log, self._frame_ticks = RingReader(ring), log, frame_ticks
         self._entry = np.zeros((), log.dtype)
-        self._stretch = -1
+        self._segment = -1
         self._next = 0
         self._latest = 0
         self.states = self.drops = 0
@@ -83,11 +83,11 @@ class FrameCollector:
         return found
 
     def _take(self, state: NDArray) -> int:
-        stretch, tick = int(state["stretch"]), int(state["tick"])
-        if stretch != self._stretch:
-            self._stretch, self._next, self.states, self._latest = stretch, 0, 0, 0
+        segment, tick = int(state["segment"]), int(state["tick"])
+        if segment != self._segment:
+            self._segment, self._next, self.states, self._latest = segment, 0, 0, 0
         self.states += 1
-        # A stretch begins with one state before its first tick.
+        # A segment begins with one state before its first tick.
         self.drops = int(state["executed"]) + 1 - self.states
         self._latest = max(self._latest, int(state["start_ns"]) - int(state["due_ns"]))
         boundary = (tick + 1) // self._frame_ticks

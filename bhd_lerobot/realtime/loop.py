@@ -91,7 +91,7 @@ class RealtimeLoop:
         ]
 
     def run(self, start_ns: int | None = None) -> TickGrid:
-        """Run a stretch of ticks, until `Word.PAUSE` or `Word.END` is set; return its grid.
+        """Run a segment of ticks, until `Word.PAUSE` or `Word.END` is set; return its grid.
 
         Args:
             start_ns: when tick 0 is due [ns]; one period from now if None.
@@ -101,7 +101,7 @@ class RealtimeLoop:
         grid = TickGrid(start, period, self.limits.most_misses)
         words[Word.EXECUTED : Word.CATCH_UP_LOST + 1] = 0
         words[Word.START] = start
-        words[Word.STRETCH] += 1
+        words[Word.SEGMENT] += 1
         words[Word.PHASE] = Phase.RUNNING
         ended = start
         # Plain numbers: an index of an enumeration costs a call.

@@ -212,7 +212,7 @@ class CommandGuard:
         self.begin()
 
     def begin(self) -> None:
-        """Begin a stretch: commands from before it do not count. A stop stays latched."""
+        """Begin a segment: commands from before it do not count. A stop stays latched."""
         self._begun = len(self._commands)
         self._checked_ns = None
         if self.phase == PlantPhase.DRIVEN:

@@ -61,7 +61,7 @@ class RecordConfig:
         engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes the speed, nothing else.
         ray: which cluster, and how much of it.
         resume: continue the dataset at `dataset.root`, or start it if there is none.
-        output_dir: run folder, for the resolved configuration and pictures; a new one in `outputs/record` if nothing.
+        output_dir: run folder, for the resolved configuration and images; a new one in `outputs/record` if nothing.
         preview_video: make an MP4 of the first episode; if nothing, where images can be rendered.
         estop_key: space or `e` in the terminal is an emergency stop, `s` ends the episode as a success and `f` as a
             failure, and with `i` an intervention begins or ends; if nothing, where there is a terminal and the robot

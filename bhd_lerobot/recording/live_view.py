@@ -139,8 +139,8 @@ class LiveView:
                 self._extras = RerunExtras(self._cameras, self._range_max)
         except Exception as error:  # of libraries that are not ours: a port in use, a package that does not fit
             raise ConfigError(
-                f"--display_data=true: {options.display_mode} could not be started: {error}. Mend that, choose another "
-                "--display_mode or --display_port, or leave --display_data out."
+                f"--display_data=true: {options.display_mode} could not be started: {error}. Repair that, choose "
+                "another --display_mode or --display_port, or leave --display_data out."
             ) from error
 
     def __call__(self, sim: int, columns: Mapping[str, Any]) -> None:
@@ -287,7 +287,7 @@ class RerunExtras:
 
 
 def points(scan: NDArray[Any], range_max: float) -> NDArray[np.float64]:
-    """Return where a scan's returns lie on a picture whose y axis points down, with ahead upwards.
+    """Return where a scan's returns lie on an image whose y axis points down, with ahead upwards.
 
     Args:
         scan: ranges [m], beam 0 straight ahead, counter-clockwise, shape (beams,).

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from bhd_lerobot.cluster.loop import ClusterLoop, open_crew
+from bhd_lerobot.cluster.loop import ClusterLoop, open_pool
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
 from bhd_lerobot.datasets.format.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
@@ -27,7 +27,7 @@ from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.live_view import live_view
-from bhd_lerobot.recording.report import RecordResult, tell_refusals, tell_summary
+from bhd_lerobot.recording.report import RecordResult, print_refusals, print_summary
 from bhd_lerobot.recording.resume_advice import instead_of_resuming
 from bhd_lerobot.robots.host.simulation import Simulation, describe
 from bhd_lerobot.rollout.configuration import run
@@ -92,7 +92,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     simulation = make_robot(config.robot, n, config.threads)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
     marks = Marks(n, outcomes_of(config.task.get_choice_name(type(config.task)), config.robot.type))
-    pressed = EstopInputs(simulation.bridge.estop, marks.hear)
+    pressed = EstopInputs(simulation.bridge.estop, marks.on_key)
     with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)
         task = make_task(config.task, simulation.n, config.dataset.fps)
@@ -101,12 +101,12 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         if is_here:
             loop = EpisodeLoop(simulation, task, brain, config.timing)
         else:
-            crew = cluster.enter_context(open_crew(config.ray, console))
+            pool = cluster.enter_context(open_pool(config.ray, console))
             loop = ClusterLoop(
-                simulation, task, brain, config.timing, crew=crew, config=config, brain_config=config.brain
+                simulation, task, brain, config.timing, pool=pool, config=config, brain_config=config.brain
             )
         loop.marks = marks
-        tell_refusals(simulation, console)
+        print_refusals(simulation, console)
         preview = _make_preview(config, simulation, console)
         if simulation.camera_names and is_here:
             simulation.start_rendering()  # a machine without OpenGL fails here, before a dataset exists
@@ -129,7 +129,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         preview.write(first.scene, states, config.dataset.fps, output_dir / "episode.mp4")
         preview.write_strip(first.scene, states, output_dir / "episode.png")
         preview.close()
-    tell_summary(console, config, result, preview is not None and first is not None)
+    print_summary(console, config, result, preview is not None and first is not None)
     if config.dataset.push_to_hub:
         _push(config, result, console)
     return result
@@ -210,8 +210,8 @@ def _episodes(
             console.print(f"Episode {spec.index}, attempt {attempt} of {_ATTEMPTS}, was not saved: {escape(why)}")
         else:
             raise RealtimeError(
-                f"Episode {spec.index} was too unpunctual {_ATTEMPTS} times. Those before it are saved. Mend the cause "
-                "and go on with --resume=true, or save such episodes too, flagged, with --timing.reject=false."
+                f"Episode {spec.index} was too unpunctual {_ATTEMPTS} times. Those before it are saved. Repair the "
+                "cause and go on with --resume=true, or save such episodes too, flagged, with --timing.reject=false."
             )
 
 
@@ -304,7 +304,7 @@ def _make_preview(config: RecordConfig, simulation: Simulation, console: Console
     except RenderingError as error:
         if config.preview_video:
             raise
-        console.print(f"No film of an episode: {error}")
+        console.print(f"No video of an episode: {error}")
         return None
 
 

@@ -75,7 +75,7 @@ class RecordResult:
         self.simulated_s += episode.frames / fps
 
 
-def tell_refusals(simulation: Simulation, console: Console) -> None:
+def print_refusals(simulation: Simulation, console: Console) -> None:
     """Say loudly what the system refused the real-time process, and the remedy."""
     refused = [grant for grant in simulation.grants or () if not grant["granted"]]
     for grant in refused:
@@ -84,8 +84,8 @@ def tell_refusals(simulation: Simulation, console: Console) -> None:
         )
 
 
-def tell_summary(console: Console, config: RecordConfig, result: RecordResult, film: bool) -> None:
-    """Print what the run did; `film` says whether it left a film."""
+def print_summary(console: Console, config: RecordConfig, result: RecordResult, video: bool) -> None:
+    """Print what the run did; `video` says whether it left a video."""
     table = Table(title="Recorded", show_header=False, title_justify="left")
     table.add_row("dataset", f"{result.root} ({result.episodes} episodes)")
     table.add_row(
@@ -104,7 +104,7 @@ def tell_summary(console: Console, config: RecordConfig, result: RecordResult, f
     files = [
         "config.yaml",
         *(["trajectories.png"] if result.recorded else []),
-        *(["episode.mp4", "episode.png"] if film else []),
+        *(["episode.mp4", "episode.png"] if video else []),
     ]
     table.add_row("run folder", f"{result.output_dir}: {', '.join(files)}")
     console.print(table)

@@ -30,7 +30,7 @@ class TurtleBot3Simulation(Simulation):
     """
 
     action_names = ("x.vel", "theta.vel")
-    film_speed = 4
+    video_speed = 4
 
     def __init__(self, config: "TurtleBot3Config", n: int = 1, threads: int | None = None) -> None:
         self.config, self.n = config, n

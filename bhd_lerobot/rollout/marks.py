@@ -65,7 +65,7 @@ class Marks:
             else:
                 self._driving.discard(simulation)
 
-    def hear(self, keys: bytes) -> None:
+    def on_key(self, keys: bytes) -> None:
         """Take keys of a terminal; see `KEYS`. They mean the first simulation."""
         for key in keys.decode("ascii", "ignore").lower():
             if key == "s":

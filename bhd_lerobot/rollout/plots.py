@@ -1,4 +1,4 @@
-"""Pictures of a run: trajectories from above, divergence over time."""
+"""Images of a run: trajectories from above, divergence over time."""
 
 import math
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ class Trajectory:
 
 
 class TrajectoryAlbum:
-    """Collects the episodes of a run that are worth a picture, in memory that does not grow with the run.
+    """Collects the episodes of a run that are worth an image, in memory that does not grow with the run.
 
     Attributes:
         added: number of episodes that were added.
@@ -203,7 +203,7 @@ def draw_divergence(
         time: time of the frames [s], shape (frames,).
         curves: divergence over time by label, each of shape (frames,).
         heading: what stands above the figure.
-        path: where the picture goes.
+        path: where the image goes.
     """
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     figure.suptitle(heading, fontsize=11)

@@ -1,4 +1,4 @@
-"""A film and a picture of a recorded episode, rendered from its recorded physics states."""
+"""A video and an image of a recorded episode, rendered from its recorded physics states."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -12,7 +12,7 @@ from bhd_lerobot.sim.camera import Camera
 
 WIDTH, HEIGHT = 640, 480
 FPS = 20
-STRIP = 2, 3  # rows and columns of the picture
+STRIP = 2, 3  # rows and columns of the image
 
 
 class Preview:
@@ -36,7 +36,7 @@ class Preview:
         return self._camera.render(0, self._simulation.view)
 
     def write(self, scene: Any, states: NDArray[np.float64], fps: int, path: Path) -> None:
-        """Write the film of an episode.
+        """Write the video of an episode.
 
         Args:
             scene: where it was.
@@ -44,11 +44,11 @@ class Preview:
             fps: recorded frames a second [Hz].
             path: the MP4 file.
         """
-        import av  # a run without a film does not need FFmpeg
+        import av  # a run without a video does not need FFmpeg
 
         self._simulation.place(np.zeros(1, np.intp), [scene])
-        # Every film frame shows the recorded frame nearest to its time.
-        frames = np.arange(0, len(states), fps * self._simulation.film_speed / FPS).round().astype(int)
+        # Every video frame shows the recorded frame nearest to its time.
+        frames = np.arange(0, len(states), fps * self._simulation.video_speed / FPS).round().astype(int)
         with av.open(str(path), "w") as container:
             stream = container.add_stream("h264", rate=Fraction(FPS), options={"crf": "24", "preset": "veryfast"})
             stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
@@ -59,7 +59,7 @@ class Preview:
             container.mux(stream.encode())
 
     def write_strip(self, scene: Any, states: NDArray[np.float64], path: Path) -> None:
-        """Write a picture of an episode: some of its frames, evenly spaced, in rows.
+        """Write an image of an episode: some of its frames, evenly spaced, in rows.
 
         Args:
             scene: where it was.

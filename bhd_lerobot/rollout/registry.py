@@ -5,7 +5,7 @@ from typing import Any
 
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig
-from bhd_lerobot.policies.dagger.brain import CorrectedBrain, CorrectedConfig, robot_of_both
+from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig, robot_of_both
 from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
 from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
@@ -29,14 +29,14 @@ __all__ = [
 ]
 
 
-class _Corrected(CorrectedBrain):
-    """A corrected brain, made of two of the brains below."""
+class _Dagger(DaggerBrain):
+    """A `dagger` brain, made of two of the brains below."""
 
-    def __init__(self, config: CorrectedConfig) -> None:
+    def __init__(self, config: DaggerConfig) -> None:
         super().__init__(config, make_brain(config.learner), make_brain(config.expert))
 
     @staticmethod
-    def robot_of(config: CorrectedConfig) -> str:
+    def robot_of(config: DaggerConfig) -> str:
         """Return the robot that both drive."""
         return robot_of_both(*(robot_of_brain(one) or ANY_ROBOT for one in (config.learner, config.expert)))
 
@@ -44,7 +44,7 @@ class _Corrected(CorrectedBrain):
 # Importing this module registers every configuration that it names.
 _BRAINS: dict[type, Callable[[Any], Brain]] = {
     AvoidanceConfig: AvoidanceBrain,
-    CorrectedConfig: _Corrected,
+    DaggerConfig: _Dagger,
     GapFollowerConfig: GapFollowerBrain,
     LanguageBrainConfig: LanguageBrain,
     LearnedBrainConfig: LearnedBrain,

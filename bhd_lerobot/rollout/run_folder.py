@@ -1,4 +1,4 @@
-"""The folder of a run: its configuration, results and pictures."""
+"""The folder of a run: its configuration, results and images."""
 
 import contextlib
 from collections.abc import Iterator

@@ -75,7 +75,7 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
 
     Args:
         rows: rows of a metrics file.
-        path: where the picture goes.
+        path: where the image goes.
         heading: what stands above it.
     """
     figure = Figure(figsize=(8.5, 5.2), layout="constrained")

@@ -89,14 +89,14 @@ class RunOutput:
         self.draw(step)
         config = self._config
         if config.save_checkpoint_to_hub and config.policy is not None:
-            again = f"When that is mended, go on with:\n  {checkpoint.resume_command(self.checkpoint)}"
+            again = f"When that is repaired, go on with:\n  {checkpoint.resume_command(self.checkpoint)}"
             with self._uploading(str(config.policy.repo_id), "The checkpoint", again):
                 push_checkpoint_to_hub(self.checkpoint, config.policy.repo_id, private=config.policy.private)
         if self._wandb is not None:
             self._wandb.log_policy(self.checkpoint)
 
     def draw(self, step: int) -> None:
-        """Draw the curve. Where that fails, what was learned is worth more than its picture: the run goes on."""
+        """Draw the curve. Where that fails, what was learned is worth more than its image: the run goes on."""
         if self._metrics is None:
             return
         config = self._config
@@ -104,7 +104,7 @@ class RunOutput:
         try:
             draw_loss(self._metrics.rows, self.folder / PLOT_NAME, heading)
         except OSError:
-            (self.folder / PLOT_NAME).unlink(missing_ok=True)  # half of a picture
+            (self.folder / PLOT_NAME).unlink(missing_ok=True)  # half of an image
 
     def push(self) -> None:
         """Upload the policy of a complete run, if that was asked for.
@@ -120,7 +120,7 @@ class RunOutput:
         if self.checkpoint is not None:
             private = ["--private"] if policy.private else []
             folder = str(self.checkpoint / PRETRAINED_MODEL_DIR)
-            again = f"When that is mended:\n  {shlex.join(['hf', 'upload', policy.repo_id, folder, '.', *private])}"
+            again = f"When that is repaired:\n  {shlex.join(['hf', 'upload', policy.repo_id, folder, '.', *private])}"
         with self._uploading(policy.repo_id, "The policy", again):
             parts.policy.push_model_to_hub(self._config)
             parts.preprocessor.push_to_hub(policy.repo_id)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _EXAMPLE_TASKS = {"turtlebot3": "avoid", "ur5": "pick"}
 
 
-def tell_start(console: Console, config: BhdTrainConfig, policy: Any, data: TrainingData, step: int) -> None:
+def print_start(console: Console, config: BhdTrainConfig, policy: Any, data: TrainingData, step: int) -> None:
     """Say what is about to be trained on what."""
     learnable = sum(one.numel() for one in policy.parameters() if one.requires_grad)
     total = sum(one.numel() for one in policy.parameters())
@@ -47,7 +47,7 @@ def tell_start(console: Console, config: BhdTrainConfig, policy: Any, data: Trai
     console.print(table)
 
 
-def tell_summary(console: Console, config: BhdTrainConfig, result: "TrainResult") -> None:
+def print_summary(console: Console, config: BhdTrainConfig, result: "TrainResult") -> None:
     """Say how it ended, where everything is, and how to go on."""
     losses = [row["loss"] for row in result.rows if row.get("loss") is not None]
     held_out = [row["held_out_loss"] for row in result.rows if row.get("held_out_loss") is not None]

@@ -37,7 +37,7 @@ from bhd_lerobot.training.setup import (
     select_parameters,
 )
 from bhd_lerobot.training.step import Learner
-from bhd_lerobot.training.summary import tell_start, tell_summary
+from bhd_lerobot.training.summary import print_start, print_summary
 
 
 @dataclass
@@ -155,10 +155,10 @@ def _run(
         raise ConfigError(f"The run has done {step} of {config.steps} steps. To go on, set more with --steps.")
     is_main = accelerator.is_main_process
     output = RunOutput(config, parts, step, is_main=is_main, processes=accelerator.num_processes)
-    tell_start(console, config, parts.policy, data, step)
+    print_start(console, config, parts.policy, data, step)
     result = TrainResult(output.folder, step, contract=parts.contract)
     _follow(loop, output, result, config, accelerator=accelerator, console=console)
-    tell_summary(console, config, result)
+    print_summary(console, config, result)
     if not loop.interrupted:
         output.push()
     accelerator.wait_for_everyone()

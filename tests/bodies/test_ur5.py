@@ -200,7 +200,7 @@ def clear_postures(count: int, margin: float = 0.05) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def clear() -> np.ndarray:
-    # At full stretch a payload bends the servos most.
+    # At full reach a payload bends the servos most.
     stretched = np.array([0.3, -0.02, 0.0, -math.pi / 2, 0.0, 0.0])
     return np.vstack([stretched, clear_postures(29)])
 

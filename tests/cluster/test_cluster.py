@@ -19,9 +19,9 @@ from rich.console import Console
 
 from bhd_lerobot.cluster import loop
 from bhd_lerobot.cluster.config import RayConfig
-from bhd_lerobot.cluster.crew import Crew
 from bhd_lerobot.cluster.job import Job
-from bhd_lerobot.cluster.loop import open_crew
+from bhd_lerobot.cluster.loop import open_pool
+from bhd_lerobot.cluster.pool import WorkerPool
 from bhd_lerobot.cluster.task import Task
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.video import count_frames
@@ -126,18 +126,18 @@ def gone(pid: int) -> bool:
 
 
 def test_a_recording_is_the_same_although_a_worker_and_a_machine_die(cluster, tmp_path, monkeypatch):
-    crews: list[Crew] = []
+    pools: list[WorkerPool] = []
 
-    class Seen(Crew):
+    class Seen(WorkerPool):
         def __init__(self, *arguments):
             super().__init__(*arguments)
-            crews.append(self)
+            pools.append(self)
 
     killed: list[int] = []
 
     def a_worker() -> int:
-        # The crew may not have missed yet the one that was killed just now.
-        pids = [int(one.host.rpartition(" ")[2]) for one in crews[0]._workers if one.is_ready]
+        # The pool may not have missed yet the one that was killed just now.
+        pids = [int(one.host.rpartition(" ")[2]) for one in pools[0]._workers if one.is_ready]
         return next(pid for pid in pids if pid not in killed)
 
     def kill_a_worker() -> None:
@@ -151,7 +151,7 @@ def test_a_recording_is_the_same_although_a_worker_and_a_machine_die(cluster, tm
         cluster.remove_node(machine, allow_graceful=False)
 
     # When the eighth is saved, 42 are missing, and no more than 16 of them can be on their way or waiting to be saved.
-    monkeypatch.setattr(loop, "Crew", Seen)
+    monkeypatch.setattr(loop, "WorkerPool", Seen)
     after_saves(monkeypatch, {3: kill_a_worker, 8: kill_its_machine})
     many = {"dataset__num_episodes": 50, "n_envs": 2, "dataset__episode_time_s": 5}
     result, printed = run_record(tmp_path / "ray", **on(cluster, ray__episodes_per_task=2), **many)
@@ -247,14 +247,14 @@ class TestOneWorker:
 
     @pytest.fixture(scope="class")
     @classmethod
-    def crew(cls, cluster):
-        with open_crew(RayConfig(address=cluster.address, num_workers=1), Console(file=io.StringIO())) as crew:
-            yield crew
+    def pool(cls, cluster):
+        with open_pool(RayConfig(address=cluster.address, num_workers=1), Console(file=io.StringIO())) as pool:
+            yield pool
 
     @pytest.fixture
-    def shared(self, crew, monkeypatch):
+    def shared(self, pool, monkeypatch):
         for module in (record_module, evaluate_module):
-            monkeypatch.setattr(module, "open_crew", lambda *_: contextlib.nullcontext(crew))
+            monkeypatch.setattr(module, "open_pool", lambda *_: contextlib.nullcontext(pool))
 
     def test_a_cluster_goes_on_with_what_one_machine_began_images_too(self, cluster, shared, tmp_path):
         several = {**ARM, "dataset__num_episodes": 4, "dataset__episode_time_s": 3, "n_envs": 2}
@@ -337,18 +337,18 @@ class TestOneWorker:
         assert files_of(tmp_path / "ray") == files_of(tmp_path / "local")
 
 
-# --- the crew, with workers that cost nothing -------------------------------------------------------------------------
+# --- the pool, with workers that cost nothing -------------------------------------------------------------------------
 
 
-def run_crew(cluster, specs, *, fingerprint=fakes.FINGERPRINT, stop=lambda: False, **settings):
+def run_pool(cluster, specs, *, fingerprint=fakes.FINGERPRINT, stop=lambda: False, **settings):
     """Run episodes with the fake server, one in a task; return their numbers as they come, and what was printed."""
     console = Console(file=io.StringIO(), width=400)
     job = Job(None, None, None, TimingTolerance(), 10, 1, 1)
     got: list[int] = []
-    with open_crew(RayConfig(**{"address": cluster.address, **settings}), console) as crew:
-        crew._server = Path(fakes.__file__).stem
+    with open_pool(RayConfig(**{"address": cluster.address, **settings}), console) as pool:
+        pool._server = Path(fakes.__file__).stem
         try:
-            for result in crew.run(job, fingerprint, [Task(i, [(i, what)]) for i, what in enumerate(specs)], stop):
+            for result in pool.run(job, fingerprint, [Task(i, [(i, what)]) for i, what in enumerate(specs)], stop):
                 got += [pickle.loads(one) for one in result["episodes"]]
         except Exception as error:
             return got, console.file.getvalue(), error
@@ -357,7 +357,7 @@ def run_crew(cluster, specs, *, fingerprint=fakes.FINGERPRINT, stop=lambda: Fals
 
 def test_what_a_worker_raises_ends_the_run_after_what_comes_before(cluster):
     specs = [fakes.SLOW, *[fakes.ECHO] * 4, fakes.RAISE, *[fakes.ECHO] * 50]
-    got, _, error = run_crew(cluster, specs)
+    got, _, error = run_pool(cluster, specs)
     assert got == [0, 1, 2, 3, 4]
     assert type(error) is RuntimeError
     assert "UnpicklableError: no way" in str(error)
@@ -366,7 +366,7 @@ def test_what_a_worker_raises_ends_the_run_after_what_comes_before(cluster):
 
 
 def test_an_episode_that_kills_every_worker_is_given_up(cluster):
-    got, printed, error = run_crew(cluster, [fakes.ECHO, fakes.DIE, fakes.ECHO], num_workers=1)
+    got, printed, error = run_pool(cluster, [fakes.ECHO, fakes.DIE, fakes.ECHO], num_workers=1)
     assert got == [0]
     assert isinstance(error, ClusterError)
     assert "3 workers were lost while they ran episode 1" in str(error)
@@ -374,7 +374,7 @@ def test_an_episode_that_kills_every_worker_is_given_up(cluster):
 
 
 def test_what_workers_print_is_prefixed_and_bounded(cluster):
-    got, printed, error = run_crew(cluster, [fakes.PRINT] * 8)
+    got, printed, error = run_pool(cluster, [fakes.PRINT] * 8)
     assert (got, error) == (list(range(8)), None)
     lines = printed.splitlines()
     assert len(lines) == 21  # twenty, and how many more there are; each once, of whichever worker
@@ -385,7 +385,7 @@ def test_what_workers_print_is_prefixed_and_bounded(cluster):
 def test_a_worker_with_other_versions_is_refused_by_name(cluster, monkeypatch):
     version = metadata.version
     monkeypatch.setattr(metadata, "version", lambda name: "9.9.9" if name == "numpy" else version(name))
-    got, _, error = run_crew(cluster, [fakes.ECHO])
+    got, _, error = run_pool(cluster, [fakes.ECHO])
     assert got == []
     assert isinstance(error, ClusterError)
     assert f"numpy {version('numpy')} there, 9.9.9 here" in str(error)
@@ -393,26 +393,26 @@ def test_a_worker_with_other_versions_is_refused_by_name(cluster, monkeypatch):
 
 
 def test_a_machine_that_computes_something_else_is_refused(cluster):
-    got, _, error = run_crew(cluster, [fakes.ECHO], fingerprint="other")
+    got, _, error = run_pool(cluster, [fakes.ECHO], fingerprint="other")
     assert got == []
     assert isinstance(error, ClusterError)
     assert "other numbers for the same episode" in str(error)
 
 
 def test_workers_that_no_machine_has_room_for_are_refused(cluster):
-    _, _, error = run_crew(cluster, [fakes.ECHO], cpus_per_worker=64)
+    _, _, error = run_pool(cluster, [fakes.ECHO], cpus_per_worker=64)
     assert isinstance(error, ClusterError)
     assert "No machine of the cluster has 64 CPUs" in str(error)
 
 
 def test_how_many_workers_run_at_a_time_is_told_if_more_were_asked_for(cluster):
-    got, printed, error = run_crew(cluster, [fakes.ECHO] * 6, num_workers=5)
+    got, printed, error = run_pool(cluster, [fakes.ECHO] * 6, num_workers=5)
     assert (got, error) == (list(range(6)), None)
     assert "ray.num_workers is 5, and the cluster has room for 2 of 1 CPU: 2 run at a time." in printed
     assert printed.count("1 CPUs and 0 GPUs") == 2  # the machines that have room, by name
     # Nobody is told about workers that there is nothing to do for.
-    assert "at a time" not in run_crew(cluster, [fakes.ECHO] * 2, num_workers=5)[1]
-    assert "at a time" not in run_crew(cluster, [fakes.ECHO] * 6)[1]
+    assert "at a time" not in run_pool(cluster, [fakes.ECHO] * 2, num_workers=5)[1]
+    assert "at a time" not in run_pool(cluster, [fakes.ECHO] * 6)[1]
 
 
 def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(cluster):
@@ -422,11 +422,11 @@ def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(cl
         def ready(self) -> bool:
             return True
 
-    with open_crew(RayConfig(address=cluster.address), Console(file=io.StringIO())):
+    with open_pool(RayConfig(address=cluster.address), Console(file=io.StringIO())):
         others = [ray.remote(Busy).options(num_cpus=1).remote() for _ in range(2)]
         ray.get([one.ready.remote() for one in others])
         # Within the same program, which is so a driver already.
-        _, _, error = run_crew(cluster, [fakes.ECHO], timeout_s=1.0)
+        _, _, error = run_pool(cluster, [fakes.ECHO], timeout_s=1.0)
     assert isinstance(error, ClusterError)
     assert "No worker could be started within 1 s" in str(error)
 
@@ -434,7 +434,7 @@ def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(cl
 def test_the_run_stops_when_it_is_told_to(cluster):
     asked = threading.Event()
     threading.Timer(2, asked.set).start()
-    got, _, error = run_crew(cluster, [fakes.SLOW] * 1000, stop=asked.is_set)
+    got, _, error = run_pool(cluster, [fakes.SLOW] * 1000, stop=asked.is_set)
     assert error is None
     assert got == list(range(len(got)))
     assert len(got) < 1000

@@ -94,7 +94,7 @@ def test_workers_that_share_the_processors_of_this_machine_are_told(monkeypatch)
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr(cluster_module, "free_places", lambda config: 99)  # Ray was told that there are as many
     there = len(os.sched_getaffinity(0))
-    told = cluster_module.tell_crowd(RayConfig(num_workers=there + 3), there + 3)
+    told = cluster_module.describe_crowding(RayConfig(num_workers=there + 3), there + 3)
     assert told == f"{there + 3} workers of 1 CPU share the {there} processors of this machine."
-    assert cluster_module.tell_crowd(RayConfig(num_workers=there), there) == ""
-    assert cluster_module.tell_crowd(RayConfig(address="auto"), there + 3) == ""
+    assert cluster_module.describe_crowding(RayConfig(num_workers=there), there) == ""
+    assert cluster_module.describe_crowding(RayConfig(address="auto"), there + 3) == ""

@@ -55,7 +55,7 @@ def wire() -> Iterator[tuple[int, int]]:
             os.close(end)
 
 
-def hear(inputs: EstopInputs, cause: str) -> None:
+def on_key(inputs: EstopInputs, cause: str) -> None:
     """Wait until a cause is among those that pressed."""
     until(lambda: cause in inputs.causes)
 
@@ -108,7 +108,7 @@ def test_a_callable_that_raises_presses(button, inputs):
         raise OSError("the bus is gone")
 
     inputs.add(broken, "relay", period_s=0.001)
-    hear(inputs, "relay failed: OSError: the bus is gone")
+    on_key(inputs, "relay failed: OSError: the bus is gone")
     assert button.is_pressed()
 
 
@@ -118,8 +118,8 @@ def test_a_callable_that_hangs_presses_and_holds_up_no_other_input(button, wire)
         inputs.add(lambda: let_go.wait(30), "relay", period_s=0.001)
         inputs.add(wire[0], "button")
         os.write(wire[1], b"x")
-        hear(inputs, "button")
-        hear(inputs, "relay does not answer")
+        on_key(inputs, "button")
+        on_key(inputs, "relay does not answer")
         assert inputs.causes == ["button", "relay does not answer"]
         let_go.set()
 

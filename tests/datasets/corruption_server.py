@@ -1,4 +1,6 @@
-"""Records with stock LeRobot in forked processes that kill themselves. Started once, so that a wreck costs no import.
+"""Records with stock LeRobot in forked processes that kill themselves.
+
+Started once, so that a corrupted dataset costs no import.
 
 Reads one JSON job per line and answers with how the child ended.
 """
@@ -47,7 +49,7 @@ def frame(episode: int, index: int, video: str) -> dict[str, Any]:
 
 
 def save_again(dataset: LeRobotDataset, episode: int, video: str) -> None:
-    """Fail to save an episode at its film, as a full disk does, and record it again, longer."""
+    """Fail to save an episode at its video, as a full disk does, and record it again, longer."""
     save_video = dataset_writer.DatasetWriter._save_episode_video
 
     def fail(*args: object, **kwargs: object) -> None:
@@ -76,7 +78,7 @@ def opened(job: dict[str, Any]) -> LeRobotDataset:
         features[CAMERA] = {"dtype": kind, "shape": (32, 48, 3), "names": ["height", "width", "channels"]}
     return LeRobotDataset.create(
         "t/t", fps=10, features=features, root=root, robot_type="toy",
-        use_videos=video in ("film", "stream"), **streaming,
+        use_videos=video in ("video", "stream"), **streaming,
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ class Episode:
     task: list[str]
     metadata: dict[str, Any]
     columns: dict[str, list[Any]]
-    films: dict[str, list[bytes]]
+    videos: dict[str, list[bytes]]
 
 
 def record(root: Path, episodes: list[int], *, video: bool = False, **options: Any) -> Path:
@@ -36,8 +36,8 @@ def record(root: Path, episodes: list[int], *, video: bool = False, **options: A
     return root
 
 
-def pictures(path: Path) -> list[bytes]:
-    """Return every decoded frame of a film."""
+def images(path: Path) -> list[bytes]:
+    """Return every decoded frame of a video."""
     with av.open(str(path)) as container:
         return [frame.to_ndarray(format="rgb24").tobytes() for frame in container.decode(video=0)]
 
@@ -52,24 +52,24 @@ def content(root: Path) -> list[Episode]:
     sentences = dict(zip(tasks["task_index"], tasks["task"], strict=True))
     assert frames["index"].to_pylist() == list(range(frames.num_rows))
     assert [row["episode_index"] for row in light] == list(range(len(light)))
-    found, decoded = [], {path: pictures(path) for path in (root / "videos").glob("*/*/*.mp4")}
+    found, decoded = [], {path: images(path) for path in (root / "videos").glob("*/*/*.mp4")}
     for row in light:
         part = frames.slice(row["dataset_from_index"], row["length"])
         assert set(part["episode_index"].to_pylist()) == {row["episode_index"]}
         assert {sentences[index] for index in part["task_index"].to_pylist()} == set(row["tasks"])
-        films = {}
+        videos = {}
         for key in [name.split("/")[1] for name in row if name.startswith("videos/") and name.endswith("file_index")]:
             file = "chunk-{:03d}/file-{:03d}.mp4".format(*(row[f"videos/{key}/{n}_index"] for n in ("chunk", "file")))
             start = round(row[f"videos/{key}/from_timestamp"] * support.FPS)
-            films[key] = decoded[root / "videos" / key / file][start : start + row["length"]]
-            assert len(films[key]) == row["length"]
+            videos[key] = decoded[root / "videos" / key / file][start : start + row["length"]]
+            assert len(videos[key]) == row["length"]
         columns = {name: part[name].to_pylist() for name in part.column_names if name not in NUMBERS}
-        found.append(Episode(row["tasks"], {n: v for n, v in row.items() if n.startswith("bhd/")}, columns, films))
+        found.append(Episode(row["tasks"], {n: v for n, v in row.items() if n.startswith("bhd/")}, columns, videos))
     return found
 
 
-def assert_sound(root: Path) -> None:
-    """Assert that `bhd-data check` finds no error: counts, files, films, and statistics that are those of the data."""
+def assert_valid(root: Path) -> None:
+    """Assert that `bhd-data check` finds no error: counts, files, videos, and statistics that are those of the data."""
     found = check_dataset(root, lambda robot: {})
     assert [str(one) for one in found.findings if one.severity is Severity.ERROR] == []
 

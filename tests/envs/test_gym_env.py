@@ -95,10 +95,10 @@ def test_observations_hold_what_was_asked_for() -> None:
 def test_it_renders_when_asked_to() -> None:
     env = make(render_mode="rgb_array")
     env.reset(seed=0)
-    picture = env.render()
-    assert picture is not None
-    assert picture.shape == (240, 320, 3)
-    assert picture.std() > 0
+    image = env.render()
+    assert image is not None
+    assert image.shape == (240, 320, 3)
+    assert image.std() > 0
     env.close()
     assert make().render() is None
 

@@ -148,9 +148,9 @@ def test_attributes_are_found_and_set() -> None:
     assert env.get_attr("task") == (AVOID,) * N
     assert env.call("task_description") == ("Roam without touching anything.",) * N
     assert env.get_attr("render_mode") == ("rgb_array",) * N
-    pictures = env.call("render")
-    assert len(pictures) == N
-    np.testing.assert_array_equal(np.stack(pictures[:2])[1], pictures[1])
+    images = env.call("render")
+    assert len(images) == N
+    np.testing.assert_array_equal(np.stack(images[:2])[1], images[1])
     with pytest.raises(AttributeError):
         env.get_attr("colour")
     env.set_attr("split", "held_out")

@@ -15,7 +15,7 @@ import pytest
 from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.evaluation import plots, run
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
-from bhd_lerobot.evaluation.plots import OUTCOMES, telling_episodes
+from bhd_lerobot.evaluation.plots import OUTCOMES, notable_episodes
 from bhd_lerobot.evaluation.results import summarise, write_json
 from bhd_lerobot.evaluation.statistics import Estimate
 from bhd_lerobot.evaluation.text import number, percent, sentences
@@ -98,29 +98,29 @@ def test_charts_are_well_formed_and_name_every_brain(page):
     assert re.search(r'src="data:image/png;base64,[^"]{1000,}"', text)
 
 
-def test_films_are_h264_in_the_page_or_the_page_says_why_there_are_none(page):
+def test_videos_are_h264_in_the_page_or_the_page_says_why_there_are_none(page):
     import av
 
     result, text = page
-    films = sorted((result.output_dir / "videos").glob("*.mp4"))
-    if not films:
-        assert "No films:" in text
+    videos = sorted((result.output_dir / "videos").glob("*.mp4"))
+    if not videos:
+        assert "No videos:" in text
         pytest.skip("no renderer here")
-    by_brain = {label: [one for one in films if one.name.startswith(label)] for label in result.results.brains}
+    by_brain = {label: [one for one in videos if one.name.startswith(label)] for label in result.results.brains}
     for label, one in result.results.brains.items():
         failed = one.episodes - one.successes
-        assert len(by_brain[label]) == (min(failed, run.FILMS) or 1)
-    with av.open(str(films[0])) as container:
+        assert len(by_brain[label]) == (min(failed, run.VIDEOS) or 1)
+    with av.open(str(videos[0])) as container:
         assert container.streams.video[0].codec_context.name == "h264"
-    assert text.count("<video") == len(films) == text.count('poster="data:image/jpeg')
+    assert text.count("<video") == len(videos) == text.count('poster="data:image/jpeg')
 
 
-def test_films_that_are_too_large_stay_beside_the_page(tmp_path, monkeypatch):
-    monkeypatch.setattr("bhd_lerobot.evaluation.report.FILM_BYTES", 10)
+def test_videos_that_are_too_large_stay_beside_the_page(tmp_path, monkeypatch):
+    monkeypatch.setattr("bhd_lerobot.evaluation.report.VIDEO_BYTES", 10)
     result, _ = run_eval(tmp_path, only="[old]", videos=None, n_episodes=1)
     text = result.report.read_text()
     assert "<video" not in text
-    assert "too large for this page" in text or "No films:" in text
+    assert "too large for this page" in text or "No videos:" in text
 
 
 def test_a_brain_without_a_rival_has_no_paired_section(tmp_path):
@@ -147,14 +147,14 @@ def test_every_way_to_end_has_a_colour_and_no_two_look_alike():
     assert len(set(OUTCOMES.values())) == len(OUTCOMES)
 
 
-def test_telling_episodes_are_the_unusual_ones_and_the_first():
+def test_notable_episodes_are_the_unusual_ones_and_the_first():
     arena = make_arena("empty", 0)
 
     def ran(failed: set[int], count: int = 30) -> dict[int, Trajectory]:
         return {n: Trajectory("", arena, np.zeros((2, 2)), n not in failed) for n in range(count)}
 
-    assert telling_episodes({"a": ran(set())}) == [0, 1, 2, 3, 4, 5]
-    assert telling_episodes({"a": ran({17, 20, 25, 28}), "b": ran({20}), "never": ran(set(range(30)))}) == [
+    assert notable_episodes({"a": ran(set())}) == [0, 1, 2, 3, 4, 5]
+    assert notable_episodes({"a": ran({17, 20, 25, 28}), "b": ran({20}), "never": ran(set(range(30)))}) == [
         0,
         1,
         2,
@@ -162,7 +162,7 @@ def test_telling_episodes_are_the_unusual_ones_and_the_first():
         20,
         25,
     ]
-    assert telling_episodes({"a": ran(set(), 2)}) == [0, 1]
+    assert notable_episodes({"a": ran(set(), 2)}) == [0, 1]
 
 
 def test_numbers_in_words():

@@ -88,11 +88,11 @@ class Rig:
             self.other.words[Word.PAUSE] = 1
 
     def tick(self, count: int = 1) -> None:
-        """Run some ticks, each stretch of which goes on with the time of the one before."""
+        """Run some ticks, each segment of which goes on with the time of the one before."""
         self.until = self.ticks + count
         words = self.other.words
         words[Word.PAUSE] = 0
-        # The grid goes on: a stretch that starts anew at the next point of the same grid.
+        # The grid goes on: a segment that starts anew at the next point of the same grid.
         next_due = self.start + self.ticks * TICK
         self.now = max(self.now, next_due - TICK // 2)
         self.cerebellum_time(next_due)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.realtime.frame_log import FrameCollector, FrameLog
 
-STATE = np.dtype([(name, np.int64) for name in ("tick", "stretch", "due_ns", "start_ns", "executed")])
+STATE = np.dtype([(name, np.int64) for name in ("tick", "segment", "due_ns", "start_ns", "executed")])
 F = 5  # ticks in a frame
 
 
@@ -19,10 +19,10 @@ class Rig:
         self.reader = self.log.reader()
         self.published = {0: 0}
 
-    def tick(self, tick: int, stretch: int = 1, lateness: int = 0) -> None:
-        executed = self.published.setdefault(stretch, 0)
-        self.published[stretch] += 1
-        self.ring.publish(np.array((tick, stretch, 1000 * tick, 1000 * tick + lateness, executed), STATE))
+    def tick(self, tick: int, segment: int = 1, lateness: int = 0) -> None:
+        executed = self.published.setdefault(segment, 0)
+        self.published[segment] += 1
+        self.ring.publish(np.array((tick, segment, 1000 * tick, 1000 * tick + lateness, executed), STATE))
 
     def boundaries(self) -> list[tuple[int, int]]:
         found = []
@@ -88,7 +88,7 @@ def test_a_new_stretch_starts_at_frame_0_and_counts_its_own_drops() -> None:
     rig.collector.drain()
     assert rig.collector.drops > 0
     for tick in range(-1, 2):
-        rig.tick(tick, stretch=2)
+        rig.tick(tick, segment=2)
     rig.boundaries()
     rig.collector.drain()
     assert rig.boundaries() == [(0, -1)]

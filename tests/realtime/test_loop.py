@@ -307,7 +307,7 @@ def test_a_pause_ends_the_stretch_and_the_next_one_starts_at_tick_0():
     loop.now += 12345 * MS
     begin = loop.now
     second = loop.run(7)
-    assert loop.words[Word.STRETCH] == 2
+    assert loop.words[Word.SEGMENT] == 2
     assert loop.words[Word.START] == begin
     assert [slot.index for slot in loop.slots[5:]] == list(range(7))
     assert loop.slots[5].due_ns == begin

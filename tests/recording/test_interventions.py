@@ -11,7 +11,7 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.baselines import NoopConfig, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Goals, Mixed, Observation
-from bhd_lerobot.policies.dagger.brain import CorrectedBrain, CorrectedConfig
+from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
@@ -79,8 +79,8 @@ class Wave:
 )
 def test_a_learner_that_nobody_corrects_drives_as_if_alone(kind: str, expert: Any) -> None:
     random = RandomConfig(scale=0.1)
-    corrected = make_brain(CorrectedConfig(random, expert, **NOBODY))
-    alone, together = run(kind, RandomBrain(random)), run(kind, corrected)
+    dagger = make_brain(DaggerConfig(random, expert, **NOBODY))
+    alone, together = run(kind, RandomBrain(random)), run(kind, dagger)
     for first, second in zip(alone, together, strict=True):
         assert_same(first, second)
         assert first.interventions is None
@@ -89,7 +89,7 @@ def test_a_learner_that_nobody_corrects_drives_as_if_alone(kind: str, expert: An
 
 
 def test_exactly_the_frames_that_the_expert_drove_are_flagged_and_its_actions_are_recorded() -> None:
-    settings = CorrectedConfig(NoopConfig(), GapFollowerConfig(), **{**NOBODY, "patience_s": 0.5, "hold_s": 0.3})
+    settings = DaggerConfig(NoopConfig(), GapFollowerConfig(), **{**NOBODY, "patience_s": 0.5, "hold_s": 0.3})
     for episode in run("turtlebot3", make_brain(settings)):
         event, action = episode.columns[keys.EVENT], episode.columns[keys.ACTION]
         flags = (np.arange(20) % 8) >= 5
@@ -119,8 +119,8 @@ class Spy(GapFollowerBrain):
 
 def test_a_rule_has_seen_the_whole_episode_and_does_what_it_would_do_with_that_memory() -> None:
     spy = Spy()
-    settings = CorrectedConfig(RandomConfig(), GapFollowerConfig(), **{**NOBODY, "patience_s": 1.0})
-    (episode,) = run("turtlebot3", CorrectedBrain(settings, RandomBrain(RandomConfig()), spy), n=1, episodes=1)
+    settings = DaggerConfig(RandomConfig(), GapFollowerConfig(), **{**NOBODY, "patience_s": 1.0})
+    (episode,) = run("turtlebot3", DaggerBrain(settings, RandomBrain(RandomConfig()), spy), n=1, episodes=1)
     np.testing.assert_array_equal(np.array(spy.seen)[:, 0], episode.columns[keys.OBSERVATION_STATE].astype(float))
     other = GapFollowerBrain()
     simulation = make_simulation(TurtleBot3Config(beams=36), 1)
@@ -133,15 +133,15 @@ def test_a_rule_has_seen_the_whole_episode_and_does_what_it_would_do_with_that_m
 # --- goals in the middle of an episode --------------------------------------------------------------------------------
 
 
-def corrected_wave(**values: Any) -> CorrectedBrain:
-    settings = CorrectedConfig(NoopConfig(), ReachBrainConfig(), **{**NOBODY, **values})
-    return CorrectedBrain(settings, Wave(), ReachBrain())
+def dagger_wave(**values: Any) -> DaggerBrain:
+    settings = DaggerConfig(NoopConfig(), ReachBrainConfig(), **{**NOBODY, **values})
+    return DaggerBrain(settings, Wave(), ReachBrain())
 
 
 @pytest.mark.parametrize("hold_s", [None, 0.4])
 def test_goals_take_over_an_arm_in_motion_without_a_jump_and_give_it_back(hold_s: float | None) -> None:
     limits = ur5().limits
-    episodes = run("ur5", corrected_wave(patience_s=0.6, hold_s=hold_s), seconds=2.4)
+    episodes = run("ur5", dagger_wave(patience_s=0.6, hold_s=hold_s), seconds=2.4)
     for episode in episodes:
         columns = episode.columns
         assert episode.goal_frames is not None
@@ -170,10 +170,10 @@ def test_goals_take_over_an_arm_in_motion_without_a_jump_and_give_it_back(hold_s
 
 def test_an_episode_does_not_depend_on_those_beside_it() -> None:
     for kind, brain in (
-        ("ur5", lambda: corrected_wave(patience_s=0.4, hold_s=0.5)),
+        ("ur5", lambda: dagger_wave(patience_s=0.4, hold_s=0.5)),
         (
             "turtlebot3",
-            lambda: make_brain(CorrectedConfig(RandomConfig(), GapFollowerConfig(), patience_s=0.5, hold_s=0.4)),
+            lambda: make_brain(DaggerConfig(RandomConfig(), GapFollowerConfig(), patience_s=0.5, hold_s=0.4)),
         ),
     ):
         for one, other in zip(run(kind, brain(), n=1), run(kind, brain(), n=3), strict=True):
@@ -184,13 +184,13 @@ def test_an_episode_does_not_depend_on_those_beside_it() -> None:
 
 # --- datasets --------------------------------------------------------------------------------------------------------
 
-AVOID = {"brain__type": "corrected", "brain__learner__type": "random", "brain__expert__type": "gap_follower"}
+AVOID = {"brain__type": "dagger", "brain__learner__type": "random", "brain__expert__type": "gap_follower"}
 TURNS = {"brain__patience_s": 1, "brain__hold_s": 1}
 REACH = {
     "robot__type": "ur5",
     "robot__beams": None,
     "task__type": "reach",
-    "brain__type": "corrected",
+    "brain__type": "dagger",
     "brain__learner__type": "random",
     "brain__learner__scale": 0.05,
     "brain__expert__type": "reach",
@@ -222,7 +222,7 @@ def test_the_dataset_is_the_same_for_any_number_of_simulations_and_replays_bit_e
         wanted[-1] = False
         assert ((event == Event.INTERVENTION) == wanted).all()
         brain = json.loads(row["bhd/brain"])
-        assert (brain["type"], brain["learner"]["type"]) == ("corrected", "random")
+        assert (brain["type"], brain["learner"]["type"]) == ("dagger", "random")
         assert Replay(one, index).open_loop().identical
 
 
@@ -241,7 +241,7 @@ def test_training_finds_the_flagged_frames(tmp_path: Path) -> None:
 
 def test_a_pick_that_the_learner_does_not_even_begin_succeeds() -> None:
     simulation = make_simulation(UR5Config(), 4)
-    brain = make_brain(CorrectedConfig(NoopConfig(), PickBrainConfig(), stall_s=0.5))
+    brain = make_brain(DaggerConfig(NoopConfig(), PickBrainConfig(), stall_s=0.5))
     loop = EpisodeLoop(simulation, make_task(PickConfig(), 4, 25), brain)
     for episode in loop.run([EpisodeSpec(i, 2 * i) for i in range(4)]):
         assert episode.outcome.success

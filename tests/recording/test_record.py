@@ -198,7 +198,7 @@ def test_a_failing_save_leaves_the_earlier_episodes_and_names_the_cause(tmp_path
     assert dataset_info(tmp_path / "d").compact
 
 
-def test_the_run_folder_has_the_resolved_configuration_and_a_picture(tmp_path):
+def test_the_run_folder_has_the_resolved_configuration_and_a_image(tmp_path):
     result, text = run_record(tmp_path / "d")
     saved = tmp_path / "d_run" / "config.yaml"
     again = parse(RecordConfig, [f"--config_path={saved}"])
@@ -208,15 +208,15 @@ def test_the_run_folder_has_the_resolved_configuration_and_a_picture(tmp_path):
         assert part in text
 
 
-def test_the_film_is_made_where_images_can_be_rendered(tmp_path):
+def test_the_video_is_made_where_images_can_be_rendered(tmp_path):
     import av
 
     try:
         run_record(tmp_path / "d", preview_video="true")
     except RenderingError as error:
         pytest.skip(f"no OpenGL here: {error}")
-    with av.open(str(tmp_path / "d_run" / "episode.mp4")) as film:
-        frames = list(film.decode(video=0))
+    with av.open(str(tmp_path / "d_run" / "episode.mp4")) as video:
+        frames = list(video.decode(video=0))
     assert len(frames) >= 10
     assert frames[0].to_ndarray(format="rgb24").std() > 5
 
@@ -228,7 +228,7 @@ def test_without_opengl_the_recording_goes_on_and_says_so(tmp_path, monkeypatch)
     monkeypatch.setattr(record_module, "Preview", no_gl)
     result, text = run_record(tmp_path / "d", preview_video="null")
     assert result.recorded == 3
-    assert "No film of an episode: No image can be rendered here" in text
+    assert "No video of an episode: No image can be rendered here" in text
     with pytest.raises(RenderingError):
         run_record(tmp_path / "e", preview_video="true")
     assert not (tmp_path / "e").exists()

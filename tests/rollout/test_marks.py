@@ -54,13 +54,13 @@ def test_what_the_robot_did_stays(hard: Event) -> None:
 
 def test_keys() -> None:
     marks = Marks(2)
-    marks.hear(b"xI")
+    marks.on_key(b"xI")
     assert marks.frame(NOTHING, ALL)[1].tolist() == [True, False]
-    marks.hear(b"i")
+    marks.on_key(b"i")
     assert not marks.frame(NOTHING, ALL)[1].any()
-    marks.hear(b"f\xff")
+    marks.on_key(b"f\xff")
     assert marks.frame(NOTHING, ALL)[0].tolist() == [Event.FAILURE, 0]
-    marks.hear(b"fs")
+    marks.on_key(b"fs")
     assert marks.frame(NOTHING, ALL)[0].tolist() == [Event.SUCCESS, 0]
 
 

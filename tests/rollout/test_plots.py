@@ -1,4 +1,4 @@
-"""Pictures: every trajectory gets a panel, whatever their number."""
+"""Images: every trajectory gets a panel, whatever their number."""
 
 import numpy as np
 import pytest

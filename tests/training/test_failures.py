@@ -225,11 +225,11 @@ def test_metrics_that_cannot_be_written_leave_the_checkpoint(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         append(self, row)
 
-    def no_picture(*_: Any) -> None:
+    def no_image(*_: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(MetricsFile, "append", full)
-    monkeypatch.setattr(output, "draw_loss", no_picture)
+    monkeypatch.setattr(output, "draw_loss", no_image)
     with pytest.raises(BhdError, match=r"metrics of step 15 .*No space left.*000010 is intact.*resume"):
         run_train(options(data, tmp_path / "run", MLP))
     monkeypatch.undo()

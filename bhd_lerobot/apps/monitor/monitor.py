@@ -82,7 +82,7 @@ def find(name: str | None) -> LiveBlock:
 
 
 class Keys:
-    """Keys of a terminal, on a thread of their own: a stop does not wait for a picture that is being drawn.
+    """Keys of a terminal, on a thread of their own: a stop does not wait for an image that is being drawn.
 
     Args:
         estop: what an emergency stop does.

@@ -87,7 +87,7 @@ class MonitorState:
         clock: whose time it lives in.
         uptime: since it was started.
         phase: what the loop does, a name of `Phase`.
-        episode: number of the stretch of ticks that runs or ran last, from 1; 0 before the first.
+        episode: number of the segment of ticks that runs or ran last, from 1; 0 before the first.
         episode_time: how long that has been running.
         mode: name of the cerebellum's `Mode`.
         estop: the word of the emergency stop is set.
@@ -210,7 +210,7 @@ class Sampler:
             clock="realtime",
             uptime=(now - self._started) / NANOSECONDS,
             phase=phase.name,
-            episode=int(words[Word.STRETCH]),
+            episode=int(words[Word.SEGMENT]),
             episode_time=max(0, now - int(words[Word.START])) / NANOSECONDS if running else None,
             estop=bool(words[Word.ESTOP]),
             control_rate=rates.get("executed"),
@@ -264,9 +264,9 @@ class Sampler:
         }
 
     def _rates(self, now: int, words: Any, state: Any) -> dict[str, float]:
-        """Return how often things happen in a second, over the window that lies within the present stretch."""
-        stretch = int(words[Word.STRETCH])
-        if state is None or int(state["stretch"]) != stretch or words[Word.PHASE] != Phase.RUNNING:
+        """Return how often things happen in a second, over the window that lies within the present segment."""
+        segment = int(words[Word.SEGMENT])
+        if state is None or int(state["segment"]) != segment or words[Word.PHASE] != Phase.RUNNING:
             self._past.clear()
             return {}
         counts = {"executed": int(state["executed"]), "setpoints": int(state["setpoints"])}
@@ -274,9 +274,9 @@ class Sampler:
             counts |= {f"{key}.{name}": int(n) for name, n in zip(names, state[key], strict=True)}
         if self._frames is not None:
             counts["frames"] = len(self._frames)
-        newest = _Counts(stretch, now, int(state["start_ns"]), counts)
+        newest = _Counts(segment, now, int(state["start_ns"]), counts)
         past = self._past
-        while past and (past[0].stretch != stretch or (len(past) > 1 and now - past[1].now > _WINDOW_NS)):
+        while past and (past[0].segment != segment or (len(past) > 1 and now - past[1].now > _WINDOW_NS)):
             past.popleft()
         past.append(newest)
         oldest = past[0]
@@ -310,7 +310,7 @@ class Sampler:
 
 @dataclass(frozen=True)
 class _Counts:
-    stretch: int
+    segment: int
     now: int
     started: int
     counts: dict[str, int]

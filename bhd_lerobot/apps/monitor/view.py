@@ -1,4 +1,4 @@
-"""How `bhd-monitor` looks: from a state to text. Pure: the same state gives the same picture.
+"""How `bhd-monitor` looks: from a state to text. Pure: the same state gives the same image.
 
 Everything has its place and a fixed width, so that nothing jumps when numbers change. 80 columns and 24 lines hold all.
 """
@@ -30,7 +30,7 @@ _NOTHING = "–"
 
 
 def render(state: MonitorState, *, height: int | None = None, message: str = "", keys: str = KEYS) -> Group:
-    """Return the picture of a state.
+    """Return the image of a state.
 
     Args:
         state: what is shown.

@@ -63,7 +63,7 @@ class ViewedDataset:
             RootLock(self.root).release()
         stamp = stamp_of(self.root)
         try:
-            state = load_state(self.root, films=False)  # a missing film is said in its place on the page
+            state = load_state(self.root, videos=False)  # a missing video is said in its place on the page
             if not state.info["fps"] > 0:
                 raise corrupt(info, f"its fps is {state.info['fps']!r}")
             return _Content(state, stamp, _summary(state, stamp))
@@ -136,8 +136,8 @@ class ViewedDataset:
             self._content = self._read()
             self._packed.clear()
 
-    def film(self, key: str, slot: layout.Slot) -> Path | None:
-        """Return the file of a camera's film, or None if there is no such camera or file.
+    def video(self, key: str, slot: layout.Slot) -> Path | None:
+        """Return the file of a camera's video, or None if there is no such camera or file.
 
         Raises:
             DatasetError: a link leads out of the dataset. It is looked at each time: links can be made meanwhile.
@@ -148,7 +148,7 @@ class ViewedDataset:
         return path if path.is_file() else None
 
     def image(self, index: int, key: str, frame: int) -> bytes | None:
-        """Return the picture of a camera whose images lie in the data files, or None if there is no such picture.
+        """Return the image of a camera whose images lie in the data files, or None if there is no such image.
 
         Raises:
             DatasetError: there is no such episode, or the dataset has changed on disk.
@@ -203,7 +203,7 @@ def _summary(state: DatasetState, stamp: str) -> dict[str, Any]:
         "robot": state.info.get("robot_type"),
         "fps": state.info["fps"],
         "frames": state.num_frames,
-        "cameras": [_camera(key, feature) for key, feature in state.info["features"].items() if _is_film(feature)],
+        "cameras": [_camera(key, feature) for key, feature in state.info["features"].items() if _is_video(feature)],
         "unfinished": (state.root / layout.STAGING).exists(),
         "tasks": list(tasks),
         "outcomes": _possible(state),
@@ -273,7 +273,7 @@ def _listed(text: Any) -> int:
         return 0
 
 
-def _is_film(feature: dict[str, Any]) -> bool:
+def _is_video(feature: dict[str, Any]) -> bool:
     return feature["dtype"] in ("video", "image")
 
 

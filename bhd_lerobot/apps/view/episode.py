@@ -57,7 +57,7 @@ def packed_episode(state: DatasetState, row: Row, table: pa.Table) -> bytes:
         "not_finite": {key: count for key, values in columns.items() if (count := _not_finite(values))},
         "views": views,
         "scene": scene_of(row),
-        "films": [_film(row, key) for key, one in features.items() if one["dtype"] in ("video", "image")],
+        "videos": [_video(row, key) for key, one in features.items() if one["dtype"] in ("video", "image")],
     }
     return pack(header, {**columns, **{f"view.{name}": values for name, values in places.items()}})
 
@@ -119,7 +119,7 @@ def _modes(modes: NDArray | None) -> list[dict[str, Any]]:
 
 
 def _runs(values: Iterable[Any]) -> list[list[Any]]:
-    """Return stretches of equal values as [first frame, frame after the last, value]; what is empty is left out."""
+    """Return segments of equal values as [first frame, frame after the last, value]; what is empty is left out."""
     runs: list[list[Any]] = []
     last: Any = None
     for frame, value in enumerate(values):
@@ -161,8 +161,8 @@ def _goals(row: Row) -> list[list[Any]]:
     return [[one[0], one[1], one[3], one[4]] for one in results if isinstance(one, list) and len(one) == 5]
 
 
-def _film(row: Row, key: str) -> dict[str, Any]:
-    """Return where in which file a camera's film of the episode lies."""
+def _video(row: Row, key: str) -> dict[str, Any]:
+    """Return where in which file a camera's video of the episode lies."""
     place = f"videos/{key}"
     if f"{place}/chunk_index" not in row:
         return {"key": key, "kind": "image"}

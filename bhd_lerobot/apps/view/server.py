@@ -1,4 +1,4 @@
-"""The web server of `bhd-data view`: the page, the dataset as the page wants it, and the films."""
+"""The web server of `bhd-data view`: the page, the dataset as the page wants it, and the videos."""
 
 import asyncio
 import re
@@ -24,7 +24,7 @@ _NUMBER = re.compile(r"[0-9]{1,9}")
 def application(dataset: ViewedDataset) -> web.Application:
     """Return the server's application."""
     token = new_token()
-    app = web.Application(middlewares=[guard(token), _tell_errors], client_max_size=64 * 1024)
+    app = web.Application(middlewares=[guard(token), _respond_to_errors], client_max_size=64 * 1024)
     app[_DATASET], app[_TOKEN] = dataset, token
     app.on_response_prepare.append(add_headers)
     app.router.add_get("/", _page)
@@ -34,7 +34,7 @@ def application(dataset: ViewedDataset) -> web.Application:
     app.router.add_get("/api/episodes/{index}", _episode)
     app.router.add_post("/api/episodes/{index}/mark", _mark)
     app.router.add_get("/api/episodes/{index}/images/{key}/{frame}", _image)
-    app.router.add_get("/films/{key}/{chunk}/{file}.mp4", _film)
+    app.router.add_get("/videos/{key}/{chunk}/{file}.mp4", _video)
     app.router.add_static("/static", STATIC)
     return app
 
@@ -79,7 +79,7 @@ async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None])
 
 
 @web.middleware
-async def _tell_errors(request: web.Request, handler: Any) -> web.StreamResponse:
+async def _respond_to_errors(request: web.Request, handler: Any) -> web.StreamResponse:
     """Tell the page what went wrong as it tells a terminal."""
     try:
         response: web.StreamResponse = await handler(request)
@@ -121,11 +121,11 @@ async def _episode(request: web.Request) -> web.Response:
     return web.Response(body=packed, content_type="application/octet-stream", headers={"ETag": etag})
 
 
-async def _film(request: web.Request) -> web.StreamResponse:
+async def _video(request: web.Request) -> web.StreamResponse:
     slot = _number(request, "chunk"), _number(request, "file")
-    path = request.app[_DATASET].film(request.match_info["key"], slot)
+    path = request.app[_DATASET].video(request.match_info["key"], slot)
     if path is None:
-        raise web.HTTPNotFound(text="There is no such film.\n")
+        raise web.HTTPNotFound(text="There is no such video.\n")
     return web.FileResponse(path, headers={"Content-Type": "video/mp4"})  # it knows ranges and conditions
 
 
@@ -133,7 +133,7 @@ async def _image(request: web.Request) -> web.Response:
     dataset, key = request.app[_DATASET], request.match_info["key"]
     content = await asyncio.to_thread(dataset.image, _number(request, "index"), key, _number(request, "frame"))
     if content is None:
-        raise web.HTTPNotFound(text="There is no such picture.\n")
+        raise web.HTTPNotFound(text="There is no such image.\n")
     kind = "image/png" if content.startswith(b"\x89PNG") else "image/jpeg"
     return web.Response(body=content, content_type=kind)
 

@@ -30,11 +30,11 @@ _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "d
 
 def add_to(commands: Commands) -> None:
     """Add `check`."""
-    help_text = "is a dataset sound? Exit status 0 if it is, 1 if not; changes nothing without --fix"
+    help_text = "is a dataset valid? Exit status 0 if it is, 1 if not; changes nothing without --fix"
     command = add_command(commands, "check", help_text, _run)
     command.add_argument("--json", action="store_true", help="print everything as JSON")
     command.add_argument("--strict", action="store_true", help="a warning is enough for exit status 1")
-    command.add_argument("--no-videos", action="store_true", help="leave the films out, which take longest")
+    command.add_argument("--no-videos", action="store_true", help="leave the videos out, which take longest")
     command.add_argument(
         "--fix", action="store_true", help="compute statistics and counts anew where they are wrong, and check again"
     )
@@ -49,14 +49,14 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, videos: bool) -> int:
-    """Check a dataset and print what was found; return 0 if it is sound and 1 if it is not.
+    """Check a dataset and print what was found; return 0 if it is valid and 1 if it is not.
 
     Args:
         root: the dataset.
         console: where it is printed.
         as_json: print plain values.
         is_strict: a warning is enough to call it unsound.
-        videos: read the films, too.
+        videos: read the videos, too.
 
     Raises:
         DatasetLockedError: it is being recorded or changed.
@@ -64,16 +64,16 @@ def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, video
     """
     if is_being_written(root):
         raise DatasetLockedError(
-            f"{root} is being recorded or changed at this moment, so it is neither sound nor not. Check it when "
+            f"{root} is being recorded or changed at this moment, so it is neither valid nor not. Check it when "
             "that has ended."
         )
     found = check_dataset(root, limits_of, videos=videos)
-    is_sound = found.worst < (Severity.WARNING if is_strict else Severity.ERROR)
+    is_valid = found.worst < (Severity.WARNING if is_strict else Severity.ERROR)
     if as_json:
-        print(json.dumps(_plain(found, is_sound), indent=1))
+        print(json.dumps(_plain(found, is_valid), indent=1))
     else:
-        _print(found, console, is_sound)
-    return 0 if is_sound else 1
+        _print(found, console, is_valid)
+    return 0 if is_valid else 1
 
 
 def limits_of(robot_type: str | None) -> Limits:
@@ -92,7 +92,7 @@ def limits_of(robot_type: str | None) -> Limits:
     return {keys.APPLIED_ACTION: ranges, **({keys.OBSERVATION_STATE: ranges} if isinstance(body, Arm) else {})}
 
 
-def _print(found: DatasetCheck, console: Console, is_sound: bool) -> None:
+def _print(found: DatasetCheck, console: Console, is_valid: bool) -> None:
     if found.findings:
         table = Table(title=str(found.root), title_justify="left")
         for heading in ("", "check", "where", "what"):
@@ -105,7 +105,7 @@ def _print(found: DatasetCheck, console: Console, is_sound: bool) -> None:
     errors, warnings = found.count(Severity.ERROR), found.count(Severity.WARNING)
     console.print(
         f"{found.root}: {found.episodes} episodes, {found.frames} frames: "
-        f"{'sound' if is_sound else 'not sound'}, {_some(errors, 'error')}, {_some(warnings, 'warning')}.",
+        f"{'valid' if is_valid else 'not valid'}, {_some(errors, 'error')}, {_some(warnings, 'warning')}.",
         soft_wrap=True,
         highlight=False,
     )
@@ -115,10 +115,10 @@ def _some(count: int, name: str) -> str:
     return f"{count or 'no'} {name}{'' if count == 1 else 's'}"
 
 
-def _plain(found: DatasetCheck, is_sound: bool) -> dict[str, object]:
+def _plain(found: DatasetCheck, is_valid: bool) -> dict[str, object]:
     return {
         "root": str(found.root),
-        "sound": is_sound,
+        "valid": is_valid,
         "episodes": found.episodes,
         "frames": found.frames,
         "checks": list(CHECKS),

@@ -45,7 +45,7 @@ def add_to(commands: Commands) -> None:
     command.add_argument("--episodes", metavar="LIST", help="which, such as 0,3,5-9; all if left out")
     command.add_argument("--one_bag", action="store_true", help="all episodes in one bag, which is --output itself")
     command.add_argument("--twist", action="store_true", help="commands of a base as Twist instead of TwistStamped")
-    command.add_argument("--compressed_images", action="store_true", help="pictures as JPEG instead of raw")
+    command.add_argument("--compressed_images", action="store_true", help="images as JPEG instead of raw")
     command.add_argument(
         "--start_time", type=float, default=START_S, metavar="S",
         help=f"when the first episode starts, seconds since 1970 (default: {START_S})",

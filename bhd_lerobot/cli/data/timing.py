@@ -11,12 +11,12 @@ from bhd_lerobot.datasets.timing.report import load_timing
 from bhd_lerobot.datasets.timing.tables import print_timing
 from bhd_lerobot.errors import ConfigError
 
-_PICTURES = (".png", ".pdf", ".svg")
+_IMAGES = (".png", ".pdf", ".svg")
 
 
 def add_to(commands: Commands) -> None:
     """Add `timing`."""
-    help_text = "how punctual a recording was: tables and a picture; changes nothing"
+    help_text = "how punctual a recording was: tables and an image; changes nothing"
     command = add_command(commands, "timing", help_text, _run)
     command.add_argument("--json", action="store_true", help="print everything as JSON")
     command.add_argument("--episode", metavar="NUMBER", type=int, help="this episode only")
@@ -24,7 +24,7 @@ def add_to(commands: Commands) -> None:
         "--output",
         metavar="FILE",
         type=Path,
-        help="picture, PNG, PDF or SVG; outputs/timing/NAME.png if nothing, and none with --json",
+        help="image, PNG, PDF or SVG; outputs/timing/NAME.png if nothing, and none with --json",
     )
 
 
@@ -41,15 +41,15 @@ def timing(root: Path, console: Console, episode: int | None, output: Path | Non
         root: the dataset.
         console: where it is printed.
         episode: the only episode that is wanted; all if None.
-        output: where the picture goes; `outputs/timing` if None, and nowhere with `as_json`.
+        output: where the image goes; `outputs/timing` if None, and nowhere with `as_json`.
         as_json: print plain values.
 
     Raises:
         DatasetError: there is no such dataset or episode, or it says nothing about its timing.
-        ConfigError: the picture cannot be written.
+        ConfigError: the image cannot be written.
     """
-    if output is not None and output.suffix.lower() not in _PICTURES:
-        raise ConfigError(f"--output is {str(output)!r}; the picture can be one of {', '.join(_PICTURES)}.")
+    if output is not None and output.suffix.lower() not in _IMAGES:
+        raise ConfigError(f"--output is {str(output)!r}; the image can be one of {', '.join(_IMAGES)}.")
     report = load_timing(root, episode)
     if as_json:
         print(json.dumps(report.values(), indent=1))
@@ -66,6 +66,6 @@ def timing(root: Path, console: Console, episode: int | None, output: Path | Non
         output.parent.mkdir(parents=True, exist_ok=True)
         draw_timing(report, output)
     except OSError as error:
-        raise ConfigError(f"The picture {output} cannot be written: {error.strerror}. Set --output.") from error
+        raise ConfigError(f"The image {output} cannot be written: {error.strerror}. Set --output.") from error
     if not as_json:
-        console.print(f"Picture: {output}")
+        console.print(f"Image: {output}")

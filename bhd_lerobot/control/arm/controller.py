@@ -63,7 +63,7 @@ class ArmController(Controller):
 
     # --- motion ------------------------------------------------------------------------------------------------------
 
-    def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
+    def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
         """Head for new setpoints; goals that are still followed end, because the newer command counts."""
         # Commands are checked when they are sent; a queue in shared memory is written by another process.
         if not np.isfinite(values).all() and (bad := mask & ~np.isfinite(values).all(axis=1)).any():
@@ -78,7 +78,7 @@ class ArmController(Controller):
             # on top of what is allowed.
             self.velocity -= np.where(left[:, None], self.acceleration * self._half_tick, 0.0)
             self.goals.drop_for_setpoint(mask)
-        self.setpoints.head_for(values, mask, self.command)
+        self.setpoints.set_setpoint(values, mask, self.command)
 
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
         """Decelerate to rest; all goals of these arms end, with the cause as their result."""

@@ -86,7 +86,7 @@ class Equilibrium:
         )
         self._feed, self._feed_opening = np.zeros((n, 6)), np.zeros((n, 1))
 
-    def head_for(self, position: Array, rotation: Array, opening: Array, mask: NDArray[np.bool_]) -> None:
+    def set_setpoint(self, position: Array, rotation: Array, opening: Array, mask: NDArray[np.bool_]) -> None:
         """Head for new setpoints.
 
         Args:

@@ -141,7 +141,7 @@ class ImpedanceController(Controller):
 
     # --- motion ------------------------------------------------------------------------------------------------------
 
-    def head_for(self, values: Array, mask: NDArray[np.bool_]) -> None:
+    def set_setpoint(self, values: Array, mask: NDArray[np.bool_]) -> None:
         """Head for new equilibria."""
         norms = np.linalg.norm(np.where(np.isfinite(values), values, 0.0)[:, 3:7].clip(-10, 10), axis=1)
         bad = mask & ~(np.isfinite(values).all(axis=1) & (norms > _NORM_RANGE[0]) & (norms < _NORM_RANGE[1]))
@@ -156,7 +156,7 @@ class ImpedanceController(Controller):
         places = asked[:, [0, 1, 2, 7]]
         clipped = np.minimum(np.maximum(places, self._lower), self._upper)
         self._limits[mask & (clipped != places).any(axis=1)] |= int(Limit.POSITION)
-        self.equilibrium.head_for(clipped[:, :3], rotation_matrices(asked[:, 3:7]), clipped[:, 3:], mask)
+        self.equilibrium.set_setpoint(clipped[:, :3], rotation_matrices(asked[:, 3:7]), clipped[:, 3:], mask)
         self._held &= ~mask
 
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:

@@ -62,7 +62,7 @@ class SetpointFilter:
         self.limited_acceleration: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.limited = False  # whether any of them may be set
 
-    def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_], position: NDArray[np.float64]) -> None:
+    def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_], position: NDArray[np.float64]) -> None:
         """Head for new setpoints.
 
         Args:

@@ -63,7 +63,7 @@ class BaseController(Controller):
         self._limited_finite = np.zeros(n, np.bool_)
         self._wheels = (1.0 / drive.wheel_radius, per_yaw, drive.max_wheel_speed, self._limited_wheels)
 
-    def head_for(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
+    def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
         """Head for new twists, with the normal accelerations."""
         np.copyto(self._target, values, where=mask[:, None])
         np.copyto(self._largest, self._change, where=mask[:, None])

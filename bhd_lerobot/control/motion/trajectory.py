@@ -262,7 +262,7 @@ def _calculate(
 def sample(answer: ruckig.Trajectory, hz: int) -> Trajectory:
     """Return what a Ruckig trajectory is at ticks 1 to T; T is the first at or after its end.
 
-    Between two switches the jerk is constant. Each dimension has up to nine such stretches: two in which it is brought
+    Between two switches the jerk is constant. Each dimension has up to nine such segments: two in which it is brought
     within the limits, and seven to the target. After the last one it stands still.
 
     Args:
@@ -286,7 +286,7 @@ def sample(answer: ruckig.Trajectory, hz: int) -> Trajectory:
     ticks = max(1, int(np.ceil(answer.duration * hz - 1e-6)))
     time = np.arange(1, ticks + 1)[:, None] / hz
     dims = np.arange(len(ends))
-    stretch = (time[:, :, None] >= ends).sum(axis=2)
-    p, v, a, j = (np.asarray(states).transpose(1, 0, 2))[:, dims, stretch]
-    since = time - begins[dims, stretch]
+    segment = (time[:, :, None] >= ends).sum(axis=2)
+    p, v, a, j = (np.asarray(states).transpose(1, 0, 2))[:, dims, segment]
+    since = time - begins[dims, segment]
     return Trajectory(p + since * (v + since * (a / 2 + since * j / 6)), v + since * (a + since * j / 2), a + since * j)

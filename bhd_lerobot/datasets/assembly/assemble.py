@@ -1,7 +1,7 @@
 """A dataset made of episodes of others: what merging, filtering, splitting, deleting and marking have in common.
 
-LeRobot's own tools encode films again when they take episodes out of one, write without the columns of
-``meta/episodes`` that they do not know, and leave a half dataset behind a kill. Here films are cut without encoding,
+LeRobot's own tools encode videos again when they take episodes out of one, write without the columns of
+``meta/episodes`` that they do not know, and leave a half dataset behind a kill. Here videos are cut without encoding,
 every column comes along, and the new dataset appears complete or not at all. Files that stay as they are are linked.
 """
 
@@ -68,7 +68,7 @@ def assemble(
     Raises:
         DatasetMismatchError: the sources have other columns, frame rates or robots.
         DatasetCorruptError: a file of a source cannot be read.
-        UnsupportedDatasetError: a film cannot be cut without encoding again.
+        UnsupportedDatasetError: a video cannot be cut without encoding again.
         OSError: a file cannot be written.
     """
     sources = _sources(picks)
@@ -125,7 +125,7 @@ def _kind(state: DatasetState) -> dict[str, Any]:
         "features": {
             key: {
                 **{name: feature.get(name) for name in ("dtype", "shape", "names")},
-                # How numbers became depth pictures; what else is told of a film may differ.
+                # How numbers became depth images; what else is told of a video may differ.
                 **{n: v for n, v in (state.info["features"][key].get("info") or {}).items() if _is_meaning(n)},
             }
             for key, feature in features.items()
@@ -186,7 +186,7 @@ def _info(sources: Sequence[DatasetState], episodes: int, frames: int, tasks: in
     for key, feature in info["features"].items():
         told = [source.info["features"][key].get("info") or {} for source in sources]
         if any(told):
-            # What films of several encoders do not share is not known of their mixture.
+            # What videos of several encoders do not share is not known of their mixture.
             feature["info"] = {
                 name: value if all(one.get(name) == value for one in told) else None for name, value in told[0].items()
             }

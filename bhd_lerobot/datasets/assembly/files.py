@@ -1,4 +1,4 @@
-"""The data files and films of a dataset that is assembled from episodes of others."""
+"""The data files and videos of a dataset that is assembled from episodes of others."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -51,10 +51,10 @@ def build_data(plan: Plan, new: Path, disk: Disk, take: Take) -> None:
 
 
 def build_videos(plan: Plan, new: Path, disk: Disk, take: Take) -> None:
-    """Write the films below `new`, and into the rows where each episode is in them; `take` those that stay.
+    """Write the videos below `new`, and into the rows where each episode is in them; `take` those that stay.
 
     Raises:
-        DatasetCorruptError: a film cannot be read.
+        DatasetCorruptError: a video cannot be read.
         UnsupportedDatasetError: one cannot be cut without encoding again.
         OSError: a file cannot be written.
     """

@@ -55,7 +55,7 @@ class EditReport:
 
 
 type Tell = Callable[[EditReport], object]
-"""Told of an edit when it is in force. Until it returns, nobody knows of it: the same edit is then recognised."""
+"""Called with an edit when it is in force. Until it returns, nobody knows of it: the same edit is then recognised."""
 
 
 def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
@@ -70,7 +70,7 @@ def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
         DatasetMismatchError: they have other robots, frame rates or features.
         DatasetExistsError: `target` exists.
         DatasetLockedError: one of them is being recorded.
-        DatasetError: one of them is no sound, finalised dataset, or cannot be written.
+        DatasetError: one of them is no valid, finalised dataset, or cannot be written.
     """
     paths = [Path(root) for root in roots]
     if len(paths) < 2:
@@ -98,7 +98,7 @@ def keep(root: Path | str, episodes: Sequence[int], target: Path | str) -> EditR
     Raises:
         DatasetExistsError: `target` exists.
         DatasetLockedError: `root` is being recorded.
-        DatasetError: there is no such episode or no sound, finalised dataset, or it cannot be written.
+        DatasetError: there is no such episode or no valid, finalised dataset, or it cannot be written.
     """
     with opened([Path(root)]) as (state,):
         check_reported(state.root)
@@ -118,7 +118,7 @@ def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | s
         ConfigError: an episode is wanted in two parts.
         DatasetExistsError: one of the new datasets exists; then none is written.
         DatasetLockedError: `root` is being recorded.
-        DatasetError: there is no such episode or no sound, finalised dataset, or it cannot be written.
+        DatasetError: there is no such episode or no valid, finalised dataset, or it cannot be written.
     """
     owner: dict[int, str] = {}
     for name, episodes in parts.items():
@@ -167,7 +167,7 @@ def delete(root: Path | str, episodes: Sequence[int], tell: Tell = lambda _: Non
 
     Raises:
         DatasetLockedError: it is being recorded.
-        DatasetError: there is no such episode or no sound, finalised dataset, no episode would be left, or the disk
+        DatasetError: there is no such episode or no valid, finalised dataset, no episode would be left, or the disk
             refuses.
     """
     edit = {"edit": "delete", "episodes": sorted(set(episodes))}

@@ -51,7 +51,7 @@ def mark(
         ConfigError: nothing is said, or an unknown outcome, one that the task or robot cannot have, or impossible
             frames.
         DatasetLockedError: the dataset is being recorded.
-        DatasetError: there is no such episode or no sound, finalised dataset, the dataset has no column for it, or the
+        DatasetError: there is no such episode or no valid, finalised dataset, the dataset has no column for it, or the
             disk refuses; it is then as it was.
     """
     if outcome is not None and outcome not in OUTCOMES:

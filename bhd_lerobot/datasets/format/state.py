@@ -137,12 +137,12 @@ def no_dataset(root: Path) -> DatasetError:
     return DatasetError(said + told)
 
 
-def load_state(root: Path, *, films: bool = True) -> DatasetState:
+def load_state(root: Path, *, videos: bool = True) -> DatasetState:
     """Read what is committed and check that every file it needs is there and readable.
 
     Args:
         root: the dataset.
-        films: whether films must be there, too.
+        videos: whether videos must be there, too.
 
     Reads file footers, not their pages: a damaged value inside a file is found by
     `bhd_lerobot.datasets.recovery.repair.repair`.
@@ -168,7 +168,7 @@ def load_state(root: Path, *, films: bool = True) -> DatasetState:
         if len(state.tasks) < info["total_tasks"]:
             raise corrupt(root / layout.TASKS, f"it has {len(state.tasks)} of {info['total_tasks']} tasks")
         _read_rows(state)
-        _check_files(state, films)
+        _check_files(state, videos)
     return state
 
 
@@ -298,7 +298,7 @@ def column_types(schema: pa.Schema) -> tuple[dict[str, pa.DataType], dict[str, p
 _STRUCTURE = ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index")
 
 
-def _check_files(state: DatasetState, films: bool) -> None:
+def _check_files(state: DatasetState, videos: bool) -> None:
     start = 0
     for row in state.rows:
         if row["dataset_from_index"] != start or row["dataset_to_index"] != start + row["length"]:
@@ -322,7 +322,7 @@ def _check_files(state: DatasetState, films: bool) -> None:
             raise corrupt(path, f"it has {found} frames; its episodes have {wanted}")
         if wrong := wrong_columns(schema, state.info["features"]):
             raise corrupt(path, wrong)
-    for key in state.video_keys if films else ():
+    for key in state.video_keys if videos else ():
         for slot in ordered_slots(state.rows, f"videos/{key}"):
             path = state.root / layout.video_file(key, slot)
             if not path.is_file() or path.stat().st_size == 0:

@@ -1,6 +1,6 @@
-"""Parts of films into one film, without encoding again.
+"""Parts of videos into one video, without encoding again.
 
-Every episode was encoded by itself before films were joined, by LeRobot as by us. So each begins with a key frame, and
+Every episode was encoded by itself before videos were joined, by LeRobot as by us. So each begins with a key frame, and
 the packets of one can be taken out without touching those of another.
 """
 
@@ -16,17 +16,17 @@ type Span = tuple[int, int]
 
 
 def splice(parts: Sequence[tuple[Path, Sequence[Span]]], target: Path, fps: int | Fraction) -> None:
-    """Write spans of frames of several films, one after the other, into one film.
+    """Write spans of frames of several videos, one after the other, into one video.
 
     Args:
-        parts: a file and its spans, in the order of the new film. All files have the same `stream_signature`.
-        target: the new film.
+        parts: a file and its spans, in the order of the new video. All files have the same `stream_signature`.
+        target: the new video.
         fps: frames per second of all of them.
 
     Raises:
-        DatasetCorruptError: a film cannot be read, or has fewer frames than a span needs.
+        DatasetCorruptError: a video cannot be read, or has fewer frames than a span needs.
         UnsupportedDatasetError: a span does not begin with a key frame.
-        OSError: the new film cannot be written.
+        OSError: the new video cannot be written.
     """
     import av
 
@@ -40,12 +40,12 @@ def splice(parts: Sequence[tuple[Path, Sequence[Span]]], target: Path, fps: int 
                     joined = output.add_stream_from_template(stream, opaque=True)
                     joined.time_base = stream.time_base
                 for (start, _), packets in zip(spans, _by_span(path, source, spans, fps), strict=True):
-                    # Counted in frames from the new film's start, so no rounding adds up.
+                    # Counted in frames from the new video's start, so no rounding adds up.
                     shift = round(Fraction(written - start) / Fraction(fps) / stream.time_base)
                     for packet in packets:
                         packet.pts, packet.dts = packet.pts + shift, packet.dts + shift
                         if last is not None and packet.dts <= last:
-                            # Films with frames out of order begin before zero in decoding order.
+                            # Videos with frames out of order begin before zero in decoding order.
                             packet.dts = last + 1
                         last = packet.dts
                         packet.stream = joined

@@ -143,8 +143,8 @@ class FrameCache:
             MemoryBudgetError: memory ran out.
         """
         self._table, self._tolerance, self._backend = table, tolerance_s, backend
-        self._pictures = [key for key in cameras if key in table.pictures]
-        self.keys = [*(key for key in cameras if key not in table.pictures), *self._pictures]
+        self._stored = [key for key in cameras if key in table.images]
+        self.keys = [*(key for key in cameras if key not in table.images), *self._stored]
         self.images: dict[str, Tensor] = {}
         try:
             for key in self.keys:
@@ -172,9 +172,9 @@ class FrameCache:
             Shape (B, C, H, W), or (B, n, C, H, W); of a video also (B, C, H, W) if n is 1. In [0, 1] if float32.
         """
         images = self.images[key].numpy()
-        picture = key in self._pictures
-        found = images.take(rows if picture or rows.ndim == 1 or rows.shape[1] > 1 else rows[:, 0], axis=0)
-        if picture or not return_uint8:
+        is_stored = key in self._stored
+        found = images.take(rows if is_stored or rows.ndim == 1 or rows.shape[1] > 1 else rows[:, 0], axis=0)
+        if is_stored or not return_uint8:
             found = np.divide(found, np.float32(255), dtype=np.float32)
         return torch.from_numpy(found)
 
@@ -184,14 +184,14 @@ class FrameCache:
         threads = max(1, (os.cpu_count() or 1) // workers)
         with ThreadPoolExecutor(workers) as pool:
             list(pool.map(lambda job: self._decode(job, threads), jobs))
-        for key in self._pictures:
-            self._decode_pictures(key)
+        for key in self._stored:
+            self._decode_stored(key)
 
     def _jobs(self) -> Iterator[_Job]:
         table, meta = self._table, self._table.meta
         times = table.columns["timestamp"].numpy().astype(np.float64)
         for key in self.keys:
-            if key in self._pictures:
+            if key in self._stored:
                 continue
             columns = {name: meta.episodes[f"videos/{key}/{name}"] for name in _VIDEO_COLUMNS}
             files: dict[tuple[int, int], list[int]] = {}
@@ -267,13 +267,13 @@ class FrameCache:
                 ) from error
             self.images[job.key][torch.from_numpy(job.rows[part])] = frames
 
-    def _decode_pictures(self, key: str) -> None:
+    def _decode_stored(self, key: str) -> None:
         from PIL import Image
 
-        column, images, root = self._table.pictures[key], self.images[key], Path(self._table.meta.root)
+        column, images, root = self._table.images[key], self.images[key], Path(self._table.meta.root)
 
         def decode(row: int, value: Mapping[str, Any]) -> None:
-            # The file of a picture that is not in the table lies beside it.
+            # The file of an image that is not in the table lies beside it.
             source = io.BytesIO(value["bytes"]) if value["bytes"] else check_inside(root, root / value["path"])
             pixels = np.asarray(Image.open(source))
             if pixels.dtype != np.uint8:

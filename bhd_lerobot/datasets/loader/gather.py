@@ -45,7 +45,7 @@ class Gatherer:
                 self._stacks.append((keys, torch.stack([table.columns[key] for key in keys]).numpy()))
         self._wide = {key: column.numpy() for key, column in table.columns.items() if key not in alone}
         # LeRobot puts videos first, then the columns; language columns do not survive its collate.
-        videos = [key for key in frames.keys if key not in table.pictures]
+        videos = [key for key in frames.keys if key not in table.images]
         self._order = [*videos, *(key for key in table.keys if key not in table.nested)]
 
     def gather(self, rows: Tensor, return_uint8: bool) -> Batch:

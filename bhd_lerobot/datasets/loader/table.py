@@ -63,7 +63,7 @@ class FrameTable:
         columns: key -> tensor of shape (N, ...); a feature of shape (1,) is a column of shape (N,).
         texts: key -> array of N strings.
         nested: key -> Arrow column of N lists (LeRobot's language columns).
-        pictures: key -> Arrow column of N encoded images (features of dtype "image").
+        images: key -> Arrow column of N encoded images (features of dtype "image").
         keys: all of these and LeRobot's index columns, in the order of the features.
         episodes: indices of the episodes, in the order of their rows.
         starts, lengths: first row and number of rows of each of them, shape (E,), int64.
@@ -77,11 +77,11 @@ class FrameTable:
         self.columns: dict[str, Tensor] = {}
         self.texts: dict[str, np.ndarray] = {}
         self.nested: dict[str, pa.ChunkedArray] = {}
-        self.pictures: dict[str, pa.ChunkedArray] = {}
+        self.images: dict[str, pa.ChunkedArray] = {}
         for key in keys:
             feature = meta.features[key]
             if feature["dtype"] == "image":
-                self.pictures[key] = table[key]
+                self.images[key] = table[key]
             elif feature["dtype"] == "language":
                 self.nested[key] = table[key]
             elif feature["dtype"] == _TEXT:

@@ -1,4 +1,4 @@
-"""Whether `meta/info.json` describes the columns that a wreck's files have: it may be another recording's."""
+"""Whether `meta/info.json` describes the columns of a corrupted dataset's files: it may be another recording's."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -15,8 +15,8 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.validate.findings import few
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError
 
-_PICTURES = ("video", "image")
-_NO_STATISTICS = ("string", "language", *_PICTURES)  # of pictures there may be some
+_IMAGES = ("video", "image")
+_NO_STATISTICS = ("string", "language", *_IMAGES)  # of images there may be some
 
 
 def misfit(root: Path, info: Mapping[str, Any]) -> str:
@@ -39,8 +39,8 @@ def wrong_rate(info: Mapping[str, Any], table: pa.Table) -> str:
 
 
 def lost_cameras(root: Path, info: Mapping[str, Any]) -> list[str]:
-    """Return the cameras of which there is no film and no picture."""
-    if any(root.glob("tmp*")):  # films that are being made, which do not say whose they are
+    """Return the cameras of which there is no video and no image."""
+    if any(root.glob("tmp*")):  # videos that are being made, which do not say whose they are
         return []
     keys = [key for key, one in info["features"].items() if one["dtype"] == "video"]
     return [key for key in keys if not (root / "videos" / key).is_dir() and not (root / "images" / key).is_dir()]
@@ -87,7 +87,7 @@ def _difference(info: Mapping[str, Any], sizes: Mapping[str, int | None], comple
     Args:
         info: describes them.
         sizes: the columns, and how many numbers each has; None if that is not told.
-        complete: whether they are all columns but films; otherwise all that are numbers, and perhaps pictures.
+        complete: whether they are all columns but videos; otherwise all that are numbers, and perhaps images.
     """
     features = {**DEFAULT_FEATURES, **info["features"]}
     unlisted = ("video",) if complete else _NO_STATISTICS

@@ -1,4 +1,4 @@
-"""What the readable files of ``meta/episodes`` of a wreck still tell."""
+"""What the readable files of ``meta/episodes`` of a corrupted dataset still tell."""
 
 import contextlib
 import re
@@ -19,7 +19,7 @@ _OURS = re.compile(rb"(?<=bhd/)[a-z][a-z0-9_]*(?![a-zA-Z0-9_])")
 """Names of our columns in the bytes of a footer."""
 
 
-class Told:
+class EpisodeRows:
     """Rows and statistics of the episodes of sessions that were finished.
 
     Attributes:
@@ -29,7 +29,7 @@ class Told:
         torn: names without prefix of columns of ours that files tell which cannot be read.
 
     Args:
-        root: the wreck.
+        root: the corrupted dataset.
     """
 
     def __init__(self, root: Path) -> None:
@@ -65,10 +65,10 @@ class Told:
     def complete(self, kept: Sequence[Found], rows: Sequence[Row]) -> None:
         """Write into the new rows what is told about their episodes by us and by other programs."""
         for one, row in zip(kept, rows, strict=True):
-            old = self.rows.get(one.number, {}) if one.is_told else {}
+            old = self.rows.get(one.number, {}) if one.has_row else {}
             row |= {PREFIX + name: old.get(PREFIX + name) for name in self.metadata_types}
             row |= {name: old.get(name) for name in self.extra_types}
 
     def stats_of(self, kept: Sequence[Found]) -> list[dict[str, dict[str, np.ndarray]]]:
         """Return the stored statistics of each episode; empty where there are none."""
-        return [self._stats.get(one.number, {}) if one.is_told else {} for one in kept]
+        return [self._stats.get(one.number, {}) if one.has_row else {} for one in kept]

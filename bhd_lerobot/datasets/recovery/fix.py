@@ -1,4 +1,4 @@
-"""`bhd-data check --fix`: mend what follows from the rest of a dataset, and nothing else.
+"""`bhd-data check --fix`: repair what follows from the rest of a dataset, and nothing else.
 
 Statistics follow from the frames, and the number of frames from the episodes. What is damaged is for `repair`, and what
 is doubtful, such as a value that is out of range, is for a person.
@@ -24,14 +24,14 @@ from bhd_lerobot.datasets.validate.findings import Finding, Severity
 
 
 def is_fixable(finding: Finding) -> bool:
-    """Tell whether `fix` mends what was found."""
+    """Tell whether `fix` repairs what was found."""
     if finding.severity is Severity.NOTE:
         return False
     return finding.check == "stats" or (finding.check == "counts" and finding.where == layout.INFO)
 
 
 def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
-    """Mend what can be mended, if everything that it follows from is sound; return a line for each thing.
+    """Repair what can be repaired, if everything that it follows from is valid; return a line for each thing.
 
     Args:
         root: the dataset.
@@ -53,7 +53,7 @@ def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
     lock = RootLock(root)
     done: list[str] = []
     try:
-        with write_errors("mend the dataset", root, "It is as it was."):
+        with write_errors("repair the dataset", root, "It is as it was."):
             if any(one.check == "counts" for one in wanted):
                 done.append(_count_frames(root, disk))
             if any(one.check == "stats" for one in wanted):
@@ -100,7 +100,7 @@ def compute_stats(state: DatasetState, disk: Disk, lock: RootLock) -> str:
 
 
 def _stored_depth(state: DatasetState) -> list[dict[str, dict[str, np.ndarray]]]:
-    """Return the statistics of depth pictures of every episode, which cannot be computed here."""
+    """Return the statistics of depth images of every episode, which cannot be computed here."""
     found: list[dict[str, dict[str, np.ndarray]]] = [{} for _ in state.rows]
     for slot, rows in ordered_slots(state.rows, "meta/episodes").items():
         order, stored = stored_stats(state.root / layout.episodes_file(slot))

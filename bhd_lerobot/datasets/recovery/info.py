@@ -10,7 +10,7 @@ from typing import Any
 from bhd_lerobot.datasets.format.parquet_rescue import rescue
 from bhd_lerobot.datasets.format.state import read_tasks
 from bhd_lerobot.datasets.recovery.columns import misfit, read_info, wrong_rate
-from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
 from bhd_lerobot.datasets.recovery.salvage import schema_of, shapes_of
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk, to_json
@@ -62,7 +62,7 @@ def adopt_info(root: Path, donor: Path, disk: Disk) -> tuple[str, Path | None]:
         kept = layout.aside_of(root) / layout.INFO
         disk.make_folder(kept.parent)
         disk.copy(path, kept)
-    rows = Told(root).rows
+    rows = EpisodeRows(root).rows
     # Ours are numbered without a hole; what is behind one is for `salvage`, which counts by itself.
     total = next(index for index in range(len(rows) + 1) if index not in rows)
     try:

@@ -11,7 +11,7 @@ import pyarrow as pa
 from bhd_lerobot.datasets.assembly.assemble import EDITS
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
-from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
 from bhd_lerobot.datasets.recovery.videos import Found
 from bhd_lerobot.datasets.validate.findings import few
 from bhd_lerobot.tasks.task import OUTCOMES, Event
@@ -23,14 +23,14 @@ _SHOWN = 30  # columns
 
 
 def recall(
-    root: Path, kept: Sequence[Found], rows: Sequence[Row], told: Told, *, is_ours: bool
+    root: Path, kept: Sequence[Found], rows: Sequence[Row], told: EpisodeRows, *, is_ours: bool
 ) -> tuple[list[str], list[str]]:
     """Write the outcomes of episodes without a row into their new rows, and name what cannot be told again.
 
     An outcome is what somebody said afterwards, or else the event of the last frame, where our recorder wrote it.
 
     Args:
-        root: the wreck.
+        root: the corrupted dataset.
         kept: episodes that were recovered.
         rows: their new rows; changed in place.
         told: what could be read of the old ones; its types get those of the outcomes.
@@ -39,13 +39,13 @@ def recall(
     Returns:
         What is lost, and what is known from elsewhere, in lines.
     """
-    untold = [(one, row) for one, row in zip(kept, rows, strict=True) if not one.is_told]
+    without_row = [(one, row) for one, row in zip(kept, rows, strict=True) if not one.has_row]
     marked, is_older = _marks(root)
-    if not untold or not (is_ours or told.torn or marked or is_older):
+    if not without_row or not (is_ours or told.torn or marked or is_older):
         return [], []
     names = {*told.metadata_types, *told.torn}
     known: list[int] = []
-    for one, row in untold:
+    for one, row in without_row:
         outcome = marked.get(one.number) or (_ended_with(one) if is_ours or told.torn else None)
         if outcome is not None:
             known.append(one.number)
@@ -58,7 +58,7 @@ def recall(
             told.metadata_types.setdefault("success", pa.bool_())
         for row in rows:
             row |= {f"bhd/{name}": row.get(f"bhd/{name}") for name in told.metadata_types}
-    numbers = [one.number for one, _ in untold]
+    numbers = [one.number for one, _ in without_row]
     lost = _lost(numbers, known, names, is_ours=is_ours or bool(told.torn))
     if is_older and set(numbers) - set(known):
         lost.append(

@@ -21,7 +21,7 @@ from bhd_lerobot.datasets.format.state import (
     read_json,
     slot_of,
 )
-from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
 from bhd_lerobot.datasets.recovery.fix import compute_stats
 from bhd_lerobot.datasets.recovery.info import adopt_info, give_back
 from bhd_lerobot.datasets.recovery.salvage import salvage
@@ -34,7 +34,7 @@ from bhd_lerobot.errors import DatasetCorruptError
 
 @dataclass(frozen=True)
 class RepairReport:
-    """What was mended. It is false if there was nothing to do.
+    """What was repaired. It is false if there was nothing to do.
 
     Attributes:
         root: the dataset.
@@ -42,7 +42,7 @@ class RepairReport:
         frames: frames it holds now.
         completed: steps that had been decided before the interruption and were completed.
         dropped: files of unfinished episodes that were removed, relative to the root.
-        lost: what of a wreck could not be recovered, and why.
+        lost: what of a corrupted dataset could not be recovered, and why.
         hints: what may be so about it.
         aside: where its damaged files lie now; None if none were damaged.
     """
@@ -57,7 +57,7 @@ class RepairReport:
     aside: Path | None = None
 
     def __bool__(self) -> bool:
-        """Whether anything was mended."""
+        """Whether anything was repaired."""
         return bool(self.completed or self.dropped)
 
     def __str__(self) -> str:
@@ -74,7 +74,7 @@ class RepairReport:
 
 
 def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
-    """Mend a dataset, check every file to the last page, and leave it compact and with statistics.
+    """Repair a dataset, check every file to the last page, and leave it compact and with statistics.
 
     Args:
         root: the dataset.
@@ -146,7 +146,7 @@ def _salvaged(
 
 
 def _repair_with(root: Path, donor: Path, disk: Disk, lock: RootLock) -> RepairReport:
-    """Mend a dataset whose `info.json` is lost.
+    """Repair a dataset whose `info.json` is lost.
 
     Frames that belong to no episode are recovered then, not dropped: nothing says any more which were saved.
     """
@@ -164,7 +164,7 @@ def _repair_with(root: Path, donor: Path, disk: Disk, lock: RootLock) -> RepairR
 
 
 def _repair_foreign(root: Path, disk: Disk, lock: RootLock, *completed: str) -> RepairReport:
-    """Mend what another program wrote: nothing if all of it can be read, and else everything that is whole."""
+    """Repair what another program wrote: nothing if all of it can be read, and else everything that is whole."""
     with write_errors("repair the dataset", root, "Its files are as they were."):
         remove_abandoned(real(root))
         if roll_forward(root, disk):
@@ -199,7 +199,7 @@ def went_on(root: Path) -> list[Path]:
     A file that our own rows need and that is cut off is damage of another kind. LeRobot always leaves a data file.
     """
     unfinished = unfinished_files(root)
-    rows = Told(root).rows.values() if any(path.is_relative_to(root / "data") for path in unfinished) else ()
+    rows = EpisodeRows(root).rows.values() if any(path.is_relative_to(root / "data") for path in unfinished) else ()
     needed = {root / layout.data_file(slot_of(row, "data")) for row in rows}
     return [] if not rows or needed & set(unfinished) else unfinished
 

@@ -1,4 +1,4 @@
-"""The new rows, counts and data files of what was recovered of a wreck."""
+"""The new rows, counts and data files of what was recovered of a corrupted dataset."""
 
 import copy
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, PARQUET_OPTIONS
 from bhd_lerobot.datasets.format.state import Row, read_tasks, slot_columns
-from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
 from bhd_lerobot.datasets.recovery.videos import Found
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk
@@ -21,7 +21,7 @@ from bhd_lerobot.errors import DatasetCorruptError
 _LOST_TASK = "(the instruction was lost)"
 
 
-def tasks_of(root: Path, kept: Sequence[Found], told: Told, lost: list[str]) -> tuple[list[str], dict[int, int]]:
+def tasks_of(root: Path, kept: Sequence[Found], told: EpisodeRows, lost: list[str]) -> tuple[list[str], dict[int, int]]:
     """Return the instructions that are used, and the new number of each old one."""
     used = sorted({int(index) for one in kept for index in pc.unique(one.table["task_index"]).to_pylist()})
     try:

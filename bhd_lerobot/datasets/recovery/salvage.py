@@ -1,9 +1,9 @@
 """Bring back every whole episode of a dataset that cannot be read: a recorder was killed, or files are damaged.
 
 LeRobot keeps one Parquet file open for a whole recording, and a file without its footer is read by nobody; it writes
-``meta/episodes`` ten episodes at a time, and ``info.json`` and a film at each. So after a kill nothing loads, though
-nearly everything is on disk. Here the frames are read without the footer, films are counted, and an episode is kept if
-all of its frames are there in all of its columns and films. Everything else of ``meta`` is made anew from that.
+``meta/episodes`` ten episodes at a time, and ``info.json`` and a video at each. So after a kill nothing loads, though
+nearly everything is on disk. Here the frames are read without the footer, videos are counted, and an episode is kept if
+all of its frames are there in all of its columns and videos. Everything else of ``meta`` is made anew from that.
 """
 
 import contextlib
@@ -24,11 +24,11 @@ from bhd_lerobot.datasets.format.meta_files import tasks_table, write_meta
 from bhd_lerobot.datasets.format.parquet_rescue import rescue
 from bhd_lerobot.datasets.format.state import corrupt, read_identity, repair_with_info
 from bhd_lerobot.datasets.recovery.columns import lost_cameras, misfit, read_info
-from bhd_lerobot.datasets.recovery.evidence import Told
+from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
 from bhd_lerobot.datasets.recovery.outcomes import RECOVERED, logged, recall
 from bhd_lerobot.datasets.recovery.rows import info_of, rows_of, tasks_of, write_data
 from bhd_lerobot.datasets.recovery.statistics import stats_of
-from bhd_lerobot.datasets.recovery.videos import Films, Found
+from bhd_lerobot.datasets.recovery.videos import Found, Videos
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import WORK, Workspace, link_others
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
@@ -39,7 +39,7 @@ from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedE
 
 @dataclass(frozen=True)
 class Salvage:
-    """What became of a wreck.
+    """What became of a corrupted dataset.
 
     Attributes:
         episodes: whole episodes that were recovered.
@@ -62,7 +62,7 @@ def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool
     Damaged files go to a folder beside the dataset first, so nothing that was there is lost.
 
     Args:
-        root: the wreck.
+        root: the corrupted dataset.
         disk: how to write.
         lock: of the dataset.
         wrong: what was found to be wrong, for the error if nothing is left.
@@ -73,7 +73,7 @@ def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool
             nothing was changed.
         DatasetLockedError: a process has files of the dataset open, so perhaps records it.
         DatasetError: the disk does not give out a file, which may be whole.
-        DatasetWriteError: the disk refuses; the wreck is as it was.
+        DatasetWriteError: the disk refuses; the corrupted dataset is as it was.
     """
     check_unused(root)
     check_readable(root)
@@ -86,11 +86,11 @@ def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool
         )
     lost: list[str] = []
     hints: list[str] = []
-    told = Told(root)
+    told = EpisodeRows(root)
     torn: list[str] = []
     found, is_torn = _frames(root, info, lost, torn)
-    films = Films(root, info, told.rows)
-    kept = films.assign(found, lost, is_torn=is_torn)
+    videos = Videos(root, info, told.rows)
+    kept = videos.assign(found, lost, is_torn=is_torn)
     counted = info.get("total_episodes")
     # Where all that was counted is there, and no more, the bytes are of a footer or of what was never saved.
     is_all = counted == len(kept) > 0 and [one.number for one in kept] == list(range(len(kept)))
@@ -113,7 +113,7 @@ def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool
             rows = rows_of(kept, tasks, renumbered)
             described = info_of(info, kept, len(tasks))
             write_data(kept, rows, described, new, disk)
-            films.write(kept, rows, described, new, disk)
+            videos.write(kept, rows, described, new, disk)
             told.complete(kept, rows)
             forgotten, known = recall(root, kept, rows, told, is_ours=is_ours)
             lost += forgotten
@@ -144,7 +144,7 @@ def _remove_unfinished(root: Path, disk: Disk) -> None:
 def _nothing_left(root: Path, info: dict[str, Any], wrong: str, lost: list[str]) -> DatasetCorruptError:
     if cameras := lost_cameras(root, info):
         lost.append(
-            f"{layout.INFO} describes {few(cameras)}, of which there is no film and no picture. If it is another "
+            f"{layout.INFO} describes {few(cameras)}, of which there is no video and no image. If it is another "
             f"recording's: {repair_with_info(root)}"
         )
     reasons = "".join(f"\n  {line}" for line in lost)
@@ -281,7 +281,7 @@ def check_unused(root: Path) -> None:
                         raise DatasetLockedError(
                             f"Process {process.name} has {target} open, so {root} may be in the middle of a "
                             "recording. Wait until it ends; without its last files a running recording looks like a "
-                            "wreck."
+                            "corrupted dataset."
                         )
 
 

@@ -1,4 +1,4 @@
-"""Statistics of what another program recorded: of columns by LeRobot's function, of pictures from the pictures."""
+"""Statistics of what another program recorded: of columns by LeRobot's function, of images from the images."""
 
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,9 +26,9 @@ def stats_of(
     Args:
         episodes: frames of each episode.
         features: LeRobot feature dictionaries.
-        new: root of the dataset, with its films.
-        rows: of the episodes, with the places of their films.
-        stored: statistics of each episode's pictures that are known already. Those of depth are never computed here.
+        new: root of the dataset, with its videos.
+        rows: of the episodes, with the places of their videos.
+        stored: statistics of each episode's images that are known already. Those of depth are never computed here.
     """
     from lerobot.datasets.compute_stats import compute_episode_stats
 
@@ -50,8 +50,8 @@ def stats_of(
                 continue
             if 3 not in (feature["shape"][0], feature["shape"][-1]):
                 continue  # depth: its statistics are in metres, by the encoder's scale
-            pictures = _film(new, key, row) if feature["dtype"] == "video" else _pictures(table, key)
-            own[key] = statistics.image_stats(np.stack([statistics.image_histogram(one) for one in pictures]))
+            images = _video(new, key, row) if feature["dtype"] == "video" else _images(table, key)
+            own[key] = statistics.image_stats(np.stack([statistics.image_histogram(one) for one in images]))
         for key, stat in own.items():
             for name, values in stat.items():
                 stacked.setdefault(key, {}).setdefault(name, []).append(
@@ -66,16 +66,16 @@ def _array(table: pa.Table, key: str, shape: tuple[int, ...]) -> np.ndarray:
     return values.reshape(len(column), *shape) if shape != (1,) else values.reshape(len(column))
 
 
-def _pictures(table: pa.Table, key: str) -> Iterator[np.ndarray]:
+def _images(table: pa.Table, key: str) -> Iterator[np.ndarray]:
     from PIL import Image
 
     for value in table[key].to_pylist():
-        with Image.open(io.BytesIO(value["bytes"])) as picture:
-            yield np.asarray(picture.convert("RGB"))
+        with Image.open(io.BytesIO(value["bytes"])) as image:
+            yield np.asarray(image.convert("RGB"))
 
 
-def _film(new: Path, key: str, row: Row) -> Iterator[np.ndarray]:
-    """Yield the pictures of an episode, shape (H, W, 3)."""
+def _video(new: Path, key: str, row: Row) -> Iterator[np.ndarray]:
+    """Yield the images of an episode, shape (H, W, 3)."""
     import av
 
     kind = f"videos/{key}"

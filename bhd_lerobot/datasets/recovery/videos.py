@@ -1,4 +1,4 @@
-"""The films of a wreck: which frames of which film show which episode."""
+"""The videos of a corrupted dataset: which frames of which video show which episode."""
 
 import contextlib
 import itertools
@@ -26,17 +26,17 @@ from bhd_lerobot.errors import UnsupportedDatasetError
 def cut_out(
     path: Path, target: Path, spans: Sequence[Span], frames: tuple[int, str], fps: Fraction
 ) -> list[int] | None:
-    """Write spans of a film into another one, which holds nothing else if each begins with a key frame.
+    """Write spans of a video into another one, which holds nothing else if each begins with a key frame.
 
     Args:
-        path: the film.
+        path: the video.
         target: the new one.
         spans: what is needed of it.
         frames: how many of its frames can be read, and what is wrong with the next, if anything.
         fps: frames per second.
 
     Returns:
-        Where each span begins in the new film; None if nothing was written, because the film can stay as it is.
+        Where each span begins in the new video; None if nothing was written, because the video can stay as it is.
     """
     count, problem = frames
     ends = list(itertools.accumulate(length for _, length in spans))
@@ -54,17 +54,17 @@ def cut_out(
 
 
 def encode(folder: Path, target: Path, length: int, fps: Fraction, feature: dict[str, Any]) -> None:
-    """Write the pictures of an episode as a film, with the settings of the others."""
+    """Write the images of an episode as a video, with the settings of the others."""
     from PIL import Image
 
     os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder tells its life otherwise; 1 leaves errors
-    with Image.open(folder / "frame-000000.png") as picture:
-        width, height = picture.size  # a feature's shape may begin with the channels
+    with Image.open(folder / "frame-000000.png") as image:
+        width, height = image.size  # a feature's shape may begin with the channels
     encoder = video.CameraEncoder(target, round(fps), (height, width), _settings(feature))
     try:
         for frame in range(length):
-            with Image.open(folder / f"frame-{frame:06d}.png") as picture:
-                encoder.add(np.asarray(picture.convert("RGB")))
+            with Image.open(folder / f"frame-{frame:06d}.png") as image:
+                encoder.add(np.asarray(image.convert("RGB")))
         encoder.finish()
     except BaseException:
         encoder.cancel()
@@ -72,7 +72,7 @@ def encode(folder: Path, target: Path, length: int, fps: Fraction, feature: dict
 
 
 def _settings(feature: dict[str, Any]) -> video.VideoSettings:
-    """Return the settings that the other films were encoded with, as far as this machine has their encoder."""
+    """Return the settings that the other videos were encoded with, as far as this machine has their encoder."""
     told = feature.get("info") or {}
     encoder = {"av1": "libsvtav1", "hevc": "hevc", "h264": "h264"}.get(str(told.get("video.codec")), "h264")
     settings = video.VideoSettings(
@@ -85,15 +85,15 @@ def _settings(feature: dict[str, Any]) -> video.VideoSettings:
     return settings
 
 
-_FRAMES = "images/{key}/episode-{episode:06d}"  # where LeRobot keeps the frames of a film that is not encoded yet
+_FRAMES = "images/{key}/episode-{episode:06d}"  # where LeRobot keeps the frames of a video that is not encoded yet
 
 
 @dataclass(frozen=True)
 class Part:
-    """Frames of a film.
+    """Frames of a video.
 
     Attributes:
-        path: the film, or a folder with a picture for each frame.
+        path: the video, or a folder with an image for each frame.
         start: number of the first frame in it.
         length: how many.
     """
@@ -110,25 +110,25 @@ class Found:
     Attributes:
         number: the number that it had.
         table: its frames.
-        films: for each camera what shows it.
-        is_told: whether a readable row of ``meta/episodes`` is about it.
+        videos: for each camera what shows it.
+        has_row: whether a readable row of ``meta/episodes`` is about it.
     """
 
     number: int
     table: pa.Table
-    films: dict[str, Part] = field(default_factory=dict)
-    is_told: bool = False
+    videos: dict[str, Part] = field(default_factory=dict)
+    has_row: bool = False
 
 
-class Films:
-    """Films and loose frames below a root.
+class Videos:
+    """Videos and loose frames below a root.
 
     Where a row of ``meta/episodes`` is left, it says where the episode is. Episodes without one come after those with
-    one, in films of their own; these hold whole episodes in the order of their numbers, one after the other, so their
-    lengths say where each is. Where that does not come out even, no episode gets a film that may be another's.
+    one, in videos of their own; these hold whole episodes in the order of their numbers, one after the other, so their
+    lengths say where each is. Where that does not come out even, no episode gets a video that may be another's.
 
     Args:
-        root: the wreck.
+        root: the corrupted dataset.
         info: content of its ``info.json``.
         rows: readable rows of ``meta/episodes``, by the number of the episode.
     """
@@ -141,18 +141,18 @@ class Films:
         self._whole_copies: dict[Path, Path] = {}
 
     def assign(self, found: Sequence[Found], lost: list[str], *, is_torn: bool) -> list[Found]:
-        """Find the film of every episode, and return the episodes that have all of theirs.
+        """Find the video of every episode, and return the episodes that have all of theirs.
 
         Args:
             found: episodes whose frames are whole, in order.
             lost: lines about what is lost are added here.
-            is_torn: whether frames are missing behind them: then a film may show more than they need.
+            is_torn: whether frames are missing behind them: then a video may show more than they need.
         """
         for one in found:
-            one.is_told = self._rows.get(one.number, {}).get("length") == one.table.num_rows
+            one.has_row = self._rows.get(one.number, {}).get("length") == one.table.num_rows
         found, certain = self._without_repeated(found, lost)
-        told = [one for one in found if one.is_told]
-        untold = [one for one in found if not one.is_told]
+        told = [one for one in found if one.has_row]
+        without_row = [one for one in found if not one.has_row]
         for key in self._keys:
             for one in told:
                 row = self._rows[one.number]
@@ -161,22 +161,22 @@ class Films:
                 path = self._root / layout.video_file(key, slot_of(row, f"videos/{key}"))
                 start = round(row[f"videos/{key}/from_timestamp"] * self._fps)
                 if start + one.table.num_rows <= self._whole(path, lost)[0]:
-                    one.films[key] = Part(self._whole_copies.get(path, path), start, one.table.num_rows)
-            self._assign(key, untold, lost, certain=certain, is_torn=is_torn)
+                    one.videos[key] = Part(self._whole_copies.get(path, path), start, one.table.num_rows)
+            self._assign(key, without_row, lost, certain=certain, is_torn=is_torn)
         kept = []
         for one in found:
-            missing = [key for key in self._keys if key not in one.films]
+            missing = [key for key in self._keys if key not in one.videos]
             if missing:
-                lost.append(f"episode {one.number}: no whole film of {', '.join(missing)}")
+                lost.append(f"episode {one.number}: no whole video of {', '.join(missing)}")
             else:
                 kept.append(one)
         return kept
 
     def _without_repeated(self, found: Sequence[Found], lost: list[str]) -> tuple[list[Found], int]:
-        """Return each episode once, and how many of those without a row have films at known places.
+        """Return each episode once, and how many of those without a row have videos at known places.
 
         An episode that could not be saved and was recorded again is there twice, under one number. The last one counts.
-        Whether a film shows the first one, too, is told nowhere.
+        Whether a video shows the first one, too, is told nowhere.
         """
         last = {one.number: one for one in found}
         once = [one for one in found if last[one.number] is one]
@@ -184,39 +184,39 @@ class Films:
         repeated = {one.number for one in found if last[one.number] is not one}
         lost += [f"episode {number}: a first attempt, which was recorded again" for number in sorted(repeated)]
         certain = 0
-        for one in (one for one in once if not one.is_told):
+        for one in (one for one in once if not one.has_row):
             if one.number != expected + certain or one.number in repeated:
                 break
             certain += 1
         return once, certain
 
-    def _assign(self, key: str, untold: Sequence[Found], lost: list[str], *, certain: int, is_torn: bool) -> None:
-        waiting = list(untold[:certain])
+    def _assign(self, key: str, without_row: Sequence[Found], lost: list[str], *, certain: int, is_torn: bool) -> None:
+        waiting = list(without_row[:certain])
         for path in self._following(key, lost) if waiting else []:
             frames, problem = self._whole(path, lost)
             taken: list[Found] = []
             start = 0
             while waiting and start + waiting[0].table.num_rows <= frames:
                 one = waiting.pop(0)
-                one.films[key] = Part(self._whole_copies.get(path, path), start, one.table.num_rows)
+                one.videos[key] = Part(self._whole_copies.get(path, path), start, one.table.num_rows)
                 taken.append(one)
                 start += one.table.num_rows
-            if start < frames and not problem and not (is_torn or len(untold) > certain):
+            if start < frames and not problem and not (is_torn or len(without_row) > certain):
                 name = path.relative_to(self._root).as_posix()
                 lost.append(
                     f"{name}: its {frames} frames are not those of whole episodes, so whose they are is not known"
                 )
                 for one in taken:
-                    del one.films[key]
+                    del one.videos[key]
                 break
             if problem and waiting:
-                break  # what films after a torn one show is not certain
-        for one in untold:
-            if key not in one.films:
-                self._look_aside(key, one, is_last=one is untold[-1])
+                break  # what videos after a torn one show is not certain
+        for one in without_row:
+            if key not in one.videos:
+                self._look_aside(key, one, is_last=one is without_row[-1])
 
     def _following(self, key: str, lost: list[str]) -> Iterator[Path]:
-        """Yield the films after those of the readable rows, as long as their numbers have no gap."""
+        """Yield the videos after those of the readable rows, as long as their numbers have no gap."""
         slots = [slot_of(row, f"videos/{key}") for row in self._rows.values() if not wrong_part(row, key)]
         slot: layout.Slot | None = max(slots, default=None)
         seen = {self._root / layout.video_file(key, one) for one in slots}
@@ -230,20 +230,20 @@ class Films:
         others = sorted(set((self._root / "videos" / key).glob("chunk-*/file-*.mp4")) - seen)
         if others:
             names = ", ".join(path.relative_to(self._root).as_posix() for path in others[:3])
-            lost.append(f"{names}: a film before is missing, so whose they are is not known")
+            lost.append(f"{names}: a video before is missing, so whose they are is not known")
 
     def _look_aside(self, key: str, one: Found, *, is_last: bool) -> None:
-        """Look for a film that was made and not joined yet, and for pictures that were not encoded yet."""
+        """Look for a video that was made and not joined yet, and for images that were not encoded yet."""
         names = [f"tmp*/{key}_{one.number:03d}.mp4", *([f"tmp*/{key}_streaming.mp4"] if is_last else [])]
         length = one.table.num_rows
         for path in (path for name in names for path in sorted(self._root.glob(name))):
             if whole_frames(path) == (length, ""):
                 self._frames[path] = (length, "")
-                one.films[key] = Part(path, 0, length)
+                one.videos[key] = Part(path, 0, length)
                 return
         folder = self._root / _FRAMES.format(key=key, episode=one.number)
         if _are_whole(folder, length):
-            one.films[key] = Part(folder, 0, length)
+            one.videos[key] = Part(folder, 0, length)
 
     def _whole(self, path: Path, lost: list[str]) -> tuple[int, str]:
         if path not in self._frames:
@@ -258,18 +258,18 @@ class Films:
         return self._frames[path]
 
     def write(self, kept: Sequence[Found], rows: Sequence[Row], info: dict[str, Any], new: Path, disk: Disk) -> None:
-        """Write the films of the recovered dataset, and into `rows` where each episode is in them.
+        """Write the videos of the recovered dataset, and into `rows` where each episode is in them.
 
-        A film of which all is needed stays as it is; of another the frames of these episodes are kept.
+        A video of which all is needed stays as it is; of another the frames of these episodes are kept.
         """
         for key in self._keys:
             slot: layout.Slot | None = None
-            for path in dict.fromkeys(one.films[key].path for one in kept):
-                members = [(one, row) for one, row in zip(kept, rows, strict=True) if one.films[key].path == path]
+            for path in dict.fromkeys(one.videos[key].path for one in kept):
+                members = [(one, row) for one, row in zip(kept, rows, strict=True) if one.videos[key].path == path]
                 slot = layout.next_slot(slot, info["chunks_size"])
                 target = new / layout.video_file(key, slot)
                 disk.make_folder(target.parent)
-                spans = [(one.films[key].start, one.films[key].length) for one, _ in members]
+                spans = [(one.videos[key].start, one.videos[key].length) for one, _ in members]
                 if path.is_dir():
                     encode(path, target, spans[0][1], self._fps, self._features[key])
                     starts = [0]
@@ -288,9 +288,9 @@ class Films:
 
 
 def _being_moved(path: Path) -> Path | None:
-    """Return the film that `path` is the beginning of.
+    """Return the video that `path` is the beginning of.
 
-    LeRobot joins films in the folder for temporary files and moves the result. On another file system that is a copy,
+    LeRobot joins videos in the folder for temporary files and moves the result. On another file system that is a copy,
     and a kill leaves the beginning of it, with the whole beside.
     """
     begin = path.read_bytes() if path.is_file() else b""
@@ -322,26 +322,26 @@ def whole_frames(path: Path) -> tuple[int, str]:
             stream = container.streams.video[0]
             for packet in container.demux(stream):
                 if packet.is_corrupt:
-                    return frames, "the film is cut off"
+                    return frames, "the video is cut off"
                 for frame in packet.decode():
                     if getattr(frame, "is_corrupt", False):
-                        return frames, "the film is damaged"
+                        return frames, "the video is damaged"
                     frames += 1
             if stream.frames and frames < stream.frames:
-                return frames, f"the film is cut off; it had {stream.frames} frames"
+                return frames, f"the video is cut off; it had {stream.frames} frames"
     except (av.error.FFmpegError, IndexError) as error:
         return frames, " ".join(str(error).split())
     return frames, ""
 
 
 def _are_whole(folder: Path, length: int) -> bool:
-    """Tell whether a folder has a readable picture for each of `length` frames."""
+    """Tell whether a folder has a readable image for each of `length` frames."""
     from PIL import Image
 
     for frame in range(length):
         try:
-            with Image.open(folder / f"frame-{frame:06d}.png") as picture:
-                picture.load()
+            with Image.open(folder / f"frame-{frame:06d}.png") as image:
+                image.load()
         except (OSError, SyntaxError):
             return False
     return True

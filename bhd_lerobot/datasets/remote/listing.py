@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from bhd_lerobot.datasets.remote.local import LocalDataset
 
 CARD = "README.md"
-PICTURE = "preview.png"
+PREVIEW = "preview.png"
 SUBSET = "meta/bhd_subset.json"
 """Says which episodes of a dataset were asked for, if files of it are missing. It is never uploaded."""
 

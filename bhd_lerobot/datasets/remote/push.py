@@ -14,7 +14,7 @@ from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.remote.listing import (
     CARD,
     MANIFEST,
-    PICTURE,
+    PREVIEW,
     Item,
     Remote,
     RemoteFile,
@@ -37,15 +37,15 @@ class Card:
 
     Attributes:
         text: Markdown, signed by `sign`.
-        picture: a PNG file's bytes; None if there is none.
+        image: a PNG file's bytes; None if there is none.
     """
 
     text: str
-    picture: bytes | None = None
+    image: bytes | None = None
 
 
 type MakeCard = Callable[[DatasetState, bool], Card]
-"""Makes a card of a dataset, given whether the user has put a picture beside it."""
+"""Makes a card of a dataset, given whether the user has put an image beside it."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def push(
         if not replace:
             _refuse_another(local, remote, there)
         cards, kept_card = _cards(local, remote, make_card, there)
-        items = [item for item in local.items if item.path not in (CARD, PICTURE)] + cards
+        items = [item for item in local.items if item.path not in (CARD, PREVIEW)] + cards
         try:
             if verify:
                 sizes = {item.path: item.size for item in items}
@@ -143,8 +143,8 @@ def is_generated(content: bytes | None) -> bool:
 def _cards(
     local: LocalDataset, remote: Remote, make_card: MakeCard | None, there: Mapping[str, RemoteFile]
 ) -> tuple[list[Item], bool]:
-    """Return the card and its picture as files to send, and whether a card there is not generated, and so kept."""
-    own = {item.path: item for item in local.items if item.path in (CARD, PICTURE)}
+    """Return the card and its image as files to send, and whether a card there is not generated, and so kept."""
+    own = {item.path: item for item in local.items if item.path in (CARD, PREVIEW)}
     if CARD in own:
         if not is_generated((local.root / CARD).read_bytes()):
             return list(own.values()), False
@@ -152,8 +152,8 @@ def _cards(
     if CARD in there and not is_generated(remote.read(CARD)):
         return [], True
     if make_card is not None:
-        card = make_card(local.state, PICTURE in own)
-        content = {CARD: card.text.encode(), PICTURE: card.picture}
+        card = make_card(local.state, PREVIEW in own)
+        content = {CARD: card.text.encode(), PREVIEW: card.image}
         own = {path: Item(path, one, len(one)) for path, one in content.items() if one is not None} | own
     return list(own.values()), False
 

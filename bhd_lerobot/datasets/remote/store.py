@@ -19,7 +19,7 @@ from bhd_lerobot.datasets.remote.listing import (
     CARD,
     LISTED,
     MANIFEST,
-    PICTURE,
+    PREVIEW,
     WORKERS,
     Item,
     RemoteFile,
@@ -144,7 +144,7 @@ class StoreDataset:
         The manifest is also written before and in between, so that a push that is repeated knows what has arrived.
         """
         sent = {item.path: item for item in items}
-        changes_data = any(path not in (CARD, PICTURE) for path in (*sent, *deleted))
+        changes_data = any(path not in (CARD, PREVIEW) for path in (*sent, *deleted))
         if not sent and not deleted and self._known == self._noted:
             return
         with store_errors(self.name, "upload the dataset to"):

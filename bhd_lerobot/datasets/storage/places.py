@@ -94,7 +94,7 @@ def check_links(root: Path) -> None:
     """Check that no link among the files of a dataset leads out of it.
 
     Args:
-        root: the dataset, whose folders are looked through: `meta`, `data`, `videos`, and those of films that LeRobot
+        root: the dataset, whose folders are looked through: `meta`, `data`, `videos`, and those of videos that LeRobot
             had not encoded yet, `images` and `tmp…`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""A picture of a dataset's timing: late ticks, ages of observations, inference times, intervals between frames."""
+"""An image of a dataset's timing: late ticks, ages of observations, inference times, intervals between frames."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def draw_timing(report: TimingReport, path: Path) -> None:
 
     Args:
         report: what is drawn.
-        path: where the picture goes; its suffix decides the format.
+        path: where the image goes; its suffix decides the format.
 
     Raises:
         OSError: it cannot be written.

@@ -1,4 +1,4 @@
-"""`bhd-data check`: is a dataset sound? Nothing is changed."""
+"""`bhd-data check`: is a dataset valid? Nothing is changed."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -22,7 +22,7 @@ CHECKS = {
     "files": "every file is there, and can be read to its last page",
     "counts": "meta/info.json, meta/episodes and the data files agree",
     "stats": "statistics are there, and are those of the data",
-    "video": "every film has as many frames as its episodes",
+    "video": "every video has as many frames as its episodes",
     "finite": "no NaN, no infinity, nothing missing",
     "frozen": "no number stands still that moves elsewhere",
     "jumps": "no action jumps",
@@ -67,7 +67,7 @@ def check_dataset(
     Args:
         root: the dataset.
         limits_of: gives the limits of a robot, by its type; only those numbers are compared.
-        videos: read the films, too, which takes longer than all the rest.
+        videos: read the videos, too, which takes longer than all the rest.
 
     Raises:
         DatasetError: there is no dataset, or its `meta/info.json` cannot be read.

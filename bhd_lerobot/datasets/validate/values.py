@@ -175,7 +175,7 @@ class ValueCheck:
             size = math.prod(self._files.features[key]["shape"])
             if values.size != len(table) * size:
                 what = f"it holds {values.size} numbers in {len(table)} frames; its shape is {size}"
-                self._findings.error("schema", key, what, "Mend the shape in meta/info.json, or record again.")
+                self._findings.error("schema", key, what, "Repair the shape in meta/info.json, or record again.")
                 continue
             self._check_column(key, values.reshape(len(table), size), starts, lengths)
         for key in (keys.LATE, keys.SKIPPED):

@@ -39,7 +39,7 @@ class DatasetRecorder:
     Attributes:
         root: the dataset.
         repo_id: its name on the Hub.
-        repair_report: what `resume` had to mend; false if nothing.
+        repair_report: what `resume` had to repair; false if nothing.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class DatasetRecorder:
         self._stats: dict[int, EpisodeStats] = {}
         self._open: list[EpisodeWriter] = []
         self._begun = 0
-        self._in_doubt = False
+        self._is_uncertain = False
         self._finalized = False
 
     @classmethod
@@ -117,7 +117,7 @@ class DatasetRecorder:
         video: VideoSettings | None = None,
         fsync: bool = False,
     ) -> Self:
-        """Continue a dataset, after mending what an interruption left. The arguments are those of `create`.
+        """Continue a dataset, after repairing what an interruption left. The arguments are those of `create`.
 
         `recording` and `video` may be None to accept the recorded ones.
 
@@ -204,7 +204,7 @@ class DatasetRecorder:
         episode.check_complete()
         if not isinstance(task, str) or not task:
             raise FrameError(f"The task must be a sentence; got {task!r}.")
-        self._settle_if_in_doubt()
+        self._settle_if_is_uncertain()
         types = self._state.metadata_types if self._state.rows else metadata_types(metadata)
         extra = checked_metadata(metadata, types)
         index = self.num_episodes
@@ -212,7 +212,7 @@ class DatasetRecorder:
         columns = self._with_defaults(episode, tasks.index(task))
         stats = statistics.column_stats({key: columns[key] for key in self._schema.float_keys})
         # From here on an exception, an interrupt too, may come between any two steps: what the disk says counts then.
-        self._in_doubt = True
+        self._is_uncertain = True
         try:
             with write_errors(f"save episode {index}", self.root, _INTACT):
                 videos = episode.finish_videos()
@@ -224,10 +224,10 @@ class DatasetRecorder:
             episode.discard()
             if isinstance(error, Exception):
                 with contextlib.suppress(OSError):
-                    self._settle_if_in_doubt()
+                    self._settle_if_is_uncertain()
             raise
         self._stats[index] = stats
-        self._in_doubt = False
+        self._is_uncertain = False
         episode.close()
         return index
 
@@ -247,11 +247,11 @@ class DatasetRecorder:
         try:
             consequence = "All saved episodes are intact and load; run `bhd-data repair` when the cause is removed."
             with write_errors("compact the dataset", self.root, consequence):
-                self._settle_if_in_doubt()
-                self._in_doubt = True
+                self._settle_if_is_uncertain()
+                self._is_uncertain = True
                 compact(self._state, self._schema, self._disk, self._lock, self._stats)
                 self._disk.remove_tree(self.root / layout.STAGING)
-                self._in_doubt = False
+                self._is_uncertain = False
             self._finalized = True
         finally:
             self._lock.release()
@@ -289,12 +289,12 @@ class DatasetRecorder:
             with contextlib.suppress(OSError):
                 self._disk.remove_tree(episode.folder)
 
-    def _settle_if_in_doubt(self) -> None:
+    def _settle_if_is_uncertain(self) -> None:
         # A failed `finalize` gave the lock back, so that `repair` can be used; somebody may have done that.
-        self._in_doubt |= self._lock.acquire()
-        if self._in_doubt:
+        self._is_uncertain |= self._lock.acquire()
+        if self._is_uncertain:
             self._state, _ = settle(self.root, self._disk, keep_staging=True)
-            self._in_doubt = False
+            self._is_uncertain = False
 
     def _check_not_finalized(self) -> None:
         if self._finalized:

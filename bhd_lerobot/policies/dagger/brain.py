@@ -1,4 +1,4 @@
-"""The brain `corrected`: a learner drives, and an expert takes over where the learner needs help.
+"""The brain `dagger`: a learner drives, and an expert takes over where the learner needs help.
 
 What the expert does is recorded as an intervention, and a policy that learns from it has seen what to do in the states
 that it gets itself into: DAgger (S. Ross, G. Gordon and D. Bagnell, AISTATS 2011) in the form of HG-DAgger (M. Kelly,
@@ -24,9 +24,9 @@ LEARNER_DRIVES = "the learner drives"
 _EXPERT_STREAM = 3  # the expert's random numbers are not the learner's
 
 
-@BrainConfig.register_subclass("corrected")
+@BrainConfig.register_subclass("dagger")
 @dataclass
-class CorrectedConfig(BrainConfig):
+class DaggerConfig(BrainConfig):
     """A learner, an expert, and when the expert takes over: one reason is enough, what is left out is not watched.
 
     Attributes:
@@ -59,15 +59,15 @@ class CorrectedConfig(BrainConfig):
             if value is not None and not 0 < value < math.inf:
                 raise ConfigError(f"brain.{name} is {value}; it must be positive and finite, or left out (null).")
         for name in ("learner", "expert"):
-            if isinstance(getattr(self, name), CorrectedConfig):
-                raise ConfigError(f"brain.{name}.type is 'corrected' itself; choose a brain that drives.")
+            if isinstance(getattr(self, name), DaggerConfig):
+                raise ConfigError(f"brain.{name}.type is 'dagger' itself; choose a brain that drives.")
         if getattr(self.learner, "stream", False):
             raise ConfigError(
                 "brain.learner.stream is true, but who drives is decided anew in every frame. Set it to false."
             )
 
 
-class CorrectedBrain:
+class DaggerBrain:
     """Drives with a learner, and with an expert where the learner needs help.
 
     The learner is asked in every frame of its turns, and between them if it gets another; a rule that gives setpoints
@@ -83,10 +83,10 @@ class CorrectedBrain:
         ConfigError: the two do not fit together.
     """
 
-    name = "corrected"
+    name = "dagger"
     robot_type = ANY_ROBOT
 
-    def __init__(self, config: CorrectedConfig, learner: Brain, expert: Brain) -> None:
+    def __init__(self, config: DaggerConfig, learner: Brain, expert: Brain) -> None:
         self.config, self.learner, self.expert = config, learner, expert
         if isinstance(learner, GoalBrain):
             raise ConfigError(f"brain.learner.type is {learner.name!r}, which gives goals; a learner gives setpoints.")

@@ -93,7 +93,7 @@ class StallWatch:
         self._window, self._dt = frames + 1, 1.0 / fps
         self._is_base = "x.vel" in names
         wanted = ("x.vel", "theta.vel") if self._is_base else _ARM.limits.names[:-1]
-        self._columns = find_columns(names, wanted, "corrected", "observation")
+        self._columns = find_columns(names, wanted, "dagger", "observation")
         self._pose: Array = np.zeros((0, 3))
         self._past: Array = np.zeros((0, 0, 0))
         self._frames = np.zeros(0, np.int64)
@@ -167,8 +167,8 @@ class BaseCollisionWatch:
     cause = "about to collide"
 
     def __init__(self, horizon_s: float, observed: Sequence[str], actions: Sequence[str]) -> None:
-        self._scan, self._angles = find_scan(observed, "corrected")
-        self._twist = find_columns(actions, ("x.vel", "theta.vel"), "corrected", "action")
+        self._scan, self._angles = find_scan(observed, "dagger")
+        self._twist = find_columns(actions, ("x.vel", "theta.vel"), "dagger", "action")
         self._limit = np.array(_BASE.limits.velocity)
         self._times = horizon_s * np.arange(1, _ARC_POINTS + 1) / _ARC_POINTS
 
@@ -210,10 +210,10 @@ class ArmCollisionWatch:
 
     def __init__(self, observed: Sequence[str], actions: Sequence[str], fps: int) -> None:
         joints = _ARM.limits.names[:_DOF]
-        self._position = find_columns(observed, joints, "corrected", "observation")
+        self._position = find_columns(observed, joints, "dagger", "observation")
         speeds = [name.replace(".pos", ".vel") for name in joints]
-        self._velocity = find_columns(observed, speeds, "corrected", "observation")
-        self._actions = find_columns(actions, joints, "corrected", "action") if set(joints) <= set(actions) else None
+        self._velocity = find_columns(observed, speeds, "dagger", "observation")
+        self._actions = find_columns(actions, joints, "dagger", "action") if set(joints) <= set(actions) else None
         self._model, self._fps = ArmKinematics(_ARM.chain, _ARM.limits).collision, fps
         limits = _ARM.limits
         self._speed, self._change = np.array(limits.velocity[:_DOF]), np.array(limits.acceleration[:_DOF])

@@ -44,7 +44,7 @@ class LiveLink:
         grants: what the real-time process was granted or refused, as plain values.
 
     Args:
-        mirror: a simulation like the one that is to run; this process's picture of the robot.
+        mirror: a simulation like the one that is to run; this process's image of the robot.
         config: the robot's configuration.
         name: name of the running robot, for `bhd-monitor`.
 
@@ -165,7 +165,7 @@ class LiveLink:
         """Start the loop; return when its tick 0 is due, monotonic [ns]."""
         words = self.block.words
         words[Word.PAUSE] = 0
-        stretch = int(words[Word.STRETCH])
+        segment = int(words[Word.SEGMENT])
         has_plant = "plant" in self._pipes
         start = time.monotonic_ns() + round(_HEAD_START_S * (1 + has_plant) * NANOSECONDS)
         if has_plant:
@@ -176,7 +176,7 @@ class LiveLink:
             self._until(lambda: words[Word.PLANT_ALIVE] > answered, _ANSWER_S, "The plant did not start")
         self._ask("run", start)
         self._running = True
-        self._until(lambda: words[Word.STRETCH] > stretch, _ANSWER_S, "The loop did not start")
+        self._until(lambda: words[Word.SEGMENT] > segment, _ANSWER_S, "The loop did not start")
         return start
 
     _running = False

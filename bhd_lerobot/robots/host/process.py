@@ -164,9 +164,9 @@ class LiveProcess:
         self._warm = True
 
     def _run(self, start_ns: int) -> tuple[int, int]:
-        """Run a stretch that begins at a monotonic time [ns]; return how many ticks were executed and skipped."""
+        """Run a segment that begins at a monotonic time [ns]; return how many ticks were executed and skipped."""
         self._statistics.reset()
-        self._publisher.restart(int(self._words[Word.STRETCH]) + 1)
+        self._publisher.restart(int(self._words[Word.SEGMENT]) + 1)
         # What is so before the first tick: the first frame's observation.
         before = Slot(-1, start_ns - self._loop.period_ns, 0, 0)
         self._publisher.publish(before, before.due_ns, before.due_ns, TickGrid(start_ns, self._loop.period_ns))

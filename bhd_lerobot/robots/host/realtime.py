@@ -60,7 +60,7 @@ class LiveSimulation(Simulation):
     """One robot on the wall clock.
 
     Attributes:
-        mirror: this process's picture of the robot.
+        mirror: this process's image of the robot.
         link: its processes.
 
     Args:
@@ -80,7 +80,7 @@ class LiveSimulation(Simulation):
         self.mirror, self.config, self.n, self.rates, self.body = mirror, mirror.config, 1, mirror.rates, mirror.body
         self.world, self.cerebellum, self.camera_names = mirror.world, mirror.cerebellum, mirror.camera_names
         self.action_names, self.observation_names = mirror.action_names, mirror.observation_names
-        self.view, self.film_speed = mirror.view, mirror.film_speed
+        self.view, self.video_speed = mirror.view, mirror.video_speed
         self.is_live, self.sensor_period_s = True, mirror.sensor_period_s
         self._begin()
         self.link = LiveLink(mirror, mirror.config, name)
@@ -325,7 +325,7 @@ class LiveSimulation(Simulation):
         due = self._origin + number * self._frame_ns
         while True:
             entry = reader.read()
-            if entry is not None and int(entry["state"]["stretch"]) == int(link.block.words[Word.STRETCH]):
+            if entry is not None and int(entry["state"]["segment"]) == int(link.block.words[Word.SEGMENT]):
                 if int(entry["frame"]) >= number:
                     self._boundary = entry
                     return entry

@@ -86,8 +86,8 @@ class Simulation(ABC):
         action_names: names of the action's floats, in order.
         observation_names: names of the observation's floats, in order.
         camera_names: the cameras that are observed.
-        view: the camera that looks at the robot from outside, for films.
-        film_speed: how much faster than the robot was a film of it is shown.
+        view: the camera that looks at the robot from outside, for videos.
+        video_speed: how much faster than the robot was a video of it is shown.
         running: which robots are in an episode, shape (n,).
         is_live: whether it runs on the wall clock, in processes of its own.
         sensor_period_s: time between two readings of the slowest sensor [s]; 0 if all are read at every tick.
@@ -105,7 +105,7 @@ class Simulation(ABC):
     observation_names: tuple[str, ...]
     camera_names: tuple[str, ...]
     view = "overview"
-    film_speed = 1
+    video_speed = 1
     is_live = False
     sensor_period_s = 0.0
     grants: list[dict[str, Any]] | None = None

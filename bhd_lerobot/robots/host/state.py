@@ -19,7 +19,7 @@ LIMITS, WATCHDOGS = tuple(limit for limit in Limit if limit), tuple(watchdog for
 
 # The numbers that a state begins with, in the order in which they are written.
 _NUMBERS = (
-    *("tick", "stretch", "due_ns", "start_ns", "ended_ns", "executed", "skipped", "overruns"),
+    *("tick", "segment", "due_ns", "start_ns", "ended_ns", "executed", "skipped", "overruns"),
     *("setpoints", "waiting", "command_age_ns", "sensed_ns", "oldest_ns"),
 )
 
@@ -29,10 +29,10 @@ def state_dtype(simulation: Simulation) -> np.dtype:
 
     Beside the fields of `CerebellumState`:
 
-    - ``tick``: number on the grid of its stretch; ``stretch``: number of the stretch.
+    - ``tick``: number on the grid of its segment; ``segment``: number of the segment.
     - ``due_ns``, ``start_ns``: when the tick was due and when it started, monotonic; ``ended_ns``: when the tick before
       it ended.
-    - ``executed``, ``skipped``, ``overruns``: ticks so far in the stretch.
+    - ``executed``, ``skipped``, ``overruns``: ticks so far in the segment.
     - ``requested``, ``setpoints``: the setpoint taken last, and how many were taken; ``command_age_ns``: its age if it
       is followed; ``waiting``: entries in the queue.
     - ``limits``, ``watchdogs``, ``refusals``, ``touches``: how often each was raised so far, of `LIMITS`, `WATCHDOGS`,
@@ -87,11 +87,11 @@ class StatePublisher:
         self._physics = self._field["physics"][:, :nq], self._field["physics"][:, nq:]
         self._frame = simulation.rates.ticks_per_frame
         self._next_frame = 0
-        self.stretch = 0
+        self.segment = 0
 
-    def restart(self, stretch: int) -> None:
-        """Begin a new stretch."""
-        self.stretch = stretch
+    def restart(self, segment: int) -> None:
+        """Begin a new segment."""
+        self.segment = segment
         self._next_frame = 0
         self._limits[:] = self._watchdogs[:] = self._touches[:] = 0
 
@@ -119,7 +119,7 @@ class StatePublisher:
         field["observation"][:], oldest = simulation.sense()
         self._numbers[:] = (
             slot.index,
-            self.stretch,
+            self.segment,
             slot.due_ns,
             start_ns,
             ended_ns,

@@ -52,7 +52,7 @@ class EpisodeTopics:
         repo_id: name of the dataset.
         start_s: when the first episode starts [s since 1970].
         bare_twist: commands of a base without stamps.
-        compressed_images: pictures as JPEG.
+        compressed_images: images as JPEG.
 
     Raises:
         UnsupportedDatasetError: the dataset holds something that no message is made for.
@@ -213,7 +213,7 @@ def camera_name(key: str) -> str:
 
 
 def image_topic(key: str, *, compressed: bool) -> str:
-    """Return the topic of a camera's pictures."""
+    """Return the topic of a camera's images."""
     return f"/{camera_name(key)}/image_raw" + ("/compressed" if compressed else "")
 
 

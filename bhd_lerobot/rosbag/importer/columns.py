@@ -1,4 +1,4 @@
-"""What is in the frames of an episode that is made of a robot's bag: every column but the pictures."""
+"""What is in the frames of an episode that is made of a robot's bag: every column but the images."""
 
 from collections.abc import Mapping
 from typing import Any

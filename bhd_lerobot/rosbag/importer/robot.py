@@ -111,7 +111,7 @@ class _Episode:
 
 
 class _RobotBag:
-    """One bag, all of it but pictures in memory."""
+    """One bag, all of it but images in memory."""
 
     def __init__(
         self,
@@ -197,16 +197,16 @@ class _RobotBag:
                     )
 
     def image_shapes(self) -> dict[str, tuple[int, int, int]]:
-        """Return the shapes of the cameras' pictures by name."""
+        """Return the shapes of the cameras' images by name."""
         return {camera.name: camera.shape() for camera in self._cameras}
 
     def save(self, episode: _Episode, recorder: DatasetRecorder) -> int:
         """Save an episode and return its number of frames.
 
         Raises:
-            DatasetError: its pictures cannot be decoded, or it was saved before.
+            DatasetError: its images cannot be decoded, or it was saved before.
         """
-        episode = self._with_pictures(episode)
+        episode = self._with_images(episode)
         times, ages = episode.grid.times, episode.grid.ages.max(axis=0)
         writer = recorder.begin_episode()
         try:
@@ -227,13 +227,13 @@ class _RobotBag:
         self.late.append(int(columns[keys.LATE].sum()))
         return len(times)
 
-    def _with_pictures(self, episode: _Episode) -> _Episode:
-        """Return an episode from the frame on at which every camera has a picture that can be decoded."""
+    def _with_images(self, episode: _Episode) -> _Episode:
+        """Return an episode from the frame on at which every camera has an image that can be decoded."""
         grid = episode.grid
         blind = max((camera.blind(episode.tracks[camera.role], grid.times) for camera in self._cameras), default=0)
         if blind:
             self.notes.append(
-                f"{self._after_start(grid)}: the episode begins {blind} frames later, with the first picture that can "
+                f"{self._after_start(grid)}: the episode begins {blind} frames later, with the first image that can "
                 "be decoded"
             )
         return replace(episode, grid=Grid(grid.times[blind:], grid.ages[:, blind:], grid.why))

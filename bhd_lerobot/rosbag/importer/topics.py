@@ -61,7 +61,7 @@ _MEANING = {
     "odom": "the robot's speed",
     "cmd": "the action",
     "imu": "the yaw rate of the gyroscope",
-    "camera": "the picture",
+    "camera": "the image",
 }
 
 

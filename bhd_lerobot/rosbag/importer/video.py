@@ -1,4 +1,4 @@
-"""The pictures of a robot's camera, out of its bag into an episode."""
+"""The images of a robot's camera, out of its bag into an episode."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from bhd_lerobot.rosbag.storage.read import Bag, Picker
 CAMERA = "camera/"
 """What the role of a camera's track begins with; its name follows."""
 
-_TRIED = 10  # pictures at the beginning, of which one must be readable
+_TRIED = 10  # images at the beginning, of which one must be readable
 
 
 class CameraImages:
@@ -34,10 +34,10 @@ class CameraImages:
     def __init__(self, bag: Bag, role: str, track: Track, notes: list[str]) -> None:
         self.role, self.name = role, role.removeprefix(CAMERA)
         self._track, self._notes = track, notes
-        self._pictures = Picker(bag, track.topic)
+        self._images = Picker(bag, track.topic)
 
     def shape(self) -> tuple[int, int, int]:
-        """Return the shape of its pictures.
+        """Return the shape of its images.
 
         Raises:
             DatasetError: none of the first ones can be decoded.
@@ -54,14 +54,14 @@ class CameraImages:
         raise reason
 
     def blind(self, track: Track, times: Times) -> int:
-        """Return how many frames at the beginning of an episode have no picture that can be decoded.
+        """Return how many frames at the beginning of an episode have no image that can be decoded.
 
         Args:
             track: the camera's messages in the segment in which the episode lies, sorted by time.
             times: of the frames [ns].
 
         Raises:
-            DatasetError: none of the first pictures can.
+            DatasetError: none of the first images can.
         """
         reason: DatasetError | None = None
         rows, first = np.unique(newest(track.times, times), return_index=True)
@@ -76,14 +76,14 @@ class CameraImages:
         raise reason
 
     def write(self, track: Track, times: Times, writer: EpisodeWriter) -> Times:
-        """Add the picture of each frame to an episode; return when they were taken [ns], shape (frames,).
+        """Add the image of each frame to an episode; return when they were taken [ns], shape (frames,).
 
-        A picture that cannot be decoded, as of a camera that was unplugged, is as if it had been lost: the one before
+        An image that cannot be decoded, as of a camera that was unplugged, is as if it had been lost: the one before
         is there in its place, and its age says so.
 
         Args:
             track: as in `blind`.
-            times: of the frames [ns]; the first one has a picture that can be decoded.
+            times: of the frames [ns]; the first one has an image that can be decoded.
             writer: the episode.
 
         Raises:
@@ -103,7 +103,7 @@ class CameraImages:
                     reason = reason or str(error)
                     if image is None or broken > max(1, MOST_LOST * total):
                         raise DatasetError(
-                            f"{broken} of {total} pictures of an episode cannot be decoded, which is more than "
+                            f"{broken} of {total} images of an episode cannot be decoded, which is more than "
                             f"{MOST_LOST:.0%}: too many to go on without them. The first: {reason}"
                         ) from error
                 before = row
@@ -112,10 +112,10 @@ class CameraImages:
             writer.add_image(f"{keys.OBSERVATION_IMAGES}.{self.name}", image)
         if broken:
             self._notes.append(
-                f"{track.topic}: {broken} of {total} pictures of an episode cannot be decoded; the one before is there "
+                f"{track.topic}: {broken} of {total} images of an episode cannot be decoded; the one before is there "
                 f"in their place. The first: {reason}"
             )
         return track.times[shown]
 
     def _decode(self, place: int) -> NDArray[np.uint8]:
-        return decode_image(self._track.topic, self._track.msgtype, self._pictures.get(place))
+        return decode_image(self._track.topic, self._track.msgtype, self._images.get(place))

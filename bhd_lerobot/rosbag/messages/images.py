@@ -15,7 +15,7 @@ from bhd_lerobot.rosbag.messages.serialize import decode, encode
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _JPEG_QUALITY = 95
-# What image_transport writes of an rgb8 picture. It decodes with OpenCV, into blue, green, red; by the last word it
+# What image_transport writes of an rgb8 image. It decodes with OpenCV, into blue, green, red; by the last word it
 # knows that red and blue have to change places.
 _FORMAT = "rgb8; jpeg compressed bgr8"
 _COLOURS = ("RGB", "RGBA", "L", "LA", "P", "1", "CMYK", "YCbCr")  # modes of PIL with 8 bits
@@ -60,11 +60,11 @@ def video_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.
                     return
     except (av.error.FFmpegError, IndexError) as error:
         raise corrupt(path, error) from error
-    raise corrupt(path, f"it ends {count - found} pictures before its episode does")
+    raise corrupt(path, f"it ends {count - found} images before its episode does")
 
 
 def encode_image(frames: Frames, frame_id: str, image: NDArray[np.uint8], *, compressed: bool) -> bytes:
-    """Return one picture as a message: raw RGB, or JPEG."""
+    """Return one image as a message: raw RGB, or JPEG."""
     fields: dict[str, Any] = {"header": header(frames.stamps, frame_id)}
     if compressed:
         from PIL import Image
@@ -79,7 +79,7 @@ def encode_image(frames: Frames, frame_id: str, image: NDArray[np.uint8], *, com
 
 
 def decode_image(topic: str, msgtype: str, message: bytes) -> NDArray[np.uint8]:
-    """Return the picture in a message, shape (H, W, 3).
+    """Return the image in a message, shape (H, W, 3).
 
     Raises:
         DatasetError: it has an encoding that is not known, or is damaged.
@@ -90,12 +90,12 @@ def decode_image(topic: str, msgtype: str, message: bytes) -> NDArray[np.uint8]:
     encoding = found.encoding
     if encoding not in _RAW:
         raise DatasetError(
-            f"The pictures of {topic} have the encoding {encoding!r}; valid: {', '.join(_RAW)}, or a CompressedImage."
+            f"The images of {topic} have the encoding {encoding!r}; valid: {', '.join(_RAW)}, or a CompressedImage."
         )
     dtype, channels, order = _RAW[encoding]
     height, width, step, data = found.height, found.width, found.step, found.data
     if not height * width or len(data) != height * step or step < width * channels:
-        raise DatasetError(f"A picture of {topic} has {len(data)} bytes, which is not {height} x {width} {encoding}.")
+        raise DatasetError(f"An image of {topic} has {len(data)} bytes, which is not {height} x {width} {encoding}.")
     rows = data.view(dtype).reshape(height, step)[:, : width * channels].reshape(height, width, channels)
     return np.ascontiguousarray(rows[:, :, order])
 
@@ -110,12 +110,12 @@ def _decompressed(topic: str, form: str, data: NDArray[np.uint8]) -> NDArray[np.
             return np.asarray(image.convert("RGB"))
     except Image.UnidentifiedImageError as error:
         raise DatasetError(
-            f"A picture of {topic} ({what}) is neither JPEG nor PNG, and cannot be decoded. Of compressed depth "
+            f"An image of {topic} ({what}) is neither JPEG nor PNG, and cannot be decoded. Of compressed depth "
             "nothing is made."
         ) from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DatasetError(f"A picture of {topic} ({what}) cannot be decoded: {error}.") from error
+        raise DatasetError(f"An image of {topic} ({what}) cannot be decoded: {error}.") from error
     raise DatasetError(
-        f"The pictures of {topic} ({what}) have more than 8 bits (mode {image.mode}), as of a depth camera; valid: "
+        f"The images of {topic} ({what}) have more than 8 bits (mode {image.mode}), as of a depth camera; valid: "
         "JPEG and PNG in colour or grey."
     )

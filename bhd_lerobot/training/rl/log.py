@@ -29,7 +29,7 @@ def draw_curve(rows: Sequence[Row], path: Path, heading: str, rule: tuple[str, M
 
     Args:
         rows: rows of a metrics file.
-        path: where the picture goes.
+        path: where the image goes.
         heading: what stands above it.
         rule: name and level of the rule on the validation episodes, by the keys `val_return` and so on.
     """

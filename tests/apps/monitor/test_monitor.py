@@ -62,10 +62,10 @@ class Robot:
         self.state = np.zeros((), dtype)
         self.start()
 
-    def start(self, stretch: int = 1) -> None:
+    def start(self, segment: int = 1) -> None:
         words = self.block.words
-        words[Word.START], words[Word.STRETCH], words[Word.PHASE] = self.now, stretch, Phase.RUNNING
-        self.state["stretch"], self.state["executed"], self.state["mode"] = stretch, 0, Mode.HOLD
+        words[Word.START], words[Word.SEGMENT], words[Word.PHASE] = self.now, segment, Phase.RUNNING
+        self.state["segment"], self.state["executed"], self.state["mode"] = segment, 0, Mode.HOLD
         self.statistics.reset()
         self.tick(0)
 
@@ -138,7 +138,7 @@ def test_who_watches_does_not_hold_the_name() -> None:
     assert not block.is_held
     again = Robot(f"{NAME}-held")
     assert not block.is_held  # another robot of the same name is another robot
-    assert block.words[Word.STRETCH] == 1  # what was seen last can still be read
+    assert block.words[Word.SEGMENT] == 1  # what was seen last can still be read
     block.close()
     block.close()
     assert not block.is_held
@@ -491,7 +491,7 @@ def test_leaving_by_ctrl_c_gives_the_terminal_back(robot: Robot, terminal: Termi
     assert robot.block.words[Word.ESTOP] == 0
 
 
-def test_a_stop_does_not_wait_for_a_picture() -> None:
+def test_a_stop_does_not_wait_for_a_image() -> None:
     master, slave = pty.openpty()
     pressed = threading.Event()
     usable = monitor.KeyTerminal.usable

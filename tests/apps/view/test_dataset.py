@@ -97,14 +97,14 @@ def test_a_description_of_another_shape_is_refused(tmp_path, change) -> None:
 
 
 @pytest.mark.parametrize("at_once", [True, False])
-def test_a_film_that_is_not_there_is_missing_and_nothing_else_is(base, tmp_path, at_once: bool) -> None:
+def test_a_video_that_is_not_there_is_missing_and_nothing_else_is(base, tmp_path, at_once: bool) -> None:
     root = Path(shutil.copytree(base, tmp_path / "d"))
-    film = next(root.rglob("*.mp4"))
+    video = next(root.rglob("*.mp4"))
     if at_once:
-        film.unlink()
+        video.unlink()
     with served(root) as server:
-        film.unlink(missing_ok=True)
-        assert server.ask(f"/films/{FRONT}/0/0.mp4")[0] == 404
+        video.unlink(missing_ok=True)
+        assert server.ask(f"/videos/{FRONT}/0/0.mp4")[0] == 404
         assert server.ask("/api/episodes/0")[0] == 200
         path = next((root / "data").rglob("*.parquet"))
         path.write_bytes(path.read_bytes()[:-9])

@@ -36,8 +36,8 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory) -> Path:
-    return record_ours(tmp_path_factory.mktemp("page") / "filmed", 5, (FRONT, WRIST))
+def video_dataset(tmp_path_factory) -> Path:
+    return record_ours(tmp_path_factory.mktemp("page") / "video_dataset", 5, (FRONT, WRIST))
 
 
 @contextmanager
@@ -66,7 +66,7 @@ def opened(
 def shown_frames(page: Any) -> dict[str, set[int]]:
     """Return the frame that each kind of view says that it shows."""
     found = page.evaluate(
-        """() => Object.entries({film: 'video, .film img', drawing: '.view canvas', timeline: '#track',
+        """() => Object.entries({video: 'video, .video img', drawing: '.view canvas', timeline: '#track',
              plot: '.playhead'}).map(([kind, query]) =>
                [kind, [...document.querySelectorAll(query)].map((one) => Number(one.dataset.frame))])"""
     )
@@ -102,11 +102,11 @@ def test_everything_moves_together(browser, base) -> None:
         assert page.title().startswith("base")
         assert numbers(page) == [0, 1, 2]
         kinds = page.eval_on_selector_all(".view", "views => views.map((one) => one.dataset.view)")
-        assert kinds == ["film", "scan", "top"]
+        assert kinds == ["video", "scan", "top"]
         wait_for_plots(page, 7)
-        assert shown_frames(page) == {"film": {0}, "drawing": {0}, "timeline": {0}, "plot": {0}}
+        assert shown_frames(page) == {"video": {0}, "drawing": {0}, "timeline": {0}, "plot": {0}}
         scrub(page, 0.525)
-        assert shown_frames(page) == {"film": {10}, "drawing": {10}, "timeline": {10}, "plot": {10}}
+        assert shown_frames(page) == {"video": {10}, "drawing": {10}, "timeline": {10}, "plot": {10}}
         page.keyboard.press("ArrowRight")
         page.keyboard.press("ArrowRight")
         page.keyboard.press("ArrowLeft")
@@ -114,11 +114,11 @@ def test_everything_moves_together(browser, base) -> None:
         page.keyboard.press("Home")
         assert shown_frames(page)["plot"] == {0}
         page.keyboard.press("End")
-        assert shown_frames(page) == {"film": {19}, "drawing": {19}, "timeline": {19}, "plot": {19}}
+        assert shown_frames(page) == {"video": {19}, "drawing": {19}, "timeline": {19}, "plot": {19}}
         # A click into a plot goes there.
         box = page.locator(".plot .u-over").first.bounding_box()
         page.mouse.click(box["x"] + 5 / 19 * box["width"], box["y"] + 20)
-        assert shown_frames(page)["film"] <= {4, 5}
+        assert shown_frames(page)["video"] <= {4, 5}
         assert len(shown_frames(page)["drawing"]) == 1
         # The mouse over one plot is shown in all, and on the timeline.
         page.mouse.move(box["x"] + 15.2 / 19 * box["width"], box["y"] + 30)
@@ -137,27 +137,27 @@ def test_playing_goes_on_to_the_end_and_stops(browser, base) -> None:
         wait_until(page, "document.querySelector('video').currentTime > 0.3")
         wait_until(page, "document.querySelector('#play').getAttribute('aria-label') === 'Play'")
         assert shown_frames(page)["drawing"] == {19}
-        # The file goes on with the next episode; the film of this one does not.
+        # The file goes on with the next episode; the video of this one does not.
         wait_until(page, "!document.querySelector('video').seeking")
         assert page.evaluate("document.querySelector('video').currentTime") == pytest.approx(1.95, abs=0.01)
 
 
-def test_the_film_shows_the_frame_that_is_chosen(browser, filmed) -> None:
+def test_the_video_shows_the_frame_that_is_chosen(browser, video_dataset) -> None:
     """Pixels that the browser shows are those that were recorded, in episodes in the middle of a file, too."""
     look = """async (camera) => {
-      const film = document.querySelector(`video[data-camera='${camera}']`);
+      const video = document.querySelector(`video[data-camera='${camera}']`);
       const canvas = document.createElement('canvas');
       [canvas.width, canvas.height] = [10, 8];
       const context = canvas.getContext('2d');
       context.imageSmoothingQuality = 'high';
-      context.drawImage(film, 0, 0, 10, 8);
+      context.drawImage(video, 0, 0, 10, 8);
       return [...context.getImageData(0, 0, 10, 8).data];
     }"""
-    with served(filmed) as server, opened(browser, server) as page:
+    with served(video_dataset) as server, opened(browser, server) as page:
         for index, frame in ((0, 0), (3, 4), (1, 2)):
             select(page, index)
             scrub(page, (frame + 0.5) / length(index))
-            assert shown_frames(page)["film"] == {frame}
+            assert shown_frames(page)["video"] == {frame}
             wait_until(
                 page, "[...document.querySelectorAll('video')].every((one) => one.readyState >= 2 && !one.seeking)"
             )
@@ -170,8 +170,8 @@ def test_the_film_shows_the_frame_that_is_chosen(browser, filmed) -> None:
                 assert distances[frame] < 30 < np.delete(distances, frame).min()
 
 
-def test_filters_search_and_sorting(browser, filmed) -> None:
-    with served(filmed) as server, opened(browser, server) as page:
+def test_filters_search_and_sorting(browser, video_dataset) -> None:
+    with served(video_dataset) as server, opened(browser, server) as page:
         chips = page.eval_on_selector_all(".chip", "chips => chips.map((one) => one.textContent)")
         assert chips == ["success3", "collision1", "timeout1"]
         page.click(".chip[data-outcome=success]")
@@ -218,10 +218,10 @@ def test_two_episodes_side_by_side(browser, base) -> None:
         page.keyboard.press("c")  # with the one before
         page.wait_for_selector(".card-b[data-episode='0']")
         assert page.locator("video").count() == 2
-        starts = server_films(server)
+        starts = server_videos(server)
         scrub(page, 0.275)
         wait_until(page, "[...document.querySelectorAll('video')].every((one) => !one.seeking)")
-        times = page.eval_on_selector_all("video", "films => films.map((one) => one.currentTime)")
+        times = page.eval_on_selector_all("video", "videos => videos.map((one) => one.currentTime)")
         assert times == pytest.approx([starts[2] + 0.55, starts[0] + 0.55], abs=0.01)  # aligned at their starts
         wait_for_plots(page, 7)
         assert "applied #0" in page.text_content(".plot")
@@ -239,8 +239,8 @@ def test_two_episodes_side_by_side(browser, base) -> None:
         assert numbers(page, ".row.compared") == [2]
 
 
-def server_films(server: Served) -> list[float]:
-    return [unpack(server.ask(f"/api/episodes/{index}")[2])[0]["films"][0]["from"] for index in range(3)]
+def server_videos(server: Served) -> list[float]:
+    return [unpack(server.ask(f"/api/episodes/{index}")[2])[0]["videos"][0]["from"] for index in range(3)]
 
 
 def test_an_arm_its_plan_and_what_was_asked_for(browser, arm) -> None:
@@ -325,12 +325,12 @@ def test_what_happens_on_disk_is_told(browser, base, tmp_path) -> None:
         page.wrong[:] = [text for text in page.wrong if "409" not in text]  # the browser's own line on the refusal
 
 
-def test_a_missing_film_is_said_in_its_place(browser, base, tmp_path) -> None:
+def test_a_missing_video_is_said_in_its_place(browser, base, tmp_path) -> None:
     root = Path(shutil.copytree(base, tmp_path / "d"))
     with served(root) as server:
         next(root.rglob("*.mp4")).unlink()
         with opened(browser, server) as page:
-            page.wait_for_selector(".film .problem:has-text('missing')")
+            page.wait_for_selector(".video .problem:has-text('missing')")
             wait_for_plots(page, 7)
             scrub(page, 0.525)
             assert shown_frames(page)["drawing"] == {10}
@@ -355,9 +355,9 @@ def test_a_dataset_of_stock_lerobot_and_odd_ones(browser, tmp_path) -> None:
         assert page.text_content(".card-a .badge") == "not judged"
         wait_until(page, "document.querySelector('video').readyState >= 2")  # AV1
         scrub(page, 0.59)
-        picture = f"img[data-camera='{PHOTO}']"
-        wait_until(page, f'document.querySelector("{picture}").dataset.frame === "3"')
-        wait_until(page, f'document.querySelector("{picture}").naturalWidth === 80')
+        image = f"img[data-camera='{PHOTO}']"
+        wait_until(page, f'document.querySelector("{image}").dataset.frame === "3"')
+        wait_until(page, f'document.querySelector("{image}").naturalWidth === 80')
         assert page.locator("#mark-intervention").is_disabled()
         assert page.locator("[data-view=top], [data-view=scan]").count() == 0
     features: dict[str, Any] = {"action": {"dtype": "float32", "shape": (2,), "names": ["x", "y"]}}

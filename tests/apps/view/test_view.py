@@ -30,12 +30,12 @@ from bhd_lerobot.errors import DatasetError
 from tests.apps.view.support import Served, episode, served
 from tests.datasets.loader.support import PHOTO, images, length
 
-# -- films and pictures ------------------------------------------------------------------------------------------------
+# -- videos and images ------------------------------------------------------------------------------------------------
 
 
-def test_a_part_of_a_film_is_that_part(base, base_server) -> None:
+def test_a_part_of_a_video_is_that_part(base, base_server) -> None:
     camera = base_server.json("/api/dataset")["cameras"][0]
-    path = f"/films/{camera['key']}/0/0.mp4"
+    path = f"/videos/{camera['key']}/0/0.mp4"
     whole = (base / "videos" / camera["key"] / "chunk-000/file-000.mp4").read_bytes()
     status, headers, content = base_server.ask(path, headers={"Range": "bytes=100-299"})
     assert (status, headers["content-type"]) == (206, "video/mp4")
@@ -44,7 +44,7 @@ def test_a_part_of_a_film_is_that_part(base, base_server) -> None:
     assert base_server.ask(path)[2] == whole
     assert base_server.ask(path, headers={"Range": f"bytes={len(whole)}-"})[0] == 416
     header, _ = episode(base_server, 1)
-    assert header["films"][0]["from"] == pytest.approx(20 / 10)  # behind the first episode's
+    assert header["videos"][0]["from"] == pytest.approx(20 / 10)  # behind the first episode's
 
 
 def test_a_link_out_of_the_dataset_is_not_served(base: Path, stock: Path, tmp_path: Path) -> None:
@@ -52,20 +52,20 @@ def test_a_link_out_of_the_dataset_is_not_served(base: Path, stock: Path, tmp_pa
     secret = tmp_path / "secret"
     secret.write_text("password")
     root = Path(shutil.copytree(base, tmp_path / "base"))
-    film = next((root / "videos").glob("*/*/*.mp4"))
+    video = next((root / "videos").glob("*/*/*.mp4"))
     with served(root) as server:  # the link is made while it runs
-        whole = film.read_bytes()
-        film.unlink()
-        film.symlink_to(secret)
-        path = f"/films/{film.parts[-3]}/0/0.mp4"
+        whole = video.read_bytes()
+        video.unlink()
+        video.symlink_to(secret)
+        path = f"/videos/{video.parts[-3]}/0/0.mp4"
         status, _, said = server.ask(path)
         assert (status, b"password" in said, b"is a link to" in said) == (409, False, True)
         (root / "own.mp4").write_bytes(whole)
-        film.unlink()
-        film.symlink_to("../../../own.mp4")
+        video.unlink()
+        video.symlink_to("../../../own.mp4")
         assert server.ask(path)[2] == whole
-    film.unlink()
-    film.symlink_to(secret)
+    video.unlink()
+    video.symlink_to(secret)
     with pytest.raises(DatasetError, match=r"is a link to .*secret, outside of the dataset"), served(root):
         pass
     root = Path(shutil.copytree(stock, tmp_path / "stock"))
@@ -84,11 +84,11 @@ def test_a_link_out_of_the_dataset_is_not_served(base: Path, stock: Path, tmp_pa
 @pytest.mark.parametrize(
     "path",
     [
-        "/films/observation.images.rear/0/0.mp4",
-        "/films/observation.images.front/0/7.mp4",
-        "/films/observation.images.front/0/-1.mp4",
-        "/films/..%2f..%2fmeta/0/0.mp4",
-        "/films/../../../etc/passwd",
+        "/videos/observation.images.rear/0/0.mp4",
+        "/videos/observation.images.front/0/7.mp4",
+        "/videos/observation.images.front/0/-1.mp4",
+        "/videos/..%2f..%2fmeta/0/0.mp4",
+        "/videos/../../../etc/passwd",
         "/static/../server.py",
         "/static/..%2fserver.py",
         "/static/%2e%2e/server.py",
@@ -103,7 +103,7 @@ def test_nothing_else_is_served(base_server, path) -> None:
     assert b"import" not in content
 
 
-def test_pictures_in_the_data_files(stock) -> None:
+def test_images_in_the_data_files(stock) -> None:
     with served(stock) as server:
         status, headers, content = server.ask(f"/api/episodes/1/images/{PHOTO}/3")
         assert (status, headers["content-type"]) == (200, "image/png")

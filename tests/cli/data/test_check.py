@@ -34,13 +34,13 @@ def broken(recorded: Path, tmp_path: Path, value: float) -> Path:
 
 def test_what_was_just_recorded_is_sound(recorded: Path, capsys) -> None:
     assert main.main(["check", str(recorded)]) == 0
-    assert "sound, no errors" in capsys.readouterr().out
+    assert "valid, no errors" in capsys.readouterr().out
 
 
 def test_as_json(recorded: Path, capsys) -> None:
     assert main.main(["check", str(recorded), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["sound"] is True
+    assert told["valid"] is True
     assert told["episodes"] == 3
     assert {one["severity"] for one in told["findings"]} <= {"note", "warning"}
 
@@ -51,7 +51,7 @@ def test_errors_and_with_strict_warnings_end_with_status_1(recorded: Path, tmp_p
     assert main.main(["check", str(root)]) == 1  # statistics are not those of the data
     text = capsys.readouterr().out
     assert "the robot's limits are -0.22 and 0.22" in text
-    assert "not sound, 1 error, " in text
+    assert "not valid, 1 error, " in text
     shutil.rmtree(root)
     root = Path(shutil.copytree(recorded, tmp_path / "d"))
     (root / "data/chunk-000/file-009.parquet").write_bytes(b"left")

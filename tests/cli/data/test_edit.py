@@ -56,7 +56,7 @@ def test_check_with_fix(recorded: Path, tmp_path: Path, capsys) -> None:
     assert "bhd-data check --fix" in " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert main.main(["check", str(root), "--fix", "--json"]) == 0
     captured = capsys.readouterr()
-    assert json.loads(captured.out)["sound"] is True
+    assert json.loads(captured.out)["valid"] is True
     assert captured.err.startswith("fixed meta/stats.json")
 
 

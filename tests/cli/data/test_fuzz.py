@@ -48,13 +48,15 @@ def sources(tmp_path_factory) -> list[Path]:
     for name, told in (("interventions", [[1, 3, "a person"]]), ("realtime", [dict.fromkeys(GRANT, "x")])):
         table = table.append_column(f"bhd/{name}", pa.array([json.dumps(told)] * table.num_rows))
     pq.write_table(table, path)
-    run_record(folder / "filmed", dataset__episode_time_s=0.5, robot__camera="true", n_envs=1, dataset__num_episodes=2)
+    run_record(
+        folder / "video_dataset", dataset__episode_time_s=0.5, robot__camera="true", n_envs=1, dataset__num_episodes=2
+    )
     killed = support.create(folder / "killed", video=True)
     for _ in range(3):
         support.record(killed, video=True)
     killed._lock.release()  # as if it had been killed
     stock = loader_support.record_stock(folder / "stock", cameras=True)
-    return [folder / "recorded", folder / "filmed", folder / "killed", stock]
+    return [folder / "recorded", folder / "video_dataset", folder / "killed", stock]
 
 
 def seeds() -> Sequence[int]:

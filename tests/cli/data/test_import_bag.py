@@ -384,7 +384,7 @@ def test_values_that_are_not_finite_count_as_lost(tmp_path, capsys):
     assert np.isfinite(read_episode(tmp_path / "d", 0)["action"]).all()
 
 
-def test_pictures_and_gyroscope(tmp_path):
+def test_images_and_gyroscope(tmp_path):
     types = bags.T
     messages = drive(seconds=3)
     for number in range(60):

@@ -351,11 +351,11 @@ def test_a_robot_in_a_namespace(tmp_path, messages, plain, capsys):
     assert "turned by 180.0 degrees, from /tf_static" in capsys.readouterr().err
 
 
-# --- pictures and scanners ---------------------------------------------------------------------------------------
+# --- images and scanners ---------------------------------------------------------------------------------------
 
 
 def jpegs(count=40):
-    """Return compressed pictures at 10 Hz, each brighter than the one before."""
+    """Return compressed images at 10 Hz, each brighter than the one before."""
     messages = []
     for number in range(count):
         file = io.BytesIO()
@@ -368,32 +368,32 @@ def jpegs(count=40):
     return messages
 
 
-def test_pictures_that_are_lost_are_as_old_as_those_in_their_place(tmp_path, messages, capsys):
+def test_images_that_are_lost_are_as_old_as_those_in_their_place(tmp_path, messages, capsys):
     whole, arguments = jpegs(), ["--camera=front=/image", "--beams=36", "--max_age=0.25"]
     bag = write(tmp_path / "whole", sorted([*messages, *whole], key=lambda one: one[1]))
     imported(bag, tmp_path / "w", *arguments)
     capsys.readouterr()
-    pictures = jpegs()
+    images = jpegs()
     for place in (0, 1, 2, 20):
-        pictures[place][2].data = pictures[place][2].data[:100]  # the camera stumbled; its message is whole
-    bag = write(tmp_path / "bag", sorted([*messages, *pictures], key=lambda one: one[1]))
+        images[place][2].data = images[place][2].data[:100]  # the camera stumbled; its message is whole
+    bag = write(tmp_path / "bag", sorted([*messages, *images], key=lambda one: one[1]))
     imported(bag, tmp_path / "d", *arguments)
     error = capsys.readouterr().err
-    assert "pictures of an episode cannot be decoded; the one before is there in their place" in error
+    assert "images of an episode cannot be decoded; the one before is there in their place" in error
     (_, begin), (_, began) = places(tmp_path / "w")[0], places(tmp_path / "d")[0]
     skipped = round((began - begin) * 10)
     assert 1 <= skipped <= 3
-    assert f"the episode begins {skipped} frames later, with the first picture that can be decoded" in error
+    assert f"the episode begins {skipped} frames later, with the first image that can be decoded" in error
     ours, theirs = read_episode(tmp_path / "d", 0), read_episode(tmp_path / "w", 0)
     older = ours["control.age"] - theirs["control.age"][skipped:]
     assert (older >= 0).all()
     assert (older > 0.01).sum() == 1  # where nothing else is as old
     assert np.array_equal(ours["observation.state"], theirs["observation.state"][skipped:])
     for place in range(3, 40, 3):
-        pictures[place][2].data = pictures[place][2].data[:100]
-    bag = write(tmp_path / "broken", sorted([*messages, *pictures], key=lambda one: one[1]))
+        images[place][2].data = images[place][2].data[:100]
+    bag = write(tmp_path / "broken", sorted([*messages, *images], key=lambda one: one[1]))
     error = refused(bag, tmp_path / "e", capsys, *arguments)
-    assert "pictures of an episode cannot be decoded, which is more than 10%" in error
+    assert "images of an episode cannot be decoded, which is more than 10%" in error
 
 
 def test_a_scanner_of_shorter_reach_is_told(tmp_path, messages, capsys):

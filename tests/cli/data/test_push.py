@@ -101,18 +101,21 @@ def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) ->
     assert json.loads(folded[1]) == json.loads((recorded / "meta/bhd.json").read_text())
     assert 'LeRobotDataset("me/avoid")' in card
     assert "](preview.png)" in card
-    picture = hub.dataset("me/avoid").files()["preview.png"].content
+    preview = hub.dataset("me/avoid").files()["preview.png"].content
     from matplotlib.image import imread
 
-    (Path(os.environ["HF_HOME"]) / "p.png").write_bytes(picture)
+    (Path(os.environ["HF_HOME"]) / "p.png").write_bytes(preview)
     image = imread(Path(os.environ["HF_HOME"]) / "p.png")
     assert image.shape[0] > 200
     assert image[..., :3].std() > 0.05
 
 
-def test_pictures_of_cameras_and_of_curves(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
-    films = make_dataset(tmp_path / "films", episodes=2, camera=True)
-    for root, said in ((films, "as `observation.images.front` saw it"), (lesson, "what was observed, and the actions")):
+def test_images_of_cameras_and_of_curves(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
+    videos = make_dataset(tmp_path / "videos", episodes=2, camera=True)
+    for root, said in (
+        (videos, "as `observation.images.front` saw it"),
+        (lesson, "what was observed, and the actions"),
+    ):
         assert main.main(["push", str(root), f"me/{root.name}"]) == 0
         assert said in text_of(hub, f"me/{root.name}")
         assert hub.dataset(f"me/{root.name}").files()["preview.png"].content.startswith(b"\x89PNG")
@@ -350,9 +353,9 @@ def test_the_command_to_repeat_says_all_that_was_asked_for(tmp_path: Path) -> No
     assert repeat_line(parser.parse_args(["push", "--root=-x", "me/d"]), "-x", "me/d") == "bhd-data push ./-x me/d"
 
 
-def test_a_picture_of_the_users_is_on_the_card(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
+def test_a_image_of_the_users_is_on_the_card(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
     mine = Path(shutil.copytree(lesson, tmp_path / "d"))
     (mine / "preview.png").write_bytes(b"mine")
     assert main.main(["push", str(mine), "me/d"]) == 0
     assert hub.dataset("me/d").files()["preview.png"].content == b"mine"
-    assert "![A picture of the dataset](preview.png)" in text_of(hub, "me/d")
+    assert "![An image of the dataset](preview.png)" in text_of(hub, "me/d")

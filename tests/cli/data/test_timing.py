@@ -132,15 +132,15 @@ def test_limits_that_differ_are_not_shown_as_one(measured):
 
 def test_the_tables_hold_what_was_measured(measured, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "170")
-    picture = tmp_path / "new" / "t.png"
-    assert main.main(["timing", str(measured), "--output", str(picture)]) == 0
+    image = tmp_path / "new" / "t.png"
+    assert main.main(["timing", str(measured), "--output", str(image)]) == 0
     text = capsys.readouterr().out
     for part in ("wall clock", "3600 run", "6 of 180 (3.3%)", "max 1.50 ms", "tolerated 1.00 ms", "9 frames or states"):
         assert part in text
     for part in ("granted, episodes 0-1", "granted, episode 2", "raise memlock [KiB]", "lateness [ms]", "rate"):
         assert part in text
-    assert str(picture) in text.replace("\n", "")
-    assert min(Image.open(picture).size) > 500
+    assert str(image) in text.replace("\n", "")
+    assert min(Image.open(image).size) > 500
 
 
 @pytest.mark.parametrize("width", [20, 80, 100, 170])
@@ -270,7 +270,7 @@ def test_bad_arguments_are_named_and_nothing_is_written(measured, tmp_path, caps
         assert stop.value.code == 2
 
 
-# --- the picture, and words ------------------------------------------------------------------------------------------
+# --- the image, and words ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 5000])

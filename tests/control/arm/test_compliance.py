@@ -98,7 +98,7 @@ def test_it_arrives_within_its_limits_along_a_straight_line() -> None:
     one = equilibrium(n)
     position, opening = rng.uniform(-0.4, 0.4, (n, 3)), rng.uniform(0, MAX_OPENING, (n, 1))
     rotation = rotation_matrices(rng.normal(size=(n, 4)))
-    one.head_for(position, rotation, opening, np.ones(n, np.bool_))
+    one.set_setpoint(position, rotation, opening, np.ones(n, np.bool_))
     log = run(one, 2200)
     speed, change = log["speed"], np.diff(log["speed"], axis=0) * HZ
     assert np.linalg.norm(speed[:, :, :3], axis=2).max() <= LIMITS.speed + 1e-9
@@ -118,7 +118,7 @@ def test_a_steady_stream_is_followed_without_a_lag() -> None:
     target = np.zeros((1, 3))
     for _ in range(50):
         target[0, 0] += 0.1 / 25
-        one.head_for(target, one.rotation.copy(), one.opening.copy(), ALL)
+        one.set_setpoint(target, one.rotation.copy(), one.opening.copy(), ALL)
         log = run(one, 20)
     assert log["speed"][-1][0, 0] == pytest.approx(0.1, abs=1e-3)
     assert one.position[0, 0] == pytest.approx(target[0, 0], abs=3e-4)  # a tick's way
@@ -126,7 +126,7 @@ def test_a_steady_stream_is_followed_without_a_lag() -> None:
 
 def test_without_a_setpoint_it_brakes_and_stays() -> None:
     one = equilibrium()
-    one.head_for(np.array([[1.0, 0, 0]]), one.rotation.copy(), one.opening.copy(), ALL)
+    one.set_setpoint(np.array([[1.0, 0, 0]]), one.rotation.copy(), one.opening.copy(), ALL)
     run(one, 500)
     one.drop(ALL)
     log = run(one, 500)

@@ -169,7 +169,7 @@ def test_places_beyond_any_reach_are_clipped() -> None:
 
 def test_values_that_are_no_numbers_stop_the_arm() -> None:
     rig = StuckRig()
-    rig.controller.head_for(np.full((1, 8), np.nan), ALL)
+    rig.controller.set_setpoint(np.full((1, 8), np.nan), ALL)
     rig.tick()
     assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
     assert np.isfinite(rig.plant.written[-1]).all()

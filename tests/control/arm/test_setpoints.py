@@ -47,13 +47,13 @@ class Stream:
         """Positions at each tick, shape (ticks, n, 7)."""
         return np.array(self.rows)[:, 0]
 
-    def head_for(self, values: np.ndarray, mask: np.ndarray | None = None) -> None:
+    def set_setpoint(self, values: np.ndarray, mask: np.ndarray | None = None) -> None:
         mask = np.ones(self.n, np.bool_) if mask is None else mask
-        self.filter.head_for(np.broadcast_to(values, (self.n, 7)).copy(), mask, self.position)
+        self.filter.set_setpoint(np.broadcast_to(values, (self.n, 7)).copy(), mask, self.position)
 
     def frame(self, values: np.ndarray, frames: int = 1) -> None:
         for _ in range(frames):
-            self.head_for(values)
+            self.set_setpoint(values)
             self.tick(self.frame_ticks)
 
 
@@ -84,7 +84,7 @@ def test_no_stream_of_setpoints_breaks_a_limit(script: list, frame: int) -> None
     for shares, ticks, kind in script:
         values = values if kind == "repeat" else middle + half * np.array(shares)
         if kind != "none":
-            stream.head_for(values, np.array([True, kind != "first"]))
+            stream.set_setpoint(values, np.array([True, kind != "first"]))
         stream.tick(ticks)
     stream.tick(200)
     stream.check()
@@ -154,7 +154,7 @@ def test_what_was_limited_is_flagged_and_nothing_else() -> None:
     stream = Stream(3)
     values = np.tile(HOME, (3, 1))
     values[1, 0], values[2, 0] = HOME[0] + 7.0, HOME[0] - 2.0
-    stream.head_for(values)
+    stream.set_setpoint(values)
     assert stream.filter.limited_position.tolist() == [False, True, False]  # beyond 2 pi
     stream.tick(200)
     assert stream.filter.limited_velocity.tolist() == [False, True, True]
@@ -163,15 +163,15 @@ def test_what_was_limited_is_flagged_and_nothing_else() -> None:
 
 def test_a_range_s_ends_are_inside() -> None:
     stream = Stream(2)
-    stream.head_for(np.stack([LOWER, UPPER]))
+    stream.set_setpoint(np.stack([LOWER, UPPER]))
     assert not stream.filter.limited_position.any()
-    stream.head_for(np.stack([np.nextafter(LOWER, -10), HOME]))
+    stream.set_setpoint(np.stack([np.nextafter(LOWER, -10), HOME]))
     assert stream.filter.limited_position.tolist() == [True, False]
 
 
 def test_an_arm_without_setpoints_is_left_alone() -> None:
     stream = Stream(2)
-    stream.head_for(off(j0=1.0), np.array([True, False]))
+    stream.set_setpoint(off(j0=1.0), np.array([True, False]))
     stream.velocity[1, 2] = 0.1  # another writes it
     before = stream.position[1].copy()
     for _ in range(50):
@@ -222,7 +222,7 @@ def test_arms_are_independent() -> None:
 def test_setpoints_that_come_more_often_than_frames_are_followed_too() -> None:
     stream = Stream()
     for step in range(400):
-        stream.head_for(off(j0=0.001 * (step + 1)))
+        stream.set_setpoint(off(j0=0.001 * (step + 1)))
         stream.tick(1)
     # Each setpoint would take a frame; the newest counts, so the reference is at most that frame behind.
     assert stream.position[0, 0] - HOME[0] == pytest.approx(0.4, abs=0.001 * (FRAME + 1))

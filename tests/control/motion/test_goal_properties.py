@@ -85,15 +85,15 @@ def test_limits_hold_and_every_goal_has_one_result(script: list) -> None:
 @settings(max_examples=40)
 @given(st.lists(actions, min_size=1, max_size=4), st.lists(actions, min_size=1, max_size=3))
 def test_an_arm_moves_the_same_whatever_the_others_do(script: list, other: list) -> None:
-    alone, crowd = Rig(), Rig(5)
+    alone, crowding = Rig(), Rig(5)
     for sim in (0, 1, 4):
         for number, ((kind, value), _) in enumerate(other):
             if kind == "goal":
-                crowd.go(f"other {number}", sim, **value)
+                crowding.go(f"other {number}", sim, **value)
     follow(alone, 0, script)
-    follow(crowd, 3, script)
-    assert np.array_equal(alone.history[:, :, 0], crowd.history[:, :, 3])
-    assert alone.results() == crowd.results(3)
+    follow(crowding, 3, script)
+    assert np.array_equal(alone.history[:, :, 0], crowding.history[:, :, 3])
+    assert alone.results() == crowding.results(3)
 
 
 @pytest.mark.parametrize("kind", range(3), ids=("position", "velocity", "acceleration"))

@@ -359,7 +359,7 @@ def test_a_goal_that_comes_while_setpoints_are_followed_begins_with_a_brake(late
     reading.position[:] = HOME
     controller.configure(np.array([0]), reading)
     for _ in range(5):
-        controller.head_for(controller.command + 0.02, np.ones(1, np.bool_))
+        controller.set_setpoint(controller.command + 0.02, np.ones(1, np.bool_))
         tick(20)
     assert controller.velocity.any()
     rows = rows[-1:]

@@ -94,7 +94,7 @@ def test_samples_agree_with_ruckig(start: State, target: Array, share: float) ->
     request = ruckig.InputParameter(6)
     request.current_position, request.current_velocity = start.position, start.velocity
     request.current_acceleration, request.target_position = start.acceleration, target
-    # With lower limits than the start's speed and acceleration there are stretches that bring it within them.
+    # With lower limits than the start's speed and acceleration there are segments that bring it within them.
     request.max_velocity, request.max_acceleration = ARM.velocity * share, ARM.acceleration * share
     request.max_jerk = ARM.jerk
     answer = ruckig.Trajectory(6)

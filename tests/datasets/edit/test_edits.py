@@ -33,7 +33,7 @@ from bhd_lerobot.errors import (
     UnsupportedDatasetError,
 )
 from tests.datasets import support
-from tests.datasets.edit_support import NUMBERS, assert_sound, content, record, steps_of
+from tests.datasets.edit_support import NUMBERS, assert_valid, content, record, steps_of
 from tests.datasets.kill_support import KillServer
 
 
@@ -50,8 +50,8 @@ def plain(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory) -> Path:
-    return record(tmp_path_factory.mktemp("filmed") / "d", list(range(4)), video=True)
+def video_dataset(tmp_path_factory) -> Path:
+    return record(tmp_path_factory.mktemp("video_dataset") / "d", list(range(4)), video=True)
 
 
 @pytest.mark.parametrize("video", [False, True])
@@ -62,7 +62,7 @@ def test_merged_are_all_episodes_in_order(tmp_path: Path, video: bool) -> None:
     assert content(tmp_path / "all") == [episode for part in before for episode in part]
     assert [content(part) for part in parts] == before
     assert (report.episodes, report.frames) == (6, sum(support.length(e) for e in range(6)))
-    assert_sound(tmp_path / "all")
+    assert_valid(tmp_path / "all")
 
 
 @pytest.mark.parametrize("wanted", [[0], [5, 2, 0], [1, 2, 3], [0, 1, 2, 3, 4, 5]])
@@ -70,14 +70,14 @@ def test_kept_are_the_wanted_in_the_wanted_order(plain: Path, tmp_path: Path, wa
     keep(plain, wanted, tmp_path / "kept")
     whole = content(plain)
     assert content(tmp_path / "kept") == [whole[episode] for episode in wanted]
-    assert_sound(tmp_path / "kept")
+    assert_valid(tmp_path / "kept")
 
 
-def test_films_are_cut_without_encoding(filmed: Path, tmp_path: Path) -> None:
-    keep(filmed, [3, 1], tmp_path / "kept")
-    whole = content(filmed)
+def test_videos_are_cut_without_encoding(video_dataset: Path, tmp_path: Path) -> None:
+    keep(video_dataset, [3, 1], tmp_path / "kept")
+    whole = content(video_dataset)
     assert content(tmp_path / "kept") == [whole[3], whole[1]]  # every pixel
-    assert_sound(tmp_path / "kept")
+    assert_valid(tmp_path / "kept")
 
 
 @pytest.mark.parametrize("gone", [[0], [5], [1, 3, 4]])
@@ -85,11 +85,11 @@ def test_delete_leaves_the_others(plain: Path, tmp_path: Path, gone: list[int]) 
     root = shutil.copytree(plain, tmp_path / "d")
     delete(root, gone)
     assert content(root) == [episode for index, episode in enumerate(content(plain)) if index not in gone]
-    assert_sound(root)
+    assert_valid(root)
     assert not (root / layout.STAGING).exists()
 
 
-@pytest.mark.parametrize("source", ["plain", "filmed"])
+@pytest.mark.parametrize("source", ["plain", "video_dataset"])
 def test_what_was_split_merges_to_what_it_was(request, tmp_path: Path, source: str) -> None:
     root = request.getfixturevalue(source)
     split(root, {"train": [0, 1], "val": [2], "test": [3]}, tmp_path / "parts")
@@ -97,10 +97,10 @@ def test_what_was_split_merges_to_what_it_was(request, tmp_path: Path, source: s
     assert content(tmp_path / "again") == content(root)[:4]
 
 
-def test_stock_lerobot_reads_the_result(filmed: Path, tmp_path: Path) -> None:
+def test_stock_lerobot_reads_the_result(video_dataset: Path, tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    merge([filmed, record(tmp_path / "more", [9], video=True)], tmp_path / "all")
+    merge([video_dataset, record(tmp_path / "more", [9], video=True)], tmp_path / "all")
     dataset = LeRobotDataset("t/t", root=tmp_path / "all", video_backend="pyav")
     frames = [(episode, frame) for episode in [0, 1, 2, 3, 9] for frame in range(support.length(episode))]
     assert len(dataset) == len(frames)
@@ -130,22 +130,22 @@ def test_data_are_those_of_lerobots_own_merge(plain: Path, tmp_path: Path) -> No
 
 def test_files_that_stay_are_linked(tmp_path: Path) -> None:
     root = record(tmp_path / "d", [0, 1, 2], video=True)
-    film = next(root.glob("videos/*/*/*.mp4"))
-    before = film.stat().st_ino
+    video = next(root.glob("videos/*/*/*.mp4"))
+    before = video.stat().st_ino
     mark(root, [1], outcome="collision")
     assert next(root.glob("videos/*/*/*.mp4")).stat().st_ino == before
-    assert content(root)[1].films == content(record(tmp_path / "same", [0, 1, 2], video=True))[1].films
+    assert content(root)[1].videos == content(record(tmp_path / "same", [0, 1, 2], video=True))[1].videos
 
 
 def test_many_files_stay_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a file is full the next one is begun, for data and for films."""
+    """Where a file is full the next one is begun, for data and for videos."""
     parts = [record(tmp_path / f"d{i}", [i, i + 1], video=True) for i in range(3)]
     monkeypatch.setattr("bhd_lerobot.datasets.assembly.files.MEBIBYTE", 10)
     merge(parts, tmp_path / "all")
     assert len(list((tmp_path / "all/data").rglob("*.parquet"))) == 3
     assert len(list((tmp_path / "all/videos").rglob("*.mp4"))) == 3
     assert content(tmp_path / "all") == [episode for part in parts for episode in content(part)]
-    assert_sound(tmp_path / "all")
+    assert_valid(tmp_path / "all")
 
 
 def test_an_edited_dataset_is_not_continued(tmp_path: Path) -> None:
@@ -335,29 +335,29 @@ def test_what_other_programs_wrote_is_kept(plain: Path, tmp_path: Path) -> None:
     assert operators(root) == [f"person {index}" for index in range(6)]
 
 
-def test_datasets_share_no_file(plain: Path, filmed: Path, tmp_path: Path) -> None:
+def test_datasets_share_no_file(plain: Path, video_dataset: Path, tmp_path: Path) -> None:
     """Other programs write into files; what happens to one dataset must not happen to another."""
-    for number, source in enumerate((plain, filmed)):
+    for number, source in enumerate((plain, video_dataset)):
         keep(source, range(4), tmp_path / f"k{number}")
         split(source, {"all": range(4)}, tmp_path / f"s{number}")
         for path in tmp_path.rglob("*"):
             assert path.is_dir() or path.stat().st_nlink == 1, path
 
 
-def test_links_of_a_cache_are_followed(filmed: Path, tmp_path: Path) -> None:
+def test_links_of_a_cache_are_followed(video_dataset: Path, tmp_path: Path) -> None:
     """The Hub's client keeps datasets as relative links."""
     cache = tmp_path / "datasets--me--d"
     (cache / "blobs").mkdir(parents=True)
     snapshot = cache / "snapshots" / "abc"
-    for number, path in enumerate(one for one in sorted(filmed.rglob("*")) if one.is_file()):
-        blob, link = cache / "blobs" / str(number), snapshot / path.relative_to(filmed)
+    for number, path in enumerate(one for one in sorted(video_dataset.rglob("*")) if one.is_file()):
+        blob, link = cache / "blobs" / str(number), snapshot / path.relative_to(video_dataset)
         shutil.copy(path, blob)
         link.parent.mkdir(parents=True, exist_ok=True)
         link.symlink_to(os.path.relpath(blob, link.parent))
     keep(snapshot, range(4), tmp_path / "kept")
-    assert content(tmp_path / "kept") == content(filmed)
+    assert content(tmp_path / "kept") == content(video_dataset)
     mark(snapshot, [0], outcome="stuck")
-    assert content(snapshot)[1:] == content(filmed)[1:]
+    assert content(snapshot)[1:] == content(video_dataset)[1:]
 
 
 def test_instructions_of_an_episode_that_has_several(tmp_path: Path) -> None:
@@ -372,18 +372,18 @@ def test_instructions_of_an_episode_that_has_several(tmp_path: Path) -> None:
     dataset.finalize()
     keep(tmp_path / "d", [2, 1], tmp_path / "kept")
     assert [set(one.task) for one in content(tmp_path / "kept")] == [{"2", "end"}, {"1", "end"}]
-    assert_sound(tmp_path / "kept")
+    assert_valid(tmp_path / "kept")
     loaded = LeRobotDataset("t/t", root=tmp_path / "kept")
     assert [loaded[index]["task"] for index in (0, 3, 4, 7)] == ["2", "end", "1", "end"]
 
 
-def test_depth_of_another_scale_does_not_merge(filmed: Path, tmp_path: Path) -> None:
-    other = shutil.copytree(filmed, tmp_path / "other")
+def test_depth_of_another_scale_does_not_merge(video_dataset: Path, tmp_path: Path) -> None:
+    other = shutil.copytree(video_dataset, tmp_path / "other")
     info = json.loads((other / "meta/info.json").read_text())
     info["features"][support.CAMERA]["info"]["video.depth_max"] = 3.0
     (other / "meta/info.json").write_text(json.dumps(info))
     with pytest.raises(DatasetMismatchError, match=r"depth_max: not"):
-        merge([filmed, other], tmp_path / "all")
+        merge([video_dataset, other], tmp_path / "all")
 
 
 def test_files_at_other_places_are_refused_by_name(plain: Path, tmp_path: Path) -> None:

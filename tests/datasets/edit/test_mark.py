@@ -17,7 +17,7 @@ from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
 from tests.datasets import support
-from tests.datasets.edit_support import assert_sound, content, record, stack, steps_of
+from tests.datasets.edit_support import assert_valid, content, record, stack, steps_of
 from tests.datasets.kill_support import KillServer
 
 FEATURES = {
@@ -68,7 +68,7 @@ def test_an_outcome_is_in_every_place(tmp_path: Path, outcome: str) -> None:
     assert after[1].columns["event"] == [*before[1].columns["event"][:-1], Event[outcome.upper()]]
     assert after[1].columns["next.success"] == [False] * (LENGTH - 1) + [outcome == "success"]
     assert after[1].columns["observation.state"] == before[1].columns["observation.state"]
-    assert_sound(root)  # the statistics are those of what is there now
+    assert_valid(root)  # the statistics are those of what is there now
     (edit,) = edits_of(root)
     assert edit["episodes"] == [{"episode": 1, "outcome": ["timeout", outcome]}]
     assert edit["note"] == "seen"

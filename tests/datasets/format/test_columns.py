@@ -55,7 +55,7 @@ def test_a_damaged_byte_is_found_or_changes_nothing(tmp_path: Path) -> None:
     root = tmp_path / "d"
     record(root).finalize()
     path = next((root / "data").rglob("*.parquet"))
-    sound, content = read_columns(root, ["x"]), path.read_bytes()
+    valid, content = read_columns(root, ["x"]), path.read_bytes()
     pages = len(content) - 8 - int.from_bytes(content[-8:-4], "little")  # the footer's length, and "PAR1", come last
     found = []
     for position in np.linspace(4, pages - 1, 50).astype(int):
@@ -67,6 +67,6 @@ def test_a_damaged_byte_is_found_or_changes_nothing(tmp_path: Path) -> None:
         except DatasetCorruptError as error:
             found.append(str(error))
         else:
-            assert all(np.array_equal(a["x"], b["x"]) for a, b in zip(columns, sound, strict=True))
+            assert all(np.array_equal(a["x"], b["x"]) for a, b in zip(columns, valid, strict=True))
     assert len(found) > 3
     assert all(path.name in message for message in found)

@@ -62,7 +62,7 @@ def test_datasets_without_the_optional_keys_can_be_edited_and_repaired(recorded:
         keep(root, [0, 2], tmp_path / "kept")
         assert repair(root).episodes == 3
         assert len(edit_support.content(tmp_path / "kept")) == 2
-        edit_support.assert_sound(tmp_path / "kept")
+        edit_support.assert_valid(tmp_path / "kept")
         shutil.rmtree(root)
         shutil.rmtree(tmp_path / "kept")
 

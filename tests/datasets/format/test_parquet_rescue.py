@@ -19,22 +19,22 @@ SCHEMA = pa.schema(
         pa.field("state", pa.list_(pa.float32(), 3)),
         pa.field("flag", pa.bool_()),
         pa.field("text", pa.string()),
-        pa.field("picture", pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])),
+        pa.field("image", pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])),
         pa.field("matrix", pa.list_(pa.list_(pa.float64(), 2), 2)),
         pa.field("index", pa.int64()),
     ]
 )
 
 
-def table(rows: int, seed: int, picture: int = 20) -> pa.Table:
+def table(rows: int, seed: int, image: int = 20) -> pa.Table:
     rng = np.random.default_rng(seed)
     return pa.table(
         {
             "state": pa.array(rng.normal(size=(rows, 3)).astype(np.float32).tolist(), SCHEMA.field("state").type),
             "flag": rng.random(rows) < 0.5,
             "text": pa.array([f"{seed}/{i % 3}" for i in range(rows)]),
-            "picture": pa.array(
-                [{"bytes": rng.bytes(picture), "path": f"{i}.png"} for i in range(rows)], SCHEMA.field("picture").type
+            "image": pa.array(
+                [{"bytes": rng.bytes(image), "path": f"{i}.png"} for i in range(rows)], SCHEMA.field("image").type
             ),
             "matrix": pa.array(rng.normal(size=(rows, 2, 2)).tolist(), SCHEMA.field("matrix").type),
             "index": np.arange(rows) + 1000 * seed,
@@ -56,18 +56,18 @@ def write(path: Path, tables: list[pa.Table], **options: Any) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    ("rows", "picture", "options"),
+    ("rows", "image", "options"),
     [
         ([1], 20, {}),
         ([5, 1, 300, 7], 20, {}),
-        ([400, 900], 4000, {}),  # pictures fill several pages, and no dictionary
+        ([400, 900], 4000, {}),  # images fill several pages, and no dictionary
         ([3000, 2], 20, {"data_page_size": 1000}),  # several pages in every column
         ([50, 60], 20, {"data_page_version": "2.0"}),
         ([500, 500], 20, {"dictionary_pagesize_limit": 500}),  # columns that give their dictionary up
     ],
 )
-def test_without_the_footer_everything_is_found(tmp_path: Path, rows: list[int], picture: int, options: dict) -> None:
-    tables = [table(count, seed, picture) for seed, count in enumerate(rows)]
+def test_without_the_footer_everything_is_found(tmp_path: Path, rows: list[int], image: int, options: dict) -> None:
+    tables = [table(count, seed, image) for seed, count in enumerate(rows)]
     write(tmp_path / "f.parquet", tables, **options)
     with pytest.raises(pa.ArrowInvalid):
         pq.read_table(tmp_path / "f.parquet")

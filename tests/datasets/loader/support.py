@@ -36,7 +36,7 @@ def length(episode: int) -> int:
 
 
 def images(episode: int, key: str, count: int) -> np.ndarray:
-    """Return pictures with edges and noise, so that a wrong frame or a wrong conversion shows."""
+    """Return images with edges and noise, so that a wrong frame or a wrong conversion shows."""
     rng = np.random.default_rng([episode, len(key)])
     coarse = rng.integers(0, 256, (count, SIZE[0] // 8, SIZE[1] // 8, 3), dtype=np.uint8)
     return np.repeat(np.repeat(coarse, 8, axis=1), 8, axis=2)

@@ -29,9 +29,9 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def video_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With two cameras."""
-    return support.record_ours(tmp_path_factory.mktemp("filmed") / "d", 4, (FRONT, WRIST))
+    return support.record_ours(tmp_path_factory.mktemp("video_dataset") / "d", 4, (FRONT, WRIST))
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +68,9 @@ def test_tables_are_those_of_lerobot(plain: Path, episodes: list[int] | None, de
 @pytest.mark.parametrize("return_uint8", [False, True])
 @pytest.mark.parametrize("deltas", [None, {"action": CHUNK, FRONT: WINDOW}, {FRONT: [0.0], WRIST: [-0.1]}])
 def test_frames_of_our_recorder_are_those_of_lerobot(
-    filmed: Path, return_uint8: bool, deltas: dict[str, list[float]] | None
+    video_dataset: Path, return_uint8: bool, deltas: dict[str, list[float]] | None
 ) -> None:
-    assert_equal_datasets(filmed, episodes=[1, 3], delta_timestamps=deltas, return_uint8=return_uint8)
+    assert_equal_datasets(video_dataset, episodes=[1, 3], delta_timestamps=deltas, return_uint8=return_uint8)
 
 
 @pytest.mark.parametrize("video", [AV1, B_FRAMES], ids=["AV1", "B-frames"])
@@ -91,9 +91,9 @@ def test_a_dataset_that_stock_lerobot_recorded(
     assert_equal_datasets(foreign, episodes=episodes, delta_timestamps=deltas)
 
 
-def test_random_transforms_draw_as_in_lerobot(filmed: Path) -> None:
+def test_random_transforms_draw_as_in_lerobot(video_dataset: Path) -> None:
     transform = v2.Compose([v2.RandomHorizontalFlip(), v2.ColorJitter(brightness=0.5)])
-    ours, theirs = both(filmed, image_transforms=transform)
+    ours, theirs = both(video_dataset, image_transforms=transform)
     torch.manual_seed(3)
     wanted = support.collated(theirs, [5, 1, 9])
     torch.manual_seed(3)
@@ -102,8 +102,8 @@ def test_random_transforms_draw_as_in_lerobot(filmed: Path) -> None:
     assert not torch.equal(ours.batch(torch.tensor([5, 1, 9]))[FRONT], wanted[FRONT])
 
 
-def test_other_decoders_are_asked_through_lerobot(filmed: Path) -> None:
-    ours = TableDataset("t/t", filmed, video_backend="video_reader", return_uint8=True)
+def test_other_decoders_are_asked_through_lerobot(video_dataset: Path) -> None:
+    ours = TableDataset("t/t", video_dataset, video_backend="video_reader", return_uint8=True)
     cache = frame_cache.FrameCache(ours.table, [FRONT], 1e-4)
     slow = frame_cache.FrameCache.__new__(frame_cache.FrameCache)
     slow.__dict__.update(cache.__dict__, _backend="pyav", images={FRONT: torch.zeros_like(cache.images[FRONT])})
@@ -121,11 +121,11 @@ def test_a_language_column_is_in_samples_and_left_out_of_batches_as_in_lerobot(t
     assert "language_persistent" not in next(iter(loader))
 
 
-def test_a_subset_shares_memory_and_is_what_lerobot_selects(filmed: Path) -> None:
-    whole = TableDataset("t/t", filmed, delta_timestamps={"action": CHUNK}, return_uint8=True)
+def test_a_subset_shares_memory_and_is_what_lerobot_selects(video_dataset: Path) -> None:
+    whole = TableDataset("t/t", video_dataset, delta_timestamps={"action": CHUNK}, return_uint8=True)
     whole.weights = torch.arange(len(whole)).float()
     part = whole.subset([3, 1])
-    theirs = support.stock(filmed, episodes=[3, 1], delta_timestamps={"action": CHUNK}, return_uint8=True)
+    theirs = support.stock(video_dataset, episodes=[3, 1], delta_timestamps={"action": CHUNK}, return_uint8=True)
     assert part.table is whole.table
     assert part.episodes == theirs.episodes
     indices = list(range(len(theirs)))
@@ -138,8 +138,8 @@ def test_a_subset_shares_memory_and_is_what_lerobot_selects(filmed: Path) -> Non
         part.subset([0])
 
 
-def test_batches_do_not_share_memory_with_the_dataset_or_each_other(filmed: Path) -> None:
-    dataset = TableDataset("t/t", filmed, delta_timestamps={"action": [0.0], "event": [0.0]}, return_uint8=True)
+def test_batches_do_not_share_memory_with_the_dataset_or_each_other(video_dataset: Path) -> None:
+    dataset = TableDataset("t/t", video_dataset, delta_timestamps={"action": [0.0], "event": [0.0]}, return_uint8=True)
     wanted = dataset.batch(torch.arange(3))
     spoiled = dataset.batch(torch.arange(3))
     for key, value in spoiled.items():
@@ -150,16 +150,16 @@ def test_batches_do_not_share_memory_with_the_dataset_or_each_other(filmed: Path
     support.assert_same(dataset.batch(torch.arange(3)), wanted)
 
 
-def test_only_what_is_kept_is_read_and_decoded(filmed: Path) -> None:
+def test_only_what_is_kept_is_read_and_decoded(video_dataset: Path) -> None:
     keep = ["action", WRIST]
-    dataset = TableDataset("t/t", filmed, keep=keep, delta_timestamps={"action": CHUNK})
-    theirs = support.stock(filmed, delta_timestamps={"action": CHUNK})
+    dataset = TableDataset("t/t", video_dataset, keep=keep, delta_timestamps={"action": CHUNK})
+    theirs = support.stock(video_dataset, delta_timestamps={"action": CHUNK})
     batch, wanted = dataset.batch(torch.tensor([4])), support.collated(theirs, [4])
     index = ["timestamp", "frame_index", "episode_index", "index", "task_index"]
     assert set(batch) == {*keep, *index, "action_is_pad", "task"}
     support.assert_same(batch, {key: wanted[key] for key in wanted if key in batch})
     assert dataset.camera_keys == [WRIST]
-    assert dataset.nbytes < TableDataset("t/t", filmed).nbytes
+    assert dataset.nbytes < TableDataset("t/t", video_dataset).nbytes
 
 
 def test_it_serves_pytorchs_data_loader_and_slices(plain: Path) -> None:
@@ -205,10 +205,10 @@ def test_the_batches_of_a_training_are_those_of_lerobot_train(plain: Path) -> No
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_the_fallback_serves_the_same_batches_and_says_so_once(filmed: Path, workers: int) -> None:
+def test_the_fallback_serves_the_same_batches_and_says_so_once(video_dataset: Path, workers: int) -> None:
     said: list[str] = []
     options: dict[str, Any] = {
-        "root": filmed,
+        "root": video_dataset,
         "batch_size": 6,
         "seed": 5,
         "eval_split": 0.5,
@@ -239,9 +239,9 @@ def test_the_fallback_serves_the_same_batches_and_says_so_once(filmed: Path, wor
     assert np.allclose(memory.dataset.meta.stats[FRONT]["mean"].squeeze(), [0.485, 0.456, 0.406])
 
 
-def test_a_resumed_fallback_goes_on_at_the_same_sample(filmed: Path) -> None:
+def test_a_resumed_fallback_goes_on_at_the_same_sample(video_dataset: Path) -> None:
     def make() -> Any:
-        return make_loader("t/t", root=filmed, batch_size=3, seed=5, budget_gib=1e-4, say=lambda _: None).train
+        return make_loader("t/t", root=video_dataset, batch_size=3, seed=5, budget_gib=1e-4, say=lambda _: None).train
 
     loader = make()
     stream = loader.cycle()

@@ -37,8 +37,8 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return support.record_ours(tmp_path_factory.mktemp("filmed") / "d", 2, (FRONT, WRIST))
+def video_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return support.record_ours(tmp_path_factory.mktemp("video_dataset") / "d", 2, (FRONT, WRIST))
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_a_share_of_all_episodes_is_held_out(kinds: int, share: float) -> None:
     assert (train, held_out) == split_episodes(meta, list(range(100)), share)
     if kinds == 1:
         assert (train, held_out) == split_episodes(meta, None, share, "instruction")
-    if kinds == 100:  # no stretch of the dataset is without
+    if kinds == 100:  # no segment of the dataset is without
         gaps = np.diff([-1, *held_out, 100])
         assert gaps.max() <= math.ceil(1 / share)
 
@@ -174,10 +174,10 @@ def test_selected_and_split_episodes_reach_the_loaders(plain: Path) -> None:
 POLICY: dict[str, Any] = {"observation.state": SimpleNamespace(shape=(3,)), "action": SimpleNamespace(shape=(2,))}
 
 
-def test_a_sound_dataset_passes(plain: Path, filmed: Path) -> None:
+def test_a_sound_dataset_passes(plain: Path, video_dataset: Path) -> None:
     for dataset in (TableDataset("t/t", plain), support.stock(plain), TableDataset("t/t", plain, [2])):
         check(dataset, POLICY, fps=FPS, names={"action": ["x.vel", "theta.vel"]})
-    check(TableDataset("t/t", filmed), ["action", FRONT])
+    check(TableDataset("t/t", video_dataset), ["action", FRONT])
 
 
 @pytest.mark.parametrize(
@@ -262,7 +262,7 @@ def test_policies_that_drop_more_than_there_is(plain: Path) -> None:
         BatchLoader(TableDataset("t/t", plain), 4, drop_n_last_frames=50)
 
 
-def test_memory_is_asked_for_before_anything_is_decoded(filmed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_asked_for_before_anything_is_decoded(video_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     decoded: list[Any] = []
 
     def decode(cache: Any) -> None:
@@ -272,18 +272,18 @@ def test_memory_is_asked_for_before_anything_is_decoded(filmed: Path, monkeypatc
     frames = support.length(0) + support.length(1)
     images = 2 * frames * support.SIZE[0] * support.SIZE[1] * 3
     with pytest.raises(MemoryBudgetError, match=f"{FRONT}, {WRIST}.* more than the budget"):
-        TableDataset("t/t", filmed, budget_gib=images / 2**30)  # the columns come on top
+        TableDataset("t/t", video_dataset, budget_gib=images / 2**30)  # the columns come on top
     monkeypatch.setattr(frame_cache, "available_memory", lambda: images)
     with pytest.raises(MemoryBudgetError, match="GiB are free"):
-        TableDataset("t/t", filmed)
+        TableDataset("t/t", video_dataset)
     assert decoded == []
-    assert TableDataset("t/t", filmed, keep=["action", FRONT]).camera_keys == [FRONT]
+    assert TableDataset("t/t", video_dataset, keep=["action", FRONT]).camera_keys == [FRONT]
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
 @pytest.mark.parametrize("part", ["columns", "images"])
 def test_memory_that_runs_out_leads_to_the_fallback(
-    filmed: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, part: str
+    video_dataset: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, part: str
 ) -> None:
     def fail(*_: Any) -> None:
         raise error if part == "images" else MemoryError
@@ -293,7 +293,7 @@ def test_memory_that_runs_out_leads_to_the_fallback(
     else:
         monkeypatch.setattr("bhd_lerobot.datasets.loader.table._read", fail)
     said: list[str] = []
-    loaders = make_loader("t/t", root=filmed, batch_size=4, say=said.append)
+    loaders = make_loader("t/t", root=video_dataset, batch_size=4, say=said.append)
     assert f"Memory ran out while the {part}" in said[0]
     assert next(iter(loaders.train))[FRONT].dtype == torch.uint8
 

@@ -1,4 +1,4 @@
-"""What follows from the rest can be mended; the rest is never touched."""
+"""What follows from the rest can be repaired; the rest is never touched."""
 
 import json
 from pathlib import Path
@@ -56,7 +56,7 @@ def test_it_is_as_it_was(tmp_path: Path, name: str, ours: bool) -> None:
     assert after.keys() == stats.keys()
     for key, stat in stats.items():
         for statistic in ("min", "max", "mean", "std", "count"):
-            # Films are encoded, so what is computed from them may differ in the last bits.
+            # Videos are encoded, so what is computed from them may differ in the last bits.
             tolerance = 0.01 if "images" in key else 1e-6
             np.testing.assert_allclose(after[key][statistic], stat[statistic], rtol=0, atol=tolerance, err_msg=key)
     assert fix(root, check_dataset(root).findings) == []

@@ -14,7 +14,7 @@ from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
 from tests.datasets import support
-from tests.datasets.edit_support import assert_sound, content, record
+from tests.datasets.edit_support import assert_valid, content, record
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_the_advice_works(
     assert main.main([*advice[1].split(), str(other)]) == 0
     assert "3 episodes, 18 frames" in capsys.readouterr().out
     assert content(root) == content(recorded)
-    assert_sound(root)
+    assert_valid(root)
     with support.resume(root, video=True) as recorder:  # it is still the recorder's own
         support.record(recorder, video=True)
     assert dataset_info(root).episodes[-1].metadata == support.metadata(3)
@@ -69,7 +69,7 @@ def test_an_interrupted_recording_of_ours_loses_nothing(other: Path, tmp_path: P
     torn(root / "meta/info.json")
     report = repair(root, other)
     assert (report.episodes, report.lost) == (3, ())
-    assert_sound(root)
+    assert_valid(root)
     assert [one.metadata["seed"] for one in dataset_info(root).episodes] == [0, 1, 2]
 
 
@@ -115,7 +115,7 @@ def test_repair_never_sends_to_repair(recorded: Path, tmp_path: Path) -> None:
     for pattern in ("data/*/*.parquet", "meta/episodes/*/*.parquet", "videos/*/*/*.mp4", "meta/tasks.parquet"):
         root = Path(shutil.copytree(recorded, tmp_path / pattern[:4]))
         path = next(root.glob(pattern))
-        path.write_bytes(bytes(30) if path.suffix == ".parquet" else b"film")
+        path.write_bytes(bytes(30) if path.suffix == ".parquet" else b"video")
         try:
             told = str(repair(root))
         except DatasetError as error:

@@ -22,7 +22,7 @@ from bhd_lerobot.datasets.recovery.repair import repair, settle
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError, DatasetWriteError
-from tests.datasets.edit_support import Episode, assert_sound, content
+from tests.datasets.edit_support import Episode, assert_valid, content
 from tests.datasets.kill_support import KillServer
 
 CAMERA = "observation.images.top"
@@ -46,7 +46,7 @@ def recorded(server: KillServer, root: Path, video: str, episodes: int, die: str
 def truth(lerobot: KillServer, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Episode]]:
     """What a recording that nobody kills is like."""
     folder = tmp_path_factory.mktemp("truth")
-    episodes = {"none": 8, "film": 4, "image": 3}
+    episodes = {"none": 8, "video": 4, "image": 3}
     return {video: content(recorded(lerobot, folder / video, video, count)) for video, count in episodes.items()}
 
 
@@ -65,14 +65,14 @@ def loaded(root: Path, frames: int) -> None:
         ("none", 8, "saved", 8),
         ("none", 4, "frames", 4),
         ("none", 5, "counting", 5),  # its frames are on the disk, though info.json does not count it
-        ("film", 3, "saved", 3),
-        ("film", 3, "encoding", 3),  # its pictures are still there
-        ("film", 2, "frames", 2),
-        ("film", 3, "counting", 3),
-        ("film", 3, "joining", 3),  # its film is finished, in a temporary folder
+        ("video", 3, "saved", 3),
+        ("video", 3, "encoding", 3),  # its images are still there
+        ("video", 2, "frames", 2),
+        ("video", 3, "counting", 3),
+        ("video", 3, "joining", 3),  # its video is finished, in a temporary folder
         ("stream", 3, "joining", 3),
         ("stream", 3, "frames", 3),
-        ("stream", 3, "encoding", 3),  # its film lies in a temporary folder
+        ("stream", 3, "encoding", 3),  # its video lies in a temporary folder
         ("image", 3, "saved", 3),
     ],
 )
@@ -85,18 +85,18 @@ def test_every_whole_episode_is_recovered(
     assert report.episodes == recovered
     assert bool(report.lost) == (recovered < episodes)
     found = content(root)
-    expected = truth["film" if video == "stream" else video][:recovered]
+    expected = truth["video" if video == "stream" else video][:recovered]
     for one, wanted in zip(found, expected, strict=True):
         assert (one.task, one.columns) == (wanted.task, wanted.columns)
-        assert one.films.keys() == wanted.films.keys()
-        for key in one.films:
-            for a, b in zip(one.films[key], wanted.films[key], strict=True):
-                # A film that had to be encoded anew, or by the streaming encoder, may round otherwise.
+        assert one.videos.keys() == wanted.videos.keys()
+        for key in one.videos:
+            for a, b in zip(one.videos[key], wanted.videos[key], strict=True):
+                # A video that had to be encoded anew, or by the streaming encoder, may round otherwise.
                 assert abs(np.frombuffer(a, np.uint8).astype(int) - np.frombuffer(b, np.uint8)).max() <= 3
-    assert_sound(root)
+    assert_valid(root)
     loaded(root, report.frames)
     assert report.aside is not None
-    assert (report.aside / "images").exists() == (video == "film" and die in ("encoding", "frames"))
+    assert (report.aside / "images").exists() == (video == "video" and die in ("encoding", "frames"))
     assert not repair(root)  # and now there is nothing to do
 
 
@@ -105,15 +105,15 @@ def test_what_was_lost_is_told(lerobot: KillServer, tmp_path: Path) -> None:
     for folder in root.glob("tmp*"):
         shutil.rmtree(folder)
     report = repair(root)
-    assert report.lost == (f"episode 2: no whole film of {CAMERA}",)
+    assert report.lost == (f"episode 2: no whole video of {CAMERA}",)
     text = str(report)
     assert "meta/episodes is corrupt" in text
-    assert f"lost: episode 2: no whole film of {CAMERA}" in text
+    assert f"lost: episode 2: no whole video of {CAMERA}" in text
     assert str(report.aside) in text
 
 
 def test_the_damaged_files_are_kept(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "film", 2, "encoding")
+    root = recorded(lerobot, tmp_path / "d", "video", 2, "encoding")
     before = {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
     for number in (1, 2):
         report = repair(root)
@@ -154,17 +154,17 @@ def test_random_kills_lose_no_saved_episode(lerobot: KillServer, tmp_path: Path)
                 repair(root)
             report = repair(root, another)
         assert saved <= report.episodes <= saved + 1
-        assert_sound(root)
+        assert_valid(root)
 
 
-def test_a_torn_film_costs_the_episodes_behind_the_tear(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
-    origin = recorded(lerobot, tmp_path / "origin", "film", 3, "saved")
+def test_a_torn_video_costs_the_episodes_behind_the_tear(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
+    origin = recorded(lerobot, tmp_path / "origin", "video", 3, "saved")
     size = next(origin.glob("videos/*/*/*.mp4")).stat().st_size
     seen = set()
     for missing in (1, 60, 120, 180, 240, 300):
         root = shutil.copytree(origin, tmp_path / f"d{missing}")
-        film = next(root.glob("videos/*/*/*.mp4"))
-        os.truncate(film, size - missing)
+        video = next(root.glob("videos/*/*/*.mp4"))
+        os.truncate(video, size - missing)
         try:
             report = repair(root)
         except DatasetCorruptError as error:
@@ -173,8 +173,8 @@ def test_a_torn_film_costs_the_episodes_behind_the_tear(lerobot: KillServer, tru
             continue
         assert report.lost
         seen.add(report.episodes)
-        assert [e.films for e in content(root)] == [e.films for e in truth["film"][: report.episodes]]
-        assert_sound(root)
+        assert [e.videos for e in content(root)] == [e.videos for e in truth["video"][: report.episodes]]
+        assert_valid(root)
     assert {2, 1} <= seen
 
 
@@ -234,7 +234,7 @@ def test_info_of_another_recording_helps(
         assert (tmp_path / "d.damaged-1/meta/info.json").read_text() == "{"
     assert (report.episodes, report.lost) == (4, ())
     assert [e.columns for e in content(root)] == [e.columns for e in truth["none"][:4]]
-    assert_sound(root)
+    assert_valid(root)
     assert not repair(root)
 
 
@@ -261,7 +261,7 @@ def changed_info(source: Path, target: Path, change: dict[str, Any], fps: int = 
 def test_info_of_another_robot_is_the_suspect(
     lerobot: KillServer, tmp_path: Path, change: dict[str, Any], told: str, by_hand: bool
 ) -> None:
-    root = recorded(lerobot, tmp_path / "d", "film", 2, "saved")
+    root = recorded(lerobot, tmp_path / "d", "video", 2, "saved")
     donor = changed_info(root, tmp_path / "other.json", change, fps=10 if change else 25)
     if by_hand:
         if not change or "note" in change:
@@ -280,7 +280,7 @@ def test_info_of_another_robot_is_the_suspect(
 
 
 def test_info_of_another_is_given_back_if_nothing_can_be_recovered(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "film", 2, "saved")
+    root = recorded(lerobot, tmp_path / "d", "video", 2, "saved")
     donor = changed_info(root, tmp_path / "other.json", {})
     shutil.rmtree(root / "videos")
     for break_it in (lambda path: path.write_text("{"), Path.unlink):
@@ -297,7 +297,7 @@ def test_a_camera_that_never_was_is_the_suspect(lerobot: KillServer, tmp_path: P
     (root / "meta/stats.json").unlink()
     camera = {"observation.images.rear": {"dtype": "video", "shape": [32, 48, 3], "names": None}}
     changed_info(root, root / "meta/info.json", camera)
-    with pytest.raises(DatasetCorruptError, match=r"describes observation\.images\.rear, of which there is no film"):
+    with pytest.raises(DatasetCorruptError, match=r"describes observation\.images\.rear, of which there is no video"):
         repair(root)
 
 
@@ -334,7 +334,7 @@ def test_a_recording_that_goes_on_is_left_alone(lerobot: KillServer, tmp_path: P
 
 
 def test_a_sound_dataset_of_lerobot_is_left_alone(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "film", 2)
+    root = recorded(lerobot, tmp_path / "d", "video", 2)
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
     assert not repair(root)
     assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
@@ -351,7 +351,7 @@ def test_numbers_are_counted_anew(lerobot: KillServer, tmp_path: Path) -> None:
     table = pq.read_table(next(root.glob("data/*/*.parquet")))
     assert sorted(set(table["episode_index"].to_pylist())) == [0, 1, 2]
     assert table["note"].to_pylist()[0] == "3/0"
-    assert_sound(root)
+    assert_valid(root)
 
 
 # --- no episode ever gets what is another's ---------------------------------------------------------------------------
@@ -359,19 +359,19 @@ def test_numbers_are_counted_anew(lerobot: KillServer, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def sessions(lerobot: KillServer, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two sessions of three episodes each, with a film of its own for each session."""
-    root = recorded(lerobot, tmp_path_factory.mktemp("sessions") / "d", "film", 3)
-    return recorded(lerobot, root, "film", 3)
+    """Two sessions of three episodes each, with a video of its own for each session."""
+    root = recorded(lerobot, tmp_path_factory.mktemp("sessions") / "d", "video", 3)
+    return recorded(lerobot, root, "video", 3)
 
 
 def numbers(root: Path) -> list[int]:
-    """Return which episodes a dataset holds, by their frames, after checking that their films are theirs."""
+    """Return which episodes a dataset holds, by their frames, after checking that their videos are theirs."""
     found = []
     for episode in content(root):
         number = int(episode.columns["observation.state"][0][2])
-        for index, picture in enumerate(episode.films.get(CAMERA, [])):
+        for index, image in enumerate(episode.videos.get(CAMERA, [])):
             grey = 20 + (37 * number + 11 * index) % 200
-            assert abs(float(np.frombuffer(picture, np.uint8).mean()) - grey) < 4, (number, index)
+            assert abs(float(np.frombuffer(image, np.uint8).mean()) - grey) < 4, (number, index)
         found.append(number)
     return found
 
@@ -383,7 +383,7 @@ def numbers(root: Path) -> list[int]:
         ("videos/observation.images.top/chunk-000/file-001.mp4", [0, 1, 2]),
         ("data/chunk-000/file-000.parquet", [3, 4, 5]),
         ("meta/episodes/chunk-000/file-001.parquet", [0, 1, 2, 3, 4, 5]),
-        ("meta/episodes/chunk-000/file-000.parquet", [3, 4, 5]),  # whose the other film is can only be guessed
+        ("meta/episodes/chunk-000/file-000.parquet", [3, 4, 5]),  # whose the other video is can only be guessed
     ],
 )
 def test_what_is_gone_costs_its_own_episodes(sessions: Path, tmp_path: Path, gone: str, left: list[int]) -> None:
@@ -392,17 +392,17 @@ def test_what_is_gone_costs_its_own_episodes(sessions: Path, tmp_path: Path, gon
     report = repair(root)
     assert numbers(root) == left
     assert bool(report.lost) == (len(left) < 6)
-    assert_sound(root)
+    assert_valid(root)
 
 
-def test_a_film_with_a_hole_is_a_sound_film(sessions: Path, tmp_path: Path) -> None:
-    """LeRobot reads where the rows say; a film may hold more."""
+def test_a_video_with_a_hole_is_a_sound_video(sessions: Path, tmp_path: Path) -> None:
+    """LeRobot reads where the rows say; a video may hold more."""
     root = shutil.copytree(sessions, tmp_path / "d")
-    film = root / "videos/observation.images.top/chunk-000/file-000.mp4"
+    video = root / "videos/observation.images.top/chunk-000/file-000.mp4"
     keep(root, [0, 2], tmp_path / "kept")
-    # As if the rows of the kept ones pointed into the film that still holds all three.
+    # As if the rows of the kept ones pointed into the video that still holds all three.
     path = tmp_path / "kept/meta/episodes/chunk-000/file-000.parquet"
-    shutil.copy(film, tmp_path / "kept/videos/observation.images.top/chunk-000/file-000.mp4")
+    shutil.copy(video, tmp_path / "kept/videos/observation.images.top/chunk-000/file-000.mp4")
     table = pq.read_table(path)
     for name, values in (("from_timestamp", [0.0, 1.1]), ("to_timestamp", [0.5, 1.8])):
         place = table.schema.get_field_index(f"videos/{CAMERA}/{name}")
@@ -414,8 +414,8 @@ def test_a_film_with_a_hole_is_a_sound_film(sessions: Path, tmp_path: Path) -> N
 
 
 def test_an_episode_that_was_recorded_again(lerobot: KillServer, tmp_path: Path) -> None:
-    """Which of its two attempts a film shows is told nowhere."""
-    root = recorded(lerobot, tmp_path / "d", "film", 4, "saved", again=2)
+    """Which of its two attempts a video shows is told nowhere."""
+    root = recorded(lerobot, tmp_path / "d", "video", 4, "saved", again=2)
     report = repair(root)
     assert numbers(root) == [0, 1]
     assert "episode 2: a first attempt, which was recorded again" in report.lost
@@ -423,13 +423,13 @@ def test_an_episode_that_was_recorded_again(lerobot: KillServer, tmp_path: Path)
 
 def test_a_kill_in_the_first_episode_of_a_second_session(lerobot: KillServer, tmp_path: Path) -> None:
     """No count is wrong then, and yet LeRobot loads nothing: a file without a footer lies there."""
-    root = recorded(lerobot, tmp_path / "d", "film", 2)
-    recorded(lerobot, root, "film", 1, "encoding")
+    root = recorded(lerobot, tmp_path / "d", "video", 2)
+    recorded(lerobot, root, "video", 1, "encoding")
     assert [one.check for one in check_dataset(root).findings if one.severity is Severity.ERROR] == ["files"]
     assert repair(root).episodes == 3
     assert numbers(root) == [0, 1, 2]
     loaded(root, 18)
-    first = recorded(lerobot, tmp_path / "first", "film", 1, "encoding")
+    first = recorded(lerobot, tmp_path / "first", "video", 1, "encoding")
     assert repair(first).episodes == 1
 
 
@@ -439,7 +439,7 @@ def test_torn_statistics_are_computed_anew(sessions: Path, tmp_path: Path) -> No
     (root / "meta/stats.json").write_text("{")
     assert "statistics of 6 episodes" in str(repair(root))
     assert content(root) == before
-    assert_sound(root)
+    assert_valid(root)
 
 
 def test_marks_and_columns_of_others_survive(lerobot: KillServer, tmp_path: Path) -> None:

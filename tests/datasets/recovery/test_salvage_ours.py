@@ -23,7 +23,7 @@ from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetEditedError, DatasetError
 from bhd_lerobot.tasks.task import Event
 from tests.datasets import support
-from tests.datasets.edit_support import assert_sound, content, record
+from tests.datasets.edit_support import assert_valid, content, record
 
 DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
@@ -47,7 +47,7 @@ def cut(size: int) -> Callable[[Path], None]:
 
 
 def without_metadata(root: Path) -> list[Any]:
-    return [(one.task, one.columns, one.films) for one in content(root)]
+    return [(one.task, one.columns, one.videos) for one in content(root)]
 
 
 @pytest.mark.parametrize("is_ours", [True, False])
@@ -68,7 +68,7 @@ def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path,
         assert report.aside is not None
         assert snapshot(report.aside) == before
         assert content(root) == content(recorded)
-        assert_sound(root)
+        assert_valid(root)
         assert not repair(root)
         if not is_ours:
             continue
@@ -97,7 +97,7 @@ def test_episodes_nobody_describes_are_recovered_and_what_is_forgotten_is_named(
     assert lost.startswith("meta/episodes: ")
     assert "bhd/" in lost
     assert lost.endswith("of episodes 0 to 3")
-    assert_sound(root)
+    assert_valid(root)
 
 
 def test_rows_that_are_left_keep_what_they_tell(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_outcomes_and_marks_are_told_again(tmp_path: Path) -> None:
     assert outcomes(root) == before
     assert report.lost == ("meta/episodes: all columns bhd/… but outcome and success of episodes 0 to 2",)
     assert [edit["edit"] for edit in edits_of(root)] == ["mark", "recovered"]
-    assert_sound(root)
+    assert_valid(root)
 
 
 def test_marks_of_another_programs_dataset_are_told_again_while_their_numbers_hold(tmp_path: Path) -> None:
@@ -301,7 +301,7 @@ def test_a_damaged_value_costs_its_episode_only(recorded: Path, tmp_path: Path) 
         assert [one[0] for one in found] == [one[0] for one in kept]
         assert [one[1]["observation.state"] for one in found] == [one[1]["observation.state"] for one in kept]
         assert [one[2] for one in found] == [one[2] for one in kept]
-        assert_sound(root)
+        assert_valid(root)
 
 
 def test_pages_that_are_damaged_cost_their_episodes_only(tmp_path: Path) -> None:

@@ -96,16 +96,16 @@ def test_hidden_files_and_leftovers_stay_here(hub: HubServer, root: Path) -> Non
 
 
 def card(text: str = "# made\n") -> Card:
-    return Card(sign(text), b"picture")
+    return Card(sign(text), b"image")
 
 
 def made(text: str = "# made\n") -> MakeCard:
-    return lambda state, has_picture: card(f"{text}{has_picture}")
+    return lambda state, has_image: card(f"{text}{has_image}")
 
 
 def test_a_generated_card_is_renewed_and_another_one_is_kept(hub: HubServer, root: Path) -> None:
     send(root, make_card=made())
-    assert stored(hub)["preview.png"] == b"picture"
+    assert stored(hub)["preview.png"] == b"image"
     assert not send(root, make_card=made("# made anew\n")).kept_card
     edited = stored(hub)["README.md"].replace(b"anew", b"by hand")
     assert not is_generated(edited)
@@ -130,7 +130,7 @@ def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path, tmp_p
     assert b"anew" in stored(hub)["README.md"]
 
 
-def test_a_picture_beside_the_dataset_is_the_picture(hub: HubServer, root: Path) -> None:
+def test_a_image_beside_the_dataset_is_the_image(hub: HubServer, root: Path) -> None:
     (root / "preview.png").write_bytes(b"mine")
     send(root, make_card=made())
     assert stored(hub)["preview.png"] == b"mine"

@@ -260,13 +260,13 @@ def test_names_are_no_patterns(root: Path, url: str, names: tuple[str, str]) -> 
 
 def test_a_file_that_was_cut_there_is_refused_and_can_be_sent_again(root: Path, url: str, tmp_path: Path) -> None:
     push(root, StoreDataset(url))
-    film = next(name for name in content(root) if name.endswith(".mp4"))
-    with fsspec.open(f"{url}/{film}", "wb") as file:
-        file.write((root / film).read_bytes()[:-40])
-    with pytest.raises(TransferError, match=Path(film).name):
+    video = next(name for name in content(root) if name.endswith(".mp4"))
+    with fsspec.open(f"{url}/{video}", "wb") as file:
+        file.write((root / video).read_bytes()[:-40])
+    with pytest.raises(TransferError, match=Path(video).name):
         pull(StoreDataset(url), tmp_path / "e")
     assert not (tmp_path / "e").exists()
-    assert push(root, StoreDataset(url)).sent == [film]
+    assert push(root, StoreDataset(url)).sent == [video]
     pull(StoreDataset(url), tmp_path / "e")
     assert content(tmp_path / "e") == content(root)
 

@@ -41,13 +41,13 @@ NAMES = st.lists(PARTS, max_size=6).map("".join) | st.text(max_size=8)
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def video_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("places") / "d", [0, 1, 2], video=True)
 
 
 @pytest.fixture
-def root(filmed: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(filmed, tmp_path / "d"))
+def root(video_dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(video_dataset, tmp_path / "d"))
 
 
 @given(NAMES)
@@ -156,10 +156,10 @@ def test_a_pull_does_not_come_together_in_a_folder_of_somebody_else(tmp_path: Pa
 
 
 def test_no_command_follows_a_link_out_of_the_dataset(root: Path, tmp_path: Path) -> None:
-    data, film = "data/chunk-000/file-000.parquet", layout.video_file(support.CAMERA, (0, 0))
+    data, video = "data/chunk-000/file-000.parquet", layout.video_file(support.CAMERA, (0, 0))
     episodes = "meta/episodes/chunk-000/file-000.parquet"
     others = ("images", "tmp123", "meta/notes.txt", "videos/x", "data/chunk-000/.hidden")
-    for name in (data, film, episodes, layout.INFO, layout.TASKS, layout.STATS, "videos", "data/chunk-000", *others):
+    for name in (data, video, episodes, layout.INFO, layout.TASKS, layout.STATS, "videos", "data/chunk-000", *others):
         place, secret = root / name, tmp_path / "secret"
         if place.exists():
             place.rename(secret)
@@ -169,7 +169,7 @@ def test_no_command_follows_a_link_out_of_the_dataset(root: Path, tmp_path: Path
         place.symlink_to(root / ".step")  # by way of a link that stays inside
         calls: list[Callable[[], Any]] = [
             lambda: load_state(root),
-            lambda: load_state(root, films=False),
+            lambda: load_state(root, videos=False),
             lambda: keep(root, [0], tmp_path / "kept"),
             lambda: repair(root),
         ]
@@ -193,12 +193,12 @@ def test_no_command_follows_a_link_out_of_the_dataset(root: Path, tmp_path: Path
 
 def test_links_within_and_to_declared_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = content(root)
-    (root / "videos").rename(root / "films")
-    (root / "videos").symlink_to("films")
+    (root / "videos").rename(root / "videos")
+    (root / "videos").symlink_to("videos")
     (root / "data" / "again").symlink_to("..")  # a circle
     (root / "meta" / "itself").symlink_to("itself")
     load_state(root)
-    (root / "films").rename(tmp_path / "big")
+    (root / "videos").rename(tmp_path / "big")
     (root / "videos").unlink()
     (root / "videos").symlink_to(tmp_path / "big")
     with pytest.raises(DatasetError, match="outside of the dataset"):
@@ -231,7 +231,7 @@ def test_a_cache_that_is_none(root: Path, tmp_path: Path) -> None:
     check_links(snapshot)
 
 
-def test_pictures_beside_the_data_are_within(root: Path) -> None:
+def test_images_beside_the_data_are_within(root: Path) -> None:
     for path in ("/etc/passwd", "../x", "images/../../x"):
         with pytest.raises(DatasetError, match="outside of the dataset"):
             check_inside(root, root / path)

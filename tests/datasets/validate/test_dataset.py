@@ -1,4 +1,4 @@
-"""A sound dataset has no finding; each kind of damage has one, which names the place."""
+"""A valid dataset has no finding; each kind of damage has one, which names the place."""
 
 import contextlib
 import json
@@ -76,12 +76,12 @@ def record(root: Path, *, finalize: bool = True, video: bool = False, outcome: s
 
 
 @pytest.fixture(scope="module")
-def sound(tmp_path_factory) -> Path:
+def valid(tmp_path_factory) -> Path:
     return record(tmp_path_factory.mktemp("check") / "d")
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory) -> Path:
+def video_dataset(tmp_path_factory) -> Path:
     return record(tmp_path_factory.mktemp("check") / "v", video=True)
 
 
@@ -116,20 +116,20 @@ def bad(found: DatasetCheck) -> list[Finding]:
     return [one for one in found.findings if one.severity > Severity.NOTE]
 
 
-# --- sound -----------------------------------------------------------------------------------------------------------
+# --- valid -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_sound_dataset_has_no_finding_and_is_left_alone(sound: Path) -> None:
-    before = contents(sound)
-    found = check_dataset(sound, limits)
+def test_a_sound_dataset_has_no_finding_and_is_left_alone(valid: Path) -> None:
+    before = contents(valid)
+    found = check_dataset(valid, limits)
     assert bad(found) == []
     assert (found.episodes, found.frames) == (EPISODES, sum(map(length, range(EPISODES))))
     assert [one.what for one in found.findings if one.check == "outcome"] == ["success 6"]
-    assert contents(sound) == before
+    assert contents(valid) == before
 
 
-def test_films_are_counted(filmed: Path) -> None:
-    assert bad(check_dataset(filmed, limits)) == []
+def test_videos_are_counted(video_dataset: Path) -> None:
+    assert bad(check_dataset(video_dataset, limits)) == []
 
 
 def test_a_dataset_of_stock_lerobot_is_sound(tmp_path: Path) -> None:
@@ -137,8 +137,8 @@ def test_a_dataset_of_stock_lerobot_is_sound(tmp_path: Path) -> None:
     assert [one for one in check_dataset(root).findings if one.severity == Severity.ERROR] == []
 
 
-def test_every_finding_belongs_to_a_check_that_is_described(sound: Path, tmp_path: Path) -> None:
-    root = copy(sound, tmp_path)
+def test_every_finding_belongs_to_a_check_that_is_described(valid: Path, tmp_path: Path) -> None:
+    root = copy(valid, tmp_path)
     (root / "meta/stats.json").unlink()
     assert {one.check for one in check_dataset(root).findings} <= set(CHECKS)
 
@@ -224,8 +224,8 @@ ERROR, WARNING = Severity.ERROR, Severity.WARNING
         (lost_row, (ERROR, "counts", "file-000", "134 frames; its episodes have 135")),
     ],
 )
-def test_damaged_numbers_are_found(sound: Path, tmp_path: Path, damage, expected) -> None:
-    root = copy(sound, tmp_path)
+def test_damaged_numbers_are_found(valid: Path, tmp_path: Path, damage, expected) -> None:
+    root = copy(valid, tmp_path)
     edit(data_file(root), damage)
     found = check_dataset(root, limits)
     severity, check, where, what = expected
@@ -236,8 +236,8 @@ def test_damaged_numbers_are_found(sound: Path, tmp_path: Path, damage, expected
     assert {one.check for one in bad(found)} <= {check, "stats", "limits"}
 
 
-def test_a_nan_that_no_policy_learns_from_is_a_note(sound: Path, tmp_path: Path) -> None:
-    root = copy(sound, tmp_path)
+def test_a_nan_that_no_policy_learns_from_is_a_note(valid: Path, tmp_path: Path) -> None:
+    root = copy(valid, tmp_path)
     edit(data_file(root), age)
     found = check_dataset(root)
     assert bad(found) == []
@@ -245,21 +245,21 @@ def test_a_nan_that_no_policy_learns_from_is_a_note(sound: Path, tmp_path: Path)
     assert "episode 0, frame 3" in note.what
 
 
-def test_a_column_with_gaps_is_found_and_the_rest_is_checked(sound: Path, tmp_path: Path) -> None:
+def test_a_column_with_gaps_is_found_and_the_rest_is_checked(valid: Path, tmp_path: Path) -> None:
     def gap(rows: dict[str, Any]) -> None:
         rows["observation.state"][3] = None
         frozen_episode({"observation.state": rows["observation.state"]})
         jump(rows)
 
-    root = copy(sound, tmp_path)
+    root = copy(valid, tmp_path)
     edit(data_file(root), gap)
     found = bad(check_dataset(root))
     assert [one.what for one in found if one.check == "finite"] == ["1 frames hold nothing"]
     assert [one.where for one in found if one.check == "jumps"] == ["action: a.pos"]
 
 
-def test_a_gripper_that_closes_once_in_every_episode_does_not_jump(sound: Path) -> None:
-    assert not [one for one in check_dataset(sound).findings if one.check == "jumps"]
+def test_a_gripper_that_closes_once_in_every_episode_does_not_jump(valid: Path) -> None:
+    assert not [one for one in check_dataset(valid).findings if one.check == "jumps"]
 
 
 def episodes_file(root: Path) -> Path:
@@ -320,8 +320,8 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str, str, str]] = {
 
 
 @pytest.mark.parametrize("case", DAMAGE)
-def test_damaged_files_are_found(sound: Path, tmp_path: Path, case: str) -> None:
-    root = copy(sound, tmp_path)
+def test_damaged_files_are_found(valid: Path, tmp_path: Path, case: str) -> None:
+    root = copy(valid, tmp_path)
     damage, check, where, what = DAMAGE[case]
     damage(root)
     found = check_dataset(root)
@@ -338,20 +338,20 @@ def test_an_unfinished_recording_is_told_with_the_command_that_finishes_it(tmp_p
     assert all("bhd-data repair" in one.remedy for one in found)
 
 
-def test_a_film_that_is_too_short_is_found(filmed: Path, tmp_path: Path) -> None:
-    root = copy(filmed, tmp_path)
-    film, other = next((root / "videos").rglob("*.mp4")), tmp_path / "other"
+def test_a_video_that_is_too_short_is_found(video_dataset: Path, tmp_path: Path) -> None:
+    root = copy(video_dataset, tmp_path)
+    video, other = next((root / "videos").rglob("*.mp4")), tmp_path / "other"
     record(other, video=True, finalize=False)
     short = min((other / "videos").rglob("*.mp4"))
-    shutil.copy(short, film)
+    shutil.copy(short, video)
     (one,) = bad(check_dataset(root))
     assert (one.check, one.what) == ("video", "it has 20 frames; its episodes have 135")
     assert bad(check_dataset(root, videos=False)) == []
 
 
-def test_a_film_that_cannot_be_read_is_found(filmed: Path, tmp_path: Path) -> None:
-    root = copy(filmed, tmp_path)
-    next((root / "videos").rglob("*.mp4")).write_bytes(b"no film")
+def test_a_video_that_cannot_be_read_is_found(video_dataset: Path, tmp_path: Path) -> None:
+    root = copy(video_dataset, tmp_path)
+    next((root / "videos").rglob("*.mp4")).write_bytes(b"no video")
     (one,) = bad(check_dataset(root))
     assert (one.check, one.severity) == ("video", Severity.ERROR)
 
@@ -361,10 +361,10 @@ def test_a_dataset_without_a_success_is_warned_of(tmp_path: Path) -> None:
     assert (one.check, one.what) == ("outcome", "none succeeded: collision 6")
 
 
-def test_what_cannot_be_checked_is_an_error(sound: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_checked_is_an_error(valid: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="does not exist"):
         check_dataset(tmp_path / "none")
-    root = copy(sound, tmp_path)
+    root = copy(valid, tmp_path)
     (root / "meta/info.json").write_text("{")
     with pytest.raises(DatasetError, match="cannot be used"):
         check_dataset(root)
@@ -374,8 +374,10 @@ def test_what_cannot_be_checked_is_an_error(sound: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_whatever_happened_to_a_file_is_a_finding_or_a_clear_error(filmed: Path, tmp_path: Path, seed: int) -> None:
-    root, rng = copy(filmed, tmp_path), np.random.default_rng(seed)
+def test_whatever_happened_to_a_file_is_a_finding_or_a_clear_error(
+    video_dataset: Path, tmp_path: Path, seed: int
+) -> None:
+    root, rng = copy(video_dataset, tmp_path), np.random.default_rng(seed)
     files = sorted(path for path in root.rglob("*") if path.is_file())
     path = files[rng.integers(len(files))]
     content = bytearray(path.read_bytes())
@@ -393,7 +395,7 @@ def test_whatever_happened_to_a_file_is_a_finding_or_a_clear_error(filmed: Path,
         worst = check_dataset(root).worst
     except DatasetError:  # of meta/info.json
         worst = Severity.ERROR
-    # Films are not decoded, and of a Parquet file the footer has no checksum: a flipped bit may be in a comment.
+    # Videos are not decoded, and of a Parquet file the footer has no checksum: a flipped bit may be in a comment.
     assert worst == Severity.ERROR or path.suffix in {".mp4", ".json"} or seed % 4 == 3
 
 
@@ -406,8 +408,8 @@ def nodes(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 @pytest.mark.parametrize("name", ["meta/info.json", "meta/stats.json"])
 @pytest.mark.parametrize("wrong", [None, "x", -1, 0, True, [], {}, ["a"], math.nan, 10**20, [[1]]])
-def test_a_value_of_any_other_kind_is_a_finding_or_a_clear_error(sound: Path, tmp_path: Path, name, wrong) -> None:
-    root = copy(sound, tmp_path)
+def test_a_value_of_any_other_kind_is_a_finding_or_a_clear_error(valid: Path, tmp_path: Path, name, wrong) -> None:
+    root = copy(valid, tmp_path)
     whole = json.loads((root / name).read_text())
     for path in [one for one in nodes(whole) if len(one) <= 2][:12]:  # one after the other
         value = wrong if not path else json.loads(json.dumps(whole))
@@ -438,9 +440,9 @@ def record_with_lerobot(root: Path) -> Path:
 
 @pytest.mark.parametrize("source", ["ours", "stock"])
 def test_what_lerobot_edited_has_warnings_of_statistics_that_no_policy_reads(
-    sound, tmp_path, source, capsys, monkeypatch
+    valid, tmp_path, source, capsys, monkeypatch
 ) -> None:
-    root = copy(sound, tmp_path) if source == "ours" else record_with_lerobot(tmp_path / "stock")
+    root = copy(valid, tmp_path) if source == "ours" else record_with_lerobot(tmp_path / "stock")
     monkeypatch.setenv("COLUMNS", "200")
     dataset, again = loader_support.stock(root), loader_support.stock(root)
     folder = tmp_path / "edited"

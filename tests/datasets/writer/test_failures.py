@@ -305,7 +305,7 @@ def test_a_corrupt_file_is_named_and_nothing_is_overwritten(
     damage(root / name)
     before = snapshot(root)
     calls = [lambda: support.resume(root, video=True), lambda: dataset_info(root), lambda: repair(root)]
-    # What only `repair` mends, in another way than a recording that was cut off, is in test_salvage_ours.py.
+    # What only `repair` repairs, in another way than a recording that was cut off, is in test_salvage_ours.py.
     for call in calls[: 2 if (name, damage) in RECOVERABLE else 3]:
         with pytest.raises(DatasetCorruptError, match="Restore this file") as caught:
             call()

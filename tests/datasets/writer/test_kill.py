@@ -73,7 +73,7 @@ def test_kill_at_every_step(server: KillServer, tmp_path: Path, video: bool, pha
         assert code == -signal.SIGKILL
         if phase == "save":
             assert saved == episodes - 1
-            # Stock LeRobot reads it as it lies there, before anything was mended.
+            # Stock LeRobot reads it as it lies there, before anything was repaired.
             support.verify(root, saved, video=video, exact=False)
             with support.resume(root, video=video) as recorder:
                 assert recorder.num_episodes in (saved, saved + 1)

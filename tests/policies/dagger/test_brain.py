@@ -1,4 +1,4 @@
-"""The corrected brain: who drives when, what learner and expert see, and how an expert that gives goals begins."""
+"""The brain `dagger`: who drives when, what learner and expert see, and how an expert that gives goals begins."""
 
 import json
 import math
@@ -12,7 +12,7 @@ from bhd_lerobot.control.commands import CommandResult, ResultCode
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomConfig
 from bhd_lerobot.policies.brain import Chunk, Mixed, Observation
-from bhd_lerobot.policies.dagger.brain import LEARNER_DRIVES, CorrectedBrain, CorrectedConfig
+from bhd_lerobot.policies.dagger.brain import LEARNER_DRIVES, DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
 from bhd_lerobot.policies.dagger.takeover import (
     ArmCollisionWatch,
@@ -61,9 +61,9 @@ class Fake:
         return {"type": self.name, "value": self.value}
 
 
-def config(**values: Any) -> CorrectedConfig:
+def config(**values: Any) -> DaggerConfig:
     nothing = {"collision_s": None, "stall_s": None}
-    return CorrectedConfig(NoopConfig(), GapFollowerConfig(), **{**nothing, **values})
+    return DaggerConfig(NoopConfig(), GapFollowerConfig(), **{**nothing, **values})
 
 
 def base(n: int = 1, speed: float = 0.0, ranges: float = 3.5) -> Observation:
@@ -76,9 +76,9 @@ def arm(q: np.ndarray, velocity: float | np.ndarray = 0.0) -> Observation:
     return Observation(ARM, np.concatenate([q, np.zeros(7) + velocity])[None], running=np.ones(1, np.bool_))
 
 
-def made(n: int = 1, **values: Any) -> tuple[CorrectedBrain, Fake, Fake]:
+def made(n: int = 1, **values: Any) -> tuple[DaggerBrain, Fake, Fake]:
     learner, expert = Fake("learner", 0.1), Fake("expert", 0.2)
-    brain = CorrectedBrain(config(**values), learner, expert)
+    brain = DaggerBrain(config(**values), learner, expert)
     brain.bind(BASE, TWIST, 10)
     brain.reset(np.arange(n), list(range(n)), n)
     return brain, learner, expert
@@ -148,17 +148,17 @@ def test_times_and_shares_are_positive(name: str, value: float) -> None:
 
 
 def test_what_does_not_fit_together_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"brain\.learner\.type is 'corrected' itself"):
-        CorrectedConfig(config(), GapFollowerConfig())
+    with pytest.raises(ConfigError, match=r"brain\.learner\.type is 'dagger' itself"):
+        DaggerConfig(config(), GapFollowerConfig())
     with pytest.raises(ConfigError, match=r"brain\.learner\.stream is true"):
-        CorrectedConfig(LearnedBrainConfig("x", stream=True), GapFollowerConfig())
+        DaggerConfig(LearnedBrainConfig("x", stream=True), GapFollowerConfig())
     with pytest.raises(ConfigError, match="'reach', which gives goals; a learner gives setpoints"):
-        make_brain(CorrectedConfig(ReachBrainConfig(), PickBrainConfig()))
+        make_brain(DaggerConfig(ReachBrainConfig(), PickBrainConfig()))
     with pytest.raises(ConfigError, match="disagreement compares setpoints, and the expert 'pick' gives goals"):
-        make_brain(CorrectedConfig(NoopConfig(), PickBrainConfig(), disagreement=0.3))
+        make_brain(DaggerConfig(NoopConfig(), PickBrainConfig(), disagreement=0.3))
     with pytest.raises(ConfigError, match=r"brain\.learner drives a turtlebot3, but brain\.expert drives a ur5"):
-        robot_of_brain(CorrectedConfig(AvoidanceConfig(), PickBrainConfig()))
-    assert robot_of_brain(CorrectedConfig(NoopConfig(), PickBrainConfig())) == "ur5"
+        robot_of_brain(DaggerConfig(AvoidanceConfig(), PickBrainConfig()))
+    assert robot_of_brain(DaggerConfig(NoopConfig(), PickBrainConfig())) == "ur5"
 
 
 def test_a_learner_that_gives_chunks_is_refused_by_name() -> None:
@@ -176,9 +176,9 @@ def test_a_robot_whose_collisions_it_cannot_foresee_is_refused() -> None:
 
 
 def test_the_parameters_name_both_and_are_plain() -> None:
-    brain = make_brain(CorrectedConfig(RandomConfig(scale=0.5), GapFollowerConfig(), hold_s=2.0))
+    brain = make_brain(DaggerConfig(RandomConfig(scale=0.5), GapFollowerConfig(), hold_s=2.0))
     parameters = json.loads(json.dumps(brain.parameters()))
-    assert parameters["type"] == "corrected"
+    assert parameters["type"] == "dagger"
     assert parameters["hold_s"] == 2.0
     assert parameters["learner"] == {"type": "random", "period_s": 1.0, "scale": 0.5}
     assert parameters["expert"]["type"] == "gap_follower"
@@ -247,18 +247,18 @@ class Table(Desk):
     def __init__(self, q: np.ndarray = HOME, patience_s: float = 0.04) -> None:
         self.n = 1
         expert = PickBrain()
-        settings = CorrectedConfig(
+        settings = DaggerConfig(
             NoopConfig(), PickBrainConfig(), collision_s=None, stall_s=None, patience_s=patience_s, hold_s=None
         )
-        self.corrected = CorrectedBrain(settings, NoopBrain(), expert)
+        self.dagger = DaggerBrain(settings, NoopBrain(), expert)
         super().__init__(expert, [scene(CUP, BOX)])
         self.state = np.concatenate([q, np.zeros(7)])[None]
-        self.corrected.bind(ARM, JOINTS, 25, ENVIRONMENT)
-        self.corrected.reset(np.arange(1), [0], 1, [""])
+        self.dagger.bind(ARM, JOINTS, 25, ENVIRONMENT)
+        self.dagger.reset(np.arange(1), [0], 1, [""])
 
     def look(self, results: Any = None, running: Any = None) -> dict[int, Any]:
         environment = self.table.reshape(1, -1)
-        mixed = self.corrected.act(Observation(ARM, self.state, {}, environment, results or {}, np.ones(1, np.bool_)))
+        mixed = self.dagger.act(Observation(ARM, self.state, {}, environment, results or {}, np.ones(1, np.bool_)))
         assert isinstance(mixed, Mixed)
         for sim, commands in mixed.commands.items():
             assert mixed.by_goals[sim]
@@ -277,16 +277,16 @@ def taken_over(q: np.ndarray = HOME, **changes: Any) -> Table:
     for name, value in changes.items():
         getattr(table, name)(**value)
     assert table.look() == {}
-    assert table.corrected.subtasks() == [LEARNER_DRIVES]
+    assert table.dagger.subtasks() == [LEARNER_DRIVES]
     table.look()
-    assert table.corrected.interventions().all()
+    assert table.dagger.interventions().all()
     return table
 
 
 def test_from_home_the_expert_begins_at_once() -> None:
     table = taken_over()
     assert table.steps() == ["above"]
-    assert table.corrected.subtasks() == ["move the gripper to the red cup"]
+    assert table.dagger.subtasks() == ["move the gripper to the red cup"]
     for _ in range(2):
         table.end()
     assert table.steps() == ["above", "down", "close"]
@@ -325,7 +325,7 @@ def test_what_the_task_is_about_and_what_is_held_already_is_raised_and_not_let_g
     assert table.end() is None  # it holds, and waits for that to be enough
     for _ in range(60):
         assert table.look() == {}
-    assert table.corrected.subtasks() == ["raise what is held"]
+    assert table.dagger.subtasks() == ["raise what is held"]
 
 
 def test_from_an_odd_posture_and_where_there_is_no_way_the_arm_goes_home_first() -> None:
@@ -353,7 +353,7 @@ def test_home_is_the_nearest_full_turn() -> None:
 
 def test_an_expert_that_gave_up_begins_again() -> None:
     table = taken_over()
-    while not table.corrected.subtasks()[0].startswith("cannot"):
+    while not table.dagger.subtasks()[0].startswith("cannot"):
         table.end(success=len(table.given[0]) % 3 != 2, message="blocked")
     before = len(table.given[0])
     for _ in range(70):

@@ -75,7 +75,7 @@ def drive(robot: TurtleBot3, speed: float = 0.2) -> None:
 
 
 def watchdog_count(state: Any, watchdog: Watchdog) -> int:
-    """Return how often a watchdog was raised in a stretch."""
+    """Return how often a watchdog was raised in a segment."""
     return int(state["watchdogs"][WATCHDOGS.index(watchdog)])
 
 

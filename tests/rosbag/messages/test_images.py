@@ -1,4 +1,4 @@
-"""Pictures in messages: every encoding that cameras have, and what is refused."""
+"""Images in messages: every encoding that cameras have, and what is refused."""
 
 import io
 
@@ -12,8 +12,8 @@ from bhd_lerobot.rosbag.messages.parts import Frames
 from tests.rosbag.support import STORE, T, header
 
 rng = np.random.default_rng(0)
-PICTURE = np.repeat(np.repeat(rng.integers(0, 256, (4, 6, 3), np.uint8), 8, axis=0), 8, axis=1)  # (32, 48, 3)
-GREY = np.repeat(PICTURE[:, :, :1], 3, axis=2)
+PREVIEW = np.repeat(np.repeat(rng.integers(0, 256, (4, 6, 3), np.uint8), 8, axis=0), 8, axis=1)  # (32, 48, 3)
+GREY = np.repeat(PREVIEW[:, :, :1], 3, axis=2)
 FULL = np.full((32, 48, 1), 255, np.uint8)
 
 
@@ -42,44 +42,44 @@ def file(image, kind, mode=None):
 @pytest.mark.parametrize(
     ("encoding", "pixels", "seen"),
     [
-        ("rgb8", PICTURE, PICTURE),
-        ("bgr8", PICTURE[:, :, ::-1], PICTURE),
-        ("rgba8", np.concatenate([PICTURE, FULL], axis=2), PICTURE),
-        ("bgra8", np.concatenate([PICTURE[:, :, ::-1], FULL], axis=2), PICTURE),
+        ("rgb8", PREVIEW, PREVIEW),
+        ("bgr8", PREVIEW[:, :, ::-1], PREVIEW),
+        ("rgba8", np.concatenate([PREVIEW, FULL], axis=2), PREVIEW),
+        ("bgra8", np.concatenate([PREVIEW[:, :, ::-1], FULL], axis=2), PREVIEW),
         ("mono8", GREY[:, :, :1], GREY),
     ],
 )
 @pytest.mark.parametrize("padding", [0, 16])
-def test_raw_pictures(encoding, pixels, seen, padding):
+def test_raw_images(encoding, pixels, seen, padding):
     message = raw(encoding, np.ascontiguousarray(pixels), padding=padding)
     assert np.array_equal(decode_image("/c", IMAGE, message), seen)
 
 
 @pytest.mark.parametrize(
     ("kind", "mode", "seen", "within"),
-    [("PNG", None, PICTURE, 0), ("PNG", "RGBA", PICTURE, 0), ("PNG", "L", None, 0), ("JPEG", None, PICTURE, 15)],
+    [("PNG", None, PREVIEW, 0), ("PNG", "RGBA", PREVIEW, 0), ("PNG", "L", None, 0), ("JPEG", None, PREVIEW, 15)],
 )
-def test_compressed_pictures(kind, mode, seen, within):
-    found = decode_image("/c", COMPRESSED, packed(file(PICTURE, kind, mode), kind.lower()))
+def test_compressed_images(kind, mode, seen, within):
+    found = decode_image("/c", COMPRESSED, packed(file(PREVIEW, kind, mode), kind.lower()))
     if seen is None:
-        assert np.array_equal(found, np.repeat(np.asarray(Image.fromarray(PICTURE).convert("L"))[..., None], 3, axis=2))
+        assert np.array_equal(found, np.repeat(np.asarray(Image.fromarray(PREVIEW).convert("L"))[..., None], 3, axis=2))
     else:
         assert np.abs(found.astype(int) - seen).mean() <= within
 
 
 @pytest.mark.parametrize("encoding", ["16UC1", "mono16", "32FC1", "bayer_rggb8", "yuv422_yuy2", ""])
-def test_raw_pictures_of_another_encoding_are_refused_with_the_valid_ones(encoding):
+def test_raw_images_of_another_encoding_are_refused_with_the_valid_ones(encoding):
     with pytest.raises(DatasetError, match=r"/c have the encoding .* valid: rgb8, bgr8"):
         decode_image("/c", IMAGE, raw(encoding, np.zeros((4, 6, 2), np.uint8)))
 
 
-def test_depth_and_broken_pictures_are_refused():
+def test_depth_and_broken_images_are_refused():
     depth = file(np.arange(24, dtype=np.uint16).reshape(4, 6) * 1000, "PNG")
     with pytest.raises(DatasetError, match="more than 8 bits"):
         decode_image("/c", COMPRESSED, packed(depth, "16UC1; png compressed "))
     with pytest.raises(DatasetError, match=r"compressedDepth png.*neither JPEG nor PNG"):
         decode_image("/c", COMPRESSED, packed(bytes(12) + depth, "16UC1; compressedDepth png"))
-    whole = {kind: file(PICTURE, kind) for kind in ("PNG", "JPEG")}
+    whole = {kind: file(PREVIEW, kind) for kind in ("PNG", "JPEG")}
     for kind, data in whole.items():
         for size in (0, 10, len(data) // 2):
             with pytest.raises(DatasetError, match="/c"):
@@ -95,16 +95,16 @@ def test_depth_and_broken_pictures_are_refused():
 def test_our_jpegs_say_how_image_transport_has_to_read_them():
     """It decodes into blue, green, red, and changes them into what stands first if "compressed bgr" follows."""
     frames = Frames(0, np.array([0]), np.array([5]))
-    message = STORE.deserialize_cdr(encode_image(frames, "c", PICTURE, compressed=True), COMPRESSED)
+    message = STORE.deserialize_cdr(encode_image(frames, "c", PREVIEW, compressed=True), COMPRESSED)
     assert message.format == "rgb8; jpeg compressed bgr8"
     stored = np.asarray(Image.open(io.BytesIO(message.data.tobytes())))  # colours as the JPEG standard has them
-    assert np.abs(stored.astype(int) - PICTURE).mean() <= 5
+    assert np.abs(stored.astype(int) - PREVIEW).mean() <= 5
 
 
 @pytest.mark.parametrize("msgtype", [IMAGE, COMPRESSED])
 def test_an_image_that_is_cut_off_is_refused(msgtype):
-    whole = raw("rgb8", PICTURE) if msgtype == IMAGE else packed(file(PICTURE, "PNG"), "rgb8; png")
-    assert np.array_equal(decode_image("/c", msgtype, whole), PICTURE)
+    whole = raw("rgb8", PREVIEW) if msgtype == IMAGE else packed(file(PREVIEW, "PNG"), "rgb8; png")
+    assert np.array_equal(decode_image("/c", msgtype, whole), PREVIEW)
     for size in (len(whole) // 2, 40, 13, 4, 1, 0):
         with pytest.raises(DatasetError):
             decode_image("/c", msgtype, whole[:size])

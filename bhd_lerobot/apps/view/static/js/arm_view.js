@@ -26,7 +26,7 @@ export function drawArm(canvas, side, together) {
   canvas.dataset.frame = frameAt(together[0][1]);
 }
 
-// Return the box of all postures of the episodes: the picture stands still while the arm moves.
+// Return the box of all postures of the episodes: the image stands still while the arm moves.
 function bounds(together, look) {
   const box = [-0.15, 0.6, look.up === 2 ? -0.03 : -0.3, look.up === 2 ? 0.5 : 0.3];
   for (const [, episode] of together) {

@@ -28,7 +28,7 @@ export function pause() {
   if (!state.playing) return;
   state.playing = false;
   emit("playing");
-  emit("time"); // films go to the exact frame
+  emit("time"); // videos go to the exact frame
 }
 
 export function setRate(rate) {

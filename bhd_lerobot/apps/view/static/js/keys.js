@@ -14,7 +14,7 @@ const HELP = [
   ["c", "compare with the episode before, or end it"],
   ["shift-click", "compare with this episode"],
   ["/", "search"],
-  ["drag, double click", "in a plot: show a stretch of time, all of it"],
+  ["drag, double click", "in a plot: show a segment of time, all of it"],
   ["click", "in a plot: go there"],
   ["esc", "close, leave the search"],
 ];

@@ -3,7 +3,7 @@
 import { colour } from "./canvas.js";
 import { seek, pause } from "./clock.js";
 import { byId, make } from "./dom.js";
-import { duration, emit, frameAt, on, shown, state, stretches } from "./store.js";
+import { duration, emit, frameAt, on, shown, state, segments } from "./store.js";
 
 const HEIGHT = 108; // [px] of a plot without its legend
 const SYNC = "bhd";
@@ -166,8 +166,8 @@ function shading(plot, about) {
     plot.ctx.restore();
   };
   if (state.a.interventions.length) fill("--shade-taken", state.a.interventions);
-  if (about.kind === "action") fill("--shade-limit", stretches(state.a.arrays["control.limits"]?.values));
-  if (about.kind === "timing") fill("--shade-late", stretches(state.a.arrays["control.late"]?.values));
+  if (about.kind === "action") fill("--shade-limit", segments(state.a.arrays["control.limits"]?.values));
+  if (about.kind === "timing") fill("--shade-late", segments(state.a.arrays["control.late"]?.values));
 }
 
 function follow() {
@@ -201,7 +201,7 @@ function clicking(plot) {
   let from = null;
   plot.over.addEventListener("pointerdown", (event) => { from = event.clientX; });
   plot.over.addEventListener("click", (event) => {
-    if (from === null || Math.abs(event.clientX - from) > 3) return; // a drag has chosen a stretch
+    if (from === null || Math.abs(event.clientX - from) > 3) return; // a drag has chosen a segment
     pause();
     seek(plot.posToVal(event.clientX - plot.over.getBoundingClientRect().left, "x"));
   });

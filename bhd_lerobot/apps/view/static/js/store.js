@@ -35,7 +35,7 @@ export function frameAt(episode, time = state.time) {
 }
 
 // Return [first frame, frame after the last] of every run of values that are not zero.
-export function stretches(values = []) {
+export function segments(values = []) {
   const found = [];
   values.forEach((value, frame) => {
     if (!value) return;

@@ -4,7 +4,7 @@ import { colour, prepare } from "./canvas.js";
 import { pause, play, seek, setRate } from "./clock.js";
 import { byId, make, seconds } from "./dom.js";
 import { outcomeColour } from "./outcomes.js";
-import { duration, emit, frameAt, on, shown, state, stretches } from "./store.js";
+import { duration, emit, frameAt, on, shown, state, segments } from "./store.js";
 
 const RATES = [0.5, 1, 2];
 const MOST_RUNS = 400; // of a band as elements of the page
@@ -170,7 +170,7 @@ function eventLane(title, name, episode) {
 function flagLane(title, name, episode, values, hue) {
   return painted(title, name, (context, height, each) => {
     context.fillStyle = colour(hue);
-    for (const [first, end] of stretches(values)) context.fillRect(first * each, 0, Math.max(1, (end - first) * each), height);
+    for (const [first, end] of segments(values)) context.fillRect(first * each, 0, Math.max(1, (end - first) * each), height);
   }, episode);
 }
 

@@ -2,7 +2,7 @@
 
 import { drawArm } from "./arm_view.js";
 import { byId, make } from "./dom.js";
-import { film } from "./films.js";
+import { video } from "./videos.js";
 import { drawScan } from "./scan_view.js";
 import { on, shown, state } from "./store.js";
 import { drawTop, sameScene } from "./top_view.js";
@@ -26,7 +26,7 @@ function arrange() {
 const follow = () => followers.forEach((show) => show());
 
 function build() {
-  const cards = [...films(), ...scans(), ...tops(), ...arms()];
+  const cards = [...videos(), ...scans(), ...tops(), ...arms()];
   followers = cards.flatMap((card) => card.follow);
   byId("views").replaceChildren(...cards.map((card) => card.element));
   byId("views").hidden = cards.length === 0;
@@ -54,27 +54,27 @@ function aspect([one, two, three]) {
   return one <= 4 && three > 4 ? [two, three] : [one, two];
 }
 
-function films() {
+function videos() {
   return state.dataset.cameras.map((camera) => {
     const sources = shown().flatMap(([name, episode]) => {
-      const about = episode.films.find((one) => one.key === camera.key);
-      return about ? [[name, film(camera, episode, about)]] : [];
+      const about = episode.videos.find((one) => one.key === camera.key);
+      return about ? [[name, video(camera, episode, about)]] : [];
     });
     for (const [name, one] of sources) {
       one.element.classList.add(name);
       one.element.classList.toggle("paired", sources.length > 1);
     }
-    const made = card("film", `camera ${camera.label}`, { follow: sources.map(([, one]) => one.show) },
+    const made = card("video", `camera ${camera.label}`, { follow: sources.map(([, one]) => one.show) },
       ...sources.map(([, one]) => one.element));
     const [high, wide] = aspect(camera.shape);
-    made.element.classList.add("of-film");
+    made.element.classList.add("of-video");
     made.element.style.setProperty("--aspect", `${(wide * sources.length) / (high * 1.08)}`); // its heading takes some
     if (sources.length > 1) stacking(made.element.querySelector(".inside"), wide / high);
     return made;
   });
 }
 
-// Two films lie beside or above each other, whichever makes them larger.
+// Two videos lie beside or above each other, whichever makes them larger.
 function stacking(box, ratio) {
   new ResizeObserver(() => {
     const { clientWidth: wide, clientHeight: high } = box;
@@ -88,7 +88,7 @@ function scans() {
   return [drawing("scan", "scan, ahead is up", "laser scan around the robot", (canvas) => drawScan(canvas, output), { output })];
 }
 
-// Episodes in the same surroundings are drawn into one picture, others side by side.
+// Episodes in the same surroundings are drawn into one image, others side by side.
 function groups(has) {
   const there = shown().filter(([, episode]) => has(episode));
   return there.length === 2 && !sameScene(there[0][1], there[1][1]) ? there.map((one) => [one]) : there.length ? [there] : [];

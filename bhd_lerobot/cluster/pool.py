@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from bhd_lerobot.cluster import remote as cluster_remote
-from bhd_lerobot.cluster.cluster import free_places, size_of, tell_crowd, tell_machines
+from bhd_lerobot.cluster.cluster import describe_crowding, describe_machines, free_places, size_of
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.job import Job
 from bhd_lerobot.cluster.task import Call, Task, Worker, cause_of, error_of
@@ -28,7 +28,7 @@ _PRINTED = 200  # lines of workers in a run
 _DISTRIBUTIONS = ("ray", "lerobot_robot_bhd", "lerobot", "mujoco", "numpy", "scipy", "pin", "ruckig")
 
 
-class Crew:
+class WorkerPool:
     """Runs tasks on workers and gives their results in order. Use it as a context manager.
 
     Attributes:
@@ -45,7 +45,7 @@ class Crew:
         self._workers: list[Worker] = []
         self._calls: dict[Any, Call] = {}
         self._lost_early = 0
-        self._is_crowd_told = False
+        self._has_described_crowding = False
         self._failed: tuple[int, BaseException] | None = None  # from this task on there are no results, and why
         self._told: Counter[str] = Counter()
         self._facts: dict[str, str] = {}
@@ -77,10 +77,10 @@ class Crew:
         self._done: dict[int, Any] = {}
         self._failed = None
         self._wanted = self.workers_for(len(tasks))
-        crowd = "" if self._is_crowd_told else tell_crowd(self._config, self._wanted)
-        if crowd:
-            self._console.print(escape(crowd), soft_wrap=True, highlight=False)
-            self._is_crowd_told = True
+        crowding = "" if self._has_described_crowding else describe_crowding(self._config, self._wanted)
+        if crowding:
+            self._console.print(escape(crowding), soft_wrap=True, highlight=False)
+            self._has_described_crowding = True
         self._idle_since = time.monotonic()
         self._dismiss(lambda worker: bool(worker.tasks))  # what a run before left undone is not wanted any more
         for worker in self._workers:
@@ -107,13 +107,13 @@ class Crew:
         places = free_places(self._config)
         if not places:
             raise ClusterError(
-                f"No machine of the cluster has {size_of(self._config)} for a worker. There is: {tell_machines()}. "
+                f"No machine of the cluster has {size_of(self._config)} for a worker. There is: {describe_machines()}. "
                 "Lower --ray.cpus_per_worker or --ray.gpus_per_worker, or add a machine."
             )
         return max(1, min(self._config.num_workers or places, tasks))
 
-    def __enter__(self) -> "Crew":
-        """Return the crew itself."""
+    def __enter__(self) -> "WorkerPool":
+        """Return the pool itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -253,7 +253,7 @@ class Crew:
         elif now - self._idle_since > self._config.timeout_s:
             raise ClusterError(
                 f"No worker could be started within {self._config.timeout_s:g} s (ray.timeout_s): each asks for "
-                f"{size_of(self._config)}, which others perhaps use. There is: {tell_machines()}. See `ray "
+                f"{size_of(self._config)}, which others perhaps use. There is: {describe_machines()}. See `ray "
                 "status`; what was saved is there, go on with --resume=true."
             )
 

@@ -1,4 +1,4 @@
-"""The picture that goes with a dataset to the Hub."""
+"""The image that goes with a dataset to the Hub."""
 
 import tempfile
 from io import BytesIO
@@ -15,21 +15,21 @@ from bhd_lerobot.datasets.format.summary import DatasetSummary
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import BhdError
 
-SHOWN = 12  # episodes in a picture from above
-FRAMES = 6  # of an episode, in a picture from a camera
+SHOWN = 12  # episodes in an image from above
+FRAMES = 6  # of an episode, in an image from a camera
 LINES = 8  # curves in a panel
 
 
 def draw(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, str] | None:
-    """Return a picture of a dataset as PNG, and what it shows; None if there is nothing that could be drawn.
+    """Return an image of a dataset as PNG, and what it shows; None if there is nothing that could be drawn.
 
     What a camera saw, or else the trajectories of robot or tool from above, or else the curves of an episode.
     """
-    for picture in (_camera, _trajectories, _curves):
+    for draw in (_camera, _trajectories, _curves):
         try:
-            drawn = picture(summary, state)
+            drawn = draw(summary, state)
         except (BhdError, KeyError, IndexError, ValueError):
-            continue  # of a robot that this version does not know, or knows otherwise: the next kind of picture
+            continue  # of a robot that this version does not know, or knows otherwise: the next kind of image
         if drawn is not None:
             return drawn
     return None
