@@ -4,12 +4,15 @@ The environment is set while this file is imported, so before any test module ca
 Child processes inherit it.
 """
 
+import contextlib
 import os
 import shutil
 import signal
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 pytest_plugins = ["tests.recorded_datasets"]
@@ -37,3 +40,16 @@ settings.load_profile("bhd")
 
 def pytest_unconfigure() -> None:
     shutil.rmtree(_HF_HOME, ignore_errors=True)
+
+
+@pytest.fixture(autouse=True)
+def _no_realtime_threads() -> Iterator[None]:
+    """Take back the real-time priority that stock LeRobot's AV1 encoder gives the thread of a test that runs as root.
+
+    Processes of later tests would inherit it, among them those that are to have no right to it.
+    """
+    yield
+    for thread in map(int, os.listdir("/proc/self/task")):
+        with contextlib.suppress(ProcessLookupError):
+            if os.sched_getscheduler(thread) != os.SCHED_OTHER:
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))

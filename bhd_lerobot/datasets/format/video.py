@@ -1,9 +1,11 @@
 """Video of one camera: encoded in a thread while the episode runs, and joined later without encoding again."""
 
 import contextlib
+import os
 import queue
+import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -75,6 +77,32 @@ class VideoSettings:
         fields = asdict(self)
         del fields["encoder_threads"], fields["queue_size"]
         return {**fields, "extra_options": dict(self.extra_options)}
+
+
+@contextlib.contextmanager
+def _same_scheduler() -> Iterator[None]:
+    """Take back real-time priority that an encoder gives itself while it is opened.
+
+    SVT-AV1 raises its threads, and the one that opens it, to `SCHED_FIFO` 99 where the process may (as root): above
+    the cerebellum, whose processor it would then take.
+    """
+    if sys.platform != "linux":
+        yield
+        return
+
+    def schedulers() -> dict[int, int]:
+        found = {}
+        for thread in map(int, os.listdir("/proc/self/task")):
+            with contextlib.suppress(ProcessLookupError):
+                found[thread] = os.sched_getscheduler(thread)
+        return found
+
+    before = schedulers()
+    yield
+    for thread, scheduler in schedulers().items():
+        if scheduler & ~os.SCHED_RESET_ON_FORK in (os.SCHED_FIFO, os.SCHED_RR) and scheduler != before.get(thread):
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _is_encoder(name: str) -> bool:
@@ -173,6 +201,8 @@ class CameraEncoder:
             stream.pix_fmt = self._settings.pix_fmt
             step = Fraction(1, self._fps)
             stream.time_base = step
+            with _same_scheduler():
+                stream.codec_context.open()
             while (image := self._queue.get()) is not None and not self._cancelled.is_set():
                 frame = av.VideoFrame.from_ndarray(image, format="rgb24")
                 frame.pts = len(self._histograms)

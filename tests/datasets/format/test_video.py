@@ -1,5 +1,6 @@
 """Encoding blocks instead of dropping, and joining keeps every frame at its time."""
 
+import os
 import threading
 import time
 from pathlib import Path
@@ -48,6 +49,16 @@ def test_joined_files_hold_every_frame_at_its_time(tmp_path: Path, settings: Vid
     for frame, grey in zip(frames, wanted, strict=True):
         assert abs(frame.to_ndarray(format="rgb24").mean() - grey) < 4
     assert video.count_frames(twice) == 12
+
+
+@pytest.mark.parametrize("settings", [VideoSettings(queue_size=1), VideoSettings("libsvtav1", preset=12, queue_size=1)])
+def test_no_encoder_gets_real_time_priority(tmp_path: Path, settings: VideoSettings) -> None:
+    """SVT-AV1 takes `SCHED_FIFO` 99 where it may, for example as root."""
+    encoder = CameraEncoder(tmp_path / "a.mp4", 10, SIZE, settings)
+    for image in np.zeros((4, *SIZE, 3), np.uint8):
+        encoder.add(image)  # more than may wait: the encoder is open
+    assert {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")} == {os.SCHED_OTHER}
+    encoder.finish()
 
 
 def test_options_and_info_are_lerobots(tmp_path: Path) -> None:
