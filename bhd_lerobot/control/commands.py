@@ -1,8 +1,9 @@
-"""Goals: what a brain may ask an arm for beyond the next setpoint, and what it hears back.
+"""Commands of a brain: setpoints, action chunks and goals; and the results of goals.
 
 A goal is accepted or refused, gives feedback while it runs, and ends in exactly one result.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
@@ -168,3 +169,48 @@ class CommandResult:
     success: bool
     code: ResultCode
     message: str
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Setpoints for several frames.
+
+    Each takes effect when its frame begins, also if the brain is late. A new chunk replaces what is left of the one
+    before; after the last setpoint of a chunk the robot holds.
+
+    Attributes:
+        actions: for this frame and those after it, shape (frames, n, actions), in the order of the action features.
+    """
+
+    actions: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Goals:
+    """Goals for n robots.
+
+    Attributes:
+        commands: new goals, by simulation; a robot without one continues with its present goal.
+    """
+
+    commands: Mapping[int, Sequence[BrainCommand]]
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """Setpoints for some robots and goals for the others.
+
+    Attributes:
+        actions: setpoints for this frame, shape (n, actions); rows of robots that follow goals are ignored.
+        by_goals: which robots follow goals in this frame, shape (n,).
+        commands: new goals, by simulation; goals of robots that follow setpoints are ignored.
+    """
+
+    actions: NDArray[np.float64]
+    by_goals: NDArray[np.bool_]
+    commands: Mapping[int, Sequence[BrainCommand]]
+
+
+Command = NDArray[np.float64] | Chunk | Goals | Mixed | None
+"""What n robots are to do: setpoints of shape (n, actions), in the order of the action features; a `Chunk` of them;
+`Goals`; both (`Mixed`); or None, to continue with the last chunk or goal."""

@@ -144,7 +144,7 @@ class Stage:
             SimulationError: the physics diverged.
         """
         simulation = self.simulation
-        report = simulation.act(actions)
+        report = simulation.step(actions)
         self._truth = simulation.truth(report)
         reward, event = self.task.judge(self._truth, simulation.running)
         event = add_faults(event, report.mode, simulation.running)

@@ -8,7 +8,7 @@ import draccus
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import BrainCommand, CommandResult
+from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.errors import ConfigError
 
 
@@ -75,46 +75,6 @@ class Observation:
     running: NDArray[np.bool_] | None = None
 
 
-@dataclass(frozen=True)
-class Goals:
-    """What a brain wants that gives goals instead of setpoints.
-
-    Attributes:
-        commands: new goals, by simulation; one without goes on with what it does.
-    """
-
-    commands: Mapping[int, Sequence[BrainCommand]]
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """What a brain wants that plans several frames ahead.
-
-    Each action takes effect when its frame begins, whatever the brain is doing then. A new chunk takes the place of
-    what is left of the last; when one is used up, the robot holds.
-
-    Attributes:
-        actions: for this frame and those after it, shape (frames, n, actions), in the order of the action features.
-    """
-
-    actions: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Mixed:
-    """What a brain wants that gives setpoints to some robots and goals to others, or first the one and then the other.
-
-    Attributes:
-        actions: setpoints for this frame, shape (n, actions); the rows of those that follow goals mean nothing.
-        by_goals: which robots follow goals in this frame, shape (n,).
-        commands: new goals, by simulation; one that follows goals without a new one goes on with what it does.
-    """
-
-    actions: NDArray[np.float64]
-    by_goals: NDArray[np.bool_]
-    commands: Mapping[int, Sequence[BrainCommand]]
-
-
 class Brain(Protocol):
     """A rule or a network that drives n robots.
 
@@ -159,11 +119,10 @@ class Brain(Protocol):
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the plan of one simulation, as plain values; of a brain that `has_plan`."""
 
-    def act(self, observation: Observation) -> "NDArray[np.float64] | Goals | Chunk | Mixed | None":
-        """Return what the robots are to do.
+    def act(self, observation: Observation) -> Command:
+        """Return the command of n robots for this frame.
 
-        Setpoints for this frame, shape (n, actions), in the order of the action features; or a chunk of them, or None
-        to go on with the last chunk; or goals. A brain gives goals always or never, unless what it gives is `Mixed`.
+        A brain returns goals always or never, unless what it returns is `Mixed`.
         """
 
     def parameters(self) -> dict[str, Any]:

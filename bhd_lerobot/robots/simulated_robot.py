@@ -203,7 +203,7 @@ class SimulatedRobot(Robot):
         values = self.action_array(action)
         if isinstance(simulation, LiveSimulation):
             return self._send_live(simulation, values)
-        report = simulation.act(values)
+        report = simulation.step(values)
         self._results += report.results.get(0, ())
         reason = Reason(int(report.sent.reasons[0]))
         if reason != Reason.ACCEPTED:
@@ -214,12 +214,12 @@ class SimulatedRobot(Robot):
 
     def _send_live(self, simulation: LiveSimulation, values: NDArray[np.float64]) -> dict[str, float]:
         """Send an action and return at once, with what is commanded now."""
-        sent, refusals = simulation.send(values, np.ones(1, np.bool_))
-        reason = Reason(int(sent.reasons[0]))
+        receipt = simulation.send(values)
+        reason = Reason(int(receipt.sent.reasons[0]))
         if reason != Reason.ACCEPTED:
             mode = Mode(int(simulation.modes[0])).name
             raise CommandRefusedError(
-                f"The {self.name} refused the action: {refusals.get(0, reason.explanation)} (mode {mode})."
+                f"The {self.name} refused the action: {receipt.refusals.get(0, reason.explanation)} (mode {mode})."
             )
         applied = simulation.to_action(simulation.live_bridge.latest["command"])
         return dict(zip(self.action_names, applied[0].tolist(), strict=True))

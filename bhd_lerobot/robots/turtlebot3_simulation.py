@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.control.base.controller import BaseController
-from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
 from bhd_lerobot.sim.lidar import Lidar
@@ -33,20 +32,21 @@ class TurtleBot3Simulation(Simulation):
     video_speed = 4
 
     def __init__(self, config: "TurtleBot3Config", n: int = 1, threads: int | None = None) -> None:
-        self.config, self.n = config, n
-        self.rates = config.rates
-        body = self.body = config.body()
-        self.world = World(body, n, physics_hz=config.physics_hz, threads=threads)
-        self.plant = SimulatedPlant(self.world)
-        self._controller = BaseController(body, n, config.control_hz)
-        self.cerebellum = Cerebellum(body, self.plant, config.control_hz, controller=self._controller)
-        self.bridge = LockstepBridge(self.cerebellum, self.rates, self.advance)
+        body = config.body()
         if body.lidar is None:
             raise AssertionError("The Burger has a lidar.")
-        self.lidar = Lidar(self.world, body.lidar, config.beams)
-        self.observation_names = observation_names(config)
-        self.camera_names = ("front",) if config.camera else ()
-        self._begin()
+        world = World(body, n, physics_hz=config.physics_hz, threads=threads)
+        self.plant = SimulatedPlant(world)
+        self.lidar = Lidar(world, body.lidar, config.beams)
+        self._controller = BaseController(body, n, config.control_hz)
+        super().__init__(
+            config,
+            world,
+            Cerebellum(body, self.plant, config.control_hz, controller=self._controller),
+            action_names=self.action_names,
+            observation_names=observation_names(config),
+            camera_names=("front",) if config.camera else (),
+        )
         self._touch = self.world.sensor(body.touch_sensor)[:, 0]
         self._gyro = self.world.sensor("imu_gyro")
         self._touched = np.zeros(n, np.bool_)

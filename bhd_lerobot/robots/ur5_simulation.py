@@ -10,7 +10,6 @@ from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.impedance import ImpedanceController
-from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
@@ -85,25 +84,25 @@ class UR5Simulation(Simulation):
     def __init__(
         self, config: "UR5Config", n: int = 1, threads: int | None = None, planning: Planning | None = None
     ) -> None:
-        self.config, self.n = config, n
-        self.rates = config.rates
-        body = self.body = config.body()
-        self.world = World(body, n, physics_hz=config.physics_hz, threads=threads)
-        self.table = Tabletop(self.world)
-        self.plant = LatePlant(SimulatedPlant(self.world), body, round(MAX_LATENCY_S * config.control_hz))
+        body = config.body()
+        world = World(body, n, physics_hz=config.physics_hz, threads=threads)
+        self.table = Tabletop(world)
+        self.plant = LatePlant(SimulatedPlant(world), body, round(MAX_LATENCY_S * config.control_hz))
+        self.kinematics = ArmKinematics(body.chain, body.limits)
+        ticks = config.rates.ticks_per_frame
         self.controller: ArmController | ImpedanceController
         if config.control == "impedance":
-            self.controller = ImpedanceController(body, n, config.control_hz, self.rates.ticks_per_frame)
+            self.controller = ImpedanceController(body, n, config.control_hz, ticks)
         else:
-            self.controller = ArmController(body, n, config.control_hz, self.rates.ticks_per_frame, planning)
-        self.cerebellum = Cerebellum(body, self.plant, config.control_hz, controller=self.controller)
-        self.bridge = LockstepBridge(self.cerebellum, self.rates, self.advance)
-        self.kinematics = ArmKinematics(body.chain, body.limits)
-        self.observation_names = observation_names(config)
-        if config.action_space == "tool":
-            self.action_names = TOOL_NAMES
-        self.camera_names = ("scene", "wrist") if config.camera else ()
-        self._begin()
+            self.controller = ArmController(body, n, config.control_hz, ticks, planning)
+        super().__init__(
+            config,
+            world,
+            Cerebellum(body, self.plant, config.control_hz, controller=self.controller),
+            action_names=TOOL_NAMES if config.action_space == "tool" else JOINT_ACTIONS,
+            observation_names=observation_names(config),
+            camera_names=("scene", "wrist") if config.camera else (),
+        )
         self._noise = np.zeros(n)
         self._now = np.ones(n, np.int64)  # times the tick
         self._arm_on_table, self._arm_on_object, self._self_contact = (np.zeros(n, np.bool_) for _ in range(3))

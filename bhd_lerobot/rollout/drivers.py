@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.policies.brain import Brain, Goals, Mixed, Observation
+from bhd_lerobot.control.commands import Goals, Mixed
+from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.tasks.task import Event
 
 Mask = NDArray[np.bool_]

@@ -2,17 +2,18 @@
 
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import BrainCommand, CommandResult
-from bhd_lerobot.control.messages import NANOSECONDS, SendResult
+from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals, Mixed
+from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.policies.brain import Brain, Chunk, Goals, Mixed, Observation
+from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.robots.faults import add_faults
 from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
@@ -171,32 +172,27 @@ class EpisodeLoop:
             simulation.running,
         )
         started = time.perf_counter()
-        decision = brain.act(seen)
+        command = in_single_precision(brain.act(seen))
         # On the lockstep clock time stands still while the brain thinks.
         thought = np.full(simulation.n, time.perf_counter() - started if simulation.is_live else 0.0)
         physics = simulation.physics_state
-        if isinstance(decision, Goals):
-            report = simulation.pursue(decision.commands)
-            action = report.applied.astype(np.float32)
-        elif isinstance(decision, Mixed):
-            action = np.asarray(decision.actions).astype(np.float32)
-            report = simulation.divide(action.astype(np.float64), decision.by_goals, decision.commands)
-        elif decision is None or isinstance(decision, Chunk):
-            if decision is None:
-                report = simulation.wait(SendResult(np.zeros(simulation.n, np.int8)))
-            else:
-                report = simulation.follow(np.asarray(decision.actions).astype(np.float32).astype(np.float64))
-            # What the chunk asks for over this frame; when it is used up, its last.
-            action = simulation.to_action(simulation.cerebellum.requested).astype(np.float32)
-        else:
-            action = np.asarray(decision).astype(np.float32)
-            report = simulation.act(action.astype(np.float64))
-        self._log(decision, report)
+        report = simulation.step(command)
+        match command:
+            case Goals():
+                action = report.applied
+            case None | Chunk():
+                # The chunk's setpoint for this frame; after its last, the last.
+                action = simulation.to_action(simulation.cerebellum.requested)
+            case Mixed():
+                action = command.actions
+            case _:
+                action = command
+        self._log(command, report)
         if brain.has_plan:
             values[keys.SUBTASK] = np.array(brain.subtasks(), object)
         values |= {
             keys.OBSERVATION_STATE: state,
-            keys.ACTION: action,
+            keys.ACTION: action.astype(np.float32),
             keys.TIME: frame.time_ns / NANOSECONDS,
             keys.AGE: frame.age_ns / NANOSECONDS,
             keys.INFERENCE_TIME: thought,
@@ -268,12 +264,12 @@ class EpisodeLoop:
             self._images.order(sim, self.observer)  # what is shown is the end of the frame before: its beginning
         return values
 
-    def _log(self, decision: Any, report: FrameReport) -> None:
+    def _log(self, command: Command, report: FrameReport) -> None:
         """Remember goals and how they ended, for the episode's metadata and for the brain."""
-        self._drivers.decided(decision)
-        if isinstance(decision, Goals | Mixed):
-            for sim, commands in decision.commands.items():
-                self._commands[sim] += [(int(self._length[sim]), command) for command in commands]
+        self._drivers.decided(command)
+        if isinstance(command, Goals | Mixed):
+            for sim, goals in command.commands.items():
+                self._commands[sim] += [(int(self._length[sim]), goal) for goal in goals]
         for sim, results in report.results.items():
             last = int(self._length[sim]) + len(report.missed)
             self._ends[sim] += [(last, result) for result in results]
@@ -340,3 +336,18 @@ class EpisodeLoop:
             interventions=self._drivers.interventions(sim, length),
             goal_frames=self._drivers.goal_frames(sim, length),
         )
+
+
+def in_single_precision(command: Command) -> Command:
+    """Return a command with its setpoints rounded to single precision, as float64; goals are left as they are."""
+    match command:
+        case None | Goals():
+            return command
+        case Chunk() | Mixed():
+            return replace(command, actions=_rounded(command.actions))
+        case _:
+            return _rounded(command)
+
+
+def _rounded(actions: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(actions).astype(np.float32).astype(np.float64)

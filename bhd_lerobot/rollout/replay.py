@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from bhd_lerobot.control.commands import BrainCommand
+from bhd_lerobot.control.commands import BrainCommand, Goals
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.identity import default_root
@@ -165,9 +165,9 @@ class Replay:
             states.append(simulation.physics_state[0])
             observations.append(simulation.observe().state[0])
             if self.goals is not None and self._by_goals[frame]:
-                simulation.pursue({0: self.goals.get(frame, [])})
+                simulation.step(Goals({0: self.goals.get(frame, [])}))
             else:
-                simulation.act(action[None])
+                simulation.step(action[None])
         return self._compare("open_loop", np.array(states), np.array(observations), ())
 
     def state_exact(self) -> Divergence:

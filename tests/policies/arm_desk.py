@@ -6,8 +6,8 @@ import numpy as np
 
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
-from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
-from bhd_lerobot.policies.brain import Goals, Observation
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
+from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.tasks.pick import ENVIRONMENT
 
 OBSERVED = ("shoulder_pan.pos", "gripper.pos")

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.commands import Goals, Mixed
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.baselines import NoopConfig, RandomBrain, RandomConfig
-from bhd_lerobot.policies.brain import Goals, Mixed, Observation
+from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig

@@ -57,7 +57,7 @@ def test_the_observed_tool_pose_is_that_of_the_observed_joints_with_their_noise(
     noisy = replace(Variation(), sensor_noise=0.01)
     scenes = [TableScene("empty", (), arm.body.home, variation=one) for one in (Variation(), noisy)]
     arm.reset(np.arange(2), scenes, [0, 1])
-    arm.act(np.repeat(arm.cerebellum.command[:1], 2, axis=0))
+    arm.step(np.repeat(arm.cerebellum.command[:1], 2, axis=0))
     state, _ = arm.sense()
     names = list(arm.observation_names)
     assert names[-7:] == list(TOOL_NAMES[:-1])
@@ -96,7 +96,7 @@ def test_the_command_comes_back_as_the_pose_that_was_asked_for(simulation) -> No
     )[3:]
     goal[:, 7] = 0.05
     for _ in range(40):
-        report = simulation.act(goal)
+        report = simulation.step(goal)
         assert report.sent.accepted.all()
         assert not report.refusals
     assert np.allclose(report.applied, goal, atol=1e-6)
@@ -111,7 +111,7 @@ def test_one_arm_s_impossible_pose_is_refused_in_words_and_the_others_go_on(simu
     action[1, 3:7] = 0.0
     action[2, 2] += 0.05
     for _ in range(15):
-        report = simulation.act(action)
+        report = simulation.step(action)
         assert report.sent.reasons.tolist() == [Reason.NO_POSTURE, Reason.NO_POSTURE, Reason.ACCEPTED]
     assert set(report.refusals) == {0, 1}
     assert "length 0" in report.refusals[1]
@@ -126,7 +126,7 @@ def test_what_is_not_finite_is_refused_and_nothing_moves(simulation, column: int
     action = before.copy()
     action[1, column] = value
     action[0, 2] += 0.02
-    report = simulation.act(action)
+    report = simulation.step(action)
     assert report.sent.accepted.tolist() == [True, False, True]
     assert np.array_equal(report.applied[1], before[1])
     assert report.mode[1] == Mode.HOLD
@@ -136,12 +136,12 @@ def test_an_arm_whose_poses_are_refused_stops_like_one_that_hears_nothing(simula
     action = start(simulation)
     for _ in range(10):
         action[:, 1] += 0.01
-        moving = simulation.act(action)
+        moving = simulation.step(action)
     assert moving.mode.tolist() == [Mode.TRACKING] * 3
     bad = action.copy()
     bad[0, 0] = 3.0
     for _ in range(15):
-        report = simulation.act(bad)
+        report = simulation.step(bad)
         assert report.sent.reasons[0] == Reason.NO_POSTURE
     assert report.mode.tolist() == [Mode.HOLD, Mode.TRACKING, Mode.TRACKING]
     assert not report.limits[0] & Limit.NON_FINITE
@@ -153,7 +153,7 @@ def test_the_arm_takes_the_posture_nearest_to_where_it_is(simulation) -> None:
     rng = np.random.default_rng(1)
     for _ in range(30):
         action[:, :3] += rng.uniform(-0.01, 0.01, 3)
-        simulation.act(action)
+        simulation.step(action)
         now = simulation.cerebellum.command[0, :6].copy()
         assert np.abs(now - joints).max() < 0.15  # no other branch of the inverse kinematics
         joints = now

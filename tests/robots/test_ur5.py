@@ -215,7 +215,7 @@ def test_one_refused_arm_does_not_hinder_the_others():
     action = simulation.to_action(simulation.cerebellum.command)
     action[1, 0] = 5.0
     action[:, 2] += 0.001
-    report = simulation.act(action)
+    report = simulation.step(action)
     assert report.sent.reasons.tolist() == [Reason.ACCEPTED, Reason.NO_POSTURE, Reason.ACCEPTED]
     assert list(report.refusals) == [1]
     assert np.array_equal(report.applied[0], report.applied[2])
@@ -331,7 +331,7 @@ def test_an_arm_that_presses_on_the_table_stops_and_lets_go(robot):
     down[0, 1] += 1.0  # the shoulder lowers the arm into the table
     reports = []
     for _ in range(60):
-        reports.append(simulation.act(down))
+        reports.append(simulation.step(down))
         if reports[-1].mode[0] == Mode.FAULT:
             break
     assert reports[-1].watchdog[0] & Watchdog.BLOCKED

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.policies.brain import Chunk
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.rollout.episode import EpisodeLoop

@@ -13,8 +13,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.commands import Mixed
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Mixed, Observation
+from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Observation
 from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
 from bhd_lerobot.policies.dagger.takeover import DisagreementWatch, PatienceWatch, StallWatch, Watch, collision_watch
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain

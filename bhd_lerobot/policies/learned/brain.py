@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Chunk, Observation
+from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Observation
 from bhd_lerobot.policies.learned.contract import WEIGHT_FILES, PolicyContract, find_checkpoint
 
 if TYPE_CHECKING:

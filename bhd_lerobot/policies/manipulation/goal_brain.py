@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import BrainCommand, CommandResult
-from bhd_lerobot.policies.brain import Goals, Observation
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals
+from bhd_lerobot.policies.brain import Observation
 
 
 class GoalBrain(ABC):

@@ -7,14 +7,14 @@ put into published states, to tell what is true and to render images.
 import itertools
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import BrainCommand, CommandResult
+from bhd_lerobot.control.commands import Command
 from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
 from bhd_lerobot.control.timing import TimingStatistics
@@ -22,7 +22,7 @@ from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.bridge import LiveBridge
 from bhd_lerobot.robots.host.link import LiveLink
-from bhd_lerobot.robots.host.simulation import Frame, FrameReport, Simulation
+from bhd_lerobot.robots.host.simulation import Frame, FrameReport, Receipt, Simulation
 from bhd_lerobot.robots.host.state import raised
 from bhd_lerobot.sim.world import Snapshot
 
@@ -77,16 +77,21 @@ class LiveSimulation(Simulation):
             raise ConfigError(
                 f"n_envs is {mirror.n}; with robot.clock = 'realtime' one robot runs at a time: use --n_envs=1."
             )
-        self.mirror, self.config, self.n, self.rates, self.body = mirror, mirror.config, 1, mirror.rates, mirror.body
-        self.world, self.cerebellum, self.camera_names = mirror.world, mirror.cerebellum, mirror.camera_names
-        self.action_names, self.observation_names = mirror.action_names, mirror.observation_names
+        self.mirror = mirror
         self.view, self.video_speed = mirror.view, mirror.video_speed
         self.is_live, self.sensor_period_s = True, mirror.sensor_period_s
-        self._begin()
         self.link = LiveLink(mirror, mirror.config, name)
-        self.live_bridge = LiveBridge(self.link.block, self.rates, self.link.bridge_side.client, self.link.wait)
-        self.bridge = self.live_bridge  # type: ignore[assignment]
         self.grants = self.link.grants
+        self.live_bridge = LiveBridge(self.link.block, mirror.rates, self.link.bridge_side.client, self.link.wait)
+        super().__init__(
+            mirror.config,
+            mirror.world,
+            mirror.cerebellum,
+            action_names=mirror.action_names,
+            observation_names=mirror.observation_names,
+            camera_names=mirror.camera_names,
+            bridge=self.live_bridge,  # type: ignore[arg-type]
+        )
         self._frame_ns = NANOSECONDS // self.rates.fps
         self._reader: RingReader | None = None
         self._boundary: Any = None  # the newest boundary of a frame that was taken
@@ -217,54 +222,25 @@ class LiveSimulation(Simulation):
 
     # --- frames ------------------------------------------------------------------------------------------------------
 
-    def send(self, action: NDArray[np.float64], mask: NDArray[np.bool_]) -> tuple[SendResult, dict[int, str]]:
-        """Send a setpoint and return at once: what became of it, and in words why it was refused.
+    def to_setpoints(
+        self, action: NDArray[np.float64], mask: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
+        """Turn an action into a setpoint, from where the mirror is, and report why it cannot be."""
+        return self.mirror.to_setpoints(action, mask)
+
+    def send(self, command: Command) -> Receipt:
+        """Send a command and return at once.
 
         Raises:
             RealtimeError: a process has ended, or is stopped.
         """
         self._show(self._newest())  # what a tool pose is solved from is where the arm is commanded to be
-        setpoints, refused = self.mirror.to_setpoints(action, mask)
-        if refused:
-            reason, message = refused[0]
-            return SendResult(np.array([reason], np.int8)), {0: message}
-        return self.live_bridge.send(setpoints, mask), {}
+        return super().send(command)
 
-    def act(self, action: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> FrameReport:
-        """Send a setpoint, and wait for the end of the present frame."""
-        sent, refusals = self.send(action, self.running if mask is None else mask & self.running)
-        return self.wait(sent, refusals=refusals)
+    def _send_rows(self, rows: NDArray[np.float64]) -> list[SendResult]:
+        return self.live_bridge.send_chunk(rows, int(self._boundary["frame"]) * self._frame_ns)
 
-    def follow(self, actions: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> FrameReport:
-        """Send an action chunk that begins with the present frame, and wait for the end of the frame that it is now."""
-        mask = self.running if mask is None else mask & self.running
-        self._show(self.live_bridge.latest)
-        rows: list[NDArray[np.float64]] = []
-        refusals: dict[int, str] = {}
-        reason = int(Reason.ACCEPTED)
-        for action in actions:
-            setpoints, refused = self.mirror.to_setpoints(action, mask)
-            if refused:
-                reason, refusals[0] = int(refused[0][0]), refused[0][1]
-                break
-            rows.append(setpoints)
-        if rows and mask[0]:
-            start = int(self._boundary["frame"]) * self._frame_ns
-            results = self.live_bridge.send_chunk(np.array(rows), start)
-            reason = next((int(one.reasons[0]) for one in results if one.reasons[0]), reason)
-        return self.wait(SendResult(np.array([reason], np.int8)), refusals=refusals)
-
-    def pursue(self, commands: Mapping[int, Sequence[BrainCommand]]) -> FrameReport:
-        """Send goals, and wait for the end of the present frame."""
-        refused = [one for goal in commands.get(0, ()) if (one := self.live_bridge.submit(goal)) is not None]
-        return self.wait(SendResult(np.zeros(1, np.int8)), refused={0: refused} if refused else None)
-
-    def wait(
-        self,
-        sent: SendResult,
-        refused: Mapping[int, Sequence[CommandResult]] | None = None,
-        refusals: Mapping[int, str] | None = None,
-    ) -> FrameReport:
+    def _frame(self, receipt: Receipt) -> FrameReport:
         """Wait for the end of the frame that it is now; frames that went by before are in `missed` of the report.
 
         Raises:
@@ -279,9 +255,7 @@ class LiveSimulation(Simulation):
             after = self._take(int(before["frame"]) + 1)
             frames.append((self._between(before, after), before))
             before = after
-        results = self.live_bridge.take_results()
-        if refused:
-            results = [one for one in refused.get(0, ()) if one not in results] + results
+        results = receipt.all_results(0, self.live_bridge.take_results())
         reports = []
         for frame, begun in frames:
             is_last = frame is frames[-1][0]
@@ -289,13 +263,13 @@ class LiveSimulation(Simulation):
             reports.append(
                 FrameReport(
                     applied=self.mirror.to_action(frame.end["command"]),
-                    sent=sent if is_last else SendResult(np.zeros(1, np.int8)),
+                    sent=receipt.sent if is_last else SendResult(np.zeros(1, np.int8)),
                     limits=np.array([limits]),
                     watchdog=np.array([watchdog]),
                     command_age_ns=np.array([int(frame.end["command_age_ns"])]),
                     mode=frame.end["mode"].copy(),
                     results={0: results} if results and is_last else {},
-                    refusals=(refusals or {}) if is_last else {},
+                    refusals=receipt.refusals if is_last else {},
                     live=frame,
                 )
             )

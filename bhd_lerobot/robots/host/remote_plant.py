@@ -44,11 +44,16 @@ class RemoteSimulation(Simulation):
 
     def __init__(self, own: Simulation, link: PlantLink) -> None:
         self._own = own
-        self.config, self.n, self.rates, self.body = own.config, 1, own.rates, own.body
-        self.world, self.cerebellum, self.bridge = own.world, own.cerebellum, own.bridge
-        self.action_names, self.observation_names = own.action_names, own.observation_names
-        self.camera_names, self.sensor_period_s = own.camera_names, own.sensor_period_s
-        self._begin()
+        super().__init__(
+            own.config,
+            own.world,
+            own.cerebellum,
+            action_names=own.action_names,
+            observation_names=own.observation_names,
+            camera_names=own.camera_names,
+            bridge=own.bridge,
+        )
+        self.sensor_period_s = own.sensor_period_s
         self.remote = self.cerebellum.plant = RemotePlant(link)
         self._taken: Any = None
         self._touches: NDArray[np.int64] = np.zeros(len(own.touches), np.int64)  # that it told of

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Body, Rates
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.commands import BrainCommand, CommandResult
+from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals, Mixed
 from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.control.timing import TimingStatistics
@@ -45,7 +44,7 @@ class FrameReport:
 
     Attributes:
         applied: the command at the end of the frame, in the space of the actions, shape (n, actions).
-        sent: what became of the setpoint that the frame began with.
+        sent: what became of the setpoints that the frame began with.
         limits: `Limit` flags, shape (n,).
         watchdog: `Watchdog` flags, shape (n,).
         command_age_ns: age of the command in force at the end of the frame [ns], shape (n,).
@@ -68,12 +67,45 @@ class FrameReport:
     missed: list["FrameReport"] = field(default_factory=list)
 
 
+@dataclass
+class Receipt:
+    """What was accepted of a command, of n robots.
+
+    Attributes:
+        sent: what became of setpoints.
+        refusals: why setpoints were refused, in words, by simulation, where a `Reason` does not say it all.
+        results: goals that were refused, by simulation.
+    """
+
+    sent: SendResult
+    refusals: dict[int, str] = field(default_factory=dict)
+    results: dict[int, list[CommandResult]] = field(default_factory=dict)
+
+    def refuse(self, refused: Mapping[int, tuple[Reason, str]]) -> None:
+        """Add setpoints that were refused, by simulation: reason and words."""
+        for sim, (reason, message) in refused.items():
+            self.sent.reasons[sim], self.refusals[sim] = reason, message
+
+    def all_results(self, sim: int, ended: list[CommandResult]) -> list[CommandResult]:
+        """Return the goals of a robot that ended, with its refused ones: a refusal is a result, too, but only once."""
+        return [result for result in self.results.get(sim, ()) if result not in ended] + ended
+
+
 class Simulation(ABC):
     """n simulated robots of one kind.
 
     Each is in an episode of its own, which nothing outside it can change: not the number of the others, not what they
-    do, not the number of threads. A subclass makes world, cerebellum and bridge in its constructor, calls `_begin`, and
-    says what is sensed and what is true.
+    do, not the number of threads. A subclass makes world and cerebellum, passes them on to this constructor, and
+    defines what is sensed and what is true.
+
+    Args:
+        config: the robot's configuration.
+        world: the physics, of n robots.
+        cerebellum: what controls the robots.
+        action_names: names of the action's floats, in order.
+        observation_names: names of the observation's floats, in order.
+        camera_names: the cameras that are observed.
+        bridge: how commands get to the cerebellum; a `LockstepBridge` that steps this simulation if None.
 
     Attributes:
         config: the robot's configuration.
@@ -94,31 +126,36 @@ class Simulation(ABC):
         grants: what the real-time process was granted and refused, as plain values; None on the lockstep clock.
     """
 
-    config: Any
-    n: int
-    rates: Rates
-    body: Body
-    world: World
-    cerebellum: Cerebellum
-    bridge: LockstepBridge
     action_names: tuple[str, ...]
-    observation_names: tuple[str, ...]
-    camera_names: tuple[str, ...]
     view = "overview"
     video_speed = 1
     is_live = False
     sensor_period_s = 0.0
     grants: list[dict[str, Any]] | None = None
 
-    def _begin(self) -> None:
-        """Set up what all kinds of robots have in common; the subclass has made the attributes above."""
-        n = self.n
+    def __init__(
+        self,
+        config: Any,
+        world: World,
+        cerebellum: Cerebellum,
+        *,
+        action_names: Sequence[str],
+        observation_names: Sequence[str],
+        camera_names: Sequence[str],
+        bridge: LockstepBridge | None = None,
+    ) -> None:
+        n = cerebellum.n
+        self.config, self.n, self.rates, self.body = config, n, config.rates, cerebellum.body
+        self.world, self.cerebellum = world, cerebellum
+        self.bridge = bridge or LockstepBridge(cerebellum, self.rates, self.advance)
+        self.action_names, self.observation_names = tuple(action_names), tuple(observation_names)
+        self.camera_names = tuple(camera_names)
         self.running = np.ones(n, np.bool_)
         self._active: NDArray[np.intp] | None = None
         self.tick = 0
         self._start_tick = np.zeros(n, np.int64)
         self._rngs = [np.random.default_rng(0) for _ in range(n)]
-        self._reading = PlantReading(n, self.cerebellum.controller.joints)
+        self._reading = PlantReading(n, cerebellum.controller.joints)
         self._camera: Camera | None = None
         self._render_thread: RenderThread | None = None
 
@@ -217,125 +254,84 @@ class Simulation(ABC):
         measured = (oldest - self._start_tick) * NANOSECONDS // self.rates.control_hz
         return Frame(state, now, now - measured)
 
-    def act(self, action: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> FrameReport:
-        """Send a setpoint to running robots and let one frame go by.
+    def step(self, command: Command) -> FrameReport:
+        """Send a command to the running robots and let one frame go by.
 
         Args:
-            action: the actions, shape (n, actions).
-            mask: the robots that it is for, shape (n,); all that run if None.
+            command: what they are to do; None continues with the last chunk or goal.
         """
-        sent, refusals = self._send(action, self.running if mask is None else mask & self.running)
-        return self.wait(sent, refusals=refusals)
+        return self._frame(self.send(command))
 
-    def _send(self, action: NDArray[np.float64], mask: NDArray[np.bool_]) -> tuple[SendResult, dict[int, str]]:
-        """Send a setpoint; return what became of it, and in words why it was refused, by simulation."""
+    def send(self, command: Command) -> Receipt:
+        """Send a command to the running robots; no time goes by. Return what was accepted of it."""
+        receipt = Receipt(SendResult(np.zeros(self.n, np.int8)))
+        match command:
+            case None:
+                pass
+            case Chunk(actions):
+                self._send_chunk(actions, receipt)
+            case Goals(commands):
+                self._submit(commands, receipt)
+            case Mixed(actions, by_goals, commands):
+                self._submit({sim: goals for sim, goals in commands.items() if by_goals[sim]}, receipt)
+                self._send_setpoint(actions, self.running & ~by_goals, receipt)
+            case _:
+                self._send_setpoint(command, self.running, receipt)
+        return receipt
+
+    def _send_setpoint(self, action: NDArray[np.float64], mask: NDArray[np.bool_], receipt: Receipt) -> None:
+        if not mask.any():
+            return
         setpoints, refused = self.to_setpoints(action, mask)
         if refused:
             mask = mask.copy()
             mask[list(refused)] = False
-        sent = self.bridge.send(setpoints, mask)
-        for sim, (reason, _) in refused.items():
-            sent.reasons[sim] = reason
-        return sent, {sim: message for sim, (_, message) in refused.items()}
+        receipt.sent = self.bridge.send(setpoints, mask)
+        receipt.refuse(refused)
 
-    def follow(self, actions: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> FrameReport:
-        """Send an action chunk to running robots and let one frame go by; `wait` goes on with it.
-
-        Args:
-            actions: for this frame and those after it, shape (frames, n, actions).
-            mask: the robots that it is for, shape (n,); all that run if None.
-        """
-        mask = self.running if mask is None else mask & self.running
+    def _send_chunk(self, actions: NDArray[np.float64], receipt: Receipt) -> None:
         rows: list[NDArray[np.float64]] = []
-        refused: dict[int, tuple[Reason, str]] = {}
         for action in actions:
-            setpoints, refused = self.to_setpoints(action, mask)
+            setpoints, refused = self.to_setpoints(action, self.running)
+            receipt.refuse(refused)
             if refused:
-                break  # what comes before it is sent
+                break  # the actions before it are sent
             rows.append(setpoints)
-        sent = SendResult(np.zeros(self.n, np.int8))
-        if rows:
-            results = self.bridge.send_chunk(np.array(rows), mask)
-            # What was refused first, of each robot.
+        results = self._send_rows(np.array(rows)) if rows else []
+        if results:
+            # Of each robot, the first reason that is a refusal.
             reasons = np.array([result.reasons for result in results])
-            sent = SendResult(reasons[(reasons != 0).argmax(axis=0), np.arange(self.n)])
-        for sim, (reason, _) in refused.items():
-            sent.reasons[sim] = reason
-        return self.wait(sent, refusals={sim: message for sim, (_, message) in refused.items()})
+            first = reasons[(reasons != 0).argmax(axis=0), np.arange(self.n)]
+            sent = receipt.sent.reasons
+            sent[sent == Reason.ACCEPTED] = first[sent == Reason.ACCEPTED]
 
-    def pursue(self, commands: Mapping[int, Sequence[BrainCommand]]) -> FrameReport:
-        """Send goals to running robots and let one frame go by.
+    def _send_rows(self, rows: NDArray[np.float64]) -> list[SendResult]:
+        """Send the setpoints of a chunk, shape (frames, n, width)."""
+        return self.bridge.send_chunk(rows, self.running)
 
-        Args:
-            commands: new goals, by simulation; a robot without one goes on with what it does.
-        """
-        return self.wait(SendResult(np.zeros(self.n, np.int8)), refused=self._submit(commands))
-
-    def divide(
-        self,
-        action: NDArray[np.float64],
-        by_goals: NDArray[np.bool_],
-        commands: Mapping[int, Sequence[BrainCommand]],
-    ) -> FrameReport:
-        """Send setpoints to some running robots and goals to the others, and let one frame go by.
-
-        Args:
-            action: the actions, shape (n, actions).
-            by_goals: the robots that follow goals, shape (n,).
-            commands: new goals, by simulation; a robot without one goes on with what it does.
-        """
-        mask = self.running & ~by_goals
-        if not mask.any():
-            return self.pursue(commands)
-        if not (self.running & by_goals).any():
-            return self.act(action)
-        refused = self._submit(commands)
-        sent, refusals = self._send(action, mask)
-        return self.wait(sent, refused, refusals)
-
-    def _submit(self, commands: Mapping[int, Sequence[BrainCommand]]) -> dict[int, list[CommandResult]]:
-        """Send goals; return those that were refused, by simulation."""
-        refused: dict[int, list[CommandResult]] = {}
+    def _submit(self, commands: Mapping[int, Sequence[BrainCommand]], receipt: Receipt) -> None:
         for sim, goals in commands.items():
-            for goal in goals:
-                refusal = self.bridge.submit(goal, sim)
-                if refusal is not None:
-                    refused.setdefault(sim, []).append(refusal)
-        return refused
+            refusals = [refusal for goal in goals if (refusal := self.bridge.submit(goal, sim)) is not None]
+            if refusals:
+                receipt.results[sim] = refusals
 
-    def wait(
-        self,
-        sent: SendResult,
-        refused: Mapping[int, Sequence[CommandResult]] | None = None,
-        refusals: Mapping[int, str] | None = None,
-    ) -> FrameReport:
-        """Let one frame go by without a new command; what is given is passed on to the report.
-
-        Args:
-            sent: what became of a setpoint.
-            refused: goals that were refused, by simulation.
-            refusals: in words why setpoints were refused, by simulation.
-        """
+    def _frame(self, receipt: Receipt) -> FrameReport:
+        """Let one frame go by, and report what happened in it and to the command that it began with."""
         self._clear_touches()
         self.bridge.advance_frame()
         self.world.check()
         limits, watchdog = self.cerebellum.take_flags()
-        results = {}
-        for sim in np.flatnonzero(self.running).tolist():
-            # A refusal is among the results, too, unless another goal has its name.
-            done = self.bridge.take_results(sim)
-            done = [one for one in (refused or {}).get(sim, ()) if one not in done] + done
-            if done:
-                results[sim] = done
+        running = np.flatnonzero(self.running).tolist()
+        results = {sim: receipt.all_results(sim, self.bridge.take_results(sim)) for sim in running}
         return FrameReport(
             applied=self.to_action(self.cerebellum.command),
-            sent=sent,
+            sent=receipt.sent,
             limits=limits,
             watchdog=watchdog,
             command_age_ns=self.cerebellum.command_age_ns(self.bridge.now_ns),
             mode=self.cerebellum.mode.copy(),
-            results=results,
-            refusals=refusals or {},
+            results={sim: ended for sim, ended in results.items() if ended},
+            refusals=receipt.refusals,
         )
 
     def render(self, sim: int, camera: str) -> NDArray[np.uint8]:

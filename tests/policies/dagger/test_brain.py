@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
-from bhd_lerobot.control.commands import CommandResult, ResultCode
+from bhd_lerobot.control.commands import Chunk, CommandResult, Mixed, ResultCode
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomConfig
-from bhd_lerobot.policies.brain import Chunk, Mixed, Observation
+from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.dagger.brain import LEARNER_DRIVES, DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
 from bhd_lerobot.policies.dagger.takeover import (

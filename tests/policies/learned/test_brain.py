@@ -8,7 +8,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from bhd_lerobot.policies.brain import Chunk, Observation
+from bhd_lerobot.control.commands import Chunk
+from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.learned.brain import LearnedBrain
 from bhd_lerobot.policies.learned.inference import StockInference
 from tests.policies.learned.rig import ACTIONS, KINDS, Stock, make_brain, observations, save_policy

@@ -8,9 +8,9 @@ import pytest
 
 from bhd_lerobot.bodies.tabletop import TableObject
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
-from bhd_lerobot.control.commands import CommandResult, ResultCode
+from bhd_lerobot.control.commands import CommandResult, Goals, ResultCode
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Goals, Observation
+from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation

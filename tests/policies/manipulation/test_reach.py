@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Goals, Observation
+from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation

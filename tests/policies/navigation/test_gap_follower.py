@@ -309,7 +309,7 @@ def test_it_gets_out_of_a_dead_end(beams: int) -> None:
     brain.reset(ids, [1, 2, 3], len(ids))
     outside = np.zeros(len(ids), np.bool_)
     for _ in range(200):
-        simulation.act(brain.act(Observation(simulation.observation_names, simulation.observe().state)))
+        simulation.step(brain.act(Observation(simulation.observation_names, simulation.observe().state)))
         assert not simulation.truth().touched.any()
         outside |= simulation.world.base_pose[:, 0] < 0.2
     assert outside.all()
