@@ -39,7 +39,7 @@ from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings, SystemCalls
-from bhd_lerobot.robots.catalog import make_robot, make_simulation, robot_config
+from bhd_lerobot.registry import make_robot, make_simulation, robot_configs
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
@@ -168,7 +168,7 @@ def ratio(ours: dict[int, dict[str, Any]], theirs: dict[int, dict[str, Any]], ke
 
 def configuration(robot: str, **options: Any) -> Any:
     """Return the configuration of a robot at the benchmark's rates."""
-    return robot_config(robot)(control_hz=RATES[robot], physics_hz=RATES[robot], **options)  # type: ignore[call-arg]
+    return robot_configs()[robot](control_hz=RATES[robot], physics_hz=RATES[robot], **options)  # type: ignore[call-arg]
 
 
 def make_task(robot: str, fps: int, seconds: float = 60.0) -> Any:

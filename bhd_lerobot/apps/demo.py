@@ -4,7 +4,6 @@ How well the networks do is measured, not known beforehand: a minute is too shor
 how far it got.
 """
 
-import argparse
 import logging
 import sys
 import time
@@ -13,13 +12,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from bhd_lerobot.command_line import Parser, exit_status
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.evaluation.config import EvalConfig
@@ -367,13 +366,17 @@ def new_folder(path: Path) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m bhd_lerobot.apps.demo", description=__doc__)
+    return exit_status(lambda: _main(arguments), "Stopped. What was finished is complete.")
+
+
+def _main(arguments: Sequence[str] | None) -> int:
+    parser = Parser(prog="python -m bhd_lerobot.apps.demo", description=__doc__)
     parser.add_argument("folder", nargs="?", type=Path, help="new folder; one in outputs/demo if nothing")
-    asked: Any = parser.parse_args(sys.argv[1:] if arguments is None else list(arguments))
+    options = parser.parse(arguments)
     console = Console()
     started = time.perf_counter()
     try:
-        folder = new_folder(asked.folder or Path(f"outputs/demo/{datetime.now():%Y-%m-%d_%H-%M-%S}"))
+        folder = new_folder(options.folder or Path(f"outputs/demo/{datetime.now():%Y-%m-%d_%H-%M-%S}"))
         log = logging.FileHandler(folder / LOG, mode="w", encoding="utf-8")  # what libraries log goes there, too
         logging.getLogger().addHandler(log)
         try:
@@ -385,12 +388,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except StoppedError as error:
         print(error, file=sys.stderr)
         return error.status
-    except BhdError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("Interrupted. What was finished is complete.", file=sys.stderr)
-        return 130
     console.print(f"\n[bold]Done in {time.perf_counter() - started:.0f} s[/bold]")
     for path in (*demo.files(), folder / LOG):
         console.print(f"  {escape(str(path))}", soft_wrap=True, highlight=False)

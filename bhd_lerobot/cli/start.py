@@ -6,15 +6,12 @@ library that catches everything; so this module imports next to nothing, and end
 
 import importlib
 import os
-import select
 import signal
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-INTERRUPTED = 128 + signal.SIGINT
-"""The exit status after Ctrl-C."""
+from bhd_lerobot.command_line import INTERRUPTED, exit_status
 
 
 @contextmanager
@@ -42,32 +39,6 @@ def _leave(number: int, frame: FrameType | None) -> None:
     os._exit(INTERRUPTED)
 
 
-def ending_when_unread(main: Callable[[], int]) -> int:
-    """Run a program; return its exit status, that of other programs if nobody reads on, as of ``| head -1``."""
-    try:
-        try:
-            return main()
-        finally:
-            if sys.stdout is not None:
-                sys.stdout.flush()  # a pipe that nobody reads shows now, not when Python ends
-    except BrokenPipeError:
-        if not _is_unread():
-            raise
-        return 128 + signal.SIGPIPE
-
-
-def _is_unread() -> bool:
-    """Tell whether nobody reads any more what is printed; then Python shall not try it again when it ends."""
-    if sys.stdout is None:
-        return False
-    poll = select.poll()
-    poll.register(sys.stdout, 0)
-    if not any(what & select.POLLERR for _, what in poll.poll(0)):
-        return False
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return True
-
-
 def run(module: str) -> int:
     """Import a module and run its `main`; return the exit status. The process is to end then."""
     # PyTorch's threads wait for each other after every operation, by default in a loop that keeps a processor busy.
@@ -78,14 +49,10 @@ def run(module: str) -> int:
     try:
         with leaving_on_interrupt():
             main = importlib.import_module(module).main
-        status = ending_when_unread(main)
-    except KeyboardInterrupt:  # where the program does not mind it by itself
-        print("Stopped.", file=sys.stderr)
-        return INTERRUPTED
+        return exit_status(main)
     finally:
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # what libraries do at the very end is no traceback either
-    return status
 
 
 def record() -> int:

@@ -22,8 +22,8 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.learned.brain import LearnedBrainConfig, find_checkpoint
+from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.registry import make_simulation, make_task
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 
 _PROBE_FRAMES = 20

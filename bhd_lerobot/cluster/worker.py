@@ -9,9 +9,9 @@ from typing import Any, cast
 from bhd_lerobot.cluster.job import Job, VideoSink, fingerprint, pack, unpacked
 from bhd_lerobot.cluster.remote import pack_error
 from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.rollout.drivers import TimedBrain
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.rollout.types import EpisodeSpec
 
 

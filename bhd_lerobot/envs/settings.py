@@ -8,8 +8,7 @@ from typing import Any
 
 from bhd_lerobot.envs.register import ENVIRONMENTS, NAMESPACE
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.robots.catalog import robot_config
-from bhd_lerobot.tasks.catalog import robot_of_task
+from bhd_lerobot.registry import robot_configs, robot_of_task
 from bhd_lerobot.tasks.task import TaskConfig
 
 Overrides = Mapping[str, Any] | None
@@ -66,7 +65,7 @@ def make_settings(
     if name not in ENVIRONMENTS:
         raise ConfigError(unknown_name("environment", environment, ENVIRONMENTS))
     robot_type, task_type = ENVIRONMENTS[name]
-    made_robot = _configuration(robot_config(robot_type), robot, "robot", robot_type)
+    made_robot = _configuration(robot_configs()[robot_type], robot, "robot", robot_type)
     made_task = _configuration(TaskConfig.get_choice_class(task_type), task, "task", task_type)
     if robot_of_task(made_task) != robot_type:
         raise ConfigError(f"The task {task_type!r} is for {robot_of_task(made_task)!r}, not for {robot_type!r}.")

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import BhdError
-from bhd_lerobot.robots.catalog import make_simulation
+from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.robots.faults import add_faults
 from bhd_lerobot.sim.camera import Camera
-from bhd_lerobot.tasks.catalog import make_task
 from bhd_lerobot.tasks.task import Event, Outcome
 
 EVENT_NAMES = np.array([event.cause for event in Event], object)

@@ -1,14 +1,13 @@
 """Configuration of `bhd-eval`."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.cluster.config import RayConfig, check_engine
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.brain import BrainConfig
-from bhd_lerobot.rollout.registry import SIMULATED_ROBOTS, robot_of_brain, robot_of_task
+from bhd_lerobot.registry import check_brain, check_robot_and_task
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 
 YARDSTICKS = ("noop", "random")
@@ -82,7 +81,7 @@ class EvalConfig:
         Raises:
             ConfigError: names the value and the valid ones.
         """
-        self._check_robot_and_task()
+        check_robot_and_task(self.robot, self.task, "bhd-eval")
         if self.brain is not None:
             name = str(self.brain.get_choice_name(type(self.brain)))
             if name in self.brains:
@@ -93,15 +92,7 @@ class EvalConfig:
                 "There is no brain to evaluate; set --brains.NAME.type, or --brain.path for a checkpoint."
             )
         for label, brain in self.brains.items():
-            try:
-                driven = robot_of_brain(brain)
-            except ConfigError as error:
-                raise ConfigError(f"brains.{label}: {error}") from error
-            if driven and driven != self.robot.type:
-                kind = brain.get_choice_name(type(brain))
-                raise ConfigError(
-                    f"brains.{label}.type is {kind!r}, which drives a {driven}; robot.type is {self.robot.type!r}."
-                )
+            check_brain(f"brains.{label}", brain, self.robot.type)
         for key, labels in (("only", self.only or []), ("baseline", [self.baseline] if self.baseline else [])):
             for label in labels:
                 if label not in self.brains:
@@ -125,22 +116,6 @@ class EvalConfig:
     def indices(self) -> list[int]:
         """Numbers of the episodes that are run, in ascending order."""
         return list(range(self.n_episodes)) if self.episodes is None else sorted(self.episodes)
-
-    def _check_robot_and_task(self) -> None:
-        simulated = sorted(kind.get_choice_name(kind) for kind in SIMULATED_ROBOTS)
-        if self.robot.type not in simulated:
-            raise ConfigError(
-                f"robot.type is {self.robot.type!r}; bhd-eval drives robots whose success can be judged: "
-                f"{', '.join(simulated)}."
-            )
-        wanted = robot_of_task(self.task)
-        if wanted != self.robot.type:
-            task = self.task.get_choice_name(type(self.task))
-            raise ConfigError(
-                f"task.type is {task!r}, which is for robot.type = {wanted!r}; robot.type is {self.robot.type!r}."
-            )
-        robot: Any = self.robot
-        _ = robot.rates  # rates that do not divide each other are refused here
 
     def _check_numbers(self) -> None:
         for name, value in (

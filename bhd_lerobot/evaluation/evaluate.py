@@ -28,11 +28,11 @@ from bhd_lerobot.evaluation.results import EvalResults, summarise, write_json, w
 from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
 from bhd_lerobot.evaluation.text import number, percent
 from bhd_lerobot.recording.report import ESTOP_STATUS, print_refusals
+from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.simulation import Simulation, describe
 from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.provenance import versions
-from bhd_lerobot.rollout.registry import make_robot, make_simulation
 from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 

@@ -16,11 +16,11 @@ from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
 from bhd_lerobot.evaluation.record import BrainRecorder
 from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.registry import make_brain, make_task
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.drivers import TimedBrain
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.plots import Trajectory
-from bhd_lerobot.rollout.registry import make_brain, make_task
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import episode_seed
 

@@ -11,7 +11,7 @@ from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.recording.live_view import check_options
-from bhd_lerobot.rollout.registry import SIMULATED_ROBOTS, brains_for, robot_of_brain, robot_of_task
+from bhd_lerobot.registry import check_brain, check_robot_and_task
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 
 
@@ -105,25 +105,8 @@ class RecordConfig:
         Raises:
             ConfigError: names the value and the valid ones.
         """
-        simulated = {kind.get_choice_name(kind): kind for kind in SIMULATED_ROBOTS}
-        if self.robot.type not in simulated:
-            raise ConfigError(
-                f"robot.type is {self.robot.type!r}; bhd-record drives simulated robots: "
-                f"{', '.join(sorted(simulated))}. Record another robot with lerobot-record."
-            )
-        wanted = robot_of_task(self.task)
-        if wanted != self.robot.type:
-            task = self.task.get_choice_name(type(self.task))
-            raise ConfigError(
-                f"task.type is {task!r}, which is for robot.type = {wanted!r}; robot.type is {self.robot.type!r}."
-            )
-        driven = robot_of_brain(self.brain)
-        if driven not in ("", self.robot.type):
-            brain = self.brain.get_choice_name(type(self.brain))
-            raise ConfigError(
-                f"brain.type is {brain!r}, which drives a {driven}; robot.type is {self.robot.type!r}. "
-                f"Brains for it: {', '.join(brains_for(self.robot.type))}."
-            )
+        check_robot_and_task(self.robot, self.task, "bhd-record")
+        check_brain("brain", self.brain, self.robot.type)
         for name, value in (
             ("dataset.num_episodes", self.dataset.num_episodes),
             ("n_envs", self.n_envs),

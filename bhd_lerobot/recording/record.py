@@ -29,6 +29,7 @@ from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.live_view import live_view
 from bhd_lerobot.recording.report import RecordResult, print_refusals, print_summary
 from bhd_lerobot.recording.resume_advice import instead_of_resuming
+from bhd_lerobot.registry import make_brain, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.simulation import Simulation, describe
 from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.episode import EpisodeLoop
@@ -36,7 +37,6 @@ from bhd_lerobot.rollout.marks import KEYS, Marks
 from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.provenance import episode_metadata
-from bhd_lerobot.rollout.registry import make_brain, make_robot, make_simulation, make_task
 from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import stop_on_signals
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec

@@ -9,7 +9,6 @@ import dataclasses
 import json
 import keyword
 import re
-import signal
 import sys
 import types
 import typing
@@ -20,7 +19,9 @@ from typing import Any
 import draccus
 import yaml
 
+from bhd_lerobot.command_line import asks_for_help, exit_status
 from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
+from bhd_lerobot.renames import check_values
 
 CONFIG_PATH = "config_path"
 
@@ -51,8 +52,9 @@ def decode[T](config_class: type[T], values: dict[str, Any]) -> T:
         values: by the names of its fields, nested; values with an exponent and entries that are nothing are replaced.
 
     Raises:
-        ConfigError: an unknown or missing key, or a value that cannot be honoured.
+        ConfigError: an unknown or missing key, a value that cannot be honoured, or names of version 0.1.
     """
+    check_values(values)
     _check_keys(config_class, values, "")
     try:
         return draccus.decode(config_class, values)
@@ -69,25 +71,32 @@ def encode(config: Any) -> dict[str, Any]:
     return draccus.encode(config)
 
 
-def run(main: Callable[[Any], int | None], config_class: type, arguments: Sequence[str] | None = None) -> int:
-    """Parse a command line and run a program on it; return its exit status.
+def run(
+    main: Callable[[Any], int | None],
+    config_class: type,
+    arguments: Sequence[str] | None = None,
+    *,
+    read: Callable[[Sequence[str]], Any] | None = None,
+    interrupted: str = "Stopped.",
+) -> int:
+    """Run a program on the configuration of a command line, or print its help; return the exit status.
 
-    An error of this package is printed as a sentence, without a traceback, and gives status 2.
+    Args:
+        main: gets the configuration, and returns its exit status; None is 0.
+        config_class: a dataclass.
+        arguments: of the command line; those of this process if None.
+        read: returns what `main` gets; `parse` if None.
+        interrupted: what is printed after Ctrl-C.
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
-    try:
-        if any(a in ("-h", "--help") for a in arguments):
-            print(describe(config_class), flush=True)
+    given = sys.argv[1:] if arguments is None else arguments
+
+    def program() -> int | None:
+        if asks_for_help(given):
+            print(describe(config_class))
             return 0
-        return main(parse(config_class, arguments)) or 0
-    except BhdError as error:
-        print(f"error: {error}", file=sys.stderr)
-        for note in getattr(error, "__notes__", ()):
-            print(f"  {note}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:  # before, or a second time after, the program minds it by itself
-        print("Interrupted.", file=sys.stderr)
-        return 128 + signal.SIGINT
+        return main(read(given) if read else parse(config_class, given))
+
+    return exit_status(program, interrupted)
 
 
 def describe(config_class: type, prefix: str = "", within: tuple[type, ...] = ()) -> str:

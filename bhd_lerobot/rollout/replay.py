@@ -23,11 +23,11 @@ from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
+from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.plots import draw_divergence
 from bhd_lerobot.rollout.provenance import command_from_json, scene_from_json, versions
-from bhd_lerobot.rollout.registry import make_simulation
 
 MODES = ("open_loop", "state", "both")
 

@@ -14,8 +14,8 @@ from bhd_lerobot.control.commands import BrainCommand, Chunk, CommandResult, Goa
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.registry import action_names_of, brains_for, make_brain, robot_of_brain
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
-from bhd_lerobot.rollout.registry import action_names_of, brains_for, make_brain, robot_of_brain
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 
 

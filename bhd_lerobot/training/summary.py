@@ -13,8 +13,8 @@ from rich.table import Table
 
 from bhd_lerobot.errors import quoted
 from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.registry import robot_configs
 from bhd_lerobot.robots.host.simulation import describe
-from bhd_lerobot.rollout.registry import SIMULATED_ROBOTS
 from bhd_lerobot.tasks.task import TaskConfig
 from bhd_lerobot.training.checkpoint import resume_command
 from bhd_lerobot.training.config import BhdTrainConfig
@@ -88,7 +88,7 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
     actions do not fit. A dataset that another program recorded does not say its task; then it is one of the robot's.
     """
     path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
-    kinds = {str(kind.get_choice_name(kind)): kind for kind in SIMULATED_ROBOTS}
+    kinds = robot_configs()
     task = (contract.task or {}).get("type")
     if contract.robot_type not in kinds:
         rollout = f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={quoted(path)} --duration=60"

@@ -1,7 +1,5 @@
 """`bhd-train`: a policy learns from a LeRobotDataset."""
 
-import signal
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,9 +12,9 @@ from rich.console import Console
 from rich.markup import escape
 
 import bhd_lerobot.plugin  # noqa: F401  registers our policies and environments
-from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.contract import PolicyContract
-from bhd_lerobot.rollout.configuration import describe
+from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 from bhd_lerobot.training import checkpoint as train_checkpoint
 from bhd_lerobot.training.arguments import Request, parse_train
@@ -229,19 +227,16 @@ def _agreement(stop: StopRequest, accelerator: Any) -> Any:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train on a dataset; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if any(one in ("-h", "--help") for one in arguments):
-        print(describe(BhdTrainConfig))
-        return 0
-    try:
+
+    def read(given: Sequence[str]) -> Request:
         register_third_party_plugins()
-        return train(parse_train(arguments)).exit_status
-    except BhdError as error:
-        Console(stderr=True).print(f"error: {escape(str(error))}", soft_wrap=True, highlight=False)
-        return 2
-    except KeyboardInterrupt:  # before the first step, or a second time while a step or a checkpoint was under way
-        print("Interrupted; checkpoints that were written before are complete.", file=sys.stderr)
-        return 128 + signal.SIGINT
+        return parse_train(given)
+
+    # Ctrl-C before the first step, or a second time while a step or a checkpoint was under way.
+    interrupted = "Stopped; checkpoints that were written before are complete."
+    return run(
+        lambda request: train(request).exit_status, BhdTrainConfig, arguments, read=read, interrupted=interrupted
+    )
 
 
 __all__ = ["TrainResult", "main", "resume_command", "train"]

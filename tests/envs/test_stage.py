@@ -10,10 +10,9 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.envs.gym_env import BhdEnv
 from bhd_lerobot.envs.settings import make_settings
 from bhd_lerobot.envs.stage import Stage
-from bhd_lerobot.robots.catalog import make_simulation
+from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
-from bhd_lerobot.tasks.catalog import make_task
 from bhd_lerobot.tasks.task import Event, episode_seed
 from tests.envs.support import NAMES, short, some_actions
 

@@ -10,10 +10,10 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.registry import brains_for, make_brain, make_simulation, make_task, robot_of_brain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.registry import brains_for, make_brain, make_simulation, make_task, robot_of_brain
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.reach import ReachConfig

@@ -16,11 +16,11 @@ from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.rollout.drivers import DriverLog, flagged, spans
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.rollout.replay import Replay
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig

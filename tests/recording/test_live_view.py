@@ -21,9 +21,9 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.recording import live_view as module
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.live_view import PACKAGES, LiveView, check_options, live_view, points
+from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.configuration import parse
-from bhd_lerobot.rollout.registry import make_simulation
 from tests.recording.support import data_columns, options, run_record
 
 

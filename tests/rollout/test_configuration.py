@@ -110,4 +110,4 @@ def test_ctrl_c_before_anything_began_is_no_traceback(capsys):
         raise KeyboardInterrupt
 
     assert run(stopped, RecordConfig, REQUIRED) == 130
-    assert capsys.readouterr().err == "Interrupted.\n"
+    assert capsys.readouterr().err == "Stopped.\n"

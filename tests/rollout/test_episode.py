@@ -8,10 +8,10 @@ import pytest
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.registry import make_simulation, make_task
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.reach import ReachConfig

@@ -14,10 +14,10 @@ import pytest
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.marks import Marks
-from bhd_lerobot.rollout.registry import make_simulation, make_task
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.task import OUTCOMES, Event

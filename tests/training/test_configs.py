@@ -7,7 +7,7 @@ import pytest
 import yaml
 from lerobot.policies.factory import make_policy
 
-from bhd_lerobot.robots.catalog import make_robot
+from bhd_lerobot.registry import make_robot
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.training.arguments import parse_train

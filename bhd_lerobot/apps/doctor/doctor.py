@@ -15,6 +15,7 @@ from rich.table import Table
 from bhd_lerobot.apps.doctor import checks
 from bhd_lerobot.apps.doctor.checks import Finding, Status
 from bhd_lerobot.apps.doctor.trials import TIMEOUT_S, Outcome, run_trials
+from bhd_lerobot.command_line import Parser, exit_status
 from bhd_lerobot.errors import ConfigError
 
 _LEAST_POINTS = 1000  # or the 99th percentile rests on fewer than ten wake-ups
@@ -23,8 +24,8 @@ _COLOURS = {Status.OK: "green", Status.WARNING: "yellow", Status.PROBLEM: "red"}
 RunTrials = Callable[[Sequence[Sequence[Any]], float], list[Outcome]]
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> Parser:
+    parser = Parser(
         prog="bhd-doctor",
         description="Check this machine; print symptom, cause and remedy of what is wrong. Exit status 1: a problem.",
     )
@@ -115,7 +116,10 @@ def _print_latency(measured: dict[str, Any], console: Console) -> None:
 
 def main(arguments: Sequence[str] | None = None, run: RunTrials = run_trials) -> int:
     """Run `bhd-doctor`; return the exit status: 0, 1 if there is a problem, 2 for wrong options."""
-    options = _parser().parse_args(arguments)
+    return exit_status(lambda: _main(_parser().parse(arguments), run))
+
+
+def _main(options: argparse.Namespace, run: RunTrials) -> int:
     root = options.root.expanduser() if options.root else None
     if root is None:
         from bhd_lerobot.datasets.format.identity import default_root
@@ -124,11 +128,7 @@ def main(arguments: Sequence[str] | None = None, run: RunTrials = run_trials) ->
     console, measured = Console(), None
     with Console(stderr=True).status("Checking this machine; half a minute …"):
         if options.realtime:
-            try:
-                _check_options(options.rate, options.seconds)
-            except ConfigError as error:
-                print(f"error: {error}", file=sys.stderr)
-                return 2
+            _check_options(options.rate, options.seconds)
             # First, while nothing else goes on.
             [tested] = run([["latency test", options.rate, options.seconds]], options.seconds + 60.0)
             measured = tested.value

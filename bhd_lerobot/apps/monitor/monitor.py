@@ -17,8 +17,9 @@ from rich.live import Live
 
 from bhd_lerobot.apps.monitor.state import MonitorState, Sampler
 from bhd_lerobot.apps.monitor.view import KEYS, WIDTH, one_line, render
+from bhd_lerobot.command_line import Parser, exit_status
 from bhd_lerobot.control.estop_terminal import KeyTerminal, standard_input
-from bhd_lerobot.errors import BhdError, ConfigError, RealtimeError
+from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.shared_memory import names
 
@@ -27,8 +28,8 @@ _LOOK_S = 0.5  # that a single snapshot measures rates over
 _LINE_S = 1.0  # between two lines where there is no terminal
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _parser() -> Parser:
+    parser = Parser(
         prog="bhd-monitor",
         description="Watch a robot that runs on the wall clock (--robot.clock=realtime). Keys: e or space is an "
         "emergency stop, at once and without a question; q quits. Exit status: 0, 1 if the robot was killed or lost "
@@ -201,15 +202,14 @@ def _end(seconds: float | None) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bhd-monitor`; return the exit status."""
-    options = _parser().parse_args(arguments)
+    return exit_status(lambda: _main(_parser().parse(arguments)))
+
+
+def _main(options: argparse.Namespace) -> int:
     console = Console(highlight=False)
-    try:
-        if options.seconds is not None and not 0 < options.seconds < math.inf:
-            raise ConfigError(f"--seconds is {options.seconds:g}; it must be positive and finite.")
-        block = find(options.id)
-    except BhdError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    if options.seconds is not None and not 0 < options.seconds < math.inf:
+        raise ConfigError(f"--seconds is {options.seconds:g}; it must be positive and finite.")
+    block = find(options.id)
     try:
         sampler = Sampler(block)
         if console.is_terminal and not (options.once or options.json):
@@ -217,8 +217,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             console = console if console.is_terminal else Console(highlight=False, width=WIDTH)
             ended = _print(block, sampler, options, console)
-    except KeyboardInterrupt:
-        return 130
     finally:
         block.close()
     if ended is None:

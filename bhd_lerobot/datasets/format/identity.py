@@ -8,6 +8,7 @@ from typing import Any
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.errors import ConfigError, DatasetEditedError, DatasetMismatchError
+from bhd_lerobot.renames import present
 
 FORMAT = 1
 """Version of ``meta/bhd.json``."""
@@ -69,7 +70,7 @@ def check_identity(
     recorded["features"] = comparable(state.info["features"])
     requested["features"] = comparable(schema.features)
     if recording is not None:
-        recorded["recording"], requested["recording"] = state.identity["recording"], as_json(recording)
+        recorded["recording"], requested["recording"] = present(state.identity["recording"]), as_json(recording)
     if video is not None:
         recorded["video"], requested["video"] = state.identity["video"], as_json(video)
     found = list(differences("", recorded, requested))

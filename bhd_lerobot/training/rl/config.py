@@ -13,8 +13,8 @@ from bhd_lerobot.envs.register import ENVIRONMENTS
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
+from bhd_lerobot.registry import robot_of_task
 from bhd_lerobot.rollout import configuration
-from bhd_lerobot.rollout.registry import robot_of_task
 from bhd_lerobot.tasks.task import Event, TaskConfig
 
 CONFIG_NAME = "config.yaml"

@@ -1,8 +1,6 @@
 """`bhd-train` with `algorithm: ppo`: a policy learns by trial and error."""
 
 import json
-import signal
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -307,14 +305,10 @@ def _text(row: Row) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Run `bhd-train` with `algorithm: ppo`; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
-    if any(one in ("-h", "--help") for one in arguments):
-        print(configuration.describe(RlConfig))
-        return 0
-    try:
-        return train(parse_rl(arguments)).stopped_by.exit_status
-    except BhdError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:  # before the run began, or a second time while it was ending
-        print("Interrupted; checkpoints that were written before are complete.", file=sys.stderr)
-        return 128 + signal.SIGINT
+    return configuration.run(
+        lambda config: train(config).stopped_by.exit_status,
+        RlConfig,
+        arguments,
+        read=parse_rl,
+        interrupted="Stopped; checkpoints that were written before are complete.",
+    )

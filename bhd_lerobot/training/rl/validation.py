@@ -9,8 +9,8 @@ import numpy as np
 
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
+from bhd_lerobot.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Event, episode_seed
 from bhd_lerobot.training.rl.config import RlConfig

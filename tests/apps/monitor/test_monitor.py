@@ -29,9 +29,9 @@ from bhd_lerobot.realtime.block import LiveBlock, LiveLayout, Phase, Word
 from bhd_lerobot.realtime.frame_log import FrameLog
 from bhd_lerobot.realtime.shared_memory import SharedBlock, names
 from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS, state_dtype
 from bhd_lerobot.rollout.configuration import parse
-from bhd_lerobot.rollout.registry import make_simulation
 from tests.recording.support import options
 from tests.waiting import until
 

@@ -10,7 +10,7 @@ import pytest
 
 from bhd_lerobot.cli.data import check, main, repair
 from bhd_lerobot.cli.data.check import limits_of
-from bhd_lerobot.robots.catalog import SIMULATED_ROBOTS
+from bhd_lerobot.registry import ROBOTS
 from tests.recording.support import run_record
 
 
@@ -76,7 +76,7 @@ def test_limits_are_those_of_the_robots() -> None:
 
 
 def test_every_robot_of_ours_has_the_limits_of_its_configuration() -> None:
-    for kind in SIMULATED_ROBOTS:
+    for kind in ROBOTS:
         limits = kind().body().limits
         told = limits_of(kind.get_choice_name(kind))["control.applied_action"]
         assert list(told) == list(limits.names)

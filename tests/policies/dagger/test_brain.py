@@ -26,7 +26,7 @@ from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
-from bhd_lerobot.rollout.registry import make_brain, robot_of_brain
+from bhd_lerobot.registry import make_brain, robot_of_brain
 from bhd_lerobot.tasks.pick import ENVIRONMENT
 from tests.policies.arm_desk import BOX, CUP, Desk, scene
 

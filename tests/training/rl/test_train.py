@@ -436,4 +436,4 @@ def test_ctrl_c_before_the_run_began_is_no_traceback(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(module, "train", stopped)
     assert main(options(tmp_path / "run")) == 130
-    assert "Interrupted" in capsys.readouterr().err
+    assert "Stopped" in capsys.readouterr().err
