@@ -24,7 +24,7 @@ _UNITS = ((".pos", "m or rad"), (".vel", "m/s or rad/s"))
 
 @dataclass(frozen=True)
 class CardOptions:
-    """What a card says besides what the dataset does.
+    """What a card has besides the content of the dataset.
 
     Attributes:
         repo_id: its name on the Hub; None if it lies elsewhere.
@@ -40,11 +40,11 @@ class CardOptions:
 
 
 def make_card(state: DatasetState, options: CardOptions, *, has_image: bool = False) -> Card:
-    """Return the card of a dataset; the same one whenever it is asked for the same dataset.
+    """Return the card of a dataset; always the same for the same dataset.
 
     Args:
         state: the dataset.
-        options: what it says besides.
+        options: what it has besides.
         has_image: the user has put an image beside the dataset: the card shows that one, and none is drawn.
     """
     summary, identity = dataset_info(state.root), state.identity or {}
@@ -93,7 +93,7 @@ def _introduction(summary: DatasetSummary, options: CardOptions) -> str:
 
 def _overview(summary: DatasetSummary) -> str:
     rows = [
-        ("robot", summary.robot_type or "not said"),
+        ("robot", summary.robot_type or "unknown"),
         ("frames a second", str(summary.fps)),
         ("episodes", str(len(summary.episodes))),
         ("frames", f"{summary.frames}, {summary.frames / summary.fps:.0f} s"),
@@ -131,15 +131,11 @@ def _success(summary: DatasetSummary) -> str:
     )
 
 
-def _shape(feature: dict[str, Any]) -> str:
-    return " x ".join(str(one) for one in feature["shape"])
-
-
 def _meaning(key: str, feature: dict[str, Any]) -> str:
-    said = keys.meaning_of(key, feature)
+    text = keys.meaning_of(key, feature)
     names = [str(name) for name in feature.get("names") or []] if isinstance(feature.get("names"), list) else []
     units = [f"`{suffix}` in {unit}" for suffix, unit in _UNITS if any(name.endswith(suffix) for name in names)]
-    return said + (f" ({', '.join(units)})" if units else "")
+    return text + (f" ({', '.join(units)})" if units else "")
 
 
 def _loading(options: CardOptions) -> str:

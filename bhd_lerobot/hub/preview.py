@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.format.columns import read_episode
+from bhd_lerobot.datasets.format.columns import read_episode, video_frames
 from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
 from bhd_lerobot.datasets.format.summary import DatasetSummary
 from bhd_lerobot.datasets.storage import layout
@@ -43,26 +43,13 @@ def _shown(state: DatasetState) -> Row:
 def _camera(_: DatasetSummary, state: DatasetState) -> tuple[bytes, str] | None:
     if not state.video_keys:
         return None
-    import av
-
     key, row = state.video_keys[0], _shown(state)
     path = state.root / layout.video_file(key, slot_of(row, f"videos/{key}"))
-    first = round(row[f"videos/{key}/from_timestamp"] * state.info["fps"])
-    wanted = {first + int(one) for one in np.linspace(0, row["length"] - 1, FRAMES).round()}
-    images = []
-    try:
-        with av.open(str(path)) as container:
-            for index, frame in enumerate(container.decode(video=0)):
-                if index in wanted:
-                    images.append(frame.to_ndarray(format="rgb24"))
-                if index >= max(wanted):
-                    break
-    except av.FFmpegError as error:
-        raise BhdError(f"{path} cannot be read: {error}") from error
+    frames = video_frames(path, row[f"videos/{key}/from_timestamp"], row["length"])
+    chosen = set(np.linspace(0, row["length"] - 1, FRAMES).round())
+    images = [image for index, image in enumerate(frames) if index in chosen]
     images += images[-1:] * (-len(images) % 3)
     rows = [np.concatenate(images[at : at + 3], axis=1) for at in range(0, len(images), 3)]
-    if not rows:
-        return None
     return _png(np.concatenate(rows)), f"Episode {row['episode_index']} as `{key}` saw it"
 
 

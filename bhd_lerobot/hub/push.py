@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from bhd_lerobot.datasets.remote.listing import check_repo_id, counted, is_url, listed, megabytes
 from bhd_lerobot.errors import BhdError, ConfigError
-from bhd_lerobot.hub.transfer import command_line, quiet_bars, storage_options
+from bhd_lerobot.hub.transfer import command_line, quiet_bars, remote_of
 
 if TYPE_CHECKING:
     from bhd_lerobot.datasets.remote.push import PushReport
@@ -44,12 +44,10 @@ def push_dataset(
         again: the command to repeat.
 
     Raises:
-        BhdError: it was not uploaded; the message says why, that the dataset is kept, and how to repeat.
+        BhdError: it was not uploaded; the message has the reason, that the dataset is kept, and the command to repeat.
     """
     from bhd_lerobot.datasets.format.state import DatasetState
-    from bhd_lerobot.datasets.remote.hub import HubDataset
     from bhd_lerobot.datasets.remote.push import Card, push
-    from bhd_lerobot.datasets.remote.store import StoreDataset
     from bhd_lerobot.datasets.remote.url import shown
 
     def make(state: DatasetState, has_image: bool) -> Card:
@@ -61,18 +59,8 @@ def push_dataset(
     again = again or push_command(root, target, private=private is True, tags=tags)
     quiet_bars()
     try:
-        remote = (
-            StoreDataset(target, storage_options(storage))
-            if is_url(target)
-            else HubDataset(target, branch, private=private, tag=tag, create=True)
-        )
-        return push(
-            root,
-            remote,
-            make_card=make if card else None,
-            replace=replace,
-            verify=verify,
-        )
+        remote = remote_of(target, storage, revision=branch, private=private, tag=tag, create=True)
+        return push(root, remote, make_card=make if card else None, replace=replace, verify=verify)
     except ConfigError:
         raise
     except BhdError as error:
@@ -94,7 +82,7 @@ def check_pushable(repo_id: str) -> None:
     """Check what can be checked without asking the Hub: the name, and that there is a token.
 
     Raises:
-        BhdError: says what is missing.
+        BhdError: names what is missing.
     """
     from bhd_lerobot.datasets.remote.hub_errors import require_token
 

@@ -12,9 +12,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from bhd_lerobot.datasets.remote.listing import is_url
 from bhd_lerobot.errors import ConfigError
+
+if TYPE_CHECKING:
+    from bhd_lerobot.datasets.remote.listing import Remote
 
 PATIENCE_S = 3.0
 """How long the threads of a transfer may take to end after Ctrl-C [s]; a stalled connection holds them for minutes."""
@@ -33,17 +37,18 @@ def command_line(command: str, places: Sequence[object], **options: Any) -> str:
 
 
 def repeat_line(options: argparse.Namespace, *places: object, **others: object) -> str:
-    """Return the command that repeats what was asked for.
+    """Return the command that repeats this one.
 
     Args:
-        options: what was asked for, with the `command_parser` that read it; values that are its defaults are left out.
+        options: of this command, with the `command_parser` that read them; values that are its defaults are left
+            out.
         places: what stands behind the command's name, whichever way it was given.
         others: options that say a place, likewise.
     """
     parser: argparse.ArgumentParser = options.command_parser
-    asked = {name: value for name, value in vars(options).items() if value != parser.get_default(name)}
-    wishes = {name: value for name, value in asked.items() if name not in _PLACES}
-    return command_line(options.command, places, **others, **wishes)
+    given = {name: value for name, value in vars(options).items() if value != parser.get_default(name)}
+    rest = {name: value for name, value in given.items() if name not in _PLACES}
+    return command_line(options.command, places, **others, **rest)
 
 
 _PLACES = {"command", "places", "source", "root", "repo_id"}
@@ -57,15 +62,15 @@ def refuse_empty(options: argparse.Namespace) -> None:
     """
     for name, value in vars(options).items():
         if value == "" or (isinstance(value, list) and "" in value):
-            said = f"--{name}" if name not in ("places", "source") else "A name"
-            raise ConfigError(f"{said} is empty. Say what is meant, or leave it out.")
+            what = f"--{name}" if name not in ("places", "source") else "A name"
+            raise ConfigError(f"{what} is empty. Give a value, or leave it out.")
 
 
 def folder_of(text: str) -> Path:
     """Return the folder that is meant.
 
     Raises:
-        ConfigError: no folder can have this name, or nobody may look at it.
+        ConfigError: no folder can have this name, or it must not be read.
     """
     try:
         folder = Path(text).expanduser()
@@ -79,7 +84,7 @@ def folder_of(text: str) -> Path:
 
 
 def warn_of_folder(name: str, root: Path) -> None:
-    """Say that a name is one on the Hub if it looks like a folder here, because folders are written the same way.
+    """Warn that a name is one on the Hub if it could also be a folder here.
 
     Args:
         name: the name on the Hub.
@@ -104,21 +109,30 @@ def for_urls(options: argparse.Namespace) -> None:
         )
 
 
-def storage_options(text: str | None) -> dict[str, Any]:
-    """Return the options of a file system.
+def remote_of(place: str, storage: str | None, **options: Any) -> "Remote":
+    """Return a place that a dataset is copied to or from.
+
+    Args:
+        place: a name on the Hub, or a URL.
+        storage: options of the URL's file system, JSON.
+        options: what `HubDataset` takes.
 
     Raises:
-        ConfigError: they are no JSON object.
+        ConfigError: it can be no such place, or `storage` is no JSON object.
+        TransferError: what serves the URL is not installed, or cannot be reached.
     """
-    if text is None:
-        return {}
+    from bhd_lerobot.datasets.remote.hub import HubDataset
+    from bhd_lerobot.datasets.remote.store import StoreDataset
+
+    if not is_url(place):
+        return HubDataset(place, **options)
     try:
-        options = json.loads(text)
+        found = json.loads(storage or "{}")
     except ValueError as error:
-        raise ConfigError(f"--storage_options is {text!r}, which is not JSON: {error}.") from error
-    if not isinstance(options, dict):
-        raise ConfigError(f"--storage_options is {text!r}; give a JSON object, such as '{{\"anon\": true}}'.")
-    return options
+        raise ConfigError(f"--storage_options is {storage!r}, which is not JSON: {error}.") from error
+    if not isinstance(found, dict):
+        raise ConfigError(f"--storage_options is {storage!r}; give a JSON object, such as '{{\"anon\": true}}'.")
+    return StoreDataset(place, found)
 
 
 def split_list(text: str | None) -> list[str]:
@@ -134,7 +148,7 @@ def prompt_interrupt(stopped: str) -> Iterator[None]:
     so that the process may end at any.
 
     Args:
-        stopped: what is left, and how to go on; printed if the process ends here, else by whoever
+        stopped: what is left, and how to go on; printed if the process ends here, else by the code that
             catches the `KeyboardInterrupt`.
     """
     is_hosted = hasattr(sys, "ps1") or "ipykernel" in sys.modules  # by a shell or a notebook, which goes on

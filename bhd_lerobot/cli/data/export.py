@@ -84,7 +84,7 @@ def robot_view(robot_type: str | None, recording: Mapping[str, Any] | None = Non
 
     Args:
         robot_type: the robot of the dataset.
-        recording: what the dataset says of its recording. If it says that the robot was simulated, the noise is known.
+        recording: the identity of its recording. If its robot was simulated, the noise is known.
     """
     if robot_type == "turtlebot3":
         robot = (recording or {}).get("robot")
@@ -122,7 +122,7 @@ def _base_noise(drive: WheelDrive) -> BaseNoise:
     """Return the noise of the simulated base. Its speed sensors and gyroscope have none but that of single precision.
 
     Of odometry it is the rounding of the encoders' counts, at the start and now, each uniform over one count. Slip is
-    not in it: nobody knows that.
+    not in it, as it is not known.
     """
     count = 2 * math.pi * drive.wheel_radius / drive.encoder_ticks
     wheel = count * math.sqrt(2 / 12)

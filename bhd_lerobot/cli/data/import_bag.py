@@ -5,13 +5,14 @@ import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.errors import ConfigError, quoted, unknown_name
-from bhd_lerobot.rosbag.importer.dataset import ImportReport, RobotImport
+from bhd_lerobot.rosbag.importer.convert import ImportReport, import_bags
 from bhd_lerobot.rosbag.importer.exported import (
     ExportedEpisode,
     exported_cameras,
@@ -20,8 +21,7 @@ from bhd_lerobot.rosbag.importer.exported import (
     is_exported,
     names_of,
 )
-from bhd_lerobot.rosbag.importer.robot import import_bags
-from bhd_lerobot.rosbag.importer.tracks import TrackOptions
+from bhd_lerobot.rosbag.importer.options import ImportOptions
 from bhd_lerobot.rosbag.messages.types import require_rosbags
 from bhd_lerobot.rosbag.storage.find import check_distinct, find_bags
 from bhd_lerobot.rosbag.storage.place import refuse_existing
@@ -80,12 +80,11 @@ def _run(options: argparse.Namespace) -> int:
     check_distinct(bags)
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()
     refuse_existing(root, "--root")  # before the bags are read, which may take long
-    topics = [bag.topics() for bag in bags]
-    exported = [options.robot is None and is_exported(one) for one in topics]
+    exported = [options.robot is None and is_exported(bag.topics) for bag in bags]
     if all(exported):
         episodes = exported_episodes(bags)
         report = import_bags(
-            bags, root, options.repo_id, _wanted_of_exported(options, episodes[0][0], topics[0]), episodes
+            bags, root, options.repo_id, _wanted_of_exported(options, episodes[0][0], bags[0].topics), episodes
         )
     elif any(exported):
         raise ConfigError(
@@ -101,7 +100,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _wanted_of_exported(
     options: argparse.Namespace, episode: ExportedEpisode, topics: Mapping[str, Topic]
-) -> RobotImport:
+) -> ImportOptions:
     """Return what the options ask for of exported bags.
 
     Raises:
@@ -109,7 +108,7 @@ def _wanted_of_exported(
     """
     if given := [name for name in _REAL if getattr(options, name) is not None]:
         raise ConfigError(
-            f"--{given[0]} is for bags of a real robot; this one was written by bhd-data export, and says itself what "
+            f"--{given[0]} is for bags of a real robot; this one was written by bhd-data export, and describes what "
             f"is in it. Leave the option out, or read the bag as a real robot's with --robot={ROBOTS[0]}."
         )
     fps = episode.fps if options.fps is None else options.fps
@@ -117,30 +116,24 @@ def _wanted_of_exported(
     assert body.lidar is not None
     limits = body.limits if episode.robot_type in ROBOTS else None
     actions = names_of(episode, keys.ACTION)
-    return RobotImport(
+    return ImportOptions(
         robot_type=episode.robot_type,
         task=options.task,
         fps=fps,
         observation_names=names_of(episode, keys.OBSERVATION_STATE),
         environment_names=names_of(episode, keys.ENVIRONMENT_STATE),
         action_names=actions,
-        tracks=TrackOptions(
-            topics={},
-            cameras=exported_cameras(episode, topics),
-            beams=0,
-            lidar=body.lidar,
-            stamps=options.stamps,
-            parts=exported_parts(episode),
-        ),
+        cameras=exported_cameras(episode, topics),
+        lidar=body.lidar,
+        parts=exported_parts(episode),
         max_speed=limits.velocity if limits is not None and limits.names == actions else None,
         command_timeout_s=math.inf,
-        outcome=options.outcome,
         **_times(options, fps, least=0.0),
     )
 
 
-def _times(options: argparse.Namespace, fps: int, least: float) -> dict[str, float]:
-    """Return the times that frames and episodes keep to, by their names in `RobotImport`.
+def _times(options: argparse.Namespace, fps: int, least: float) -> dict[str, Any]:
+    """Return the times that frames and episodes keep to, by their names in `ImportOptions`.
 
     Raises:
         ConfigError: one, or another option that all bags have, cannot be honoured.
@@ -165,10 +158,16 @@ def _times(options: argparse.Namespace, fps: int, least: float) -> dict[str, flo
     shortest = least if options.min_episode_s is None else options.min_episode_s
     if not 0 <= shortest < math.inf:
         raise ConfigError(f"--min_episode_s is {shortest}; it must be 0 or positive.")
-    return {"max_age_s": max_age, "max_gap_s": options.max_gap, "min_episode_s": shortest}
+    return {
+        "max_age_s": max_age,
+        "max_gap_s": options.max_gap,
+        "min_episode_s": shortest,
+        "stamps": options.stamps,
+        "outcome": options.outcome,
+    }
 
 
-def _wanted(options: argparse.Namespace) -> RobotImport:
+def _wanted(options: argparse.Namespace) -> ImportOptions:
     """Return what the options ask for of a real robot's bags.
 
     Raises:
@@ -198,27 +197,22 @@ def _wanted(options: argparse.Namespace) -> RobotImport:
     topics = {role: getattr(options, role) or topic for role, topic in _TOPICS.items()}
     if options.imu is not None:
         topics["imu"] = options.imu
-    return RobotImport(
+    return ImportOptions(
         robot_type=robot,
         task=options.task,
         fps=fps,
         observation_names=observation_names(config),
-        environment_names=(),
         action_names=body.limits.names,
-        tracks=TrackOptions(
-            topics=topics,
-            cameras=_cameras(options.camera or []),
-            beams=beams,
-            lidar=body.lidar,
-            stamps=options.stamps,
-            scan_frame=options.scan_frame,
-            odom_frame=options.odom_frame,
-            scan_yaw=options.scan_yaw,
-            pose=pose,
-        ),
+        topics=topics,
+        cameras=_cameras(options.camera or []),
+        beams=beams,
+        lidar=body.lidar,
+        scan_frame=options.scan_frame,
+        odom_frame=options.odom_frame,
+        scan_yaw=options.scan_yaw,
+        pose=pose,
         max_speed=body.limits.velocity,
         command_timeout_s=timeout,
-        outcome=options.outcome,
         **times,
     )
 

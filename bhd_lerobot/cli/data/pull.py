@@ -10,7 +10,7 @@ from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.cli.data.episode_list import parse_episodes, short
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.remote.listing import check_repo_id, counted, is_url, megabytes
-from bhd_lerobot.datasets.remote.url import check_url, shown
+from bhd_lerobot.datasets.remote.url import shown
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetWriteError, TransferError
 from bhd_lerobot.hub.transfer import (
     folder_of,
@@ -18,9 +18,9 @@ from bhd_lerobot.hub.transfer import (
     prompt_interrupt,
     quiet_bars,
     refuse_empty,
+    remote_of,
     repeat_line,
     split_list,
-    storage_options,
     warn_of_folder,
 )
 
@@ -47,9 +47,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from bhd_lerobot.datasets.remote.hub import HubDataset
     from bhd_lerobot.datasets.remote.pull import pull
-    from bhd_lerobot.datasets.remote.store import StoreDataset
 
     source, root = _places(options)
     again = repeat_line(options, source, root=root)
@@ -58,11 +56,7 @@ def _run(options: argparse.Namespace) -> int:
     select = _selection(options)
     quiet_bars()
     with prompt_interrupt(options.stopped):
-        remote = (
-            StoreDataset(source, storage_options(options.storage_options))
-            if is_url(source)
-            else HubDataset(source, options.revision)
-        )
+        remote = remote_of(source, options.storage_options, revision=options.revision)
         try:
             report = pull(remote, root, select=select, replace=options.replace, verify=options.verify)
         except (TransferError, DatasetWriteError) as error:
@@ -123,7 +117,7 @@ def _selection(options: argparse.Namespace) -> "Select | None":
             return wanted.select(LeRobotDatasetMetadata("bhd/pull", root=folder), episodes)
         except BhdError:
             raise
-        except Exception as error:  # LeRobot believes what it reads, whoever wrote it
+        except Exception as error:  # LeRobot does not validate what it reads
             raise DatasetError(
                 f"The metadata of the dataset cannot be read, so no episode can be chosen ({error!r}). Pull all of "
                 "it, without --outcome and --min_score, and run bhd-data check on it."
@@ -138,7 +132,6 @@ def _places(options: argparse.Namespace) -> tuple[str, Path]:
     if source is None or (options.source and options.repo_id):
         raise ConfigError("Say where from, once: bhd-data pull user/name, or bhd-data pull s3://bucket/dir --root=DIR.")
     if is_url(source):
-        check_url(source)
         if options.root is None:
             raise ConfigError(f"Say where to: bhd-data pull {source} --root=DIR.")
         if options.revision is not None:

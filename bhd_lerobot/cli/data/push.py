@@ -6,7 +6,6 @@ from pathlib import Path
 from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.remote.listing import check_repo_id, is_url
-from bhd_lerobot.datasets.remote.url import check_url
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.hub.push import format_push_report, left_by_interrupt, push_dataset
 from bhd_lerobot.hub.transfer import (
@@ -89,7 +88,6 @@ def _places(options: argparse.Namespace) -> tuple[Path, str]:
             "Say where to: bhd-data push ROOT user/name for the Hub, or bhd-data push ROOT s3://bucket/dir for a URL."
         )
     if is_url(target):
-        check_url(target)
         if options.branch or options.tag or options.private or options.public:
             raise ConfigError(f"{target} is a URL: it has no branches, tags or privacy of its own.")
         if options.root is None:

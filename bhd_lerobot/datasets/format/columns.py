@@ -1,6 +1,6 @@
 """Columns of episodes, straight from their Parquet files: all of one episode, or a few of many."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -85,3 +85,37 @@ def _to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray:
     if pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type):
         return array.flatten().to_numpy(zero_copy_only=False).reshape(len(array), *shape)
     return np.asarray(array.to_numpy(zero_copy_only=False))
+
+
+def video_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.uint8]]:
+    """Yield images of a video, each of shape (H, W, 3).
+
+    Args:
+        path: the video.
+        start_s: time of the first one [s].
+        count: how many.
+
+    Raises:
+        DatasetCorruptError: the video cannot be read, or ends before.
+    """
+    import av
+
+    found = 0
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            base, rate = stream.time_base, stream.average_rate
+            assert base is not None
+            assert rate is not None
+            half = 0.5 / float(rate)
+            container.seek(max(0, int((start_s - half) / float(base))), stream=stream)
+            for frame in container.decode(stream):
+                if frame.pts is not None and frame.pts * float(base) < start_s - half:
+                    continue
+                yield np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+                found += 1
+                if found == count:
+                    return
+    except (av.error.FFmpegError, IndexError) as error:
+        raise corrupt(path, error) from error
+    raise corrupt(path, f"it ends {count - found} images before its episode does")

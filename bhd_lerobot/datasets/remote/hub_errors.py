@@ -15,8 +15,8 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _STATUS = {
     403: "this token has no permission for it. Use one that may write, and a name of your own or of an organisation "
     "that you may write to.",
-    409: "somebody else changed it at the same time. Look at what is there now.",
-    412: "somebody else changed it at the same time. Look at what is there now.",
+    409: "it was changed by another client at the same time. Check what is there now.",
+    412: "it was changed by another client at the same time. Check what is there now.",
     413: "the Hub refuses so much at once.",
     429: "the Hub has had too many requests from here. Wait some minutes.",
 }
@@ -29,7 +29,7 @@ def hub_errors(name: str, action: str, *, revision: str | None = None) -> Iterat
     Args:
         name: the repository.
         action: what is being done, for example ``"upload the dataset to"``.
-        revision: the branch, tag or commit that is asked for; None if none is.
+        revision: the branch, tag or commit that is requested; None if none is.
     """
     try:
         yield
@@ -45,8 +45,8 @@ def explain(error: BaseException, name: str, revision: str | None = None) -> str
     meanings = _meanings(name, revision)
     for one in chain:
         for kind, meaning in meanings:
-            if isinstance(one, kind) and (said := meaning(one)):
-                return said
+            if isinstance(one, kind) and (message := meaning(one)):
+                return message
     text = " ".join(str(error).split())
     is_xet = any("xet" in str(one).lower() for one in chain)
     hint = " If this Hub does not know the Xet protocol, set HF_HUB_DISABLE_XET=1." if is_xet else ""
@@ -78,7 +78,7 @@ def _meanings(name: str, revision: str | None) -> list[tuple[type, Callable[[Any
         (errors.LocalTokenNotFoundError, lambda _: f"no token of the Hub was found. {_LOGIN}."),
         (
             errors.GatedRepoError,
-            lambda _: "its owner lets in only those who asked. Ask for access on its page on the Hub.",
+            lambda _: "it is gated: its owner grants access on request. Request it on its page on the Hub.",
         ),
         (
             errors.RevisionNotFoundError,
@@ -122,8 +122,8 @@ def _status(error: BaseException, name: str) -> str:
     from huggingface_hub import get_token
 
     status = getattr(getattr(error, "response", None), "status_code", 0)
-    said = " ".join(str(getattr(error, "server_message", None) or "").split())
-    quoted = f' The Hub says: "{said[:200]}".' if said else ""
+    answer = " ".join(str(getattr(error, "server_message", None) or "").split())
+    quoted = f' The Hub says: "{answer[:200]}".' if answer else ""
     if status == 401 and get_token():
         meaning = f"the Hub does not accept the token: it has expired or was revoked. {_LOGIN} to a new one."
     elif status in (401, 404):

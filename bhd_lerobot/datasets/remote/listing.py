@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 CARD = "README.md"
 PREVIEW = "preview.png"
 SUBSET = "meta/bhd_subset.json"
-"""Says which episodes of a dataset were asked for, if files of it are missing. It is never uploaded."""
+"""Names the episodes of a dataset that were requested, if files of it are missing. It is never uploaded."""
 
 MANIFEST = "bhd_files.json"
 """Size and checksum of every file, beside a dataset below a URL; no part of the dataset."""
@@ -97,11 +97,7 @@ class Remote(Protocol):
         """
 
     def verified(self, paths: Sequence[str]) -> dict[str, RemoteFile]:
-        """Return listed files with the checksum of what lies there now, which is read for it.
-
-        Raises:
-            ConfigError: the place makes the checksums from the contents itself, so there is nothing to verify.
-        """
+        """Return listed files with the checksum of their content, which is read; none if the place itself makes it."""
 
     def fetch(self, paths: Sequence[str], folder: Path) -> None:
         """Copy files into a folder, each of which is then the listed one, to the last byte.
@@ -247,7 +243,7 @@ def parse_info(content: bytes | None, place: str) -> dict[str, Any]:
         place: whose it is, for messages.
 
     Raises:
-        DatasetError: it is none, or that of another format; says what is wrong.
+        DatasetError: it is none, or that of another format; the message has the reason.
     """
     if content is None:
         raise DatasetError(f"{place} is no LeRobot dataset any more: its {layout.INFO} is gone.")

@@ -107,7 +107,7 @@ def _refuse_unfinished(state: DatasetState) -> None:
 
 
 def _files(state: DatasetState, stamps: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """Return the files that belong to the dataset, and those that look like its own and belong to no episode."""
+    """Return the files that belong to the dataset, and those that have names of its layout and belong to no episode."""
     needed = state.files()
     if unseen := sorted(needed - stamps.keys()):
         raise DatasetError(
@@ -117,7 +117,7 @@ def _files(state: DatasetState, stamps: dict[str, Any]) -> tuple[list[str], list
     left_out = sorted(name for name in stamps if is_recorded(name) and name not in needed)
     skipped = {*left_out, SUBSET, MANIFEST, layout.UNREPORTED}
     names = [name for name in sorted(stamps) if name not in skipped and name.split("/")[0] not in _TEMPORARY]
-    for name in names:  # notes beside the dataset, too: nobody sees in a listing that a file is only linked there
+    for name in names:  # notes beside the dataset, too: a listing does not show that a file is only linked there
         check_inside(state.root, state.root / name)
     return names, left_out
 
@@ -129,7 +129,7 @@ def _stamps(root: Path) -> dict[str, tuple[int, ...]]:
         folders[:] = [name for name in folders if not name.startswith(".")]
         for path in (Path(folder, name) for name in names if not name.startswith(".")):
             if path.is_file():
-                with contextlib.suppress(FileNotFoundError):  # it was removed just now: whoever compares notices
+                with contextlib.suppress(FileNotFoundError):  # it was removed just now: the comparison notices
                     stat = path.stat()
                     found[path.relative_to(root).as_posix()] = (stat.st_size, stat.st_mtime_ns, stat.st_ino)
     return found

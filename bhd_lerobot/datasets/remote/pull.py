@@ -44,7 +44,7 @@ class PullReport:
     Attributes:
         root: the dataset on this machine.
         episodes: the episodes that were chosen, and those that were there before, by number; None if none were.
-        is_whole: whether it holds all files, though only some episodes may have been asked for.
+        is_whole: whether it holds all files, though only some episodes may have been requested.
         total_episodes: episodes of the whole dataset.
         fetched: files that were fetched.
         fetched_bytes: their bytes.
@@ -86,7 +86,7 @@ def pull(
             what is listed about them.
 
     Raises:
-        ConfigError: both are the same folder, or the place needs no verifying.
+        ConfigError: both are the same folder.
         DatasetExistsError: there is another dataset at `root`, or a changed one, and `replace` is false.
         DatasetError: the remote dataset has another format, or none of the wanted episodes.
         DatasetLockedError: `root` is being recorded, repaired or pulled by another process.

@@ -94,7 +94,7 @@ def push(
 
     Raises:
         DatasetExistsError: there is another dataset, or one with more episodes, and `replace` is false.
-        ConfigError: both are the same folder, or the place needs no verifying.
+        ConfigError: both are the same folder.
         DatasetError: the dataset is not complete and finalised, is in use, or was changed meanwhile.
         TransferError: the place cannot be reached or does not let this user write; what was sent is not sent again.
     """
@@ -206,7 +206,7 @@ def _deleted_since(root: Path, there: bytes | None) -> int:
         known = len(former) if edits[: len(former)] == former else 0
         return sum(len(edit["episodes"]) for edit in edits[known:] if edit["edit"] == "delete")
     except (OSError, ValueError, KeyError, TypeError):
-        return 0  # nobody knows, so none
+        return 0  # not known, so none
 
 
 def _kind(info: Mapping[str, Any]) -> tuple[Any, ...]:

@@ -79,7 +79,7 @@ class Staging:
         """
         root, folder = self._root, self.folder
         if root.is_dir():
-            folder.chmod(root.stat().st_mode & 0o7777)  # who may look into it stays the same
+            folder.chmod(root.stat().st_mode & 0o7777)  # the permissions stay the same
         for path in sorted(folder.rglob("*"), reverse=True):  # what an attempt for another version left
             if path.is_dir():
                 with contextlib.suppress(OSError):  # it is not empty

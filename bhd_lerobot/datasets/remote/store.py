@@ -52,7 +52,7 @@ class StoreDataset:
     """
 
     def __init__(self, url: str, storage_options: dict[str, Any] | None = None) -> None:
-        """Name it; nothing is asked for yet.
+        """Name it; nothing is requested yet.
 
         Args:
             url: for example ``s3://bucket/folder``.
@@ -70,8 +70,8 @@ class StoreDataset:
         # Others, such as FTP, have one connection for all threads.
         self._workers = WORKERS if self._fs.async_impl or not {*LOCAL, "memory"}.isdisjoint(kinds) else 1
         self._there: dict[str, RemoteFile] = {}
-        self._known: dict[str, RemoteFile] = {}  # what the manifest says, or is going to
-        self._noted: dict[str, RemoteFile] = {}  # what the manifest says
+        self._known: dict[str, RemoteFile] = {}  # what the manifest has, or will have
+        self._noted: dict[str, RemoteFile] = {}  # what the manifest has
         self._former_info = ""  # of a push that has not ended: what it took away
 
     def files(self) -> dict[str, RemoteFile]:
@@ -81,7 +81,7 @@ class StoreDataset:
             try:
                 found = self._fs.find(self._root, detail=True)
             except (FileNotFoundError, NotADirectoryError):
-                found = {}  # a folder or a prefix that nobody wrote to yet; a missing bucket fails when it is written
+                found = {}  # a folder or a prefix that is not written yet; a missing bucket fails when it is written
             root = self._fs._strip_protocol(self._root).rstrip("/")
             sizes = {
                 name[len(root) :].removeprefix("/"): int(about["size"] or 0)
@@ -162,7 +162,7 @@ class StoreDataset:
                 self._put(sent)
                 source.check_unchanged()
             except BaseException:  # Ctrl-C as well
-                with contextlib.suppress(Exception):  # the first error says more
+                with contextlib.suppress(Exception):  # the first error is more specific
                     self._write_manifest()
                 raise
             if info is not None:
@@ -208,7 +208,7 @@ class StoreDataset:
             self._fs.rm_file(self._at(path))
 
     def _read_manifest(self, *, exists: bool) -> None:
-        """Read what the manifest says; nothing if it cannot be read: then all is sent again."""
+        """Read the manifest; nothing if it cannot be read: then all is sent again."""
         try:
             found = json.loads(self._fs.cat_file(self._at(MANIFEST)) if exists else "{}")
             self._former_info = str(found.get("info", ""))

@@ -52,7 +52,7 @@ def is_subset(root: Path) -> bool:
 
 
 def subset_episodes(root: Path) -> list[int]:
-    """Return the episodes that were asked for, ascending; none if no note says so, or it cannot be read."""
+    """Return the episodes that were requested, ascending; none without a note, or if it cannot be read."""
     try:
         return sorted(int(one) for one in _read(root)["episodes"])
     except (ValueError, KeyError, TypeError, OverflowError):

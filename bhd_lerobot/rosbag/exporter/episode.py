@@ -1,4 +1,4 @@
-"""An episode of a dataset as topics of a bag: what is said of it, its columns, and what is there to look at."""
+"""An episode of a dataset as topics of a bag: its description, its columns, and topics for viewers."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pyarrow import types as arrow
 
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.columns import video_frames
 from bhd_lerobot.datasets.format.episode_table import PREFIX
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES, LANGUAGE
 from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
@@ -16,7 +17,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError, UnsupportedDatasetError
 from bhd_lerobot.rosbag.messages import types, views
 from bhd_lerobot.rosbag.messages.base import OdometryPart, ScanPart
-from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, encode_image, video_frames
+from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, encode_image
 from bhd_lerobot.rosbag.messages.parts import (
     NANO,
     Frames,
@@ -32,7 +33,7 @@ from bhd_lerobot.rosbag.messages.split import check_topics, parts_of
 from bhd_lerobot.rosbag.storage.write import Stream
 
 _PLAIN = (arrow.is_string, arrow.is_boolean, arrow.is_integer, arrow.is_floating, arrow.is_list, arrow.is_null)
-_LONGEST_S = 1e8  # three years, which nobody records
+_LONGEST_S = 1e8  # three years, longer than any recording
 _PAUSE_NS = 10 * NANO  # between two episodes
 
 STATE_COLUMNS = (
@@ -177,8 +178,8 @@ class EpisodeTopics:
         streams = [Stream(topic, COMPRESSED if compressed else IMAGE, messages())]
         if fovy := self._view.fovy.get(camera):
             size = (int(self._features[key]["shape"][0]), int(self._features[key]["shape"][1]))
-            told = views.camera_info(frames, optical, size, fovy)
-            streams.append(_stream(f"/{camera}/camera_info", views.CAMERA_INFO, frames, told))
+            geometry = views.camera_info(frames, optical, size, fovy)
+            streams.append(_stream(f"/{camera}/camera_info", views.CAMERA_INFO, frames, geometry))
         return streams
 
     def _episode(self, row: Row, start: int) -> bytes:

@@ -1,4 +1,4 @@
-"""From a dataset to rosbag2 bags, from which `bag_restore` makes the same dataset again."""
+"""From a dataset to rosbag2 bags, of which `bhd-data import` makes a dataset of the same drives."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -66,7 +66,7 @@ def export_bags(
         options: how.
 
     Raises:
-        DatasetError: no such dataset or episode, or an edit of it was interrupted that nobody was told of.
+        DatasetError: no such dataset or episode, or an interrupted edit of it was completed and not reported yet.
         DatasetLockedError: it is being recorded or edited.
         ConfigError: `output` lies in the dataset.
         DatasetExistsError: `output` is there already.
@@ -121,7 +121,7 @@ def _chosen(state: DatasetState, episodes: Sequence[int] | None) -> list[Row]:
         return state.rows
     wrong = [index for index in episodes if not 0 <= index < state.num_episodes]
     if wrong or not episodes:
-        which = f"There is no episode {wrong[0]} in {state.root}" if wrong else "No episode was asked for"
+        which = f"There is no episode {wrong[0]} in {state.root}" if wrong else "No episode was requested"
         raise DatasetError(f"{which}; it has {state.num_episodes}, from 0 to {state.num_episodes - 1}.")
     return [state.rows[index] for index in sorted(set(episodes))]
 

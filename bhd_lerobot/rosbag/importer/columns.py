@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.rosbag.importer.dataset import RobotImport
+from bhd_lerobot.rosbag.importer.options import ImportOptions
 from bhd_lerobot.rosbag.importer.resample import NANO, Times, newest
 from bhd_lerobot.rosbag.importer.tracks import Array, Track
 from bhd_lerobot.rosbag.messages.base import ODOMETRY, TWIST
@@ -19,44 +19,44 @@ _MOVES = 0.01
 
 
 def frame_columns(
-    wanted: RobotImport, tracks: Mapping[str, Track], times: Times, ages: Times, outcome: str | None
+    options: ImportOptions, tracks: Mapping[str, Track], times: Times, ages: Times, outcome: str | None
 ) -> dict[str, NDArray[Any]]:
     """Return the columns of an episode.
 
     Args:
-        wanted: what becomes of the bag.
+        options: what becomes of the bag.
         tracks: by role, each sorted by time.
         times: of the frames [ns], shape (n,).
         ages: of the oldest of each frame's newest readings [ns], shape (n,).
         outcome: what the episode ended with, if that is known.
     """
     n = len(times)
-    asked, command_age = _commands(wanted, tracks, times)
-    heard = command_age >= 0
-    limits = np.inf if wanted.max_speed is None else np.array(wanted.max_speed)
-    applied = np.clip(asked, -limits, limits)
-    over = (applied != asked).any(axis=1)
+    commands, command_age = _commands(options, tracks, times)
+    in_force = command_age >= 0
+    limits = np.inf if options.max_speed is None else np.array(options.max_speed)
+    applied = np.clip(commands, -limits, limits)
+    over = (applied != commands).any(axis=1)
     done = np.arange(n) == n - 1
     ended = Event[outcome.upper()] if outcome in OUTCOMES else Event.NOTHING
     vectors = {
-        keys.OBSERVATION_STATE: _state(wanted, tracks, times),
-        keys.ENVIRONMENT_STATE: _vector(wanted.environment_names, keys.ENVIRONMENT_STATE, tracks, times),
-        keys.ACTION: asked,
+        keys.OBSERVATION_STATE: _state(options, tracks, times),
+        keys.ENVIRONMENT_STATE: _vector(options.environment_names, keys.ENVIRONMENT_STATE, tracks, times),
+        keys.ACTION: commands,
         keys.APPLIED_ACTION: applied,
     }
     return {
         **{key: values.astype(np.float32) for key, values in vectors.items() if values.shape[1]},
         keys.TIME: (times - times[0]) / NANO,
         keys.AGE: (ages / NANO).astype(np.float32),
-        keys.COMMAND_AGE: (np.where(heard, command_age, 0) / NANO).astype(np.float32),
+        keys.COMMAND_AGE: (np.where(in_force, command_age, 0) / NANO).astype(np.float32),
         keys.LATENESS: np.zeros(n, np.float32),
         keys.OVERRUNS: np.zeros(n, np.int64),
         keys.SKIPPED: np.zeros(n, np.int64),
         keys.INFERENCE_TIME: np.zeros(n, np.float32),
-        keys.LATE: ages > round(wanted.max_age_s * NANO),
+        keys.LATE: ages > round(options.max_age_s * NANO),
         keys.LIMITS: np.where(over, int(Limit.VELOCITY), 0),
-        keys.WATCHDOG: np.where(heard, 0, int(Watchdog.COMMAND_AGE)),
-        keys.MODE: np.where(heard, int(Mode.TRACKING), int(Mode.HOLD)),
+        keys.WATCHDOG: np.where(in_force, 0, int(Watchdog.COMMAND_AGE)),
+        keys.MODE: np.where(in_force, int(Mode.TRACKING), int(Mode.HOLD)),
         keys.REWARD: np.zeros(n, np.float32),
         keys.SUCCESS: done & (ended == Event.SUCCESS),
         keys.DONE: done,
@@ -64,17 +64,17 @@ def frame_columns(
     }
 
 
-def command_note(wanted: RobotImport, columns: Mapping[str, NDArray[Any]]) -> str | None:
+def command_note(options: ImportOptions, columns: Mapping[str, NDArray[Any]]) -> str | None:
     """Return how many frames have no command, and whether the robot drove in them; None if all have one."""
     silent = columns[keys.MODE] == int(Mode.HOLD)
     if not silent.any():
         return None
-    names = list(wanted.observation_names)
+    names = list(options.observation_names)
     speeds = columns[keys.OBSERVATION_STATE][:, [names.index(name) for name in TWIST]]
     moving = int((silent & (np.abs(speeds) > _MOVES).any(axis=1)).sum())
-    for_ever = np.isinf(wanted.command_timeout_s)
+    for_ever = np.isinf(options.command_timeout_s)
     lacking = "come before the first command" if for_ever else (
-        f"have no command that is younger than {wanted.command_timeout_s:g} s"
+        f"have no command that is younger than {options.command_timeout_s:g} s"
     )  # fmt: skip
     drove = f", though the robot moved in {moving} of them" if moving else ""
     if moving and not for_ever:
@@ -82,34 +82,34 @@ def command_note(wanted: RobotImport, columns: Mapping[str, NDArray[Any]]) -> st
     return f"{int(silent.sum())} of {len(silent)} frames of the episode {lacking}; their action is 0{drove}"
 
 
-def _commands(wanted: RobotImport, tracks: Mapping[str, Track], times: Times) -> tuple[Array, Times]:
+def _commands(options: ImportOptions, tracks: Mapping[str, Track], times: Times) -> tuple[Array, Times]:
     """Return the command in force at the end of each frame, shape (n, d), and its age then [ns]; 0 and -1 if none.
 
-    An action is what was asked for over the frame that an observation begins. What answers the observation comes after
+    An action is the command over the frame that an observation begins. What answers the observation comes after
     it: the command in force when the observation was taken is the answer to the one before.
     """
-    ends = times + round(NANO / wanted.fps)
+    ends = times + round(NANO / options.fps)
     if "cmd" not in tracks:
         parts = [track for role, track in tracks.items() if role.startswith(f"{keys.ACTION}/")]
         ages = [ends - track.times[newest(track.times, ends - 1)] for track in parts]
         oldest = np.maximum.reduce(ages) if ages else np.zeros_like(ends)
-        return _vector(wanted.action_names, keys.ACTION, tracks, ends - 1), oldest
+        return _vector(options.action_names, keys.ACTION, tracks, ends - 1), oldest
     track = tracks["cmd"]
     place = newest(track.times, ends - 1)
     known = np.maximum(place, 0)
     if not len(track.times):
         return np.zeros((len(times), len(TWIST))), np.full(len(times), -1, np.int64)
     age = np.where(place < 0, -1, ends - track.times[known])
-    if np.isfinite(wanted.command_timeout_s):
-        age = np.where(age > round(wanted.command_timeout_s * NANO), -1, age)
-    order = [TWIST.index(name) for name in wanted.action_names]
+    if np.isfinite(options.command_timeout_s):
+        age = np.where(age > round(options.command_timeout_s * NANO), -1, age)
+    order = [TWIST.index(name) for name in options.action_names]
     return np.where(age[:, None] >= 0, track.values[known], 0.0)[:, order], age
 
 
-def _state(wanted: RobotImport, tracks: Mapping[str, Track], times: Times) -> Array:
-    state = _vector(wanted.observation_names, keys.OBSERVATION_STATE, tracks, times)
-    names = list(wanted.observation_names)
-    if "odom" in tracks and wanted.tracks.pose:
+def _state(options: ImportOptions, tracks: Mapping[str, Track], times: Times) -> Array:
+    state = _vector(options.observation_names, keys.OBSERVATION_STATE, tracks, times)
+    names = list(options.observation_names)
+    if "odom" in tracks and options.pose:
         pose = [names.index(name) for name in ODOMETRY]
         state[:, pose] = _since_start(state[:, pose])
     elif ODOMETRY[2] in names:  # unwrapped over a bag, which may hold several episodes

@@ -18,11 +18,11 @@ _PACE = 0.05  # two clocks of one time differ by less than a thousandth
 _WINDOW_NS = NANO // 2  # in which a robot moves farther than its sensors' noise, and does not turn round
 _MOVED = (0.05, 0.15)  # [m, rad] in a window
 _MOVES = 10  # windows
-_SAME = (0.5, 2.0)  # of a speed and what the pose says: wheels slip
+_SAME = (0.5, 2.0)  # ratio of a speed to that of the pose: wheels slip
 
 
 def pace(received: Times, stamps: Times) -> float:
-    """Return by how many seconds the headers of a topic go on in a second of the recorder; 1 if nothing can be said.
+    """Return by how many seconds the headers of a topic go on in a second of the recorder; 1 if that is not known.
 
     Args:
         received: when the recorder got the messages [ns], shape (n,), in the order in which they were written.
@@ -31,8 +31,8 @@ def pace(received: Times, stamps: Times) -> float:
     by_recorder, by_header = np.diff(received), np.diff(stamps)
     steady = np.minimum(by_recorder, by_header) >= -STEP_BACK_NS
     steady &= np.abs(by_recorder - by_header) < _JUMP_NS
-    whole, told = int(by_recorder[steady].sum()), int(by_header[steady].sum())
-    return told / whole if whole >= _LONG_NS and told > 0 else 1.0
+    whole, by_stamps = int(by_recorder[steady].sum()), int(by_header[steady].sum())
+    return by_stamps / whole if whole >= _LONG_NS and by_stamps > 0 else 1.0
 
 
 def pace_warnings(paces: Mapping[str, float]) -> list[str]:
@@ -74,17 +74,17 @@ def speed_warnings(topic: str, times: Times, speeds: Array, pose: Array) -> list
     x, y, yaw = np.diff(pose[first], axis=0)[whole].T
     by_speed = np.diff(way[first], axis=0)[whole]
     notes = []
-    for name, told, seen, least in (
+    for name, by_twist, by_pose, least in (
         ("linear.x", np.abs(by_speed[:, 0]), np.hypot(x, y), _MOVED[0]),
         ("angular.z", by_speed[:, 1], yaw, _MOVED[1]),
     ):
-        moved = np.abs(seen) > least
+        moved = np.abs(by_pose) > least
         if int(moved.sum()) < _MOVES:
             continue
-        share = float(np.median(told[moved] / seen[moved]))
+        share = float(np.median(by_twist[moved] / by_pose[moved]))
         if not _SAME[0] <= share <= _SAME[1]:
             notes.append(
-                f"{topic}: its twist.{name} is {share:.2f} times what its pose says where the robot moves. The "
+                f"{topic}: its twist.{name} is {share:.2f} times that of its pose where the robot moves. The "
                 "observation is made of the twist; is it filled in, in m/s and rad/s? --odom names another topic"
             )
     return notes

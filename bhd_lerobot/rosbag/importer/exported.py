@@ -1,8 +1,9 @@
-"""What a bag of `bhd-data export` says of itself: robot, rate, features, episodes. An import of it needs no option."""
+"""The description in a bag of `bhd-data export`: robot, rate, features, episodes. Its import needs no option."""
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from bhd_lerobot.datasets.format import features as keys
@@ -26,11 +27,11 @@ class ExportedEpisode:
 
     Attributes:
         place: of its description among all messages of the bag; those of the episode come after it.
-        start: the first frame [ns]: when its description was received, and as its stamp says.
+        start: the first frame [ns]: by the reception of its description, and by its stamp.
         duration: of all of its frames [ns].
         robot_type, fps, features: of its dataset.
         task: the instruction.
-        metadata: what the dataset says of it, without the prefix ``bhd/``; the same keys in all episodes.
+        metadata: of the episode in the dataset, without the prefix ``bhd/``; the same keys in all episodes.
         metadata_types: names of their types.
         parts: what carries a feature's numbers.
     """
@@ -75,21 +76,20 @@ def exported_episodes(bags: Sequence[Bag]) -> list[list[ExportedEpisode]]:
 
 
 def _episodes(bag: Bag) -> list[ExportedEpisode]:
-    messages = bag.read([EPISODE_TOPIC])[EPISODE_TOPIC]
-    if not messages.data:
-        raise DatasetError(
-            f"{bag.path}: no message of {EPISODE_TOPIC} can be read. {'; '.join(bag.problems)}. {_REMEDY}"
-        )
     try:
-        return [
-            _episode(*one)
-            for one in zip(messages.data, messages.received.tolist(), messages.order.tolist(), strict=True)
-        ]
+        # A bag of one episode begins with its description, and is not read to its end here.
+        messages = islice(bag.messages((EPISODE_TOPIC,)), bag.topics[EPISODE_TOPIC].count)
+        episodes = [_episode(payload, received, place) for _, received, place, payload in messages]
     except (DatasetError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
         raise DatasetError(
             f"{bag.path}: {EPISODE_TOPIC} cannot be read as version {types.FORMAT} of our messages ({error}). It is "
             f"damaged, or another version of bhd_lerobot wrote it. {_REMEDY}"
         ) from error
+    if not episodes:
+        raise DatasetError(
+            f"{bag.path}: no message of {EPISODE_TOPIC} can be read. {'; '.join(bag.problems)}. {_REMEDY}"
+        )
+    return episodes
 
 
 def _episode(message: bytes, received: int, place: int) -> ExportedEpisode:

@@ -21,7 +21,7 @@ _DEEPEST = 32  # frames between a sensor and the base
 
 
 def static_frames(messages: Sequence[bytes]) -> tuple[Static, int]:
-    """Return what ``/tf_static`` says, and how many of its messages cannot be read."""
+    """Return the transforms of ``/tf_static``, and how many of its messages cannot be read."""
     frames: dict[str, tuple[str, Array]] = {}
     lost = 0
     for message, times in Counter(messages).items():  # a latched message may be there many times
@@ -60,8 +60,8 @@ def scanner_rotation(topic: str, frame: str, static: Static, given: str | None, 
         topic: of the scans.
         frame: that they are in.
         static: the bag's static transforms.
-        given: a frame that the user says is the scanner's, or None.
-        yaw: the scanner's angle in the robot [rad], if the user says it.
+        given: the scanner's frame, if the user names it.
+        yaw: the scanner's angle in the robot [rad], if the user gives it.
 
     Raises:
         DatasetError: the frame is not known.
@@ -70,7 +70,7 @@ def scanner_rotation(topic: str, frame: str, static: Static, given: str | None, 
     known = rotation is not None or frame == given or _last(frame) == SCAN_FRAME
     if not known:
         raise DatasetError(
-            f"The scans of {topic} are in the frame {frame!r}, and nothing says how that is turned in the robot: it is "
+            f"The scans of {topic} are in the frame {frame!r}, whose rotation in the robot is not known: it is "
             f"not {SCAN_FRAME!r}, and /tf_static has no way from {' or '.join(BASE_FRAMES)} to it. Say that it is the "
             f"scanner with --scan_frame={frame}, and where its zero points with --scan_yaw (0 is straight ahead)."
         )

@@ -1,8 +1,8 @@
 """From messages, which come when they come, to frames, which come at a fixed rate: never looking into the future.
 
 A frame at time T has of each topic the newest message at or before T. Where frames lie depends on earlier messages
-only, too: an episode begins when every sensor has been heard, and its frames follow at 1 / fps. So nothing that happens
-after T changes the frame at T; only that a frame was the last one shows later.
+only, too: an episode begins when a message of every sensor has been received, and its frames follow at 1 / fps. So
+nothing that happens after T changes the frame at T; only that a frame was the last one shows later.
 """
 
 from collections.abc import Sequence
@@ -58,7 +58,7 @@ def sane(received: Times, stamps: Times, tolerance_ns: int = NANO // 2) -> NDArr
 
 
 def apart(one: tuple[Times, Times], other: tuple[Times, Times]) -> int:
-    """Return by how much the clock of a topic is ahead of another topic's, if both were heard at the same time [ns].
+    """Return by how much the clock of a topic is ahead of another topic's, if both were received at the same time [ns].
 
     What the delay on the way adds or takes is some tenths of a second.
 
@@ -111,8 +111,8 @@ def newest(times: Times, at: Times) -> NDArray[np.intp]:
 def grids(sensors: Sequence[Times], fps: float, *, max_age_ns: int, max_gap_ns: int, why: str = "start") -> list[Grid]:
     """Return the frames of the episodes that some sensors allow.
 
-    An episode goes on as long as every sensor was heard within the last `max_gap_ns`. At its end, frames that only have
-    readings older than `max_age_ns` are left out: they tell what was, not what is.
+    An episode goes on as long as every sensor was received within the last `max_gap_ns`. Frames at its end that only
+    have readings older than `max_age_ns` are left out.
 
     Args:
         sensors: times of each sensor's messages, ascending.

@@ -20,7 +20,7 @@ def clean_ranges(ranges: NDArray[np.floating], lidar: LidarSpec, range_min: floa
     """Return ranges as the dataset has them.
 
     No return is 0, infinity, not a number or a negative value in drivers of real scanners; it becomes the maximum
-    range, as does what is beyond the range that the scanner says it has: by ROS's rule such a reading is none. Minus
+    range, as does what is beyond the scanner's own range: by ROS's rule such a reading is none. Minus
     infinity is ROS's word for something too near. What is nearer than the scanner can see, or farther, reads its
     nearest or farthest range.
 

@@ -15,7 +15,7 @@ _NAMED = 6  # joints
 
 
 def other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
-    """Return, in sentences, that a bag is not of a TurtleBot3 and what can be done; None if nothing says so.
+    """Return, in sentences, that a bag is not of a TurtleBot3 and what can be done; None if it may be.
 
     Args:
         bag: the bag.
@@ -40,7 +40,7 @@ def other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
 def _joints(bag: Bag, topic: str) -> list[str]:
     """Return the joints of the first message of a topic; none if that cannot be read."""
     try:
-        for _, payload in bag.payloads(topic):
+        for *_, payload in bag.messages((topic,)):
             return list(decode(JOINT_STATE, payload).name)
     except DatasetError:
         pass
@@ -97,7 +97,7 @@ def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) ->
     if others := topics[name].others:
         raise DatasetError(
             f"{name} in {bag.path} has messages of several types, {', '.join((topics[name].msgtype, *others))}, and "
-            f"nothing says which of them {_MEANING[role]} is. Make a bag with one of them: ros2 bag convert."
+            f"it is not known which of them is {_MEANING[role]}. Make a bag with one of them: ros2 bag convert."
         )
     if (serialisation := topics[name].serialisation) != "cdr":
         raise DatasetError(f"{name} in {bag.path} is serialised as {serialisation!r}; only cdr can be read.")
@@ -114,12 +114,12 @@ def exported_topic(bag: Bag, topics: Mapping[str, Topic], role: str, part: Part)
     if topic is None or not topic.count:
         raise DatasetError(
             f"{bag.path} has no message of {part.topic}, which carries {role.removesuffix(part.topic)}, as "
-            f"/bhd/episode says.{_damage(bag)} Export the dataset again."
+            f"/bhd/episode lists.{_damage(bag)} Export the dataset again."
         )
     if topic.msgtype != part.msgtype or topic.others:
         raise DatasetError(
             f"{part.topic} in {bag.path} is of type {', '.join((topic.msgtype, *topic.others))}, not {part.msgtype} "
-            "alone, as /bhd/episode says. Export the dataset again."
+            "alone, as described in /bhd/episode. Export the dataset again."
         )
     return topic
 
@@ -147,12 +147,12 @@ def publisher_notes(topics: Mapping[str, Topic], wanted: Mapping[str, Topic]) ->
             each = " and ".join(str(count) for count in topic.connections)
             notes.append(
                 f"{topic.name} has messages of {len(topic.connections)} connections ({each}), so of several "
-                f"publishers; the {counts}, whoever sent it"
+                f"publishers; the {counts}, whichever publisher sent it"
             )
         elif topic.publishers > 1:
             notes.append(
                 f"{topic.name} had {topic.publishers} publishers when the recording began. Which of them sent a "
-                f"message is not in the bag; the {counts}, whoever sent it"
+                f"message is not in the bag; the {counts}, whichever publisher sent it"
             )
     if "cmd" not in wanted:
         return notes  # an exported bag, whose other topics are known

@@ -1,21 +1,21 @@
 """The topics of a robot's bag as tracks: when something was measured, and what; sorted by time, judged one by one."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.importer import frames
 from bhd_lerobot.rosbag.importer.diagnostics import pace, pace_warnings, speed_warnings
+from bhd_lerobot.rosbag.importer.options import ImportOptions
 from bhd_lerobot.rosbag.importer.resample import Times, apart, message_times, sane
 from bhd_lerobot.rosbag.importer.scan import GEOMETRY, resampled_scans
 from bhd_lerobot.rosbag.importer.topics import TYPES, exported_topic, publisher_notes, static_topics, wanted_topic
 from bhd_lerobot.rosbag.messages.base import GYRO, ODOMETRY, TWIST, BareTwistPart, GyroPart, TwistPart, odometry
-from bhd_lerobot.rosbag.messages.parts import NANO, Part, head_stamps, header_stamps
+from bhd_lerobot.rosbag.messages.parts import NANO, head_stamps, header_stamps
 from bhd_lerobot.rosbag.messages.serialize import decode
 from bhd_lerobot.rosbag.storage.read import Bag, Messages, Topic
 
@@ -26,34 +26,6 @@ MOST_LOST = 0.1
 
 _HEADER_BYTES = 12  # of a message: what it is serialised as, and the stamp
 _APART_NS = NANO // 2  # of two topics' clocks: a scan is stamped at its first ray, and a network delays
-
-
-@dataclass(frozen=True)
-class TrackOptions:
-    """How a bag of a base is read.
-
-    Attributes:
-        topics: role (``scan``, ``odom``, ``cmd``, ``imu``) -> topic; only roles that are wanted.
-        cameras: name of a camera -> topic.
-        parts: role -> what carries numbers, of exported bags; the role begins with the feature and a slash.
-        beams: that a scan has in the dataset.
-        lidar: the scanner that the dataset is of.
-        stamps: ``"auto"``, ``"header"`` or ``"receive"``.
-        scan_frame, odom_frame: frames that the user says are the scanner's and the base's.
-        scan_yaw: angle of the scanner in the robot [rad], if the user says it.
-        pose: whether the odometry's pose is wanted, beside its speeds.
-    """
-
-    topics: Mapping[str, str]
-    cameras: Mapping[str, str]
-    beams: int
-    lidar: LidarSpec
-    stamps: str = "receive"
-    scan_frame: str | None = None
-    odom_frame: str | None = None
-    scan_yaw: float | None = None
-    pose: bool = False
-    parts: Mapping[str, Part] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -90,18 +62,18 @@ class Track:
         return replace(self, times=times, order=self.order[rows], values=self.values[rows], stamps=stamps)
 
 
-def read_tracks(bag: Bag, options: TrackOptions, notes: list[str]) -> dict[str, Track]:
+def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> dict[str, Track]:
     """Return the tracks of a bag by role; cameras' as ``camera/<name>``.
 
     Args:
         bag: the bag.
         options: what is wanted.
-        notes: what somebody should know is added to it.
+        notes: what the user should know is added to it.
 
     Raises:
         DatasetError: a topic is missing, empty, of another type or mostly unreadable, or its frame is not known.
     """
-    topics = bag.topics()
+    topics = bag.topics
     wanted = {role: wanted_topic(bag, topics, role, name) for role, name in options.topics.items()}
     wanted |= {role: exported_topic(bag, topics, role, part) for role, part in options.parts.items()}
     cameras = {f"camera/{name}": wanted_topic(bag, topics, "camera", topic) for name, topic in options.cameras.items()}
@@ -156,11 +128,11 @@ def _check_one_time(bag: Bag, reference: str, clocks: Mapping[str, tuple[Times, 
             raise DatasetError(
                 f"{bag.path}: when they were received together, {topic} is {seconds(abs(ahead))} "
                 f"{'ahead of' if ahead > 0 else 'behind'} {reference}. Their stamps are of different clocks, so "
-                "nothing says which command belongs to which scan; --stamps=receive takes the recorder's for all."
+                "it is not known which command belongs to which scan; --stamps=receive takes the recorder's for all."
             )
 
 
-def _names(role: str, options: TrackOptions) -> tuple[str, ...]:
+def _names(role: str, options: ImportOptions) -> tuple[str, ...]:
     if role in options.parts:
         return options.parts[role].names
     scan = tuple(f"scan_{beam:03d}.pos" for beam in range(options.beams))
@@ -208,9 +180,9 @@ def _stamps(topic: Topic, messages: Messages, decoded: Sequence[Any]) -> Times |
 
 @dataclass(frozen=True)
 class _Reading:
-    """What decoding needs to know, and where it says what it did."""
+    """What decoding needs to know, and where its notes go."""
 
-    options: TrackOptions
+    options: ImportOptions
     static: frames.Static
     static_lost: bool
     notes: list[str]

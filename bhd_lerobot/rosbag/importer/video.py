@@ -1,5 +1,7 @@
 """The images of a robot's camera, out of its bag into an episode."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +11,7 @@ from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.importer.resample import Times, newest
 from bhd_lerobot.rosbag.importer.tracks import MOST_LOST, Track
 from bhd_lerobot.rosbag.messages.images import decode_image
-from bhd_lerobot.rosbag.storage.read import Bag, Picker
+from bhd_lerobot.rosbag.storage.read import Bag
 
 CAMERA = "camera/"
 """What the role of a camera's track begins with; its name follows."""
@@ -33,8 +35,10 @@ class CameraImages:
 
     def __init__(self, bag: Bag, role: str, track: Track, notes: list[str]) -> None:
         self.role, self.name = role, role.removeprefix(CAMERA)
-        self._track, self._notes = track, notes
-        self._images = Picker(bag, track.topic)
+        self._bag, self._track, self._notes = bag, track, notes
+        self._messages = bag.messages((track.topic,))
+        self._place, self._payload = -1, b""  # the newest message that was read
+        self._image: NDArray[np.uint8] | None = None  # of that message, once it is decoded
 
     def shape(self) -> tuple[int, int, int]:
         """Return the shape of its images.
@@ -42,16 +46,10 @@ class CameraImages:
         Raises:
             DatasetError: none of the first ones can be decoded.
         """
-        reason: DatasetError | None = None
-        for place in self._track.values[:_TRIED, 0].astype(np.int64).tolist():
-            try:
-                height, width, channels = self._decode(place).shape
-            except DatasetError as error:
-                reason = reason or error
-            else:
-                return height, width, channels
-        assert reason is not None
-        raise reason
+        height, width, channels = self._decode(
+            self._track, self._first(self._track, range(len(self._track.times)))
+        ).shape
+        return height, width, channels
 
     def blind(self, track: Track, times: Times) -> int:
         """Return how many frames at the beginning of an episode have no image that can be decoded.
@@ -63,23 +61,14 @@ class CameraImages:
         Raises:
             DatasetError: none of the first images can.
         """
-        reason: DatasetError | None = None
         rows, first = np.unique(newest(track.times, times), return_index=True)
-        for row, frame in zip(rows[:_TRIED].tolist(), first.tolist(), strict=False):
-            try:
-                self._decode(int(track.values[row, 0]))
-            except DatasetError as error:
-                reason = reason or error
-            else:
-                return int(frame)
-        assert reason is not None
-        raise reason
+        return int(first[rows == self._first(track, rows.tolist())][0])
 
     def write(self, track: Track, times: Times, writer: EpisodeWriter) -> Times:
         """Add the image of each frame to an episode; return when they were taken [ns], shape (frames,).
 
         An image that cannot be decoded, as of a camera that was unplugged, is as if it had been lost: the one before
-        is there in its place, and its age says so.
+        is there in its place, with its age.
 
         Args:
             track: as in `blind`.
@@ -96,7 +85,7 @@ class CameraImages:
         for frame, row in enumerate(rows.tolist()):
             if row != before:
                 try:
-                    image = self._decode(int(track.values[row, 0]))
+                    image = self._decode(track, row)
                     good = row
                 except DatasetError as error:
                     broken += 1
@@ -117,5 +106,32 @@ class CameraImages:
             )
         return track.times[shown]
 
-    def _decode(self, place: int) -> NDArray[np.uint8]:
-        return decode_image(self._track.topic, self._track.msgtype, self._images.get(place))
+    def _first(self, track: Track, rows: Sequence[int]) -> int:
+        """Return the first of some messages that can be decoded.
+
+        Raises:
+            DatasetError: none of the first ten can; gives the reason of the first.
+        """
+        reason: DatasetError | None = None
+        for row in rows[:_TRIED]:
+            try:
+                self._decode(track, row)
+            except DatasetError as error:
+                reason = reason or error
+            else:
+                return row
+        assert reason is not None
+        raise reason
+
+    def _decode(self, track: Track, row: int) -> NDArray[np.uint8]:
+        """Return the image of a message. Images are read from the bag one by one, best in their order."""
+        place = int(track.values[row, 0])
+        if place != self._place:
+            if place < self._place:
+                self._messages, self._place = self._bag.messages((track.topic,)), -1
+            while self._place < place:
+                _, _, self._place, self._payload = next(self._messages)
+            self._image = None
+        if self._image is None:
+            self._image = decode_image(track.topic, track.msgtype, self._payload)
+        return self._image

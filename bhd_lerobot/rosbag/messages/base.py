@@ -160,7 +160,7 @@ def _yaw_tree(yaw: Array) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class GyroPart(Part):
-    """A gyroscope; orientation and acceleration are said to be unknown, as ROS has it.
+    """A gyroscope; orientation and acceleration are marked as unknown, as ROS specifies.
 
     Attributes:
         noise: if it is known; only needed to write.
@@ -191,7 +191,7 @@ class GyroPart(Part):
 
 @dataclass(frozen=True)
 class ScanPart(Part):
-    """A scan. ROS says infinity where nothing came back; the dataset says the maximum range.
+    """A scan. Without a return, ROS has infinity and the dataset the maximum range.
 
     Attributes:
         lidar: its ranges and rate; only needed to write.

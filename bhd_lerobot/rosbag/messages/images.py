@@ -1,14 +1,11 @@
-"""Images in bags: out of a dataset's videos, into `sensor_msgs/Image` or `CompressedImage`, and back."""
+"""Images in bags: `sensor_msgs/Image` and `CompressedImage`."""
 
 import io
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.format.state import corrupt
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages.parts import Frames, header
 from bhd_lerobot.rosbag.messages.serialize import decode, encode
@@ -27,40 +24,6 @@ _RAW = {
     "bgra8": (np.uint8, 4, (2, 1, 0)),
     "mono8": (np.uint8, 1, (0, 0, 0)),
 }
-
-
-def video_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.uint8]]:
-    """Yield images of a video, each of shape (H, W, 3).
-
-    Args:
-        path: the video.
-        start_s: time of the first one [s].
-        count: how many.
-
-    Raises:
-        DatasetCorruptError: the video cannot be read, or ends before.
-    """
-    import av
-
-    found = 0
-    try:
-        with av.open(str(path)) as container:
-            stream = container.streams.video[0]
-            base, rate = stream.time_base, stream.average_rate
-            assert base is not None
-            assert rate is not None
-            half = 0.5 / float(rate)
-            container.seek(max(0, int((start_s - half) / float(base))), stream=stream)
-            for frame in container.decode(stream):
-                if frame.pts is not None and frame.pts * float(base) < start_s - half:
-                    continue
-                yield np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
-                found += 1
-                if found == count:
-                    return
-    except (av.error.FFmpegError, IndexError) as error:
-        raise corrupt(path, error) from error
-    raise corrupt(path, f"it ends {count - found} images before its episode does")
 
 
 def encode_image(frames: Frames, frame_id: str, image: NDArray[np.uint8], *, compressed: bool) -> bytes:

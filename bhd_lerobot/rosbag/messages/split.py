@@ -27,7 +27,7 @@ PARTS: Mapping[str, type[Part]] = {
         TwistPart, BareTwistPart, OdometryPart, GyroPart, ScanPart, JointsPart, PosePart, NumbersPart, IntegersPart,
     )
 }  # fmt: skip
-"""What a part can be, by the name under which a bag says it."""
+"""What a part can be, by its name in the bag."""
 
 _SCAN = re.compile(r"scan_\d+\.pos")
 _OBSERVED, _ASKED, _APPLIED = keys.OBSERVATION_STATE, keys.ACTION, keys.APPLIED_ACTION

@@ -130,10 +130,12 @@ def require_rosbags() -> None:
         ConfigError: it is not; names the command that installs it.
     """
     try:
+        import mcap.reader  # noqa: F401
         import rosbags.rosbag2  # noqa: F401
     except ImportError as error:
         raise ConfigError(
-            f"ROS 2 bags need the package rosbags, which cannot be imported ({error}). {install_extra('ros2')}"
+            f"ROS 2 bags need the packages rosbags and mcap, which cannot be imported ({error}). "
+            f"{install_extra('ros2')}"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Topics that are there for those who look at a bag: transforms, cameras' geometry, wheels. Nothing reads them back."""
+"""Topics for viewers: transforms, cameras' geometry, wheels. The import does not read them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -8,8 +8,7 @@ from typing import Any
 import yaml
 
 from bhd_lerobot.errors import ConfigError, DatasetError
-from bhd_lerobot.rosbag.storage.qos import offered
-from bhd_lerobot.rosbag.storage.read import FILES, Bag, first_time
+from bhd_lerobot.rosbag.storage.read import FILES, Bag, opened, publishers_in
 
 _UNREADABLE = (
     *(OSError, yaml.YAMLError, RecursionError),  # the file, its YAML, or how deep that is
@@ -37,7 +36,7 @@ def find_bags(path: Path) -> list[Bag]:
     if bag and inside:
         raise DatasetError(
             f"{path} has bag files of its own ({', '.join(file.name for file in bag.files)}) and folders of bags "
-            f"({', '.join(found.path.name for found in inside)}), and nothing says what belongs together. Name the "
+            f"({', '.join(found.path.name for found in inside)}), and it is not known what belongs together. Name the "
             "bags one by one, or put the files into a folder of their own."
         )
     if bag:
@@ -58,8 +57,8 @@ def check_distinct(bags: Sequence[Bag]) -> None:
     seen: dict[tuple[int, int], Path] = {}
     for bag in bags:
         for file in bag.files:
-            told = file.stat()  # of what a link leads to
-            before = seen.setdefault((told.st_dev, told.st_ino), bag.path)
+            stat = file.stat()  # of what a link leads to
+            before = seen.setdefault((stat.st_dev, stat.st_ino), bag.path)
             if before is not bag.path:
                 raise ConfigError(
                     f"{before} and {bag.path} are the same recording: both have the file {file.resolve()}. Its "
@@ -74,12 +73,14 @@ def _folder(path: Path) -> Bag | None:
         problem = f"{path.name}: it has no metadata.yaml, as after a recording that was killed"
         return _without_metadata(path, files, problem) if files else None
     try:
-        told = yaml.safe_load(metadata.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        about = yaml.safe_load(metadata.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        if not isinstance(about["relative_file_paths"], list):
+            raise TypeError("relative_file_paths is not a list of names")
         # rosbag2's first versions wrote the folder in front of the name, and a moved bag has another one
-        names = [Path(name).name for name in _texts(told["relative_file_paths"])]
-        expected = int(told["message_count"])
-        mode, kind = (_text(told.get(f"compression_{what}") or "").lower() for what in ("mode", "format"))
-        publishers = publishers_of(told.get("topics_with_message_count"))
+        names = [Path(_text(name)).name for name in about["relative_file_paths"]]
+        expected = int(about["message_count"])
+        mode, kind = (_text(about.get(f"compression_{what}") or "").lower() for what in ("mode", "format"))
+        publishers = publishers_of(about.get("topics_with_message_count"))
     except _UNREADABLE as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         if not files:
@@ -158,7 +159,13 @@ def _in_order(path: Path, listed: list[Path], problems: list[str]) -> list[Path]
     numbered = sorted(listed, key=_natural)
     if numbered == listed:
         return listed
-    times = [first_time(file) for file in numbered]
+    times = []
+    for name in numbered:
+        try:
+            with opened(name) as file:
+                times.append(next((received for _, received, _ in file.messages()), None))
+        except DatasetError:
+            return listed
     known = [time for time in times if time is not None]
     if len(known) < len(times) or known != sorted(known):
         return listed
@@ -169,26 +176,17 @@ def _in_order(path: Path, listed: list[Path], problems: list[str]) -> list[Path]
 
 
 def publishers_of(topics: Any) -> dict[str, int]:
-    """Return topic -> how many publishers offered it when the recorder subscribed; what is not said is left out.
+    """Return topic -> how many publishers offered it when the recorder subscribed, where that is known.
 
     Args:
         topics: ``topics_with_message_count`` of a metadata.yaml.
     """
     found: dict[str, int] = {}
-    for one in topics if isinstance(topics, list) else ():
-        told = one.get("topic_metadata") if isinstance(one, dict) else None
-        if isinstance(told, dict):
-            name = told.get("name")
-            if not isinstance(name, str):
-                continue
-            found[name] = max(found.get(name, 0), offered(told.get("offered_qos_profiles")))
+    for topic in topics if isinstance(topics, list) else ():
+        about = topic.get("topic_metadata") if isinstance(topic, dict) else None
+        if isinstance(about, dict) and isinstance(name := about.get("name"), str):
+            found[name] = max(found.get(name, 0), publishers_in(about.get("offered_qos_profiles")))
     return {name: count for name, count in found.items() if count}
-
-
-def _texts(value: Any) -> list[str]:
-    if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
-        raise TypeError("relative_file_paths is not a list of names")
-    return value
 
 
 def _text(value: Any) -> str:

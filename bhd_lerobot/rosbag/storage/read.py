@@ -2,12 +2,14 @@
 
 import contextlib
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import DatasetError
@@ -53,19 +55,17 @@ class Messages:
     Attributes:
         received: when [ns], shape (n,).
         order: each one's place among all messages of the bag, shape (n,).
-        sizes: each one's size [bytes], shape (n,).
         data: each one's bytes, or their beginning.
     """
 
     received: NDArray[np.int64]
     order: NDArray[np.int64]
-    sizes: NDArray[np.int64]
     data: list[bytes]
 
     def part(self, mask: NDArray[np.bool_]) -> "Messages":
         """Return some of them."""
-        data = [one for one, wanted in zip(self.data, mask.tolist(), strict=True) if wanted]
-        return Messages(self.received[mask], self.order[mask], self.sizes[mask], data)
+        data = [message for message, wanted in zip(self.data, mask.tolist(), strict=True) if wanted]
+        return Messages(self.received[mask], self.order[mask], data)
 
 
 @dataclass
@@ -88,8 +88,9 @@ class Bag:
     per_message: bool = False
     publishers: dict[str, int] = field(default_factory=dict)
 
+    @cached_property
     def topics(self) -> dict[str, Topic]:
-        """Return its topics by name.
+        """Its topics by name; they are read once.
 
         Raises:
             DatasetError: a file cannot be read at all.
@@ -107,7 +108,7 @@ class Bag:
                 count = counts.get(number, 0)
                 types.setdefault(name, Counter())[msgtype, serialisation] += count
                 here.setdefault(name, []).extend([count] * bool(count))
-                publishers[name] = max(publishers.get(name, 0), file.publishers.get(number, 0))
+                publishers[name] = max(publishers.get(name, 0), publishers_in(file.profiles.get(number)))
             for name, several in here.items():
                 connections[name] = max(connections.get(name, []), several, key=len)
         found = {}
@@ -122,7 +123,7 @@ class Bag:
         return found
 
     def read(self, topics: Collection[str], heads: Collection[str] = ()) -> dict[str, Messages]:
-        """Return the messages of some topics.
+        """Return the messages of some topics; what could not be read is added to `problems`.
 
         Args:
             topics: these.
@@ -131,117 +132,97 @@ class Bag:
         Raises:
             DatasetError: a file cannot be read at all.
         """
-        rows: dict[str, list[tuple[int, int, int, bytes]]] = {name: [] for name in (*topics, *heads)}
-        walk = _Walk(self, rows)
-        for name, received, place, payload in walk.messages():
-            kept = payload[:_HEAD_BYTES] if name in heads else payload
-            rows[name].append((received, place, len(payload), kept))
-        problems = walk.problems
-        if walk.lost:
-            problems.append(
-                f"{self.path.name}: {walk.lost} messages that cannot be decompressed, or have no possible time"
-            )
-        if walk.packed and not self.per_message:
-            problems.append(
-                f"{self.path.name}: its messages are compressed one by one (compression_mode: MESSAGE), which only the "
-                "missing metadata.yaml could say; they were decompressed"
-            )
-        if self.expected is not None and walk.total < self.expected and not problems:
-            problems.append(f"{self.path.name}: its metadata count {self.expected} messages; it has {walk.total}")
-        self._note(problems)
-        return {name: _messages(found) for name, found in rows.items()}
+        rows: dict[str, list[tuple[int, int, bytes]]] = {name: [] for name in (*topics, *heads)}
+        for name, received, place, payload in self.messages(rows, note=True):
+            rows[name].append((received, place, payload[:_HEAD_BYTES] if name in heads else payload))
+        found = {}
+        for name, messages in rows.items():
+            times, order = (np.array([message[column] for message in messages], np.int64) for column in (0, 1))
+            found[name] = Messages(times, order, [data for *_, data in messages])
+        return found
 
-    def payloads(self, topic: str) -> Iterator[tuple[int, bytes]]:
-        """Yield the messages of a topic that `read` has: their places among all messages of the bag, and all bytes."""
-        for _, _, place, payload in _Walk(self, (topic,)).messages():
-            yield place, payload
+    def messages(self, topics: Collection[str], *, note: bool = False) -> Iterator[tuple[str, int, int, bytes]]:
+        """Yield topic, receive time [ns], place among all messages and bytes, in the order in which they were written.
+
+        Args:
+            topics: whose messages.
+            note: whether what could not be read is added to `problems` at the end.
+        """
+        counts: Counter[str] = Counter()
+        problems: list[str] = []
+        for file in self._open():
+            names: dict[int, str] = {}
+            for channel, received, data in file.messages():
+                counts["all"] += 1
+                if channel not in names:
+                    names[channel] = file.channels.get(channel, ("",))[0]
+                if names[channel] not in topics:
+                    continue
+                is_packed = data[:4] == _ZSTD  # a serialised message never begins so
+                counts["packed"] += is_packed
+                payload = _unpacked(file, data) if is_packed else data
+                if payload is None or not 0 <= received < _END_OF_TIME:
+                    counts["lost"] += 1
+                    continue
+                yield names[channel], received, counts["all"], payload
+            problems += file.problems
+        if note:
+            self._note([*problems, *self._losses(counts, has_problems=bool(problems))])
+
+    def _losses(self, counts: Mapping[str, int], *, has_problems: bool) -> Iterator[str]:
+        name = self.path.name
+        if counts["lost"]:
+            yield f"{name}: {counts['lost']} messages that cannot be decompressed, or have no possible time"
+        if counts["packed"] and not self.per_message:
+            yield (
+                f"{name}: its messages are compressed one by one (compression_mode: MESSAGE), which only the missing "
+                "metadata.yaml could say; they were decompressed"
+            )
+        elif self.expected is not None and counts["all"] < self.expected and not has_problems and not counts["lost"]:
+            yield f"{name}: its metadata count {self.expected} messages; it has {counts['all']}"
 
     def _note(self, problems: Iterable[str]) -> None:
         self.problems += [problem for problem in problems if problem not in self.problems]
 
     def _open(self) -> Iterator[Any]:
         for path in self.files:
-            with plain_file(path) as plain, contextlib.closing(FILES[plain.suffix](plain, Budget(path))) as file:
+            with opened(path) as file:
                 yield file
 
 
-def _messages(rows: list[tuple[int, int, int, bytes]]) -> Messages:
-    received, order, sizes, data = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return Messages(np.array(received, np.int64), np.array(order, np.int64), np.array(sizes, np.int64), list(data))
+def _unpacked(file: Any, data: bytes) -> bytes | None:
+    """Return a message without the compression around it; None if it is damaged."""
+    try:
+        return bytes(file.budget.unpack("zstd", data))
+    except (DatasetError, MemoryError):
+        raise
+    except Exception:  # of whichever zstd there is
+        return None
 
 
-class _Walk:
-    """One way through a bag's messages, in the order in which they were written.
-
-    Attributes:
-        total: messages that the bag has, of all topics.
-        lost: messages of the wanted topics that cannot be decompressed, or have no possible time.
-        packed: messages that were compressed.
-        problems: what could not be read, in sentences.
-    """
-
-    def __init__(self, bag: Bag, wanted: Collection[str]) -> None:
-        self.total = self.lost = self.packed = 0
-        self.problems: list[str] = []
-        self._bag, self._wanted = bag, wanted
-
-    def messages(self) -> Iterator[tuple[str, int, int, bytes]]:
-        """Yield topic, receive time [ns], place among all messages, and bytes."""
-        total = 0
-        for file in self._bag._open():
-            names: dict[int, str] = {}
-            for channel, received, buffer, first, last in file.messages():
-                total += 1
-                if channel not in names:
-                    told = file.channels.get(channel, ("",))[0]
-                    names[channel] = told if told in self._wanted else ""
-                name = names[channel]
-                if not name:
-                    continue
-                payload = bytes(buffer[first:last])
-                if payload[:4] == _ZSTD:  # a serialised message never begins so
-                    self.packed += 1
-                    try:
-                        payload = file.budget.unpack("zstd", payload)
-                    except (DatasetError, MemoryError):
-                        raise
-                    except Exception:  # of whichever zstd there is
-                        self.lost += 1
-                        continue
-                if 0 <= received < _END_OF_TIME:
-                    yield name, received, total, payload
-                else:
-                    self.lost += 1
-            self.total = total
-            self.problems += file.problems
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Give a bag's file, without the compression around it, as a reader of `FILES`."""
+    with plain_file(path) as plain, contextlib.closing(FILES[plain.suffix](plain, Budget(path))) as file:
+        yield file
 
 
-class Picker:
-    """Gives large messages of a topic one by one, reading on in the bag; best asked for in their order.
+def publishers_in(profiles: Any) -> int:
+    """Return how many publishers offered a topic when the recorder subscribed; 0 if that is not known.
 
     Args:
-        bag: the bag.
-        topic: the topic.
+        profiles: ``offered_qos_profiles``, one quality of service for each publisher: a YAML text in versions 4 to 8 of
+            rosbag2's metadata, in SQLite files and in the channels of MCAP files; a list in version 9.
     """
-
-    def __init__(self, bag: Bag, topic: str) -> None:
-        self._bag, self._topic = bag, topic
-        self._place, self._payload = -1, b""
-        self._payloads = bag.payloads(topic)
-
-    def get(self, place: int) -> bytes:
-        """Return a message, by its place among all messages of the bag (`Messages.order`)."""
-        if place < self._place:
-            self._place, self._payloads = -1, self._bag.payloads(self._topic)
-        while self._place < place:
-            self._place, self._payload = next(self._payloads)
-        return self._payload
+    if isinstance(profiles, str):
+        return _profiles_in(profiles)
+    return len(profiles) if isinstance(profiles, list) else 0
 
 
-def first_time(path: Path) -> int | None:
-    """Return when the first message of a file was received [ns]; None if it cannot be read."""
+@lru_cache(maxsize=256)  # a bag has few that differ, and YAML is slow
+def _profiles_in(text: str) -> int:
     try:
-        with plain_file(path) as plain, contextlib.closing(FILES[plain.suffix](plain, Budget(path))) as file:
-            return next((int(received) for _, received, *_ in file.messages()), None)
-    except DatasetError:
-        return None
+        profiles = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return 0
+    return len(profiles) if isinstance(profiles, list) else 0

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.storage.qos import offered
 from bhd_lerobot.rosbag.storage.unpack import Budget, temporary_copy
 
-_STEPS = 10_000  # of SQLite's own machine, between two looks at how many there were
+_STEPS = 10_000  # of SQLite's own machine, between two checks of their number
 _LEAST_STEPS, _STEPS_PER_BYTE = 10_000_000, 20
 
 
@@ -19,7 +18,7 @@ class SqliteFile:
 
     Attributes:
         channels: number -> topic, type, serialisation.
-        publishers: number -> how many offered the topic, where the recorder wrote it.
+        profiles: number -> quality of service of the topic's publishers, where the recorder wrote it.
         budget: how much compressed messages may still unpack to.
         problems: what could not be read, in sentences.
 
@@ -52,7 +51,7 @@ class SqliteFile:
             connection = sqlite3.connect(f"{whole.resolve().as_uri()}?{options}", uri=True)
             self._connection = self._stack.enter_context(contextlib.closing(connection))
             self._bound()
-            # Without it SQLite does not open a file that has fewer pages than its header says. Nothing is written.
+            # Without it SQLite does not open a file that has fewer pages than its header counts. Nothing is written.
             self._connection.execute("PRAGMA writable_schema = ON")
             self._refuse_computed()
             rows = list(self._rows("SELECT id, name, type, serialization_format FROM topics"))
@@ -62,13 +61,12 @@ class SqliteFile:
                 "copy, or try `sqlite3 BAG .recover`."
             ) from error
         self.channels: dict[int, tuple[str, str, str]] = {number: (a, b, c) for number, a, b, c in rows}
-        self.publishers: dict[int, int] = {}
+        self.profiles: dict[int, Any] = {}
         with contextlib.suppress(sqlite3.Error):  # rosbag2's first versions have no such column
-            rows = list(self._rows("SELECT id, offered_qos_profiles FROM topics"))
-            self.publishers = {number: offered(profiles) for number, profiles in rows}
+            self.profiles = dict(self._rows("SELECT id, offered_qos_profiles FROM topics"))
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close the file."""
         self._stack.close()
 
     def _bound(self) -> None:
@@ -123,7 +121,7 @@ class SqliteFile:
         with path.open("rb") as file:
             head = file.read(18)
         page = (int.from_bytes(head[16:18]) or 4096) if len(head) == 18 else 4096
-        page = 65536 if page == 1 else page  # so the format says it
+        page = 65536 if page == 1 else page  # 65536 does not fit into the field
         size = path.stat().st_size
         if size < page or not size % page:
             return path
@@ -132,15 +130,15 @@ class SqliteFile:
     def summary(self) -> dict[int, int] | None:
         """Return how many messages each topic has; None if that cannot be counted."""
         try:
-            # Without it SQLite does not open a file that has fewer pages than its header says. Nothing is written.
+            # Without it SQLite does not open a file that has fewer pages than its header counts. Nothing is written.
             self._connection.execute("PRAGMA writable_schema = ON")
             rows = dict(self._rows("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
         except sqlite3.Error:
             return None
         return dict.fromkeys(self.channels, 0) | rows
 
-    def messages(self) -> Iterator[tuple[int, int, Any, int, int]]:
-        """Yield topic, receive time [ns], and where its bytes lie: a buffer, first and last; as they were written.
+    def messages(self) -> Iterator[tuple[int, int, bytes]]:
+        """Yield topic, receive time [ns] and bytes of each message, as they were written.
 
         Raises:
             DatasetError: there are more than the file can hold.
@@ -154,8 +152,7 @@ class SqliteFile:
             for channel, received, data in self._rows("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
                 count += 1
                 # Of a damaged row a value may be of any type: it has no possible time, or cannot be decoded.
-                payload = data if isinstance(data, bytes) else b""
-                yield channel, received if isinstance(received, int) else -1, payload, 0, len(payload)
+                yield channel, received if isinstance(received, int) else -1, data if isinstance(data, bytes) else b""
         except sqlite3.Error as error:
             self.problems.append(
                 f"{self.path.name}: after {count} messages it cannot be read any more ({error}); what is before is read"

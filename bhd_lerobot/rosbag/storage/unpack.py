@@ -58,8 +58,8 @@ class Budget:
         Args:
             name: how: `zstd` or `lz4`.
             data: what is compressed.
-            declared: what it is said to unpack to [bytes]; one byte more at most is unpacked, and of data that are cut
-                off, as much as there is. If None, the data must be whole.
+            declared: the size that the file declares [bytes]; one byte more at most is unpacked, and of data that are
+                cut off, as much as there is. If None, the data must be whole.
 
         Raises:
             DatasetError: it is more than the file may unpack to, or the compression is not known.

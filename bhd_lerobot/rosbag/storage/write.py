@@ -33,7 +33,7 @@ class Stream:
 
 
 class BagWriter:
-    """Writes one bag; use it as a context manager. An exception inside leaves no bag, or a half one to nobody.
+    """Writes one bag; use it as a context manager. After an exception inside the bag is incomplete.
 
     Args:
         path: the folder to write; it must not exist.

@@ -74,6 +74,26 @@ def decoded(path):
     return found
 
 
+@pytest.fixture(scope="module")
+def base_bags(turtlebot3):
+    """A bag for each episode of a base, from 1000 s on."""
+    return export(turtlebot3, turtlebot3.with_name("base_bags"), "--start_time=1000")
+
+
+@pytest.fixture(scope="module")
+def base(base_bags):
+    """Topics of the base's first episode."""
+    return decoded(base_bags / "episode_000000/episode_000000.mcap")
+
+
+@pytest.fixture(scope="module")
+def arm(ur5):
+    """Topics of the arm's second episode."""
+    bags = export(ur5, ur5.with_name("arm_bags"), "--episodes=1")
+    assert [bag.name for bag in bags.iterdir()] == ["episode_000001"]
+    return decoded(bags / "episode_000001/episode_000001.mcap")
+
+
 def stamp(message):
     return message.header.stamp.sec * NANO + message.header.stamp.nanosec
 
@@ -105,9 +125,11 @@ def same_drive(old, new):
             np.testing.assert_allclose(ours["control.time"], theirs["control.time"], atol=1e-6)
 
 
-@pytest.mark.parametrize("robot", ["turtlebot3", "ur5"])
-@pytest.mark.parametrize("layout", [[], ["--one_bag", "--format=sqlite3", "--twist"]])
-def test_a_drive_comes_back_and_is_valid(request, tmp_path, robot, layout):
+@pytest.mark.parametrize(
+    ("robot", "layout"),
+    [("turtlebot3", ["--one_bag", "--format=sqlite3", "--twist"]), ("turtlebot3", []), ("ur5", ["--one_bag"])],
+)
+def test_a_recording_comes_back_and_is_valid(request, tmp_path, robot, layout):
     root = request.getfixturevalue(robot)
     bags = export(root, tmp_path / "bags", *layout)
     assert (bags / "metadata.yaml").exists() == bool(layout)
@@ -160,12 +182,11 @@ def test_texts_and_images_of_an_unknown_robot(toy, tmp_path, compressed):
         assert dataset[frame][support.CAMERA].numpy().mean() * 255 == pytest.approx(support.grey(0, frame), abs=4)
 
 
-def test_an_independent_reader_sees_what_was_recorded_of_a_base(turtlebot3, tmp_path):
-    bags = export(turtlebot3, tmp_path / "bags", "--start_time=1000")
+def test_an_independent_reader_sees_what_was_recorded_of_a_base(turtlebot3, base):
+    topics = base
     columns = read_episode(turtlebot3, 0)
     names = dataset_info(turtlebot3).features["observation.state"]["names"]
     state = {name: columns["observation.state"][:, column] for column, name in enumerate(names)}
-    topics = decoded(bags / "episode_000000/episode_000000.mcap")
     times = 1000 * NANO + np.round(columns["control.time"] * NANO).astype(np.int64)
     n = len(times)
     for topic in ("/odom", "/imu", "/cmd_vel", "/joint_states", "/cmd_vel_applied", "/bhd/outcome"):
@@ -178,8 +199,8 @@ def test_an_independent_reader_sees_what_was_recorded_of_a_base(turtlebot3, tmp_
     yaw = [2 * np.arctan2(one.pose.pose.orientation.z, one.pose.pose.orientation.w) for one in odom]
     assert yaw == pytest.approx(state["theta.pos"], abs=1e-12)
     assert {(one.header.frame_id, one.child_frame_id) for one in odom} == {("odom", "base_footprint")}
-    asked = [(m.twist.linear.x, m.twist.angular.z) for _, m in topics["/cmd_vel"]]
-    assert asked == [tuple(row) for row in columns["action"].tolist()]
+    commands = [(m.twist.linear.x, m.twist.angular.z) for _, m in topics["/cmd_vel"]]
+    assert commands == [tuple(row) for row in columns["action"].tolist()]
     applied = [(stamp(m), m.twist.linear.x, m.twist.angular.z) for _, m in topics["/cmd_vel_applied"]]
     ends = [*times[1:].tolist(), int(times[-1]) + NANO // 10]
     assert applied == [(end, *row) for end, row in zip(ends, columns["control.applied_action"].tolist(), strict=True)]
@@ -193,16 +214,15 @@ def test_an_independent_reader_sees_what_was_recorded_of_a_base(turtlebot3, tmp_
     assert list(wheels.position) == columns["simulation.state"][-1, 7:9].tolist()
     frames = {one.child_frame_id: one for one in topics["/tf_static"][0][1].transforms}
     assert frames["base_scan"].transform.translation.z + frames["base_link"].transform.translation.z == 0.182
-    told = topics["/bhd/episode"][0][1]
-    assert (told.task, told.frames, told.episode_index) == (dataset_info(turtlebot3).episodes[0].task, n, 0)
+    episode = topics["/bhd/episode"][0][1]
+    assert (episode.task, episode.frames, episode.episode_index) == (dataset_info(turtlebot3).episodes[0].task, n, 0)
 
 
-def test_scans_are_there_once_with_infinity_for_no_return(turtlebot3, tmp_path):
-    bags = export(turtlebot3, tmp_path / "bags", "--start_time=1000")
+def test_each_scan_is_exported_once_with_infinity_for_no_return(turtlebot3, base_bags):
     for episode in (0, 1):
         columns = read_episode(turtlebot3, episode)
         name = f"episode_{episode:06d}"
-        topics = decoded(bags / name / f"{name}.mcap")
+        topics = decoded(base_bags / name / f"{name}.mcap")
         start = topics["/bhd/episode"][0][0]
         scans = [message for _, message in topics["/scan"]]
         measured = np.array([stamp(one) for one in scans])
@@ -221,71 +241,57 @@ def test_scans_are_there_once_with_infinity_for_no_return(turtlebot3, tmp_path):
         assert (one.range_min, one.range_max, one.scan_time) == pytest.approx((0.12, 3.5, 0.2))
 
 
-def test_an_independent_reader_sees_what_was_recorded_of_an_arm(ur5, tmp_path):
-    bags = export(ur5, tmp_path / "bags", "--episodes=1")
-    assert [one.name for one in bags.iterdir()] == ["episode_000001"]
-    topics = decoded(bags / "episode_000001/episode_000001.mcap")
+def test_an_independent_reader_sees_what_was_recorded_of_an_arm(ur5, arm):
     columns = read_episode(ur5, 1)
     state = columns["observation.state"].astype(np.float64)
-    joints = [message for _, message in topics["/joint_states"]]
+    joints = [message for _, message in arm["/joint_states"]]
     assert np.array_equal([one.position for one in joints], state[:, :7])
     assert np.array_equal([one.velocity for one in joints], state[:, 7:])
     assert list(joints[0].name)[:2] == ["shoulder_pan_joint", "shoulder_lift_joint"]
-    assert np.array_equal([m.position for _, m in topics["/joint_command"]], columns["action"].astype(np.float64))
-    texts = [message.subtask for _, message in topics["/bhd/outcome"]]
+    assert np.array_equal([m.position for _, m in arm["/joint_command"]], columns["action"].astype(np.float64))
+    texts = [message.subtask for _, message in arm["/bhd/outcome"]]
     assert texts == columns["subtask"].tolist()
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_rosbags_reads_it_with_the_embedded_definitions(turtlebot3, tmp_path, storage):
-    bags = export(turtlebot3, tmp_path / "bags", f"--format={storage}")
-    for bag in bags.iterdir():
-        with AnyReader([bag]) as reader:
-            count, before = 0, {}
-            for connection, time, raw in reader.messages():
-                message = reader.deserialize(raw, connection.msgtype)
-                count += 1
-                assert time >= before.get("", 0)
-                before[""] = time
-                if hasattr(message, "header"):
-                    assert stamp(message) > before.get(connection.topic, 0)
-                    before[connection.topic] = stamp(message)
-            assert count == reader.message_count
-            latched = {
-                one.topic
-                for one in reader.connections
-                if one.ext.offered_qos_profiles[0].durability == QosDurability.TRANSIENT_LOCAL
-            }
-            assert latched == {"/tf_static", "/bhd/episode"}
-
-
-@pytest.mark.parametrize("robot", ["turtlebot3", "ur5"])
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_the_metadata_say_what_ros_asks_for(request, tmp_path, robot, storage):
-    bags = export(request.getfixturevalue(robot), tmp_path / "bags", "--one_bag", f"--format={storage}")
-    told = yaml.safe_load((bags / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
-    assert (told["version"], told["storage_identifier"]) == (8, storage)
-    for one in told["topics_with_message_count"]:
-        topic = one["topic_metadata"]
+@pytest.mark.parametrize(("robot", "storage"), [("turtlebot3", "mcap"), ("ur5", "sqlite3")])
+def test_rosbags_reads_it_with_embedded_definitions_and_the_metadata_that_ros_needs(request, tmp_path, robot, storage):
+    bag = export(request.getfixturevalue(robot), tmp_path / "bags", "--one_bag", f"--format={storage}")
+    with AnyReader([bag]) as reader:
+        count, before, newest = 0, {}, 0
+        for connection, time, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            count += 1
+            assert time >= newest
+            newest = time
+            if hasattr(message, "header"):
+                assert stamp(message) > before.get(connection.topic, 0)
+                before[connection.topic] = stamp(message)
+        assert count == reader.message_count
+        latched = {
+            connection.topic
+            for connection in reader.connections
+            if connection.ext.offered_qos_profiles[0].durability == QosDurability.TRANSIENT_LOCAL
+        }
+        assert latched == {"/tf_static", "/bhd/episode"}
+    metadata = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert (metadata["version"], metadata["storage_identifier"]) == (8, storage)
+    topics = [topic["topic_metadata"] for topic in metadata["topics_with_message_count"]]
+    for topic in topics:
         (profile,) = yaml.safe_load(topic["offered_qos_profiles"])  # a text in version 8
-        latched = topic["name"] in ("/tf_static", "/bhd/episode")
-        assert (profile["durability"], profile["depth"]) == ((1, 1) if latched else (2, 10))
+        assert (profile["durability"], profile["depth"]) == ((1, 1) if topic["name"] in latched else (2, 10))
         assert (profile["history"], profile["reliability"]) == (1, 1)
         forever = {"sec": 9223372036, "nsec": 854775807}
         assert [profile[key] for key in ("deadline", "lifespan", "liveliness_lease_duration")] == [forever] * 3
         assert re.fullmatch(r"RIHS01_[0-9a-f]{64}", topic["type_description_hash"])
-    # As ROS 2 computes it.
-    hashes = {one["topic_metadata"]["type"]: one["topic_metadata"]["type_description_hash"]
-              for one in told["topics_with_message_count"]}  # fmt: skip
-    if robot == "turtlebot3":
+    hashes = {topic["type"]: topic["type_description_hash"] for topic in topics}
+    if robot == "turtlebot3":  # as ROS 2 computes it
         known = "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828"
         assert hashes["sensor_msgs/msg/LaserScan"] == known
 
 
-@pytest.mark.parametrize("robot", ["turtlebot3", "ur5"])
-def test_every_frame_is_in_one_tree(request, tmp_path, robot):
-    bags = export(request.getfixturevalue(robot), tmp_path / "bags", "--episodes=0")
-    topics = decoded(bags / "episode_000000/episode_000000.mcap")
+@pytest.mark.parametrize(("robot", "expected"), [("base", "odom"), ("arm", "base_link")])
+def test_every_frame_is_in_one_tree(request, robot, expected):
+    topics = request.getfixturevalue(robot)
     transforms = [one for name in ("/tf", "/tf_static") for _, message in topics[name] for one in message.transforms]
     parents = {}
     for one in transforms:
@@ -293,7 +299,7 @@ def test_every_frame_is_in_one_tree(request, tmp_path, robot):
         assert turn.x**2 + turn.y**2 + turn.z**2 + turn.w**2 == pytest.approx(1)
         assert parents.setdefault(one.child_frame_id, one.header.frame_id) == one.header.frame_id
     (root,) = set(parents.values()) - parents.keys()
-    assert root == {"turtlebot3": "odom", "ur5": "base_link"}[robot]
+    assert root == expected
     used = {message.header.frame_id for name, sent in topics.items() if not name.startswith(("/bhd", "/tf"))
             for _, message in sent}  # fmt: skip
     assert used - {""} <= {root, *parents}
@@ -384,12 +390,10 @@ def test_an_arm_without_joints_has_its_tool_and_nothing_that_hangs_in_the_air(tm
     assert lookup(links, "base", "tool")[:3, 3] == pytest.approx((0.1, 0.2, 0.3), abs=1e-7)
 
 
-def test_the_wheels_of_a_base_are_where_the_urdf_has_them_and_turn_with_their_joints(turtlebot3, tmp_path):
-    bags = export(turtlebot3, tmp_path / "bags", "--episodes=1")
-    topics = decoded(bags / "episode_000001/episode_000001.mcap")
-    state = read_episode(turtlebot3, 1)["simulation.state"]
+def test_the_wheels_of_a_base_are_where_the_urdf_has_them_and_turn_with_their_joints(turtlebot3, base):
+    state = read_episode(turtlebot3, 0)["simulation.state"]
     for frame in (0, len(state) // 2, len(state) - 1):
-        links = tree(topics, frame)
+        links = tree(base, frame)
         for column, (side, y) in enumerate((("left", 0.08), ("right", -0.08))):
             wheel = lookup(links, "base_link", f"wheel_{side}_link")
             assert np.allclose(wheel[:3, 3], (0, y, 0.023), atol=1e-12)
@@ -406,15 +410,14 @@ def test_the_wheels_of_a_base_are_where_the_urdf_has_them_and_turn_with_their_jo
             assert np.allclose(lookup(links, "base_link", name)[:3, 3], place, atol=1e-12)
 
 
-def test_covariances_are_those_of_the_simulated_sensors_and_zeros_where_nobody_knows_them(turtlebot3, tmp_path):
-    topics = decoded(export(turtlebot3, tmp_path / "bags", "--one_bag") / "bags.mcap")
+def test_covariances_are_those_of_the_simulated_sensors_and_zeros_where_they_are_unknown(turtlebot3, base, tmp_path):
     drive = turtlebot3_burger().drive
     # Counts of both wheels are rounded at the start and now: an experiment of its own.
     rng = np.random.default_rng(0)
     moved = rng.uniform(0, 10, (200_000, 2, 2)) * drive.encoder_ticks
     error = np.diff(np.floor(moved) - moved, axis=1)[:, 0] * 2 * np.pi * drive.wheel_radius / drive.encoder_ticks
     distance, yaw = error.mean(axis=1).var(), (np.diff(error, axis=1) / drive.wheel_separation).var()
-    for _, one in topics["/odom"]:
+    for _, one in base["/odom"]:
         pose, twist = (np.array(part.covariance).reshape(6, 6) for part in (one.pose, one.twist))
         assert np.trace(pose[:2, :2]) == pytest.approx(distance, rel=0.02)
         assert pose[5, 5] == pytest.approx(yaw, rel=0.02)
@@ -423,7 +426,7 @@ def test_covariances_are_those_of_the_simulated_sensors_and_zeros_where_nobody_k
             assert (np.linalg.eigvalsh(covariance) >= -1e-20).all()
         assert 0 < twist[0, 0] < 1e-12
         assert 0 < twist[5, 5] < 1e-12
-    for _, one in topics["/imu"]:
+    for _, one in base["/imu"]:
         assert 0 < one.angular_velocity_covariance[0] == one.angular_velocity_covariance[8] < 1e-12
         assert one.orientation_covariance[0] == one.linear_acceleration_covariance[0] == -1
     # Of an imported drive of a real robot, nothing says how good its sensors are.
@@ -461,44 +464,32 @@ def test_nothing_is_left_when_the_disk_refuses(turtlebot3, tmp_path, monkeypatch
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["--episodes=7"], "no episode 7 in"),
-        (["--episodes=3-1"], "runs backwards; write 1-3"),
-        (["--episodes=a"], "such as 0,3,5-9"),
-        (["--start_time=-1"], "--start_time is -1"),
-        (["--start_time=nan"], "--start_time is nan"),
-    ],
-)
-def test_what_cannot_be_exported_is_refused(turtlebot3, tmp_path, capsys, arguments, told):
-    assert main.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}", *arguments]) == 2
-    assert told in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
+def test_what_cannot_be_exported_is_refused_and_changes_nothing(turtlebot3, tmp_path, capsys):
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "note").write_text("mine")
+    new, inside = tmp_path / "bags", turtlebot3 / "bags"
+    for root, output, arguments, message in (
+        (turtlebot3, new, ["--episodes=7"], "no episode 7 in"),
+        (turtlebot3, new, ["--episodes=3-1"], "runs backwards; write 1-3"),
+        (turtlebot3, new, ["--episodes=a"], "such as 0,3,5-9"),
+        (turtlebot3, new, ["--start_time=-1"], "--start_time is -1"),
+        (turtlebot3, new, ["--start_time=nan"], "--start_time is nan"),
+        (turtlebot3, inside, [], "which is to stay as it is"),
+        (turtlebot3, mine, [], "exists already"),
+        (tmp_path / "none", new, [], "none"),
+    ):
+        assert main.main(["export", str(root), f"--output={output}", *arguments]) == 2
+        assert message in capsys.readouterr().err
+        assert not inside.exists()
+        assert (os.listdir(tmp_path), os.listdir(mine)) == (["mine"], ["note"])
 
 
-def test_bags_do_not_get_into_the_dataset(turtlebot3, capsys):
-    assert main.main(["export", str(turtlebot3), f"--output={turtlebot3 / 'bags'}"]) == 2
-    assert "which is to stay as it is" in capsys.readouterr().err
-    assert not (turtlebot3 / "bags").exists()
-
-
-def test_what_is_there_is_not_overwritten(turtlebot3, tmp_path, capsys):
-    (tmp_path / "bags").mkdir()
-    (tmp_path / "bags" / "note").write_text("mine")
-    assert main.main(["export", str(turtlebot3), f"--output={tmp_path / 'bags'}"]) == 2
-    assert "exists already" in capsys.readouterr().err
-    assert os.listdir(tmp_path / "bags") == ["note"]
-    assert main.main(["export", str(tmp_path / "none"), f"--output={tmp_path / 'b'}"]) == 2
-
-
-def test_of_an_exported_bag_that_lost_messages_what_is_there_is_imported_without_the_outcome(
-    turtlebot3, tmp_path, capsys
-):
-    bags = export(turtlebot3, tmp_path / "bags", "--episodes=0")
-    path = bags / "episode_000000" / "episode_000000.mcap"
+def test_an_exported_bag_that_was_cut_is_imported_without_the_outcome(turtlebot3, base_bags, tmp_path, capsys):
+    bag = shutil.copytree(base_bags / "episode_000000", tmp_path / "episode_000000")
+    path = bag / "episode_000000.mcap"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    (episode,) = back(bags, tmp_path / "back").episodes
+    (episode,) = back(bag, tmp_path / "back").episodes
     error = capsys.readouterr().err
     assert "ends at byte" in error
     assert "ends before the one that was exported" in error
@@ -512,9 +503,9 @@ def test_of_an_exported_bag_that_lost_messages_what_is_there_is_imported_without
     )
 
 
-def test_a_description_that_cannot_be_read_is_refused_with_the_remedies(turtlebot3, tmp_path, capsys, monkeypatch):
-    bags = export(turtlebot3, tmp_path / "bags", "--episodes=0")
-    path = bags / "episode_000000" / "episode_000000.mcap"
+def test_a_description_that_cannot_be_read_is_refused_with_the_remedies(base_bags, tmp_path, capsys, monkeypatch):
+    bags = shutil.copytree(base_bags / "episode_000000", tmp_path / "episode_000000")
+    path = bags / "episode_000000.mcap"
     content = path.read_bytes()
     named = ["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]
     for version, written in ((2, content.replace(b'{"observation.state"', b'["observation.state"')), (3, content)):
@@ -528,8 +519,8 @@ def test_a_description_that_cannot_be_read_is_refused_with_the_remedies(turtlebo
     assert main.main([*named, "--robot=turtlebot3", "--task=Drive."]) == 0
 
 
-def test_bags_of_two_datasets_do_not_become_one(turtlebot3, ur5, tmp_path, capsys):
-    one, other = export(turtlebot3, tmp_path / "a"), export(ur5, tmp_path / "b")
+def test_bags_of_two_datasets_do_not_become_one(base_bags, arm, ur5, tmp_path, capsys):
+    one, other = base_bags, ur5.with_name("arm_bags")
     arguments = ["import", str(one), str(other), "--repo_id=t/t", f"--root={tmp_path / 'back'}"]
     assert main.main(arguments) == 2
     assert "differs" in capsys.readouterr().err
@@ -538,9 +529,8 @@ def test_bags_of_two_datasets_do_not_become_one(turtlebot3, ur5, tmp_path, capsy
     assert "--beams is for bags of a real robot" in capsys.readouterr().err
 
 
-def test_options_count_more_than_what_an_exported_bag_says(turtlebot3, tmp_path):
-    bags = export(turtlebot3, tmp_path / "bags")
-    info = back(bags, tmp_path / "back", "--fps=5", "--task=Turn.", "--outcome=failure")
+def test_options_have_precedence_over_an_exported_bag(turtlebot3, base_bags, tmp_path):
+    info = back(base_bags, tmp_path / "back", "--fps=5", "--task=Turn.", "--outcome=failure")
     assert (info.fps, info.tasks) == (5, ("Turn.",))
     assert {one.metadata["outcome"] for one in info.episodes} == {"failure"}
     ours, theirs = read_episode(turtlebot3, 0), read_episode(tmp_path / "back", 0)
@@ -567,11 +557,10 @@ def test_nothing_heavy_is_imported_before_it_is_needed():
     assert found.stdout.split() == []
 
 
-def test_an_arm_is_not_read_as_a_base(ur5, tmp_path, capsys):
-    bags = export(ur5, tmp_path / "bags", "--episodes=0")
-    named = ["import", str(bags), "--repo_id=t/t", f"--root={tmp_path / 'd'}"]
+def test_an_arm_is_not_read_as_a_base(ur5, arm, tmp_path, capsys):
+    named = ["import", str(ur5.with_name("arm_bags")), "--repo_id=t/t", f"--root={tmp_path / 'd'}"]
     assert main.main([*named, "--robot=turtlebot3", "--task=Reach."]) == 2
     error = " ".join(capsys.readouterr().err.split())
     assert "seems to be of an arm: /joint_states has the joints shoulder_pan_joint" in error
     assert "is for bags of a TurtleBot3" in error
-    assert os.listdir(tmp_path) == ["bags"]
+    assert os.listdir(tmp_path) == []

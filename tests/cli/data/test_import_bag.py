@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 
 import numpy as np
 import pytest
@@ -22,9 +21,21 @@ def plain(tmp_path_factory):
     return write(tmp_path_factory.mktemp("real") / "plain", drive())
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-@pytest.mark.parametrize("stamped", [False, True])
-def test_humble_and_jazzy_in_both_storages_become_what_was_measured(tmp_path, storage, stamped):
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory, plain):
+    """The dataset that is made of it."""
+    root = tmp_path_factory.mktemp("real") / "d"
+    imported(plain, root)
+    return root
+
+
+def source_of(root, episode=0):
+    """Return where an episode is from."""
+    return json.loads(dataset_info(root).episodes[episode].metadata["source"])
+
+
+@pytest.mark.parametrize(("storage", "stamped"), [("sqlite3", False), ("mcap", True)])
+def test_bags_of_humble_and_jazzy_become_what_was_measured(tmp_path, storage, stamped):
     source = write(tmp_path / "bag", drive(stamped=stamped), storage)
     info = imported(source, tmp_path / "d")
     columns = read_episode(tmp_path / "d", 0)
@@ -37,8 +48,8 @@ def test_humble_and_jazzy_in_both_storages_become_what_was_measured(tmp_path, st
     forward = columns["observation.state"][:, 0]
     known = np.array([bags.speed(t)[0] for t in times])
     assert np.abs(forward - known).max() < 0.05 * 0.075
-    asked = np.array([bags.command(t)[0] for t in times])
-    assert np.abs(columns["action"][:, 0] - asked).max() < 0.05 * 0.15
+    commands = np.array([bags.command(t)[0] for t in times])
+    assert np.abs(columns["action"][:, 0] - commands).max() < 0.05 * 0.15
     assert np.array_equal(columns["action"], columns["control.applied_action"])
     assert (columns["control.age"] >= 0).all()
     assert (columns["control.age"] < 0.25).all()
@@ -64,41 +75,44 @@ def test_the_schema_is_that_of_our_recordings(tmp_path, plain):
     assert way[-1] == pytest.approx(0.1 * columns["control.time"][-1], abs=0.02)
 
 
-def test_a_scan_is_the_newest_one_and_lies_right(tmp_path, plain):
-    imported(plain, tmp_path / "d")
-    columns = read_episode(tmp_path / "d", 0)
+def test_a_scan_is_the_newest_and_its_beams_are_in_order(dataset):
+    columns = read_episode(dataset, 0)
     scans = columns["observation.state"][:, 2:]
     angle = 2 * np.pi * np.arange(360) / 360
     stamps = np.array([message.header.stamp.sec * NANO + message.header.stamp.nanosec
                        for topic, _, message in drive() if topic == "/scan"])  # fmt: skip
-    start = json.loads(dataset_info(tmp_path / "d").episodes[0].metadata["source"])["start_ns"]
+    start = source_of(dataset)["start_ns"]
     received = np.array([at for topic, at, _ in drive() if topic == "/scan"])
     for frame, scan in enumerate(scans):
         stamp = stamps[np.searchsorted(received, start + frame * NANO // 10, side="right") - 1]
         assert scan == pytest.approx(bags.distance(angle, (stamp - START) / NANO), abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    "scanner",
-    [{"clockwise": True}, {"angle_min": -np.pi}, {"beams": 223}, {"beams": 720, "clockwise": True, "angle_min": 1.0}],
-)
-def test_other_scanners_see_the_same(tmp_path, plain, scanner):
-    imported(plain, tmp_path / "a")
-    imported(write(tmp_path / "bag", drive(**scanner)), tmp_path / "b")
-    ours, theirs = (read_episode(tmp_path / name, 0)["observation.state"] for name in ("a", "b"))
-    assert np.abs(ours - theirs).max() < 1.4 * np.pi / scanner.get("beams", 360) + 1e-5
+def test_other_scanners_see_the_same(tmp_path, dataset):
+    expected = read_episode(dataset, 0)["observation.state"]
+    for number, scanner in enumerate(
+        [
+            {"clockwise": True},
+            {"angle_min": -np.pi},
+            {"beams": 223},
+            {"beams": 720, "clockwise": True, "angle_min": 1.0},
+        ]
+    ):
+        root = tmp_path / f"d{number}"
+        imported(write(tmp_path / f"bag{number}", drive(**scanner)), root)
+        difference = np.abs(expected - read_episode(root, 0)["observation.state"]).max()
+        assert difference < 1.4 * np.pi / scanner.get("beams", 360) + 1e-5, scanner
 
 
-def test_what_happens_later_changes_nothing_before(tmp_path, plain):
+def test_what_happens_later_changes_nothing_before(tmp_path, dataset):
     """The law of no look-ahead, for whole bags: after t everything is another drive, with a gap and a clock jump."""
     until = START + 3 * NANO
     other = [one for one in drive() if one[1] <= until]
     other += [(topic, time + NANO, bags.twist(9, 9) if topic == "/cmd_vel" else message)
               for topic, time, message in drive(seed=5) if time > until]  # fmt: skip
-    imported(plain, tmp_path / "a")
     imported(write(tmp_path / "bag", other), tmp_path / "b", "--stamps=auto")
-    ours, theirs = read_episode(tmp_path / "a", 0), read_episode(tmp_path / "b", 0)
-    start = json.loads(dataset_info(tmp_path / "a").episodes[0].metadata["source"])["start_ns"]
+    ours, theirs = read_episode(dataset, 0), read_episode(tmp_path / "b", 0)
+    start = source_of(dataset)["start_ns"]
     count = (until - start) // (NANO // 10) - 1
     assert count > 20
     for key, values in ours.items():
@@ -117,14 +131,14 @@ def test_gaps_are_flagged_or_begin_an_episode(tmp_path, capsys):
     info = imported(source, tmp_path / "d")
     error = capsys.readouterr().err
     assert "/scan was silent for 1." in error
-    (told,) = (line for line in error.splitlines() if "older than 0.3 s; control.late is true" in line)
+    (late_note,) = (line for line in error.splitlines() if "older than 0.3 s; control.late is true" in line)
     assert len(info.episodes) == 2
     columns = read_episode(tmp_path / "d", 0)
     late = columns["control.late"]
     assert np.array_equal(late, columns["control.age"] > 0.3)
     assert 1 <= late.sum() <= 3
     total = late.sum() + read_episode(tmp_path / "d", 1)["control.late"].sum()
-    assert f"{total} of {info.frames} frames, in " in told
+    assert f"{total} of {info.frames} frames, in " in late_note
     assert columns["control.time"][-1] < 3.3
     assert [json.loads(one.metadata["source"])["why"] for one in info.episodes] == ["start", "gap"]
     assert main.main(["check", str(tmp_path / "d")]) == 0
@@ -132,12 +146,14 @@ def test_gaps_are_flagged_or_begin_an_episode(tmp_path, capsys):
     assert len(one.episodes) == 1
 
 
-@pytest.mark.parametrize(("jump", "told"), [(-3600, "jumped back 1 times"), (86400 * 365, "clock jumped ahead")])
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_clock_jumps_split_the_episode(tmp_path, capsys, jump, told, storage):
+@pytest.mark.parametrize(
+    ("jump", "note", "storage"),
+    [(-3600, "jumped back 1 times", "sqlite3"), (86400 * 365, "clock jumped ahead", "mcap")],
+)
+def test_clock_jumps_split_the_episode(tmp_path, capsys, jump, note, storage):
     first, second = drive(seconds=4), drive(seconds=4, start=START + (4 + jump) * NANO)
     info = imported(write(tmp_path / "bag", first + second, storage), tmp_path / "d")
-    assert told in capsys.readouterr().err
+    assert note in capsys.readouterr().err
     assert len(info.episodes) == 2
     alone = imported(write(tmp_path / "alone", first), tmp_path / "alone_d")
     frames = alone.episodes[0].frames  # in a gap there may be a few more, whose readings are fresh enough
@@ -163,30 +179,25 @@ def test_silence_of_the_commands_is_a_standstill(tmp_path, capsys):
     assert held["control.command_age"].max() > 1.5
 
 
-def test_what_is_too_fast_is_limited_and_said_to_be(tmp_path):
+def test_a_command_beyond_the_limits_is_limited_and_flagged(tmp_path):
     messages = [(t, at, bags.twist(0.5, 0.1) if t == "/cmd_vel" else message) for t, at, message in drive()]
     imported(write(tmp_path / "bag", messages), tmp_path / "d")
     columns = read_episode(tmp_path / "d", 0)
-    asked = columns["control.mode"] == 3
-    assert asked.sum() > 50
-    assert (columns["action"][asked] == np.float32([0.5, 0.1])).all()
-    assert (columns["control.applied_action"][asked] == np.float32([0.22, 0.1])).all()
-    assert (columns["control.limits"][asked] == 2).all()
+    driven = columns["control.mode"] == 3
+    assert driven.sum() > 50
+    assert (columns["action"][driven] == np.float32([0.5, 0.1])).all()
+    assert (columns["control.applied_action"][driven] == np.float32([0.22, 0.1])).all()
+    assert (columns["control.limits"][driven] == 2).all()
 
 
-@pytest.mark.parametrize(
-    ("missing", "parts"),
-    [
-        ("/odom", ["no topic /odom", "speed", "--odom", "/scan (sensor_msgs/msg/LaserScan, 30)", "/cmd_vel"]),
-        ("/scan", ["no topic /scan", "--scan"]),
-        ("/cmd_vel", ["no topic /cmd_vel", "action", "--cmd"]),
-    ],
-)
-def test_a_bag_without_a_topic_is_refused_with_those_it_has(tmp_path, capsys, missing, parts):
-    source = write(tmp_path / "bag", list(filter(without(missing), drive())))
-    error = refused(source, tmp_path / "d", capsys)
-    for part in parts:
-        assert part in error
+def test_a_bag_without_a_topic_is_refused_with_those_it_has(tmp_path, capsys):
+    for missing, *parts in (
+        ("/odom", "no topic /odom", "speed", "--odom", "/scan (sensor_msgs/msg/LaserScan, 30)", "/cmd_vel"),
+        ("/scan", "no topic /scan", "--scan"),
+        ("/cmd_vel", "no topic /cmd_vel", "action", "--cmd"),
+    ):
+        error = refused(write(tmp_path / missing[1:], list(filter(without(missing), drive()))), tmp_path / "d", capsys)
+        assert all(part in error for part in parts), error
 
 
 def joint_states(*names):
@@ -197,7 +208,7 @@ def joint_states(*names):
     return [("/joint_states", START, state)]
 
 
-def test_a_bag_of_an_arm_is_said_to_be_one(tmp_path, capsys):
+def test_a_bag_of_an_arm_is_refused_as_such(tmp_path, capsys):
     arm = write(tmp_path / "arm", joint_states("shoulder_pan_joint", "elbow_joint"))
     error = refused(arm, tmp_path / "d", capsys)
     assert "seems to be of an arm: /joint_states has the joints shoulder_pan_joint, elbow_joint, and" in error
@@ -218,14 +229,13 @@ def test_another_topic_can_be_named_and_must_be_of_the_right_type(tmp_path, caps
     assert len(imported(source, tmp_path / "d", *named).episodes) == 1
 
 
-def test_other_frames_are_asked_about(tmp_path, capsys, plain):
+def test_other_frames_are_refused_until_an_option_names_them(tmp_path, capsys, dataset):
     source = write(tmp_path / "bag", drive(frame="laser"))
     error = refused(source, tmp_path / "d", capsys)
     for part in ("frame 'laser'", "--scan_frame=laser", "--scan_yaw"):
         assert part in error
-    imported(plain, tmp_path / "a")
     imported(source, tmp_path / "b", "--scan_frame=laser", f"--scan_yaw={np.pi / 2}")
-    ours, theirs = (read_episode(tmp_path / name, 0)["observation.state"][:, 2:] for name in ("a", "b"))
+    ours, theirs = (read_episode(root, 0)["observation.state"][:, 2:] for root in (dataset, tmp_path / "b"))
     assert np.array_equal(theirs, np.roll(ours, 90, axis=1))
     messages = [(t, at, bags.odometry(at, child="imu") if t == "/odom" else message) for t, at, message in drive()]
     odd = write(tmp_path / "odd", messages)
@@ -235,47 +245,38 @@ def test_other_frames_are_asked_about(tmp_path, capsys, plain):
     assert "several frames" in refused(write(tmp_path / "mixed", mixed), tmp_path / "d", capsys)
 
 
-def test_a_static_transform_says_how_the_scanner_is_turned(tmp_path, capsys, plain):
+def static(*transforms):
+    """Return a message of `/tf_static`: parent, child, z and w of the rotation of each transform."""
     types = bags.T
-    transforms = [
+    stamped = [
         types["geometry_msgs/msg/TransformStamped"](
             header=bags.header(START, parent),
             child_frame_id=child,
             transform=types["geometry_msgs/msg/Transform"](
                 translation=bags.Vector(x=0.0, y=0.0, z=0.1),
-                rotation=bags.Quaternion(x=0.0, y=0.0, z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2))),
+                rotation=bags.Quaternion(x=0.0, y=0.0, z=float(z), w=float(w)),
             ),
         )
-        for parent, child, yaw in (("base_link", "mast", np.pi / 4), ("mast", "laser", np.pi / 4))
+        for parent, child, z, w in transforms
     ]
-    static = ("/tf_static", START, types["tf2_msgs/msg/TFMessage"](transforms=transforms))
-    imported(write(tmp_path / "bag", [static, *drive(frame="laser")]), tmp_path / "b")
+    return ("/tf_static", START, types["tf2_msgs/msg/TFMessage"](transforms=stamped))
+
+
+def test_a_static_transform_turns_the_scanner_and_a_lost_one_must_be_replaced(tmp_path, capsys, dataset):
+    expected = read_episode(dataset, 0)["observation.state"]
+    turn = np.sin(np.pi / 8), np.cos(np.pi / 8)
+    turned = static(("base_link", "mast", *turn), ("mast", "laser", *turn))
+    imported(write(tmp_path / "bag", [turned, *drive(frame="laser")]), tmp_path / "b")
     assert "turned by 90.0 degrees, from /tf_static" in capsys.readouterr().err
-    imported(plain, tmp_path / "a")
-    ours, theirs = (read_episode(tmp_path / name, 0)["observation.state"][:, 2:] for name in ("a", "b"))
-    assert np.array_equal(theirs, np.roll(ours, 90, axis=1))
-
-
-def test_a_static_transform_that_is_lost_is_asked_for(tmp_path, capsys, plain):
-    quaternion = bags.Quaternion(x=0.0, y=0.0, z=float("nan"), w=1.0)
-    transform = bags.T["geometry_msgs/msg/TransformStamped"](
-        header=bags.header(START, "base_link"),
-        child_frame_id="base_scan",
-        transform=bags.T["geometry_msgs/msg/Transform"](
-            translation=bags.Vector(x=0.0, y=0.0, z=0.1), rotation=quaternion
-        ),
-    )
-    static = ("/tf_static", START, bags.T["tf2_msgs/msg/TFMessage"](transforms=[transform]))
-    bag = write(tmp_path / "bag", [static, *drive()])
+    assert np.array_equal(read_episode(tmp_path / "b", 0)["observation.state"][:, 2:], np.roll(expected[:, 2:], 90, 1))
+    bag = write(tmp_path / "lost", [static(("base_link", "base_scan", np.nan, 1.0)), *drive()])
     assert "--scan_yaw (0 is straight ahead)" in refused(bag, tmp_path / "d", capsys)
     imported(bag, tmp_path / "d", "--scan_yaw=0")
     assert "1 messages of /tf_static cannot be read" in capsys.readouterr().err
-    imported(plain, tmp_path / "a")
-    ours, theirs = (read_episode(tmp_path / name, 0)["observation.state"] for name in ("a", "d"))
-    assert np.array_equal(ours, theirs)
+    assert np.array_equal(read_episode(tmp_path / "d", 0)["observation.state"], expected)
 
 
-def test_stamps_that_cannot_be_true_are_told_and_the_reception_counts(tmp_path, capsys):
+def test_stamps_that_cannot_be_true_are_reported_and_the_reception_counts(tmp_path, capsys):
     messages = [
         (topic, at, bags.odometry(at - 1000 * NANO) if topic == "/odom" else message) for topic, at, message in drive()
     ]
@@ -288,23 +289,24 @@ def test_stamps_that_cannot_be_true_are_told_and_the_reception_counts(tmp_path, 
     assert "header stamps" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("late_ms", [0, 1, 20, 50, 99])
-def test_an_action_is_the_answer_to_its_observation(tmp_path, late_ms):
+def test_an_action_is_the_answer_to_its_observation(tmp_path):
     """A brain answers each observation after a while; the action of a frame is that answer, not the one before."""
-    base = [one for one in drive(seconds=4) if one[0] != "/cmd_vel"]
+    base = [message for message in drive(seconds=4) if message[0] != "/cmd_vel"]
     imported(write(tmp_path / "silent", [*base, ("/cmd_vel", base[0][1], bags.twist(0, 0))]), tmp_path / "a")
-    start = json.loads(dataset_info(tmp_path / "a").episodes[0].metadata["source"])["start_ns"]
-    answers = [
-        ("/cmd_vel", start + frame * NANO // 10 + late_ms * NANO // 1000, bags.twist(frame / 1000, -frame / 500))
-        for frame in range(60)
-    ]
-    imported(write(tmp_path / "bag", sorted([*base, *answers], key=lambda one: one[1])), tmp_path / "b")
-    action = read_episode(tmp_path / "b", 0)["action"]
-    assert action[:, 0] == pytest.approx(np.arange(len(action)) / 1000)
-    assert action[:, 1] == pytest.approx(-np.arange(len(action)) / 500)
+    start = source_of(tmp_path / "a")["start_ns"]
+    for late_ms in (0, 1, 50, 99):
+        answers = [
+            ("/cmd_vel", start + frame * NANO // 10 + late_ms * NANO // 1000, bags.twist(frame / 1000, -frame / 500))
+            for frame in range(60)
+        ]
+        root = tmp_path / f"d{late_ms}"
+        imported(write(tmp_path / f"bag{late_ms}", sorted([*base, *answers], key=lambda message: message[1])), root)
+        action = read_episode(root, 0)["action"]
+        assert action[:, 0] == pytest.approx(np.arange(len(action)) / 1000), late_ms
+        assert action[:, 1] == pytest.approx(-np.arange(len(action)) / 500), late_ms
 
 
-def test_frames_without_a_command_are_told(tmp_path, capsys):
+def test_frames_without_a_command_are_counted(tmp_path, capsys):
     messages = [one for one in drive() if one[0] != "/cmd_vel" or one[1] < START + NANO]
     info = imported(write(tmp_path / "bag", messages), tmp_path / "d")
     error = capsys.readouterr().err
@@ -343,7 +345,7 @@ def test_a_step_of_the_recorders_clock_begins_an_episode(tmp_path, capsys):
     assert "the clock jumped back" in capsys.readouterr().err
 
 
-def test_a_truncated_bag_is_taken_to_its_end_and_told(tmp_path, capsys, plain):
+def test_a_truncated_bag_is_imported_up_to_its_end_with_a_message(tmp_path, capsys, plain, dataset):
     whole = (plain / "plain.mcap").read_bytes()
     path = tmp_path / "cut.mcap"
     path.write_bytes(whole[: len(whole) // 2])
@@ -352,8 +354,7 @@ def test_a_truncated_bag_is_taken_to_its_end_and_told(tmp_path, capsys, plain):
     assert f"damaged: cut.mcap: it ends at byte {len(whole) // 2}" in error
     (problem,) = json.loads(info.episodes[0].metadata["source"])["problems"]
     assert "ends at byte" in problem
-    imported(plain, tmp_path / "whole")
-    ours, theirs = read_episode(tmp_path / "whole", 0), read_episode(tmp_path / "d", 0)
+    ours, theirs = read_episode(dataset, 0), read_episode(tmp_path / "d", 0)
     frames = len(theirs["action"]) - 3  # the last ones may have lost a message
     assert 20 < frames < len(ours["action"])
     for key, values in ours.items():
@@ -417,7 +418,7 @@ def test_images_and_gyroscope(tmp_path):
         assert grey == pytest.approx(4 * newest[frame], abs=4)
 
 
-def test_an_outcome_is_taken_or_marked_later(tmp_path, plain):
+def test_an_outcome_is_given_or_marked_later(tmp_path, plain):
     info = imported(plain, tmp_path / "d", "--outcome=success")
     columns = read_episode(tmp_path / "d", 0)
     assert (info.episodes[0].metadata["outcome"], columns["event"][-1], columns["next.success"][-1]) == (
@@ -431,12 +432,11 @@ def test_an_outcome_is_taken_or_marked_later(tmp_path, plain):
     assert dataset_info(tmp_path / "e").episodes[0].metadata["outcome"] == "collision"
 
 
-def test_an_exported_bag_can_be_read_as_a_robots(tmp_path, plain, capsys):
-    imported(plain, tmp_path / "d")
+def test_an_exported_bag_can_be_read_as_a_robots(tmp_path, plain, dataset, capsys):
     bags = tmp_path / "bags"
-    assert main.main(["export", str(tmp_path / "d"), f"--output={bags}"]) == 0
+    assert main.main(["export", str(dataset), f"--output={bags}"]) == 0
     assert run(bags, tmp_path / "back", "--robot=turtlebot3") == 0
-    ours, theirs = read_episode(tmp_path / "d", 0), read_episode(tmp_path / "back", 0)
+    ours, theirs = read_episode(dataset, 0), read_episode(tmp_path / "back", 0)
     for key in ("observation.state", "action"):
         assert np.array_equal(ours[key], theirs[key]), key
     arguments = ["import", str(bags), str(plain), "--repo_id=t/t", f"--root={tmp_path / 'e'}", TASK]
@@ -444,31 +444,28 @@ def test_an_exported_bag_can_be_read_as_a_robots(tmp_path, plain, capsys):
     assert "--robot=turtlebot3" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["--robot=ur5"], "Unknown robot 'ur5'"),
-        (["--fps=0"], "--fps is 0"),
-        (["--beams=7"], "it must divide 360"),
-        (["--stamps=mine"], "Unknown stamps 'mine'"),
-        (["--outcome=winning"], "Unknown outcome 'winning'"),
-        (["--max_gap=0.1"], "--max_gap is 0.1"),
-        (["--max_gap=nan"], "--max_gap is nan"),
-        (["--max_age=-1"], "--max_age is -1"),
-        (["--command_timeout=0"], "--command_timeout is 0"),
-        (["--min_episode_s=inf"], "--min_episode_s is inf"),
-        (["--min_episode_s=100"], "No episode of 100 s or more"),
-        (["--camera=front"], "NAME=TOPIC"),
-        (["--camera=front=/nothing"], "no topic /nothing"),
-        (["--scan_yaw=nan"], "--scan_yaw is nan"),
-        (["--task="], "Say what the robot was to do"),
-    ],
-)
-def test_options_that_cannot_be_honoured_are_refused(tmp_path, plain, capsys, arguments, told):
-    assert told in refused(plain, tmp_path / "d", capsys, *arguments)
+def test_options_that_cannot_be_honoured_are_refused(tmp_path, plain, capsys):
+    for argument, message in (
+        ("--robot=ur5", "Unknown robot 'ur5'"),
+        ("--fps=0", "--fps is 0"),
+        ("--beams=7", "it must divide 360"),
+        ("--stamps=mine", "Unknown stamps 'mine'"),
+        ("--outcome=winning", "Unknown outcome 'winning'"),
+        ("--max_gap=0.1", "--max_gap is 0.1"),
+        ("--max_gap=nan", "--max_gap is nan"),
+        ("--max_age=-1", "--max_age is -1"),
+        ("--command_timeout=0", "--command_timeout is 0"),
+        ("--min_episode_s=inf", "--min_episode_s is inf"),
+        ("--min_episode_s=100", "No episode of 100 s or more"),
+        ("--camera=front", "NAME=TOPIC"),
+        ("--camera=front=/nothing", "no topic /nothing"),
+        ("--scan_yaw=nan", "--scan_yaw is nan"),
+        ("--task=", "Say what the robot was to do"),
+    ):
+        assert message in refused(plain, tmp_path / "d", capsys, argument), argument
 
 
-def test_a_dataset_that_is_there_stays(tmp_path, plain, capsys):
+def test_an_existing_dataset_stays_and_a_refused_import_leaves_none(tmp_path, plain, capsys):
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "mine").write_text("x")
     assert run(plain, tmp_path / "d") == 2
@@ -476,12 +473,11 @@ def test_a_dataset_that_is_there_stays(tmp_path, plain, capsys):
     assert (tmp_path / "d" / "mine").read_text() == "x"
     assert run(tmp_path / "none", tmp_path / "e") == 2
     assert "no bag at" in capsys.readouterr().err
-
-
-def test_a_bag_that_is_named_twice_is_refused(tmp_path, plain, capsys):
-    arguments = ["import", str(plain), f"{plain}/../plain", "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
+    bad = write(tmp_path / "bad", list(filter(without("/odom"), drive())))
+    arguments = ["import", str(plain), str(bad), "--repo_id=t/t", f"--root={tmp_path / 'e'}", TASK]
     assert main.main(arguments) == 2
-    assert "must not be named twice" in capsys.readouterr().err
+    assert "no topic /odom" in capsys.readouterr().err
+    assert not (tmp_path / "e").exists()
 
 
 @pytest.mark.parametrize("source", ["mcap", "sqlite3", "ours"])
@@ -494,7 +490,7 @@ def test_random_damage_is_read_or_refused_and_never_a_surprise(tmp_path, source)
         (path,) = (one for one in write(tmp_path / "bag", drive(seconds=2), source).iterdir() if one.suffix != ".yaml")
     whole, damaged = path.read_bytes(), tmp_path / f"damaged{path.suffix}"
     statuses = set()
-    for seed in range(40):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         content = np.frombuffer(whole, np.uint8).copy()
         reach = len(content) if seed % 2 else 6000
@@ -507,13 +503,3 @@ def test_random_damage_is_read_or_refused_and_never_a_surprise(tmp_path, source)
         assert status in (0, 2)
         assert root.exists() == (status == 0)
     assert statuses == {0, 2}
-
-
-def test_a_bag_that_cannot_be_used_leaves_no_dataset(tmp_path, plain, capsys):
-    bad = write(tmp_path / "bad", list(filter(without("/odom"), drive())))
-    good = tmp_path / "good"
-    shutil.copytree(plain, good)
-    arguments = ["import", str(good), str(bad), "--repo_id=t/t", f"--root={tmp_path / 'd'}", TASK]
-    assert main.main(arguments) == 2
-    assert "no topic /odom" in capsys.readouterr().err
-    assert not (tmp_path / "d").exists()

@@ -112,12 +112,12 @@ def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) ->
 
 def test_images_of_cameras_and_of_curves(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
     videos = make_dataset(tmp_path / "videos", episodes=2, camera=True)
-    for root, said in (
+    for root, caption in (
         (videos, "as `observation.images.front` saw it"),
         (lesson, "what was observed, and the actions"),
     ):
         assert main.main(["push", str(root), f"me/{root.name}"]) == 0
-        assert said in text_of(hub, f"me/{root.name}")
+        assert caption in text_of(hub, f"me/{root.name}")
         assert hub.dataset(f"me/{root.name}").files()["preview.png"].content.startswith(b"\x89PNG")
 
 
@@ -130,7 +130,7 @@ def test_an_edited_card_is_kept_and_that_is_reported(hub: HubServer, lesson: Pat
     assert "# A fine dataset" in text_of(hub, "me/d")
 
 
-def test_a_url(recorded: Path, tmp_path: Path, capsys) -> None:
+def test_a_dataset_goes_to_a_url_and_back(recorded: Path, tmp_path: Path, capsys) -> None:
     url = f"file://{tmp_path}/shelf/avoid"
     assert main.main(["push", str(recorded), url]) == 0
     assert f"bhd-data pull {url} --root=data/here" in (tmp_path / "shelf/avoid/README.md").read_text()
@@ -140,55 +140,55 @@ def test_a_url(recorded: Path, tmp_path: Path, capsys) -> None:
     assert content(tmp_path / "e").items() >= content(recorded).items()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["push"], "Say where to"),
-        (["push", "ROOT"], "Say where to"),
-        (["push", "ROOT", "me"], "neither a name on the Hub"),
-        (["push", "ROOT", "me/a", "me/b"], "too much"),
-        (["push", "ROOT", "s3://b/d", "--tag=x"], "is a URL"),
-        (["push", "ROOT", "me/a", "--storage_options={}"], "is for URLs"),
-        (["push", "ROOT", "memory://b/d", "--storage_options=[1]"], "give a JSON object"),
-        (["push", "ROOT", "memory://b/d", "--storage_options={"], "is not JSON"),
-        (["push", "memory://b/d"], "Name the folder"),
-        (["push", "nowhere", "me/a"], "does not exist"),
-        (["push", "", "me/a"], "A name is empty"),
-        (["push", "ROOT", "me/a", "--tag="], "--tag is empty"),
-        (["push", "a\0b", "me/a"], "cannot be the folder"),
-        (["push", "~nobodyatall/d", "me/a"], "cannot be the folder"),
-        (["push", "ROOT", "me/a", "--verify"], "--verify is for URLs"),
-        (["push", "ROOT", "ftp://"], "names no folder"),
-        (["push", "ROOT", "zip://d.zip"], "no place for a dataset"),
-        (["push", "ROOT", "s3://"], "names no folder"),
-        (["push", "ROOT", "s3:///d"], "names no bucket"),
-        (["push", "ROOT", "foo://b/d"], "Protocol not known"),
-        (["push", "ROOT", "file://rel/d"], "is not a whole path. Write file:///"),
-        (["push", "ROOT", "ftp://127.0.0.1:9/d"], "cannot be reached"),
-        (["pull"], "Say where from"),
-        (["pull", "me/a", "--repo_id=me/b"], "Say where from, once"),
-        (["pull", "memory://b/d"], "Say where to"),
-        (["pull", "memory://b/d", "--root=x", "--revision=main"], "has no revisions"),
-        (["pull", "me/a", "--root=x", "--episodes=all"], "such as 0,3,5-9"),
-        (["pull", "me/a", "--root=x", "--outcome=good"], "Unknown outcome 'good'"),
-        (["pull", "me/a", "--root=x", "--min_score=2"], "from 0 to 1"),
-        (["pull", "me/a", "--root="], "--root is empty"),
-        (["pull", ""], "A name is empty"),
-        (["pull", "me/a", "--root=a\0b"], "cannot be the folder"),
-        (["pull", "me/a", f"--root={'x' * 5000}"], "File name too long"),
-        (["pull", "me/a", "--root=x", "--verify"], "--verify is for URLs"),
-        (["pull", "gs:///d", "--root=x"], "names no bucket"),
-        (["pull", "file://rel/d", "--root=x"], "is not a whole path"),
-    ],
-)
+BAD_ARGUMENTS = [
+    (["push"], "Say where to"),
+    (["push", "ROOT"], "Say where to"),
+    (["push", "ROOT", "me"], "neither a name on the Hub"),
+    (["push", "ROOT", "me/a", "me/b"], "too much"),
+    (["push", "ROOT", "s3://b/d", "--tag=x"], "is a URL"),
+    (["push", "ROOT", "me/a", "--storage_options={}"], "is for URLs"),
+    (["push", "ROOT", "memory://b/d", "--storage_options=[1]"], "give a JSON object"),
+    (["push", "ROOT", "memory://b/d", "--storage_options={"], "is not JSON"),
+    (["push", "memory://b/d"], "Name the folder"),
+    (["push", "nowhere", "me/a"], "does not exist"),
+    (["push", "", "me/a"], "A name is empty"),
+    (["push", "ROOT", "me/a", "--tag="], "--tag is empty"),
+    (["push", "a\0b", "me/a"], "cannot be the folder"),
+    (["push", "~nobodyatall/d", "me/a"], "cannot be the folder"),
+    (["push", "ROOT", "me/a", "--verify"], "--verify is for URLs"),
+    (["push", "ROOT", "ftp://"], "names no folder"),
+    (["push", "ROOT", "zip://d.zip"], "no place for a dataset"),
+    (["push", "ROOT", "s3://"], "names no folder"),
+    (["push", "ROOT", "s3:///d"], "names no bucket"),
+    (["push", "ROOT", "foo://b/d"], "Protocol not known"),
+    (["push", "ROOT", "file://rel/d"], "is not a whole path. Write file:///"),
+    (["push", "ROOT", "ftp://127.0.0.1:9/d"], "cannot be reached"),
+    (["pull"], "Say where from"),
+    (["pull", "me/a", "--repo_id=me/b"], "Say where from, once"),
+    (["pull", "memory://b/d"], "Say where to"),
+    (["pull", "memory://b/d", "--root=x", "--revision=main"], "has no revisions"),
+    (["pull", "me/a", "--root=x", "--episodes=all"], "such as 0,3,5-9"),
+    (["pull", "me/a", "--root=x", "--outcome=good"], "Unknown outcome 'good'"),
+    (["pull", "me/a", "--root=x", "--min_score=2"], "from 0 to 1"),
+    (["pull", "me/a", "--root="], "--root is empty"),
+    (["pull", ""], "A name is empty"),
+    (["pull", "me/a", "--root=a\0b"], "cannot be the folder"),
+    (["pull", "me/a", f"--root={'x' * 5000}"], "File name too long"),
+    (["pull", "me/a", "--root=x", "--verify"], "--verify is for URLs"),
+    (["pull", "gs:///d", "--root=x"], "names no bucket"),
+    (["pull", "file://rel/d", "--root=x"], "is not a whole path"),
+]
+
+
 @pytest.mark.usefixtures("hub")
-def test_bad_arguments(lesson: Path, empty: Path, capsys, arguments: list[str], words: str) -> None:
-    assert main.main([str(lesson) if one == "ROOT" else one for one in arguments]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert words in error
-    assert "\0" not in error
-    assert list(empty.iterdir()) == []
+def test_bad_arguments_are_refused_and_change_nothing(lesson: Path, empty: Path, capsys) -> None:
+    for arguments, message in BAD_ARGUMENTS:
+        assert main.main([str(lesson) if word == "ROOT" else word for word in arguments]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: "), arguments
+        assert message in error, arguments
+        assert "\0" not in error
+        assert list(empty.iterdir()) == []
 
 
 def test_a_failure_says_what_is_kept_and_how_to_repeat(hub: HubServer, lesson: Path, tmp_path: Path, capsys) -> None:
@@ -235,8 +235,8 @@ def test_ctrl_c_ends_a_stalled_upload_at_once(hub: HubServer, lesson: Path) -> N
 def test_recording_uploads_by_the_same_code(hub: HubServer, tmp_path: Path, capsys) -> None:
     root = tmp_path / "d"
     short = {"dataset__repo_id": "me/avoid", "dataset__push_to_hub": "true", "dataset__num_episodes": 1}
-    _, said = run_record(root, **short, dataset__private="true", dataset__tags="[avoid]")
-    assert "me/avoid: 1 episodes" in said
+    _, output = run_record(root, **short, dataset__private="true", dataset__tags="[avoid]")
+    assert "me/avoid: 1 episodes" in output
     assert hub.dataset("me/avoid").private
     assert is_generated(text_of(hub, "me/avoid").encode())
     hub.faults = [Fault("/preupload/", times=-1, status=403)]
@@ -314,7 +314,7 @@ def test_streaming_gives_the_same_samples(hub: HubServer, recorded: Path, monkey
     shutil.rmtree(Path(os.environ["HF_LEROBOT_HOME"]) / "hub", ignore_errors=True)
 
 
-def test_a_name_that_looks_like_a_folder_is_told(hub: HubServer, lesson: Path, empty: Path, capsys) -> None:
+def test_a_name_that_could_be_a_folder_gets_a_warning(hub: HubServer, lesson: Path, empty: Path, capsys) -> None:
     """`store/c3` may be meant as the folder beside this one; nothing in its form says which."""
     (empty / "store").mkdir()
     assert main.main(["push", str(lesson), "store/c3"]) == 2
@@ -329,7 +329,7 @@ def test_a_name_that_looks_like_a_folder_is_told(hub: HubServer, lesson: Path, e
     assert "is taken for" not in capsys.readouterr().err
 
 
-def test_the_command_to_repeat_says_all_that_was_asked_for(tmp_path: Path) -> None:
+def test_the_command_to_repeat_has_all_options(tmp_path: Path) -> None:
     parser = main._parser()
     for words in (
         "push A me/d --branch=b --tag=t --private --tags=a,b --licence=mit --no-card --replace",
@@ -340,20 +340,20 @@ def test_the_command_to_repeat_says_all_that_was_asked_for(tmp_path: Path) -> No
         "pull s3://b/d --root=A --verify --storage_options={}",
         "pull me/d --root=A --min_score=0",
     ):
-        asked = parser.parse_args(words.split())
-        source = asked.repo_id or (asked.places[1] if asked.command == "push" else asked.source)
-        places = {"root": "A"} if asked.command == "pull" else {}
-        line = repeat_line(asked, *([] if places else ["A"]), source, **places)
+        options = parser.parse_args(words.split())
+        source = options.repo_id or (options.places[1] if options.command == "push" else options.source)
+        places = {"root": "A"} if options.command == "pull" else {}
+        line = repeat_line(options, *([] if places else ["A"]), source, **places)
         again = vars(parser.parse_args(shlex.split(line)[1:]))
         ways = ("places", "root", "repo_id", "source")
         assert {k: v for k, v in again.items() if k not in ways} == {
-            k: v for k, v in vars(asked).items() if k not in ways
+            k: v for k, v in vars(options).items() if k not in ways
         }
         assert again.get("places", [again.get("source"), again["root"]]) in (["A", source], [source, "A"])
     assert repeat_line(parser.parse_args(["push", "--root=-x", "me/d"]), "-x", "me/d") == "bhd-data push ./-x me/d"
 
 
-def test_a_image_of_the_users_is_on_the_card(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
+def test_an_image_beside_the_dataset_is_on_the_card(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
     mine = Path(shutil.copytree(lesson, tmp_path / "d"))
     (mine / "preview.png").write_bytes(b"mine")
     assert main.main(["push", str(mine), "me/d"]) == 0

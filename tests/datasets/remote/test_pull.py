@@ -1,4 +1,4 @@
-"""What a pull makes of the folder that it is told, and of some episodes. From a Hub on this machine."""
+"""What a pull does with its target folder, and with some episodes. From a Hub on this machine."""
 
 import json
 import shutil
@@ -63,7 +63,7 @@ def test_episodes_that_do_not_exist(hub: HubServer, root: Path, tmp_path: Path) 
     assert list(tmp_path.iterdir()) == [root]
 
 
-def test_a_changed_dataset_is_not_overwritten_unless_that_is_said(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_a_changed_dataset_is_not_overwritten_without_replace(hub: HubServer, root: Path, tmp_path: Path) -> None:
     send(root)
     target = tmp_path / "e"
     pull(HubDataset("me/d"), target)
@@ -79,22 +79,25 @@ def test_a_changed_dataset_is_not_overwritten_unless_that_is_said(hub: HubServer
     assert content(target) == content(root) | {"notes.txt": b"mine"}
 
 
-def test_folders_that_are_no_place_for_a_dataset(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_folders_that_hold_something_else_are_never_replaced(hub: HubServer, root: Path, tmp_path: Path) -> None:
     send(root)
+    (tmp_path / "like/data/chunk-000").mkdir(parents=True)
+    (tmp_path / "like/data/chunk-000/file-777.parquet").write_text("mine")
     (tmp_path / "file").write_text("x")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("x")
     (tmp_path / "empty").mkdir()
-    for name in ("file", "full"):
+    for name in ("file", "full", "like"):
         with pytest.raises(DatasetExistsError, match="Choose another folder"):
-            pull(HubDataset("me/d"), tmp_path / name)
+            pull(HubDataset("me/d"), tmp_path / name, replace=True)
+    assert content(tmp_path / "like") == {"data/chunk-000/file-777.parquet": b"mine"}
     pull(HubDataset("me/d"), tmp_path / "empty")
     assert content(tmp_path / "empty") == content(root)
     with pytest.raises(DatasetWriteError, match=r"not a folder|Not a directory"):
         pull(HubDataset("me/d"), tmp_path / "file" / "below")
 
 
-def test_a_folder_of_somebody_else_in_its_way_is_left_alone(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_a_foreign_folder_at_the_staging_place_is_not_touched(hub: HubServer, root: Path, tmp_path: Path) -> None:
     name = ".e.pull"
     send(root)
     (tmp_path / name).mkdir()
@@ -149,7 +152,7 @@ def test_what_is_not_valid_there_comes_as_it_is_and_is_reported(hub: HubServer, 
     hub.reset()
     with pytest.raises(DatasetError, match=r"format v2\.1"):
         pull(HubDataset("me/d", "old"), tmp_path / "f")
-    assert not hub.asked("GET .*/resolve/.*/data/")  # said before everything was fetched
+    assert not hub.asked("GET .*/resolve/.*/data/")  # refused before everything was fetched
 
 
 def test_what_belongs_to_no_dataset_survives_an_exchange(hub: HubServer, root: Path, tmp_path: Path) -> None:
@@ -173,15 +176,6 @@ def test_what_belongs_to_no_dataset_survives_an_exchange(hub: HubServer, root: P
     assert (target / "plots").is_symlink()
     assert (target / "gone").is_symlink()
     assert not (target / ".bhd-pull").exists()
-
-
-def test_a_folder_that_is_no_dataset_is_never_replaced(hub: HubServer, root: Path, tmp_path: Path) -> None:
-    send(root)
-    (tmp_path / "e/data/chunk-000").mkdir(parents=True)
-    (tmp_path / "e/data/chunk-000/file-777.parquet").write_text("mine")
-    with pytest.raises(DatasetExistsError, match="is no dataset"):
-        pull(HubDataset("me/d"), tmp_path / "e", replace=True)
-    assert (tmp_path / "e/data/chunk-000/file-777.parquet").read_text() == "mine"
 
 
 def test_files_that_hold_all_episodes_are_the_dataset(hub: HubServer, tmp_path: Path) -> None:
@@ -212,7 +206,7 @@ def test_another_pull_of_the_same_folder_is_refused(hub: HubServer, root: Path, 
     assert content(tmp_path / "e") == content(root)
 
 
-def test_episodes_whose_files_nobody_names_are_told(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_metadata_without_the_files_of_episodes_are_refused(hub: HubServer, root: Path, tmp_path: Path) -> None:
     send(root)
     files = hub.dataset("me/d").files()
     path = next(path for path in files if path.startswith("meta/episodes/"))
@@ -254,7 +248,7 @@ def test_what_an_attempt_for_another_version_left_gets_into_no_dataset(
     assert content(target) == old
 
 
-def test_episodes_of_a_dataset_that_was_given_up_are_not_asked_for(hub: HubServer, root: Path, tmp_path: Path) -> None:
+def test_episodes_of_a_replaced_dataset_are_not_requested(hub: HubServer, root: Path, tmp_path: Path) -> None:
     send(root)
     target = tmp_path / "e"
     pull(HubDataset("me/d"), target, select=lambda folder: [5])
@@ -263,7 +257,7 @@ def test_episodes_of_a_dataset_that_was_given_up_are_not_asked_for(hub: HubServe
     send(root)
     report = pull(HubDataset("me/d"), target, select=lambda folder: [0], replace=True)
     assert report.episodes == [0]
-    assert target.stat().st_mode & 0o777 == 0o700  # nobody else may look into it now, either
+    assert target.stat().st_mode & 0o777 == 0o700  # the permissions are kept
 
 
 def test_a_folder_named_by_dots_is_the_folder(hub: HubServer, root: Path, tmp_path: Path, monkeypatch) -> None:

@@ -130,7 +130,7 @@ def test_a_card_beside_the_dataset_is_the_card(hub: HubServer, root: Path, tmp_p
     assert b"anew" in stored(hub)["README.md"]
 
 
-def test_a_image_beside_the_dataset_is_the_image(hub: HubServer, root: Path) -> None:
+def test_an_image_beside_the_dataset_is_the_image(hub: HubServer, root: Path) -> None:
     (root / "preview.png").write_bytes(b"mine")
     send(root, make_card=made())
     assert stored(hub)["preview.png"] == b"mine"
@@ -138,7 +138,7 @@ def test_a_image_beside_the_dataset_is_the_image(hub: HubServer, root: Path) -> 
     assert not send(root, make_card=made()).sent
 
 
-def test_a_folder_behind_a_link_is_not_taken_for_gone(
+def test_a_folder_behind_a_link_is_not_removed_from_the_hub(
     hub: HubServer, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is not seen must not be removed at the other end."""
@@ -147,16 +147,16 @@ def test_a_folder_behind_a_link_is_not_taken_for_gone(
     before = HubDataset("me/d").files()
     (copied / "videos").rename(tmp_path / "big")
     (copied / "videos").symlink_to(tmp_path / "big")
-    for declared, said in (("", "is a link to .*big"), (tmp_path / "big", "behind a link")):
+    for declared, message in (("", "is a link to .*big"), (tmp_path / "big", "behind a link")):
         monkeypatch.setenv("BHD_LINKED_FOLDERS", str(declared))
-        with pytest.raises(DatasetError, match=said):
+        with pytest.raises(DatasetError, match=message):
             send(copied)
     assert HubDataset("me/d").files() == before
 
 
 @pytest.mark.parametrize("where", ["notes.txt", "data/chunk-000/file-000.parquet", "meta/info.json"])
 def test_a_link_to_the_outside_is_refused(hub: HubServer, root: Path, tmp_path: Path, where: str) -> None:
-    """What it points to is nobody's business, or would be missed where the dataset is copied to."""
+    """A copy would contain a file that is no part of the dataset, or lack one that is."""
     secret = tmp_path / "outside"
     if (root / where).exists():
         (root / where).rename(secret)
@@ -168,7 +168,7 @@ def test_a_link_to_the_outside_is_refused(hub: HubServer, root: Path, tmp_path: 
     with pytest.raises(DatasetError, match=r"is a link to .*outside, outside of the dataset.*cp -rL") as caught:
         send(root)
     assert str(root / where) in str(caught.value)
-    assert not hub.repositories  # nothing was asked of the Hub
+    assert not hub.repositories  # no request was sent to the Hub
     whole = tmp_path / "whole"
     shutil.copytree(root, whole)  # which follows links, as cp -rL does
     send(whole)

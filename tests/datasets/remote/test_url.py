@@ -49,7 +49,7 @@ def test_a_path_that_is_not_whole_is_refused_with_the_one_that_is(tmp_path: Path
     assert StoreDataset(f"file://{tmp_path}/d").folder == tmp_path / "d"
 
 
-def test_what_cannot_be_reached_is_told_without_a_traceback(capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_unreachable_place_ends_without_a_traceback(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(TransferError, match="cannot be reached"):
         StoreDataset("ftp://127.0.0.1:9/d")
     with pytest.raises(BhdError, match=r"cannot be used|not installed|cannot be reached"):

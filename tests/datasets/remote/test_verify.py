@@ -63,7 +63,7 @@ def test_verifying_finds_what_is_there_without_a_list_and_writes_one(root: Path,
     assert push(root, StoreDataset(url)).sent == []  # what was read is noted, and not sent for want of a note
 
 
-def test_a_pull_that_verifies_says_that_the_place_is_damaged(root: Path, url: str, tmp_path: Path) -> None:
+def test_a_pull_that_verifies_reports_a_damaged_place(root: Path, url: str, tmp_path: Path) -> None:
     push(root, StoreDataset(url))
     pull(StoreDataset(url), tmp_path / "e")
     flip(url, DATA)
@@ -76,7 +76,7 @@ def test_a_pull_that_verifies_says_that_the_place_is_damaged(root: Path, url: st
     assert (report.fetched, report.by_size) == ([], 0)
 
 
-def test_without_a_list_sizes_are_compared_and_that_is_told(root: Path, url: str, tmp_path: Path) -> None:
+def test_without_a_list_sizes_are_compared_and_that_is_reported(root: Path, url: str, tmp_path: Path) -> None:
     push(root, StoreDataset(url))
     fs, folder = fsspec.core.url_to_fs(url)
     fs.rm_file(f"{folder}/{MANIFEST}")
@@ -146,7 +146,7 @@ def test_what_a_kill_leaves_below_a_folder_is_no_part_of_the_dataset(root: Path,
     shelf = tmp_path / "shelf"
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", _killed)
-        patch.setattr(Path, "unlink", lambda path, missing_ok=False: None)  # nobody cleans up after a kill
+        patch.setattr(Path, "unlink", lambda path, missing_ok=False: None)  # nothing cleans up after a kill
         with pytest.raises(KeyboardInterrupt):
             push(root, StoreDataset(f"file://{shelf}"))
     assert any(name.endswith(".bhd-part") for name in content(shelf))

@@ -1,4 +1,4 @@
-"""What is told of a bag of which every message can be read."""
+"""Warnings about a bag of which every message can be read."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_the_pace_of_a_simulation_is_seen_through_delays_gaps_and_restarts(rate)
 
 
 @pytest.mark.parametrize("stamps", [np.zeros(300, np.int64), np.full(300, 7 * NANO), RECEIVED[::-1]])
-def test_headers_that_say_nothing_have_no_pace(stamps):
+def test_headers_without_times_have_no_pace(stamps):
     assert pace(RECEIVED, stamps) == 1.0
     assert pace(RECEIVED[:20], RECEIVED[:20] // 2) == 1.0  # four seconds are too few
     assert pace(RECEIVED[:1], RECEIVED[:1]) == pace(RECEIVED[:0], RECEIVED[:0]) == 1.0
@@ -39,7 +39,7 @@ def drive(seconds=30.0, rate=30):
 
 
 @pytest.mark.parametrize(
-    ("factors", "told"),
+    ("factors", "warnings"),
     [
         ((1, 1), []),
         ((0.8, 1.2), []),  # wheels slip
@@ -49,17 +49,17 @@ def drive(seconds=30.0, rate=30):
         ((1, -1), ["angular.z is -1.0"]),
     ],
 )
-def test_speeds_that_are_not_those_of_the_pose_are_told(factors, told):
+def test_speeds_that_are_not_those_of_the_pose_are_reported(factors, warnings):
     times, speeds, pose = drive()
     pose = pose + np.random.default_rng(0).normal(0, 0.002, pose.shape)
     pose[400:] += [5.0, -3.0, 0.0]  # a reset
     pose[7] = np.nan
     notes = speed_warnings("/odom", times, speeds * factors, pose)
-    assert len(notes) == len(told)
-    assert all(part in note for part, note in zip(told, notes, strict=True))
+    assert len(notes) == len(warnings)
+    assert all(part in note for part, note in zip(warnings, notes, strict=True))
 
 
-def test_where_the_pose_says_nothing_nothing_is_told():
+def test_an_unusable_pose_causes_no_warning():
     times, speeds, pose = drive()
     assert speed_warnings("/odom", times, speeds, np.zeros_like(pose)) == []  # never filled in
     assert speed_warnings("/odom", times, speeds, np.full_like(pose, np.nan)) == []

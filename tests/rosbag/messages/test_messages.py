@@ -69,8 +69,8 @@ def test_a_message_of_another_type_cut_off_or_of_another_encoding_is_refused():
     ],
 )
 def test_constants_of_the_messages_are_those_of_the_program(definition, prefix, enum):
-    told = dict(re.findall(rf"int64 {prefix}([A-Z][A-Z_]*)=(\d+)", types.DEFINITIONS[definition]))
-    values = {int(value) for name, value in told.items() if prefix or not name.startswith(("LIMIT", "WATCHDOG"))}
+    constants = dict(re.findall(rf"int64 {prefix}([A-Z][A-Z_]*)=(\d+)", types.DEFINITIONS[definition]))
+    values = {int(value) for name, value in constants.items() if prefix or not name.startswith(("LIMIT", "WATCHDOG"))}
     assert values == {int(one) for one in enum if prefix == "" or int(one)}
 
 

@@ -1,4 +1,4 @@
-"""Small bags that would unpack to any size: refused in words, within the memory that their size explains."""
+"""Small bags that would unpack to any size: refused with a message, within the memory that their size explains."""
 
 import json
 import sqlite3
@@ -40,25 +40,25 @@ if sys.argv[1] != "0":
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]),) * 2)
 if sys.argv[2]:
     tempfile.tempdir = sys.argv[2]
-said = {}
+results = {}
 for path in map(Path, sys.argv[3:]):
     try:
         (bag,) = find_bags(path)
-        found = bag.topics()
+        found = bag.topics
         read = bag.read(["/scan"])
-        said[path.name] = f"{len(found)} topics, {len(read['/scan'].data)} messages; {bag.problems}"
+        results[path.name] = f"{len(found)} topics, {len(read['/scan'].data)} messages; {bag.problems}"
     except BhdError as error:
-        said[path.name] = f"error: {error}"
+        results[path.name] = f"error: {error}"
     except MemoryError as error:
-        said[path.name] = "memory"
+        results[path.name] = "memory"
     except BaseException as error:
-        said[path.name] = f"{type(error).__name__}: {error}"
-print(json.dumps(said))
+        results[path.name] = f"{type(error).__name__}: {error}"
+print(json.dumps(results))
 """
 
 
 def read_in_bounds(paths: Iterable[Path], file_bytes: int = 0, folder: str = "") -> dict[str, str]:
-    """Return what a process with little memory says of bags, by their names."""
+    """Return what a process with little memory reads of bags, or its error, by their names."""
     command = [sys.executable, "-c", CHILD, str(file_bytes), folder, *map(str, paths)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -125,12 +125,12 @@ def test_a_bomb_is_an_error_and_takes_no_memory(tmp_path: Path) -> None:
     whole.write_bytes(zstd.compress(bytes(640 * MIB)))
     bombs.append(whole)
     assert max(path.stat().st_size for path in bombs if "lz4" not in path.name) < 200_000
-    for name, said in read_in_bounds(bombs).items():
+    for name, result in read_in_bounds(bombs).items():
         if "lz4" in name:  # which makes 255 times the size at most
             continue
-        assert said.startswith("error: "), (name, said)
+        assert result.startswith("error: "), (name, result)
         for part in (str(tmp_path / name), "unpacks to more than", "MiB", "take the compression away first"):
-            assert part in said, (name, said)
+            assert part in result, (name, result)
 
 
 def test_sizes_that_lie_are_damage(tmp_path: Path) -> None:
@@ -140,16 +140,16 @@ def test_sizes_that_lie_are_damage(tmp_path: Path) -> None:
         mcap(tmp_path / "more.mcap", chunk(content, "zstd", 1 << 62), chunk(content, "zstd")),
         mcap(tmp_path / "more_lz4.mcap", chunk(content, "lz4", 1 << 62), chunk(content, "lz4")),
     ]
-    for name, said in read_in_bounds(bags).items():
-        assert said.startswith("1 topics, 1 messages"), (name, said)
-        assert "its checksum or size is wrong; left out" in said, (name, said)
+    for name, result in read_in_bounds(bags).items():
+        assert result.startswith("1 topics, 1 messages"), (name, result)
+        assert "its checksum or size is wrong; left out" in result, (name, result)
 
 
 def test_texts_that_reach_beyond_their_record(tmp_path: Path) -> None:
     """Each topic of a file would be named after all of it."""
     channels = [record(4, struct.pack("<HHI", number, 1, 2 * MIB)) for number in range(2, 2000)]
-    said = read_in_bounds([mcap(tmp_path / "texts.mcap", *channels, bytes(2 * MIB))])["texts.mcap"]
-    assert "a record that describes a topic is damaged" in said
+    result = read_in_bounds([mcap(tmp_path / "texts.mcap", *channels, bytes(2 * MIB))])["texts.mcap"]
+    assert "it has a damaged record" in result
 
 
 ENDLESS = (
@@ -204,11 +204,11 @@ def test_rows_that_are_computed(tmp_path: Path) -> None:
         "virtual": database(tmp_path / "virtual.db3", "CREATE VIRTUAL TABLE messages USING rtree(id, a, b)"),
         "pages": same_page(tmp_path / "pages.db3"),
     }
-    said = read_in_bounds(bags.values())
+    results = read_in_bounds(bags.values())
     for what, path in bags.items():
         wanted = "and its rows have more" if what == "pages" else "which computes rows instead of holding them"
-        assert said[path.name].startswith(f"error: {path}"), (what, said)
-        assert wanted in said[path.name], (what, said)
+        assert results[path.name].startswith(f"error: {path}"), (what, results)
+        assert wanted in results[path.name], (what, results)
 
 
 def test_metadata_that_grow_when_they_are_written_out(tmp_path: Path) -> None:
@@ -230,8 +230,8 @@ def test_metadata_that_grow_when_they_are_written_out(tmp_path: Path) -> None:
         values = "".join(f"  {key}: {value}\n" for key, value in {**usual, **changed}.items())
         (folder / "metadata.yaml").write_text(f"{aliases}rosbag2_bagfile_information:\n{values}")
         bags.append(folder)
-    for name, said in read_in_bounds(bags).items():
-        assert said.startswith("1 topics, 1 messages"), (name, said)
+    for name, result in read_in_bounds(bags).items():
+        assert result.startswith("1 topics, 1 messages"), (name, result)
 
 
 def test_a_full_temporary_folder_is_an_error_with_a_remedy(tmp_path: Path) -> None:
@@ -239,12 +239,12 @@ def test_a_full_temporary_folder_is_an_error_with_a_remedy(tmp_path: Path) -> No
     packed.write_bytes(zstd.compress(mcap(tmp_path / "plain.mcap", message(bytes(8 * MIB))).read_bytes()))
     cut = database(tmp_path / "cut.db3", rows=[bytes(1000)] * 8000)
     cut.write_bytes(cut.read_bytes()[:-100])
-    assert all("1 topics" in said for said in read_in_bounds([packed, cut]).values())
+    assert all("1 topics" in result for result in read_in_bounds([packed, cut]).values())
     for limit, folder in ((MIB, ""), (0, str(tmp_path / "nowhere"))):
         before = set(tmp_path.iterdir())
-        for name, said in read_in_bounds([packed, cut], limit, folder or str(tmp_path)).items():
-            assert said.startswith(f"error: {tmp_path / name} cannot be unpacked into {folder or tmp_path}"), said
-            assert "Free some space there, or name another folder in the environment variable TMPDIR" in said
+        for name, result in read_in_bounds([packed, cut], limit, folder or str(tmp_path)).items():
+            assert result.startswith(f"error: {tmp_path / name} cannot be unpacked into {folder or tmp_path}"), result
+            assert "Free some space there, or name another folder in the environment variable TMPDIR" in result
         assert set(tmp_path.iterdir()) == before  # the folders are gone, too
 
 

@@ -8,7 +8,7 @@ import yaml
 
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.storage.find import find_bags, publishers_of
-from bhd_lerobot.rosbag.storage.qos import offered
+from bhd_lerobot.rosbag.storage.read import publishers_in
 from tests.rosbag.support import STORE, drive, write
 
 TOPICS = ("/cmd_vel", "/odom", "/scan")
@@ -28,44 +28,46 @@ def parts(tmp_path_factory, messages):
 
 @pytest.fixture
 def split(tmp_path, parts, messages):
-    """Return a function that makes the bag, with what its metadata say changed."""
+    """Return a function that makes the bag, with changed metadata."""
 
     def make(paths=("drive_0.mcap", "drive_1.mcap", "drive_2.mcap"), **more):
         bag = tmp_path / "bag"
         bag.mkdir()
         for part in parts:
             shutil.copy(part / f"{part.name}.mcap", bag)
-        told = {"version": 5, "relative_file_paths": list(paths), "message_count": len(messages), **more}
-        (bag / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": told}))
+        about = {"version": 5, "relative_file_paths": list(paths), "message_count": len(messages), **more}
+        (bag / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": about}))
         return bag
 
     return make
 
 
-def check(path, messages, *told):
-    """Check that a bag is read as it was recorded, and which problems are told."""
+def check(path, messages, *problems):
+    """Check that a bag is read as it was recorded, and its problems."""
     (bag,) = find_bags(path)
     read = bag.read(TOPICS)
     for topic in TOPICS:
         wanted = [(at, bytes(STORE.serialize_cdr(one, one.__msgtype__))) for name, at, one in messages if name == topic]
         assert list(zip(read[topic].received.tolist(), read[topic].data, strict=True)) == wanted
         assert (np.diff(read[topic].order) > 0).all()
-        assert read[topic].sizes.tolist() == [len(data) for _, data in wanted]
-        assert list(bag.payloads(topic)) == list(zip(read[topic].order.tolist(), read[topic].data, strict=True))
-    assert len(bag.problems) == len(told), bag.problems
-    for part, problem in zip(told, bag.problems, strict=True):
+    assert len(bag.problems) == len(problems), bag.problems
+    for part, problem in zip(problems, bag.problems, strict=True):
         assert part in problem
 
 
-def test_a_recording_that_was_split_is_one_bag(split, messages):
-    check(split(), messages)
+def test_a_recording_that_was_split_is_one_bag(split, parts, messages):
+    bag = split(["bag/drive_0.mcap", "drive_1.mcap", "drive_2.mcap"])  # as rosbag2's first versions named files
+    check(bag, messages)
+    (bag / "metadata.yaml").unlink()
+    check(bag, messages, "no metadata.yaml")
+    assert [found.path.name for found in find_bags(parts[0].parent)] == ["drive_0", "drive_1", "drive_2"]
 
 
 def test_files_that_are_listed_in_a_wrong_order_are_read_by_time(split, messages):
     check(split(["drive_2.mcap", "drive_0.mcap", "drive_1.mcap"]), messages, "another order than that of their times")
 
 
-def test_an_order_that_the_times_speak_for_stays(split, tmp_path, messages):
+def test_an_order_that_agrees_with_the_times_stays(split, tmp_path, messages):
     bag = split(["drive_7.mcap", "drive_1.mcap", "drive_2.mcap"])
     (bag / "drive_0.mcap").rename(bag / "drive_7.mcap")  # somebody renamed it
     check(bag, messages)
@@ -84,14 +86,14 @@ def test_a_missing_file_is_named_with_what_can_be_done(split):
     assert [one.path.name for file in ("drive_0.mcap", "drive_2.mcap") for one in find_bags(bag / file)]
 
 
-def test_a_file_that_is_not_listed_is_told(split, messages):
+def test_a_file_that_is_not_listed_is_reported(split, messages):
     bag = split(["drive_0.mcap", "drive_1.mcap"], message_count=0)
     (found,) = find_bags(bag)
     assert [file.name for file in found.files] == ["drive_0.mcap", "drive_1.mcap"]
     assert "drive_2.mcap is not in metadata.yaml, and is not read" in found.problems[0]
 
 
-def test_an_empty_file_of_a_recording_is_left_out_and_told(split, messages):
+def test_an_empty_file_of_a_recording_is_left_out_and_reported(split, messages):
     bag = split(["drive_0.mcap", "drive_1.mcap", "drive_2.mcap", "drive_3.mcap"])
     (bag / "drive_3.mcap").touch()
     check(bag, messages, "drive_3.mcap is empty")
@@ -99,7 +101,7 @@ def test_an_empty_file_of_a_recording_is_left_out_and_told(split, messages):
     check(bag, messages, "no metadata.yaml", "drive_3.mcap is empty")
 
 
-def test_metadata_that_list_nothing_or_no_list_are_told(split, messages):
+def test_metadata_that_list_nothing_or_no_list_are_reported(split, messages):
     bag = split([])
     check(bag, messages, "metadata.yaml lists no file")
     text = (bag / "metadata.yaml").read_text()
@@ -153,14 +155,14 @@ NAMED = {**PROFILE, "history": "keep_last", "reliability": "reliable", "durabili
         (5, 0),
     ],
 )
-def test_profiles_of_every_version_tell_how_many_publishers_there_were(profiles, count):
-    assert offered(profiles) == count
+def test_profiles_of_every_version_give_the_number_of_publishers(profiles, count):
+    assert publishers_in(profiles) == count
     topics = [{"topic_metadata": {"name": "/cmd_vel", "offered_qos_profiles": profiles}, "message_count": 3}]
     assert publishers_of(topics) == ({"/cmd_vel": count} if count else {})
 
 
 @pytest.mark.parametrize("topics", [None, "x", 3, [None, {}, {"topic_metadata": None}, {"topic_metadata": {}}]])
-def test_topics_that_are_none_say_nothing(topics):
+def test_malformed_topics_give_no_publishers(topics):
     assert publishers_of(topics) == {}
 
 
@@ -172,14 +174,14 @@ def test_every_version_of_metadata_is_read(split, messages):
         (8, yaml.safe_dump([PROFILE] * 2)),
         (9, [NAMED] * 2),
     ):
-        told = yaml.safe_load((bag / "metadata.yaml").read_text())
-        one = told["rosbag2_bagfile_information"]
-        one["version"] = version
+        metadata = yaml.safe_load((bag / "metadata.yaml").read_text())
+        about = metadata["rosbag2_bagfile_information"]
+        about["version"] = version
         topic = {"name": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "offered_qos_profiles": profiles}
-        one["topics_with_message_count"] = [{"topic_metadata": topic, "message_count": 30}]
-        (bag / "metadata.yaml").write_text(yaml.safe_dump(told))
+        about["topics_with_message_count"] = [{"topic_metadata": topic, "message_count": 30}]
+        (bag / "metadata.yaml").write_text(yaml.safe_dump(metadata))
         check(bag, messages)
-        assert find_bags(bag)[0].topics()["/cmd_vel"].publishers == offered(profiles)
+        assert find_bags(bag)[0].topics["/cmd_vel"].publishers == publishers_in(profiles)
 
 
 def test_files_beside_folders_of_bags_are_refused_and_not_forgotten(tmp_path, parts, split, messages):

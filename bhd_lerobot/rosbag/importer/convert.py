@@ -1,8 +1,9 @@
-"""From bags to episodes with the columns that our own recordings of the robot have."""
+"""From bags to a dataset with the columns that our own recordings of the robot have: all of it, or nothing."""
 
+import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -13,88 +14,155 @@ from numpy.typing import NDArray
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.importer.breaks import segments, silence_notes
+from bhd_lerobot.errors import DatasetError, DatasetWriteError
 from bhd_lerobot.rosbag.importer.columns import command_note, frame_columns
-from bhd_lerobot.rosbag.importer.dataset import ImportReport, RobotImport, all_or_nothing
 from bhd_lerobot.rosbag.importer.exported import ExportedEpisode
+from bhd_lerobot.rosbag.importer.options import ImportOptions
 from bhd_lerobot.rosbag.importer.resample import NANO, Grid, grids
+from bhd_lerobot.rosbag.importer.segments import segments, silence_notes
 from bhd_lerobot.rosbag.importer.tracks import Track, read_tracks, seconds
 from bhd_lerobot.rosbag.importer.video import CAMERA, CameraImages
+from bhd_lerobot.rosbag.storage.place import complete_or_not
 from bhd_lerobot.rosbag.storage.read import Bag
 from bhd_lerobot.tasks.task import Event
 
 _LISTED = 8  # sentences in an error; a damaged bag may give hundreds
 
 
+@dataclass
+class ImportReport:
+    """What was made of bags.
+
+    Attributes:
+        root: the dataset.
+        episodes, frames: how many.
+        problems: what was wrong with the bags, in sentences.
+        notes: what was done that the user should know, in sentences.
+    """
+
+    root: Path
+    episodes: int = 0
+    frames: int = 0
+    problems: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
 def import_bags(
     bags: Sequence[Bag],
     root: Path | str | None,
     repo_id: str,
-    wanted: RobotImport,
+    options: ImportOptions,
     exported: Sequence[Sequence[ExportedEpisode]] = (),
 ) -> ImportReport:
-    """Make a dataset of bags of a robot, or of exported ones; the whole of it, or nothing.
+    """Make a dataset of bags of a robot, or of exported ones; the whole of it, or nothing, also after a kill.
 
     Args:
         bags: in order; each gives one episode, or several where it has gaps.
         root: where to put it; LeRobot's default place if None.
         repo_id: its name.
-        wanted: what becomes of them.
-        exported: what each bag says of its episodes, if `bhd-data export` wrote it.
+        options: what becomes of them.
+        exported: the episodes that each bag describes, if `bhd-data export` wrote it.
 
     Raises:
         DatasetError: a bag does not have what is needed.
         DatasetExistsError: `root` exists.
+        DatasetWriteError: the dataset cannot be written.
     """
     report = ImportReport(Path(root) if root is not None else default_root(repo_id))
-    recorder: DatasetRecorder | None = None
-    seen: dict[tuple[int, ...], Path] = {}
-    late: list[tuple[int, str]] = []
-    with all_or_nothing(report.root) as (folder, made):
+    # A dataset with some of the episodes would look like a recording that was interrupted.
+    with (
+        complete_or_not(report.root, "--root", "import bags", "No dataset was made.") as folder,
+        _recording(folder, repo_id, options) as recording,
+    ):
         for place, bag in enumerate(bags):
-            robot_bag = _RobotBag(bag, wanted, seen, exported[place] if exported else ())
+            robot_bag = _RobotBag(bag, options, recording, exported[place] if exported else ())
             for episode in robot_bag.episodes():
-                if recorder is None:
-                    features = _features(wanted, robot_bag.image_shapes())
-                    recorder = made(
-                        DatasetRecorder.create(
-                            repo_id,
-                            wanted.fps,
-                            features,
-                            robot_type=wanted.robot_type,
-                            root=folder,
-                            recording=wanted.identity(),
-                        )
-                    )
-                report.frames += robot_bag.save(episode, recorder)
+                report.frames += robot_bag.save(episode)
                 report.episodes += 1
             report.problems += bag.problems
             report.notes += [f"{bag.path.name}: {note}" for note in robot_bag.notes]
-            late += [(count, bag.path.name) for count in robot_bag.late if count]
-        if recorder is None:
-            sensors = ", ".join(topic for role, topic in wanted.topics.items() if role != "cmd")
-            told = "; ".join([*report.problems, *report.notes][:_LISTED])
+        if not report.episodes:
+            sensors = ", ".join(topic for role, topic in options.topic_of.items() if role != "cmd")
+            reasons = "; ".join([*report.problems, *report.notes][:_LISTED])
             raise DatasetError(
-                f"No episode of {wanted.min_episode_s:g} s or more came out of {', '.join(str(b.path) for b in bags)}: "
-                f"there is no such time in which {sensors} were heard at least every {wanted.max_gap_s:g} s. {told}"
+                f"No episode of {options.min_episode_s:g} s or more came out of {', '.join(str(b.path) for b in bags)}:"
+                f" there is no such time in which {sensors} were received at least every {options.max_gap_s:g} s. "
+                f"{reasons}"
             )
-    if late:
+    if late := recording.late:
         most, bag_name = max(late)
-        total = sum(count for count, _ in late)
         report.notes.append(
-            f"{total} of {report.frames} frames, in {len(late)} of {report.episodes} episodes, "
-            f"have a reading older than {wanted.max_age_s:g} s; control.late is true in them (the most in one of "
-            f"{bag_name}: {most})"
+            f"{sum(count for count, _ in late)} of {report.frames} frames, in {len(late)} of {report.episodes} "
+            f"episodes, have a reading older than {options.max_age_s:g} s; control.late is true in them (the most in "
+            f"one of {bag_name}: {most})"
         )
     return report
 
 
-def _features(wanted: RobotImport, images: Mapping[str, tuple[int, int, int]]) -> dict[str, dict[str, Any]]:
-    features = keys.dataset_features(
-        wanted.observation_names, wanted.action_names, images, (), wanted.environment_names
-    )  # nobody knows the state of a real robot's physics
-    return {key: feature for key, feature in features.items() if feature["shape"] != (0,)}
+@contextlib.contextmanager
+def _recording(folder: Path, repo_id: str, options: ImportOptions) -> Iterator["_Recording"]:
+    """Give the dataset that is being made, and finalise it at the end of the block."""
+    recording = _Recording(folder, repo_id, options)
+    try:
+        yield recording
+        recording.finalize()
+    except BaseException as error:
+        with contextlib.suppress(Exception):
+            recording.finalize()  # releases the lock
+        if isinstance(error, DatasetWriteError) and isinstance(error.__cause__, OSError):
+            raise error.__cause__ from None  # the recorder's remedies are for a dataset that stays
+        raise
+
+
+class _Recording:
+    """The dataset that is being made.
+
+    Attributes:
+        late: of each episode that has any, how many frames are late, and the name of its bag.
+    """
+
+    def __init__(self, folder: Path, repo_id: str, options: ImportOptions) -> None:
+        self.late: list[tuple[int, str]] = []
+        self._folder, self._repo_id, self._options = folder, repo_id, options
+        self._recorder: DatasetRecorder | None = None
+        self._seen: dict[tuple[int, ...], Path] = {}
+
+    def finalize(self) -> None:
+        if self._recorder is not None:
+            self._recorder.finalize()
+
+    def recorder(self, cameras: Sequence[CameraImages]) -> DatasetRecorder:
+        """Return the recorder, which is created with the first episode."""
+        if self._recorder is None:
+            options = self._options
+            images = {camera.name: camera.shape() for camera in cameras}
+            features = keys.dataset_features(
+                options.observation_names, options.action_names, images, (), options.environment_names
+            )  # the state of a real robot's physics is not known
+            self._recorder = DatasetRecorder.create(
+                self._repo_id,
+                options.fps,
+                {key: feature for key, feature in features.items() if feature["shape"] != (0,)},
+                robot_type=options.robot_type,
+                root=self._folder,
+                recording=options.identity(),
+            )
+        return self._recorder
+
+    def refuse_again(self, bag: Path, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Refuse a drive that is in another bag, too: one that was copied, or converted to another storage.
+
+        Raises:
+            DatasetError: it is. No two drives have the same numbers at the same nanosecond.
+        """
+        vectors = (columns[key] for key in (keys.OBSERVATION_STATE, keys.ACTION) if key in columns)
+        numbers = (start, *(crc32(values.tobytes()) for values in vectors))
+        if numbers in self._seen:
+            raise DatasetError(
+                f"{self._seen[numbers]} and {bag} hold the same drive: the same numbers at {start / NANO:.3f} s. It "
+                "would be in the dataset twice; leave one of them out."
+            )
+        self._seen[numbers] = bag
 
 
 @dataclass(frozen=True)
@@ -102,7 +170,7 @@ class _Episode:
     """Frames, and the tracks of the segment of the bag in which they lie, sorted by time.
 
     Attributes:
-        exported: what the bag says of it, if `bhd-data export` wrote the bag.
+        exported: its description, if `bhd-data export` wrote the bag.
     """
 
     grid: Grid
@@ -114,18 +182,11 @@ class _RobotBag:
     """One bag, all of it but images in memory."""
 
     def __init__(
-        self,
-        bag: Bag,
-        wanted: RobotImport,
-        seen: dict[tuple[int, ...], Path],
-        exported: Sequence[ExportedEpisode],
+        self, bag: Bag, options: ImportOptions, recording: _Recording, exported: Sequence[ExportedEpisode]
     ) -> None:
         self.notes: list[str] = []
-        self.late: list[int] = []  # frames of each episode that was saved
-        self._seen = seen
-        self._bag, self._wanted = bag, wanted
-        self._exported = exported
-        self._tracks = read_tracks(bag, wanted.tracks, self.notes)
+        self._bag, self._options, self._recording, self._exported = bag, options, recording, exported
+        self._tracks = read_tracks(bag, options, self.notes)
         self._cameras = [
             CameraImages(bag, role, track, self.notes)
             for role, track in self._tracks.items()
@@ -159,13 +220,13 @@ class _RobotBag:
         Raises:
             DatasetError: the pose that is to be observed jumps all the time.
         """
-        wanted = self._wanted
+        options = self._options
         parts = segments(
             self._tracks,
             [one.place for one in self._exported],
-            stamps=wanted.tracks.stamps,
-            max_speed=wanted.max_speed if "odom" in self._tracks and wanted.tracks.pose else None,
-            max_gap_s=wanted.max_gap_s,
+            stamps=options.stamps,
+            max_speed=options.max_speed if "odom" in self._tracks and options.pose else None,
+            max_gap_s=options.max_gap_s,
             notes=self.notes,
         )
         begin = 0
@@ -179,16 +240,16 @@ class _RobotBag:
                 for role, track in self._tracks.items()
             }
             sensors = {role: track for role, track in tracks.items() if role != "cmd"}
-            self.notes += silence_notes(sensors, self._begin, round(wanted.max_gap_s * NANO))
+            self.notes += silence_notes(sensors, self._begin, round(options.max_gap_s * NANO))
             for grid in grids(
                 [track.times for track in sensors.values()],
-                wanted.fps,
-                max_age_ns=round(wanted.max_age_s * NANO),
-                max_gap_ns=round(wanted.max_gap_s * NANO),
+                options.fps,
+                max_age_ns=round(options.max_age_s * NANO),
+                max_gap_ns=round(options.max_gap_s * NANO),
                 why=part.why,
             ):
-                lasts = (len(grid.times) - 1) / wanted.fps
-                if lasts >= wanted.min_episode_s:
+                lasts = (len(grid.times) - 1) / options.fps
+                if lasts >= options.min_episode_s:
                     yield _Episode(grid, tracks, begun[-1] if begun else None)
                 else:
                     self.notes.append(
@@ -196,16 +257,13 @@ class _RobotBag:
                         "was left out"
                     )
 
-    def image_shapes(self) -> dict[str, tuple[int, int, int]]:
-        """Return the shapes of the cameras' images by name."""
-        return {camera.name: camera.shape() for camera in self._cameras}
-
-    def save(self, episode: _Episode, recorder: DatasetRecorder) -> int:
+    def save(self, episode: _Episode) -> int:
         """Save an episode and return its number of frames.
 
         Raises:
             DatasetError: its images cannot be decoded, or it was saved before.
         """
+        recorder = self._recording.recorder(self._cameras)
         episode = self._with_images(episode)
         times, ages = episode.grid.times, episode.grid.ages.max(axis=0)
         writer = recorder.begin_episode()
@@ -214,17 +272,18 @@ class _RobotBag:
                 shown = camera.write(episode.tracks[camera.role], times, writer)
                 ages = np.maximum(ages, times - shown)
             task, metadata = self._described(episode)
-            columns = frame_columns(self._wanted, episode.tracks, times, ages, metadata.get("outcome"))
-            self._refuse_again(int(times[0]), columns)
+            columns = frame_columns(self._options, episode.tracks, times, ages, metadata.get("outcome"))
+            self._recording.refuse_again(self._bag.path, int(times[0]), columns)
             writer.set_columns(columns)
             recorder.save(writer, task=task, metadata={**metadata, "source": self._source(episode, columns)})
         except BaseException:
             writer.discard()
             raise
         begin = self._after_start(episode.grid)
-        if silence := command_note(self._wanted, columns):
+        if silence := command_note(self._options, columns):
             self.notes.append(f"{begin}: {silence}")
-        self.late.append(int(columns[keys.LATE].sum()))
+        if late := int(columns[keys.LATE].sum()):
+            self._recording.late.append((late, self._bag.path.name))
         return len(times)
 
     def _with_images(self, episode: _Episode) -> _Episode:
@@ -238,39 +297,24 @@ class _RobotBag:
             )
         return replace(episode, grid=Grid(grid.times[blind:], grid.ages[:, blind:], grid.why))
 
-    def _refuse_again(self, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Refuse a drive that is in another bag, too: one that was copied, or converted to another storage.
-
-        Raises:
-            DatasetError: it is. No two drives have the same numbers at the same nanosecond.
-        """
-        vectors = (columns[key] for key in (keys.OBSERVATION_STATE, keys.ACTION) if key in columns)
-        numbers = (start, *(crc32(values.tobytes()) for values in vectors))
-        if numbers in self._seen:
-            raise DatasetError(
-                f"{self._seen[numbers]} and {self._bag.path} hold the same drive: the same numbers at "
-                f"{start / NANO:.3f} s. It would be in the dataset twice; leave one of them out."
-            )
-        self._seen[numbers] = self._bag.path
-
     def _described(self, episode: _Episode) -> tuple[str, dict[str, Any]]:
-        """Return the task of an episode, and what is known of it: what the user says, or else the bag."""
-        wanted, exported = self._wanted, episode.exported
-        said = {} if wanted.outcome is None else {
-            "outcome": wanted.outcome, "success": wanted.outcome == Event.SUCCESS.cause
-        }  # fmt: skip
+        """Return the task of an episode, and its metadata: those of the user have precedence over those of the bag."""
+        options, exported = self._options, episode.exported
+        given: dict[str, Any] = {}
+        if options.outcome is not None:
+            given = {"outcome": options.outcome, "success": options.outcome == Event.SUCCESS.cause}
         if exported is None:
-            assert wanted.task is not None
-            return wanted.task, said
+            assert options.task is not None
+            return options.task, given
         metadata = {**exported.metadata}
-        end = exported.start[wanted.tracks.stamps == "header"] + exported.duration
-        if int(episode.grid.times[-1]) + 2 * NANO // wanted.fps < end and metadata.get("outcome"):
+        end = exported.start[options.stamps == "header"] + exported.duration
+        if int(episode.grid.times[-1]) + 2 * NANO // options.fps < end and metadata.get("outcome"):
             self.notes.append(
                 f"{self._after_start(episode.grid)}: the episode ends before the one that was exported, so that its "
                 f"outcome, {metadata['outcome']}, is left out"
             )
             metadata |= {"outcome": ""} | ({"success": False} if "success" in metadata else {})
-        return wanted.task or exported.task, metadata | said
+        return options.task or exported.task, metadata | given
 
     def _source(self, episode: _Episode, columns: Mapping[str, NDArray[Any]]) -> str:
         """Return where an episode is from, JSON."""

@@ -18,7 +18,7 @@ _ODD = 0.05  # the same of poses that jump
 POSE_FACTOR, POSE_SLACK = 1.5, (0.1, 0.3)
 """A pose jumps if it moves by more than this many times what the robot's limits allow, and this much [m, rad].
 
-Wheels slip, times of reception jitter by some messages, and a filter corrects what it has said.
+Wheels slip, times of reception jitter by some messages, and a filter corrects what it has reported.
 """
 
 
@@ -52,8 +52,8 @@ def segments(
 
     Args:
         tracks: by role.
-        starts: places at which an exported bag says that an episode begins.
-        stamps: whose time counts, see `TrackOptions.stamps`.
+        starts: places at which episodes of an exported bag begin.
+        stamps: whose time counts, see `ImportOptions.stamps`.
         max_speed: of the robot forward [m/s] and turning [rad/s], if its pose matters; None if it does not.
         max_gap_s: silence that ends an episode anyway.
         notes: what is found is added to it.
@@ -114,7 +114,7 @@ def _resets(
     """Return where the odometry's pose jumps."""
     track = tracks["odom"]
     begin = min(int(one.times.min()) for one in tracks.values())
-    places, told = [], []
+    places, jumps = [], []
     for part in parts:
         rows = np.flatnonzero(part.mask(track))
         way, turn, took = pose_steps(track.times[rows], track.values[rows, 2:])
@@ -122,7 +122,7 @@ def _resets(
         jumped = ((way > limits[0]) | (turn > limits[1])) & (took <= max_gap_s)
         for row in np.flatnonzero(jumped).tolist():
             places.append(int(track.order[rows[row + 1]]))
-            told.append(
+            jumps.append(
                 f"{track.topic}: the pose jumped by {way[row]:.2f} m and {np.degrees(turn[row]):.0f} degrees in "
                 f"{took[row]:.3f} s, {seconds(int(track.times[rows[row + 1]]) - begin)} after the start: farther than "
                 "the robot drives, as when its driver or a filter is restarted; a new episode begins"
@@ -131,10 +131,10 @@ def _resets(
         raise DatasetError(
             f"The pose of {track.topic} jumps {len(places)} times in {len(track.times)} messages, farther than a robot "
             f"with the limits {max_speed[0]:g} m/s and {max_speed[1]:g} rad/s drives. Is it another robot, or are "
-            f"there two publishers? The first: {told[0].partition(': ')[2]}. Leave out --odometry, or name another "
+            f"there two publishers? The first: {jumps[0].partition(': ')[2]}. Leave out --odometry, or name another "
             "topic with --odom."
         )
-    notes += told[:_LISTED] + [f"{track.topic}: {len(told) - _LISTED} more such jumps"] * (len(told) > _LISTED)
+    notes += jumps[:_LISTED] + [f"{track.topic}: {len(jumps) - _LISTED} more such jumps"] * (len(jumps) > _LISTED)
     return places
 
 
@@ -144,26 +144,26 @@ def silence_notes(sensors: Mapping[str, Track], start: int, gap: int) -> list[st
     Args:
         sensors: tracks of the segment, sorted by time.
         start: of the bag [ns].
-        gap: silence that is told [ns].
+        gap: silence that is reported [ns].
     """
-    heard = [track.times for track in sensors.values() if len(track.times)]
-    if not heard:
+    received = [track.times for track in sensors.values() if len(track.times)]
+    if not received:
         return []
-    begin, end = min(int(times[0]) for times in heard), max(int(times[-1]) for times in heard)
+    begin, end = min(int(times[0]) for times in received), max(int(times[-1]) for times in received)
     notes = []
     for track in sensors.values():
         if not len(track.times):
             if end - begin > gap:  # a restart is seen a moment later by the sensor that is slower
                 notes.append(
-                    f"{track.topic} was not heard in the {seconds(end - begin)} from {seconds(begin - start)} after "
+                    f"{track.topic} was not received in the {seconds(end - begin)} from {seconds(begin - start)} after "
                     "the start on, which are left out"
                 )
             continue
         first, last, steps = int(track.times[0]), int(track.times[-1]), np.diff(track.times)
         if first - begin > gap:
             notes.append(
-                f"{track.topic} was first heard {seconds(first - start)} after the start; {seconds(first - begin)} in "
-                "which other sensors were heard are left out"
+                f"{track.topic} was first received {seconds(first - start)} after the start; {seconds(first - begin)} "
+                "in which other sensors were received are left out"
             )
         silent = np.flatnonzero(steps > gap)
         for place in silent[:_LISTED].tolist():
@@ -175,8 +175,8 @@ def silence_notes(sensors: Mapping[str, Track], start: int, gap: int) -> list[st
         notes += [f"{track.topic}: {len(silent) - _LISTED} more such silences"] * (len(silent) > _LISTED)
         if end - last > gap:
             notes.append(
-                f"{track.topic} was last heard {seconds(last - start)} after the start; {seconds(end - last)} in which "
-                "other sensors were heard are left out"
+                f"{track.topic} was last received {seconds(last - start)} after the start; {seconds(end - last)} in "
+                "which other sensors were received are left out"
             )
     return notes
 
