@@ -1,7 +1,6 @@
 """Checkpoints of a training run: LeRobot's, written so that a kill at any moment leaves the one before usable."""
 
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ from typing import Any
 from lerobot.common.train_utils import get_step_checkpoint_dir, load_training_state, save_checkpoint
 from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
 
+from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, quoted
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.training.config import BhdTrainConfig
@@ -123,6 +123,7 @@ def writing(final: Path) -> Iterator[Path]:
         BhdError: it cannot be written; those before it are intact.
     """
     part, old = (final.with_name(f".{final.name}.{suffix}") for suffix in ("part", "old"))
+    disk = Disk()
     try:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
@@ -130,8 +131,8 @@ def writing(final: Path) -> Iterator[Path]:
         _flush(part)
         shutil.rmtree(old, ignore_errors=True)
         if final.exists():  # a kill between the renaming and the link; `last` still points at one before
-            os.replace(final, old)
-        os.replace(part, final)
+            disk.move(final, old)
+        disk.move(part, final)
         shutil.rmtree(old, ignore_errors=True)
         point(final, LAST_CHECKPOINT_LINK)
     except Exception as error:  # for a full disk, PyTorch and safetensors raise errors of their own
@@ -147,14 +148,11 @@ def point(checkpoint: Path, name: str) -> None:
     link = checkpoint.with_name(f".{name}.part")
     link.unlink(missing_ok=True)
     link.symlink_to(checkpoint.name)
-    os.replace(link, checkpoint.with_name(name))
+    Disk().move(link, checkpoint.with_name(name))
 
 
 def _flush(folder: Path) -> None:
     """Have the system write the files to disk before they get their final name, in case the power fails."""
+    disk = Disk(fsync=True)
     for path in (p for p in folder.rglob("*") if p.is_file()):
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        disk.flush(path)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from bhd_lerobot.datasets.storage.disk import Disk
 
 METRICS_NAME = "metrics.jsonl"
 PLOT_NAME = "loss.png"
@@ -38,9 +39,7 @@ class MetricsFile:
         """
         self.path = path
         self.rows = list(rows)
-        part = path.with_name(f".{path.name}.part")
-        part.write_text("".join(_line(row) for row in self.rows), encoding="utf-8")
-        os.replace(part, path)
+        Disk().publish(path, "".join(_line(row) for row in self.rows).encode())
 
     def append(self, row: Row) -> None:
         """Add a row; it is in the file when this returns."""

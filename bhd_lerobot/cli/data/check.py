@@ -35,9 +35,7 @@ def add_to(commands: Commands) -> None:
     command.add_argument("--json", action="store_true", help="print everything as JSON")
     command.add_argument("--strict", action="store_true", help="a warning is enough for exit status 1")
     command.add_argument("--no-videos", action="store_true", help="leave the videos out, which take longest")
-    command.add_argument(
-        "--fix", action="store_true", help="compute statistics and counts anew where they are wrong, and check again"
-    )
+    command.add_argument("--fix", action="store_true", help="correct wrong statistics and counts, and check again")
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -55,7 +53,7 @@ def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, video
         root: the dataset.
         console: where it is printed.
         as_json: print plain values.
-        is_strict: a warning is enough to call it unsound.
+        is_strict: a warning makes it invalid, too.
         videos: read the videos, too.
 
     Raises:
@@ -88,7 +86,7 @@ def limits_of(robot_type: str | None) -> Limits:
         high = np.asarray(limits.velocity)
         low = -high
     ranges = dict(zip(limits.names, zip(low.tolist(), high.tolist(), strict=True), strict=True))
-    # What a base measures, slip and all, may be a little more than what it is asked for.
+    # What a base measures, slip and all, may be a little more than its command.
     return {keys.APPLIED_ACTION: ranges, **({keys.OBSERVATION_STATE: ranges} if isinstance(body, Arm) else {})}
 
 

@@ -28,7 +28,7 @@ def add_to(commands: Commands) -> None:
     command.add_argument("--exclude_late", action="store_true", help="without those that have too many late frames")
     command.add_argument("--output", metavar="FOLDER", type=Path, required=True, help="folder of the new dataset")
 
-    text = "remove episodes from a dataset, in place; the others are numbered anew"
+    text = "remove episodes from a dataset, in place; the others are renumbered"
     command = add_command(commands, "delete", text, _delete)
     command.add_argument("--episodes", metavar="LIST", required=True, help="which, for example 0,3,5-9")
 
@@ -70,11 +70,11 @@ def _filter(options: argparse.Namespace) -> int:
 
 
 def _delete(options: argparse.Namespace) -> int:
-    def tell(report: EditReport) -> None:
+    def print_report(report: EditReport) -> None:
         gone = f"; episodes {options.episodes} are gone, and those behind them have new numbers"
         print(f"{report}{'' if report.is_repeated else gone}", flush=True)
 
-    delete(root_of(options), parse_episodes(options.episodes), tell)
+    delete(root_of(options), parse_episodes(options.episodes), print_report)
     return 0
 
 

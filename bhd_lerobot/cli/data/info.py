@@ -5,6 +5,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +36,8 @@ def _run(options: argparse.Namespace) -> int:
     if options.short:
         return short(roots)
     if options.json:
-        told = [_plain(dataset_info(root)) for root in roots]
-        print(
-            json.dumps(told if len(told) > 1 else told[0], indent=1, default=str)
-        )  # who calls the recorder chooses the metadata
+        values = [_plain(dataset_info(root)) for root in roots]
+        print(json.dumps(values if len(values) > 1 else values[0], indent=1, default=str))
         return 0
     for root in roots:
         info(root, Terminal())
@@ -46,7 +45,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def short(roots: Sequence[Path]) -> int:
-    """Print a line for each dataset; return the exit status: 2 if one of them is none, after all were told."""
+    """Print a line for each dataset; return the exit status: 2 if one of them is none, after all were printed."""
     status = 0
     for root in roots:
         try:
@@ -123,15 +122,15 @@ def info(root: Path, console: Console) -> None:
         return
     episodes = Table(title="Episodes", title_justify="left")
     columns = _episode_columns(summary, timings)
-    told = len({episode.task for episode in summary.episodes}) > 1
-    # At least a few words of the instruction, if it is told; it wraps.
-    shown = fitting(columns, console.width - 33 * told)
+    has_tasks = len({episode.task for episode in summary.episodes}) > 1
+    # At least a few words of the instruction, if there is a column for it; it wraps.
+    shown = fitting(columns, console.width - 33 * has_tasks)
     for heading, _ in shown:
         episodes.add_column(heading, justify="left" if heading == "outcome" else "right", no_wrap=True)
-    if told:
+    if has_tasks:
         episodes.add_column("instruction")
     for row, episode in zip(zip(*(cells for _, cells in shown), strict=True), summary.episodes, strict=True):
-        episodes.add_row(*row, *[escape(episode.task)] * told)
+        episodes.add_row(*row, *[escape(episode.task)] * has_tasks)
     console.print(episodes)
 
 
@@ -171,23 +170,11 @@ def _timing(timings: Sequence[TimingSummary]) -> str:
     skipped, drops = sum(t.skipped for t in measured), sum(t.drops for t in measured)
     return (
         f"wall-clock time: {late} of {frames} frames out of tolerance, {skipped} ticks skipped, {drops} frames or "
-        "states lost; `bhd-data timing` says more"
+        "states lost; `bhd-data timing` has the details"
     )
 
 
 def _plain(summary: DatasetSummary) -> dict[str, Any]:
-    return {
-        "root": str(summary.root),
-        "robot_type": summary.robot_type,
-        "fps": summary.fps,
-        "frames": summary.frames,
-        "files": summary.files,
-        "bytes": summary.size,
-        "compact": summary.compact,
-        "tasks": list(summary.tasks),
-        "recording": summary.recording,
-        "features": summary.features,
-        "episodes": [
-            {"index": e.index, "frames": e.frames, "task": e.task, "metadata": e.metadata} for e in summary.episodes
-        ],
-    }
+    values = asdict(summary)
+    values["bytes"] = values.pop("size")
+    return values

@@ -1,4 +1,4 @@
-"""`bhd-data mark`: say afterwards how an episode ended, or where somebody intervened."""
+"""`bhd-data mark`: mark afterwards how an episode ended, or an intervention."""
 
 import argparse
 
@@ -11,12 +11,12 @@ from bhd_lerobot.tasks.task import OUTCOMES
 
 def add_to(commands: Commands) -> None:
     """Add `mark`."""
-    text = "say how episodes ended or where somebody intervened; what was said before stays in meta/edits.jsonl"
+    text = "mark how episodes ended, or interventions; former marks stay in meta/edits.jsonl"
     command = add_command(commands, "mark", text, _run)
     command.add_argument("--episodes", metavar="LIST", required=True, help="which, for example 0,3,5-9")
     text = f"how they ended: {', '.join(OUTCOMES)}; of the robots and tasks of this package, what they can end with"
     command.add_argument("--outcome", metavar="NAME", help=text)
-    text = "first and last frame in which somebody intervened, such as 20-35"
+    text = "first and last frame of an intervention, such as 20-35"
     command.add_argument("--intervention", metavar="FIRST-LAST", help=text)
     command.add_argument("--clear_interventions", action="store_true", help="take back all interventions")
     command.add_argument("--note", metavar="TEXT", default="", help="why; for the log")
@@ -31,9 +31,9 @@ def _run(options: argparse.Namespace) -> int:
                 f"--intervention is {options.intervention!r}; valid: FIRST-LAST in frames, such as 20-35."
             )
         span = int(first), int(last or first)
-    said = [options.outcome] * bool(options.outcome)
-    said += [f"an intervention in frames {span[0]} to {span[1]}"] if span is not None else []
-    said += ["no interventions"] * options.clear_interventions
+    marks = [options.outcome] * bool(options.outcome)
+    marks += [f"an intervention in frames {span[0]} to {span[1]}"] if span is not None else []
+    marks += ["no interventions"] * options.clear_interventions
     mark(
         root_of(options),
         parse_episodes(options.episodes),
@@ -41,6 +41,6 @@ def _run(options: argparse.Namespace) -> int:
         intervention=span,
         clear_interventions=options.clear_interventions,
         note=options.note,
-        tell=lambda report: print(f"{report}; episodes {options.episodes}: {', '.join(said)}", flush=True),
+        on_done=lambda report: print(f"{report}; episodes {options.episodes}: {', '.join(marks)}", flush=True),
     )
     return 0

@@ -15,7 +15,7 @@ def add_to(commands: Commands) -> None:
         "--info",
         type=Path,
         metavar="OTHER",
-        help="a recording with the same robot and cameras, which says what the columns are if meta/info.json is lost",
+        help="a recording with the same robot and cameras, which describes the columns if meta/info.json is lost",
     )
     command.set_defaults(stopped="run it again to finish")
 

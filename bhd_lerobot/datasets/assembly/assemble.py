@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.assembly.files import build_data, build_videos
+from bhd_lerobot.datasets.assembly.files import build_data, build_videos, data_groups, video_groups
 from bhd_lerobot.datasets.assembly.picks import Files, Pick, Plan
 from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.datasets.format.episode_table import PREFIX, stored_stats
@@ -37,10 +37,10 @@ WRITTEN = (
     "tasks.parquet",
     "bhd.json",
     "edits.jsonl",
-    "bhd_subset.json",  # tells what a pull was asked for, which is not so of an edited dataset
+    "bhd_subset.json",  # the episodes of a pull, which an edited dataset does not have any more
     "episodes/chunk-*/file-*.parquet",
 )
-"""Files of ``meta`` that are made anew with every change of episodes; all others are taken along."""
+"""Files of ``meta`` that are rewritten with every change of episodes; all others are copied."""
 
 
 def assemble(
@@ -62,7 +62,7 @@ def assemble(
         types: Arrow types of metadata columns that no source has, by name without prefix.
         in_place: the new content takes the place of the only source's. Then files that stay are linked; two datasets
             never share one, because other programs write into files.
-        edit: what is told in ``meta/edits.jsonl`` of this step.
+        edit: the entry in ``meta/edits.jsonl``.
         identity: content of ``meta/bhd.json``; no such file if None.
 
     Raises:
@@ -80,8 +80,9 @@ def assemble(
     rows = _rows(picks, kinds, extra)
     plan = Plan(picks, rows, tasks, info, Files(picks))
     take = disk.link if in_place else disk.copy
-    build_data(plan, new, disk, take)
-    build_videos(plan, new, disk, take)
+    build_data(plan, data_groups(plan), new, disk, take=take)
+    for key in sources[0].video_keys:
+        build_videos(plan, key, video_groups(plan, key), new, disk, take=take)
     disk.make_folder(new / "meta")
     if len(sources) == 1:
         link_others(sources[0].root / "meta", new / "meta", disk, *WRITTEN, take=take)
@@ -104,7 +105,7 @@ def check_alike(sources: Sequence[DatasetState]) -> None:
     """Check that episodes of several datasets can be in one.
 
     Raises:
-        DatasetMismatchError: they cannot; every difference is told.
+        DatasetMismatchError: they cannot; the message lists every difference.
     """
     first = sources[0]
     for other in sources[1:]:
@@ -125,7 +126,7 @@ def _kind(state: DatasetState) -> dict[str, Any]:
         "features": {
             key: {
                 **{name: feature.get(name) for name in ("dtype", "shape", "names")},
-                # How numbers became depth images; what else is told of a video may differ.
+                # The encoding of depth; other descriptions of a video may differ.
                 **{n: v for n, v in (state.info["features"][key].get("info") or {}).items() if _is_meaning(n)},
             }
             for key, feature in features.items()
@@ -184,11 +185,12 @@ def _tasks(picks: Sequence[Pick]) -> dict[str, int]:
 def _info(sources: Sequence[DatasetState], episodes: int, frames: int, tasks: int) -> dict[str, Any]:
     info = copy.deepcopy(sources[0].info)
     for key, feature in info["features"].items():
-        told = [source.info["features"][key].get("info") or {} for source in sources]
-        if any(told):
-            # What videos of several encoders do not share is not known of their mixture.
+        infos = [source.info["features"][key].get("info") or {} for source in sources]
+        if any(infos):
+            # Values that differ between the encoders are unknown for the mixture.
             feature["info"] = {
-                name: value if all(one.get(name) == value for one in told) else None for name, value in told[0].items()
+                name: value if all(one.get(name) == value for one in infos) else None
+                for name, value in infos[0].items()
             }
     return info | {
         "total_episodes": episodes,

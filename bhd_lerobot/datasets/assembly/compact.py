@@ -4,45 +4,25 @@ New folders are built beside the old ones; files that need no change are linked.
 `bhd_lerobot.datasets.storage.atomic`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from bhd_lerobot.datasets.format import statistics, video
+from bhd_lerobot.datasets.assembly.files import build_data, build_videos, data_groups, video_groups
+from bhd_lerobot.datasets.assembly.picks import Files, Pick, Plan
+from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.datasets.format.episode_table import stored_stats
-from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, PARQUET_OPTIONS, write_meta
+from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, write_meta
 from bhd_lerobot.datasets.format.schema import Schema, as_numpy
-from bhd_lerobot.datasets.format.state import (
-    DatasetState,
-    Row,
-    corrupt,
-    ordered_slots,
-    read_frames,
-    slot_columns,
-    slot_of,
-)
+from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, ordered_slots, read_frames, slot_of
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import Workspace, link_others
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock
 from bhd_lerobot.datasets.storage.layout import Slot
 
 EpisodeStats = dict[str, statistics.Stats]
-
-
-@dataclass
-class _Group:
-    """Files of one kind that become one file."""
-
-    target: Slot
-    sources: list[Slot]
-
-    @property
-    def unchanged(self) -> bool:
-        return self.sources == [self.target]
 
 
 def compact(
@@ -64,126 +44,27 @@ def compact(
         OSError: a file cannot be written; the dataset is then as it was.
         DatasetCorruptError: a file cannot be read.
     """
-    data = _data_groups(state)
-    videos = {key: _video_groups(state, key) for key in state.video_keys}
-    moved = any(not group.unchanged for groups in (data, *videos.values()) for group in groups)
-    if not state.rows or (not moved and not state.without_stats and (state.root / layout.STATS).exists()):
+    picks, rows = [Pick(state, row) for row in state.rows], [dict(row) for row in state.rows]
+    plan = Plan(picks, rows, {task: index for index, task in enumerate(state.tasks)}, state.info, Files(picks))
+    data = data_groups(plan)
+    videos = {key: video_groups(plan, key) for key in state.video_keys}
+    move_data = not all(group.is_in_place for group in data)
+    move_videos = not all(group.is_in_place for groups in videos.values() for group in groups)
+    has_stats = not state.without_stats and (state.root / layout.STATS).exists()
+    if not rows or not (move_data or move_videos or not has_stats):
         return False
     with Workspace(state.root, disk, lock) as space:
         stats = _all_stats(state, schema, known or {})
-        rows = [dict(row) for row in state.rows]
-        _build_data(state, schema, disk, data, rows, new=space.folder)
-        _build_videos(state, disk, videos, rows, new=space.folder)
+        if move_data:
+            link_others(state.root / "data", space.folder / "data", disk, "chunk-*/file-*.parquet")
+            build_data(plan, data, space.folder, disk, take=disk.link, schema=schema.arrow)
+        if move_videos:
+            link_others(state.root / "videos", space.folder / "videos", disk, "*/chunk-*/file-*.mp4")
+            for key, groups in videos.items():
+                build_videos(plan, key, groups, space.folder, disk, take=disk.link)
         _build_meta(state, disk, rows, stats, new=space.folder)
         space.publish(f"the files of {state.root} had been merged")
     return True
-
-
-def _groups(sizes: Mapping[Slot, int], limit: float, chunks_size: int, split: Callable[[Slot], bool]) -> list[_Group]:
-    """Pack files in order, as many into one as fit below `limit` bytes; `split` says that a file must start anew."""
-    groups: list[_Group] = []
-    filled = 0
-    for slot, size in sizes.items():
-        if not groups or filled + size >= limit or split(slot):
-            groups.append(_Group(layout.next_slot(groups[-1].target if groups else None, chunks_size), []))
-            filled = 0
-        groups[-1].sources.append(slot)
-        filled += size
-    return groups
-
-
-def _data_groups(state: DatasetState) -> list[_Group]:
-    sizes = {slot: (state.root / layout.data_file(slot)).stat().st_size for slot in ordered_slots(state.rows, "data")}
-    limit = state.info["data_files_size_in_mb"] * MEBIBYTE
-    return _groups(sizes, limit, state.info["chunks_size"], lambda slot: False)
-
-
-def _video_groups(state: DatasetState, key: str) -> list[_Group]:
-    paths = {slot: state.root / layout.video_file(key, slot) for slot in ordered_slots(state.rows, f"videos/{key}")}
-    signatures = {slot: video.stream_signature(path) for slot, path in paths.items()}
-    previous: list[Slot] = []
-
-    def differs(slot: Slot) -> bool:
-        before = previous[-1] if previous else slot
-        previous.append(slot)
-        return signatures[before] != signatures[slot]
-
-    limit = state.info["video_files_size_in_mb"] * MEBIBYTE
-    sizes = {slot: path.stat().st_size for slot, path in paths.items()}
-    return _groups(sizes, limit, state.info["chunks_size"], differs)
-
-
-def _build_data(
-    state: DatasetState, schema: Schema, disk: Disk, groups: list[_Group], rows: list[Row], *, new: Path
-) -> None:
-    if all(group.unchanged for group in groups):
-        return
-    targets = {source: group.target for group in groups for source in group.sources}
-    link_others(state.root / "data", new / "data", disk, "chunk-*/file-*.parquet")
-    for group in groups:
-        target = new / layout.data_file(group.target)
-        disk.make_folder(target.parent)
-        sources = [state.root / layout.data_file(source) for source in group.sources]
-        if len(sources) == 1:
-            disk.link(sources[0], target)
-        else:
-            _merge_parquet(sources, target, schema.arrow, disk)
-    for row in rows:
-        row.update(slot_columns("data", targets[slot_of(row, "data")]))
-
-
-def _merge_parquet(sources: list[Path], target: Path, schema: pa.Schema, disk: Disk) -> None:
-    """Write the row groups of several files into one; readers fetch an episode as one row group."""
-    disk.write(target, b"")
-    with pq.ParquetWriter(target, schema, **PARQUET_OPTIONS) as writer:
-        for source in sources:
-            for table in _row_groups(source):
-                same = table.schema.equals(schema, check_metadata=True)
-                writer.write_table(table if same else table.select(schema.names).cast(schema))
-    disk.flush(target)
-
-
-def _row_groups(source: Path) -> Iterator[pa.Table]:
-    """Read a file group by group. Arrow reports damaged pages as an OSError; here it cannot mean a full disk."""
-    try:
-        file = pq.ParquetFile(source, page_checksum_verification=True)
-        for group in range(file.num_row_groups):
-            yield file.read_row_group(group, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
-        raise corrupt(source, error) from error
-
-
-def _build_videos(
-    state: DatasetState, disk: Disk, videos: Mapping[str, list[_Group]], rows: list[Row], *, new: Path
-) -> None:
-    if all(group.unchanged for groups in videos.values() for group in groups):
-        return
-    fps = state.info["fps"]
-    link_others(state.root / "videos", new / "videos", disk, "*/chunk-*/file-*.mp4")
-    for key, groups in videos.items():
-        kind = f"videos/{key}"
-        by_slot = ordered_slots(rows, kind)
-        for group in groups:
-            target = new / layout.video_file(key, group.target)
-            disk.make_folder(target.parent)
-            sources = [state.root / layout.video_file(key, source) for source in group.sources]
-            lengths = [sum(row["length"] for row in by_slot[source]) for source in group.sources]
-            if len(sources) == 1:
-                disk.link(sources[0], target)
-            else:
-                disk.write(target, b"")
-                for source, found, wanted in zip(
-                    sources, video.concatenate(sources, target, fps), lengths, strict=True
-                ):
-                    if found != wanted:
-                        raise corrupt(source, f"it has {found} frames; its episodes have {wanted}")
-                disk.flush(target)
-            start = 0
-            for row in (row for source in group.sources for row in by_slot[source]):
-                row.update(slot_columns(kind, group.target))
-                row[f"{kind}/from_timestamp"] = start / fps
-                start += row["length"]
-                row[f"{kind}/to_timestamp"] = start / fps
 
 
 def _build_meta(

@@ -99,6 +99,6 @@ def _exists(root: Path, remedy: str) -> DatasetError:
             RootLock(root, is_choice=True).release()
         except DatasetLockedError as error:
             return error
-        except OSError:  # a folder of somebody else's
+        except OSError:  # the folder may not be read
             pass
     return DatasetExistsError(f"{root} exists already. {remedy}, or choose another root.")

@@ -1,6 +1,6 @@
 """The data files and videos of a dataset that is assembled from episodes of others."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from bhd_lerobot.datasets.assembly.picks import Group, Plan, Run
 from bhd_lerobot.datasets.format import video
 from bhd_lerobot.datasets.format.meta_files import MEBIBYTE, PARQUET_OPTIONS
 from bhd_lerobot.datasets.format.state import corrupt, read_frames, slot_columns
-from bhd_lerobot.datasets.format.video_splice import splice
+from bhd_lerobot.datasets.format.video_splice import Span, splice
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import DatasetMismatchError
@@ -21,19 +21,49 @@ type Take = Callable[[Path, Path], None]
 """How a file that stays as it is gets to its new place."""
 
 
-def build_data(plan: Plan, new: Path, disk: Disk, take: Take) -> None:
-    """Write the data files below `new`, and into the rows in which file each episode is; `take` those that stay.
+def data_groups(plan: Plan) -> list[Group]:
+    """Return which new data file holds which runs of episodes."""
+    runs = list(plan.files.runs("data"))
+    sizes = [(run.source.root / layout.data_file(run.slot)).stat().st_size * run.share for run in runs]
+    limit = plan.info["data_files_size_in_mb"] * MEBIBYTE
+    return _groups(runs, sizes, limit, plan.info["chunks_size"], [None] * len(runs))
+
+
+def video_groups(plan: Plan, key: str) -> list[Group]:
+    """Return which new video of a camera holds which runs of episodes; all of one video have the same encoding.
+
+    Raises:
+        DatasetCorruptError: a video cannot be read.
+    """
+    runs = list(plan.files.runs(f"videos/{key}"))
+    paths = [run.source.root / layout.video_file(key, run.slot) for run in runs]
+    signatures = {path: video.stream_signature(path) for path in dict.fromkeys(paths)}
+    sizes = [path.stat().st_size * run.share for run, path in zip(runs, paths, strict=True)]
+    limit = plan.info["video_files_size_in_mb"] * MEBIBYTE
+    return _groups(runs, sizes, limit, plan.info["chunks_size"], [signatures[path] for path in paths])
+
+
+def build_data(
+    plan: Plan, groups: Sequence[Group], new: Path, disk: Disk, *, take: Take, schema: pa.Schema | None = None
+) -> None:
+    """Write the data files below `new`, and into the rows the file of each episode.
+
+    Args:
+        plan: the new dataset.
+        groups: from `data_groups`.
+        new: its root.
+        disk: how to write.
+        take: called with the old and the new path of a file that stays as it is.
+        schema: the columns; those of the first file if None.
 
     Raises:
         DatasetCorruptError: a data file cannot be read.
         DatasetMismatchError: the columns of one dataset are stored in another way.
         OSError: a file cannot be written.
     """
-    runs = list(plan.files.runs("data"))
-    sizes = [(run.source.root / layout.data_file(run.slot)).stat().st_size * run.share for run in runs]
-    limit = plan.info["data_files_size_in_mb"] * MEBIBYTE
-    schema = _schema(runs[0].source.root / layout.data_file(runs[0].slot))
-    for group in _groups(runs, sizes, limit, plan.info["chunks_size"], lambda run: False):
+    first = groups[0].runs[0]
+    schema = schema or _schema(first.source.root / layout.data_file(first.slot))
+    for group in groups:
         target = new / layout.data_file(group.target)
         disk.make_folder(target.parent)
         sources = [run.source.root / layout.data_file(run.slot) for run in group.runs]
@@ -50,64 +80,58 @@ def build_data(plan: Plan, new: Path, disk: Disk, take: Take) -> None:
             plan.rows[place].update(slot_columns("data", group.target))
 
 
-def build_videos(plan: Plan, new: Path, disk: Disk, take: Take) -> None:
-    """Write the videos below `new`, and into the rows where each episode is in them; `take` those that stay.
+def build_videos(plan: Plan, key: str, groups: Sequence[Group], new: Path, disk: Disk, *, take: Take) -> None:
+    """Write the videos of a camera below `new`, and into the rows the place of each episode; see `build_data`.
 
     Raises:
         DatasetCorruptError: a video cannot be read.
         UnsupportedDatasetError: one cannot be cut without encoding again.
         OSError: a file cannot be written.
     """
-    fps, rows = plan.info["fps"], plan.rows
-    for key in [key for key, feature in plan.info["features"].items() if feature["dtype"] == "video"]:
-        kind = f"videos/{key}"
-        runs = list(plan.files.runs(kind))
-        paths = [run.source.root / layout.video_file(key, run.slot) for run in runs]
-        known: dict[Path, tuple[Any, ...]] = {path: video.stream_signature(path) for path in dict.fromkeys(paths)}
-        signature = {id(run): known[path] for run, path in zip(runs, paths, strict=True)}
-        sizes = [path.stat().st_size * run.share for run, path in zip(runs, paths, strict=True)]
-        limit = plan.info["video_files_size_in_mb"] * MEBIBYTE
-        before: list[Run] = []
+    fps, rows, kind = plan.info["fps"], plan.rows, f"videos/{key}"
+    for group in groups:
+        target = new / layout.video_file(key, group.target)
+        disk.make_folder(target.parent)
+        parts = []
+        for run in group.runs:
+            old = [plan.picks[place].row for place in run.places]
+            spans = [(round(row[f"{kind}/from_timestamp"] * fps), row["length"]) for row in old]
+            parts.append((run.source.root / layout.video_file(key, run.slot), spans))
+        if len(parts) == 1 and group.runs[0].whole:
+            take(parts[0][0], target)
+            starts = [span[0] for span in parts[0][1]]
+        else:
+            disk.write(target, b"")
+            splice([(path, _joined(spans)) for path, spans in parts], target, fps)
+            disk.flush(target)
+            lengths = [length for _, spans in parts for _, length in spans]
+            starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(int).tolist()
+        places = [place for run in group.runs for place in run.places]
+        for place, start in zip(places, starts, strict=True):
+            rows[place].update(slot_columns(kind, group.target))
+            rows[place][f"{kind}/from_timestamp"] = start / fps
+            rows[place][f"{kind}/to_timestamp"] = (start + rows[place]["length"]) / fps
 
-        def differs(run: Run, signature: dict[int, Any] = signature, before: list[Run] = before) -> bool:
-            last = before[-1] if before else run
-            before.append(run)
-            return signature[id(last)] != signature[id(run)]
 
-        for group in _groups(runs, sizes, limit, plan.info["chunks_size"], differs):
-            target = new / layout.video_file(key, group.target)
-            disk.make_folder(target.parent)
-            parts = []
-            for run in group.runs:
-                spans = [
-                    (round(plan.picks[place].row[f"{kind}/from_timestamp"] * fps), plan.picks[place].row["length"])
-                    for place in run.places
-                ]
-                parts.append((run.source.root / layout.video_file(key, run.slot), spans))
-            if len(parts) == 1 and group.runs[0].whole:
-                take(parts[0][0], target)
-                starts = [span[0] for span in parts[0][1]]
-            else:
-                disk.write(target, b"")
-                splice(parts, target, fps)
-                disk.flush(target)
-                lengths = [length for _, spans in parts for _, length in spans]
-                starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(int).tolist()
-            places = [place for run in group.runs for place in run.places]
-            for place, start in zip(places, starts, strict=True):
-                rows[place].update(slot_columns(kind, group.target))
-                rows[place][f"{kind}/from_timestamp"] = start / fps
-                rows[place][f"{kind}/to_timestamp"] = (start + rows[place]["length"]) / fps
+def _joined(spans: Iterable[Span]) -> list[Span]:
+    """Join spans that follow each other: only the first frame of the whole must be a key frame."""
+    joined: list[Span] = []
+    for start, length in spans:
+        if joined and sum(joined[-1]) == start:
+            joined[-1] = joined[-1][0], joined[-1][1] + length
+        else:
+            joined.append((start, length))
+    return joined
 
 
 def _groups(
-    runs: Iterable[Run], sizes: Iterable[float], limit: float, chunks_size: int, split: Callable[[Run], bool]
+    runs: Sequence[Run], sizes: Iterable[float], limit: float, chunks_size: int, kinds: Sequence[Any]
 ) -> list[Group]:
-    """Pack runs in order, as many into one file as fit below `limit` bytes; `split` says that one must start anew."""
+    """Pack runs in order, as many into one file as fit below `limit` bytes; runs of several kinds share no file."""
     groups: list[Group] = []
     filled = 0.0
-    for run, size in zip(runs, sizes, strict=True):
-        if split(run) or not groups or filled + size >= limit:
+    for run, size, kind, before in zip(runs, sizes, kinds, [None, *kinds], strict=False):
+        if not groups or kind != before or filled + size >= limit:
             groups.append(Group(layout.next_slot(groups[-1].target if groups else None, chunks_size), []))
             filled = 0.0
         groups[-1].runs.append(run)
@@ -116,14 +140,14 @@ def _groups(
 
 
 def _is_same(run: Run, plan: Plan) -> bool:
-    """Tell whether a data file can stay as it is."""
+    """Return whether a data file can stay as it is."""
     numbers = {task: index for index, task in enumerate(run.source.tasks)}
     pairs = [(plan.picks[place], plan.rows[place]) for place in run.places]
     return run.whole and all(
         not pick.columns
         and pick.row["episode_index"] == row["episode_index"]
         and pick.row["dataset_from_index"] == row["dataset_from_index"]
-        and all(numbers.get(task) == plan.tasks[task] for task in row["tasks"])
+        and all(numbers.get(task) == plan.tasks.get(task) for task in row["tasks"])
         for pick, row in pairs
     )
 
@@ -145,17 +169,17 @@ def _episodes(run: Run, path: Path, plan: Plan) -> Iterable[pa.Table]:
         part = table.slice(old["dataset_from_index"] - first, length)
         if part.num_rows != length or part["episode_index"][0].as_py() != old["episode_index"]:
             raise corrupt(path, f"the frames of episode {old['episode_index']} are not where they should be")
-        told = part["task_index"].to_numpy()
-        if told.min() < 0 or told.max() >= len(renumbered):
-            raise corrupt(path, f"episode {old['episode_index']} has an instruction that {layout.TASKS} does not tell")
+        tasks = part["task_index"].to_numpy()
+        if tasks.min() < 0 or tasks.max() >= len(renumbered):
+            raise corrupt(path, f"episode {old['episode_index']} has an instruction that {layout.TASKS} does not have")
         changed: dict[str, np.ndarray] = {
             "episode_index": np.full(length, new["episode_index"]),
             "index": np.arange(new["dataset_from_index"], new["dataset_to_index"]),
-            "task_index": renumbered[told],
+            "task_index": renumbered[tasks],
             **plan.picks[place].columns,
         }
         if (changed["task_index"] < 0).any():
-            raise corrupt(path, f"episode {old['episode_index']} has an instruction that meta/episodes does not tell")
+            raise corrupt(path, f"episode {old['episode_index']} has an instruction that meta/episodes does not have")
         for name, values in changed.items():
             position = part.schema.get_field_index(name)
             part = part.set_column(position, part.schema.field(position), pa.array(values, part.schema.types[position]))

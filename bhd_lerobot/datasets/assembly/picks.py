@@ -53,12 +53,17 @@ class Group:
     target: Slot
     runs: list[Run]
 
+    @property
+    def is_in_place(self) -> bool:
+        """Whether it is a file of its dataset, unchanged and under its own number."""
+        return len(self.runs) == 1 and self.runs[0].whole and self.runs[0].slot == self.target
+
 
 class Files:
-    """Which episodes lie in which file, asked once for each dataset."""
+    """The episodes of each file, computed once for each dataset."""
 
     def __init__(self, picks: Sequence[Pick]) -> None:
-        """Remember the picks."""
+        """Store the picks."""
         self._picks = picks
         self._rows: dict[tuple[int, str], dict[Slot, list[Row]]] = {}
 

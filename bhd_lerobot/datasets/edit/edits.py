@@ -39,7 +39,7 @@ class EditReport:
         root: the dataset that was made or changed.
         episodes: episodes it holds now.
         frames: frames it holds now.
-        is_repeated: whether this edit had been completed before, by a process that was killed before it said so;
+        is_repeated: whether this edit had been completed before, by a process that was killed before it reported it;
             nothing was changed now.
     """
 
@@ -50,12 +50,12 @@ class EditReport:
 
     def __str__(self) -> str:
         """Return the report for a terminal."""
-        told = "; the same edit was interrupted before, after it had been completed: nothing was changed now"
-        return f"{self.root}: {self.episodes} episodes, {self.frames} frames{told if self.is_repeated else ''}"
+        note = "; the same edit was interrupted before, after it had been completed: nothing was changed now"
+        return f"{self.root}: {self.episodes} episodes, {self.frames} frames{note if self.is_repeated else ''}"
 
 
-type Tell = Callable[[EditReport], object]
-"""Called with an edit when it is in force. Until it returns, nobody knows of it: the same edit is then recognised."""
+type OnDone = Callable[[EditReport], object]
+"""Called with the report when an edit is in force. Until it returns, the same edit is recognised as repeated."""
 
 
 def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
@@ -154,16 +154,16 @@ def split(root: Path | str, parts: Mapping[str, Sequence[int]], folder: Path | s
         return done
 
 
-def delete(root: Path | str, episodes: Sequence[int], tell: Tell = lambda _: None) -> EditReport:
-    """Remove episodes from a dataset, in place; the others are numbered anew.
+def delete(root: Path | str, episodes: Sequence[int], on_done: OnDone = lambda _: None) -> EditReport:
+    """Remove episodes from a dataset, in place; the others are renumbered.
 
-    A kill at any moment leaves either the old dataset or the new one. If it comes when the new one is there and `tell`
-    has not returned, the same call does nothing but say so, and another one with numbers of episodes is refused once.
+    A kill at any moment leaves either the old dataset or the new one. If the new one is in place and `on_done` has not
+    returned, the same call only reports that, and another one with numbers of episodes is refused once.
 
     Args:
         root: the dataset.
         episodes: what is removed.
-        tell: told what came out.
+        on_done: called with the report.
 
     Raises:
         DatasetLockedError: it is being recorded.
@@ -178,7 +178,7 @@ def delete(root: Path | str, episodes: Sequence[int], tell: Tell = lambda _: Non
         picks = [Pick(state, row) for row in state.rows if row["episode_index"] not in gone]
         return Change(picks, edit, _edited(state, edit))
 
-    return rewrite(Path(root), edit, change, tell)
+    return rewrite(Path(root), edit, change, on_done)
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ class Change:
 
     Attributes:
         picks: its new episodes.
-        edit: what is told about it in ``meta/edits.jsonl``; the time is added.
+        edit: the entry in ``meta/edits.jsonl``; the time is added.
         identity: new content of ``meta/bhd.json``.
         types: Arrow types of new metadata columns, by name without prefix.
     """
@@ -198,14 +198,16 @@ class Change:
     types: Mapping[str, pa.DataType] = field(default_factory=dict)
 
 
-def rewrite(root: Path, request: Mapping[str, Any], change: Callable[[DatasetState], Change], tell: Tell) -> EditReport:
+def rewrite(
+    root: Path, request: Mapping[str, Any], change: Callable[[DatasetState], Change], on_done: OnDone
+) -> EditReport:
     """Put other content into a dataset.
 
     Args:
         root: the dataset.
-        request: what was asked for, JSON values: an edit that is repeated is recognised by them.
+        request: JSON values by which a repeated edit is recognised.
         change: makes the new content from the old.
-        tell: told what came out.
+        on_done: called with the report.
 
     Raises:
         DatasetWriteError: the disk refuses; the dataset is as it was.
@@ -226,19 +228,19 @@ def rewrite(root: Path, request: Mapping[str, Any], change: Callable[[DatasetSta
                 assemble(
                     new.picks, space.folder, disk, types=new.types, in_place=True, edit=edit, identity=new.identity
                 )
-                told = {"request": request, "time": edit["time"]}
-                disk.write(space.folder / layout.UNREPORTED, to_json(told))
+                unreported = {"request": request, "time": edit["time"]}
+                disk.write(space.folder / layout.UNREPORTED, to_json(unreported))
                 space.publish(f"the edit of {root} had been completed")
             disk.try_remove_tree(root / layout.STAGING)
             report = _report(root, new.picks)
-        with uninterrupted():  # or who repeats it is told that it was done twice
-            tell(report)
+        with uninterrupted():  # or a repeated edit would be reported twice
+            on_done(report)
             (root / layout.UNREPORTED).unlink(missing_ok=True)
     return report
 
 
 def _repeated(root: Path, request: Mapping[str, Any]) -> EditReport | None:
-    """Return the report of the edit that made the dataset what it is, if nobody was told and it is the one meant."""
+    """Return the report of the last edit, if it was not reported and is the requested one."""
     if (last := _unreported(root)) is None or last.get("request") != json.loads(json.dumps(request)):
         return None
     state = _state_of(root)
@@ -246,29 +248,29 @@ def _repeated(root: Path, request: Mapping[str, Any]) -> EditReport | None:
 
 
 def _unreported(root: Path) -> dict[str, Any] | None:
-    """Return the edit that made the dataset what it is, if nobody was told of it."""
+    """Return the last edit of the dataset, if it was not reported."""
     path = root / layout.UNREPORTED
     if not path.is_file():
         return None
     last, edits = read_json(path), edits_of(root)
-    # What was put into the place of the dataset since is not what the edit made of it.
+    # Another dataset may have been put into this place since.
     return last if edits and edits[-1].get("time") == last.get("time") else None
 
 
 def check_reported(root: Path) -> None:
-    """Check that the dataset is what whoever names its episodes believes it to be; it is refused only once.
+    """Refuse, once, numbers of episodes after an edit that was not reported.
 
     Raises:
-        DatasetError: an edit changed it, and was killed before it said so.
+        DatasetError: there was one.
     """
     if (last := _unreported(root)) is None:
         return
-    asked = ", ".join(f"{name} {value}" for name, value in dict(last.get("request") or {}).items())
+    request = ", ".join(f"{name} {value}" for name, value in dict(last.get("request") or {}).items())
     (root / layout.UNREPORTED).unlink(missing_ok=True)
     raise DatasetError(
-        f"{root} is not what it was: an edit ({asked}) that was interrupted at {last.get('time')} had been completed, "
-        f"so episodes may have other numbers now. Look at `bhd-data info {quoted(root)}`, then repeat this command. "
-        "Nothing was changed now."
+        f"{root} is not what it was: an edit ({request}) that was interrupted at {last.get('time')} had been "
+        f"completed, so episodes may have other numbers now. Check `bhd-data info {quoted(root)}`, then repeat this "
+        "command. Nothing was changed now."
     )
 
 
@@ -277,7 +279,7 @@ def _picks(state: DatasetState, episodes: Sequence[int]) -> list[Pick]:
 
 
 def _kept(state: DatasetState, episodes: Sequence[int], name: str) -> tuple[dict[str, Any], Mapping[str, Any]]:
-    """Return what is told of some episodes of a dataset as a new one, and of what recording they are."""
+    """Return the log entry and the recording of a new dataset of some episodes."""
     check_episodes(state, episodes)
     edit = {"edit": name, "of": state.root.name, "episodes": list(episodes)}
     identity = _edited(state, edit)
@@ -313,7 +315,7 @@ def _report(root: Path, picks: Sequence[Pick]) -> EditReport:
 
 
 def _edited(state: DatasetState, edit: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return an identity that cannot be resumed: the next episode would no longer be the one that the seed says."""
+    """Return an identity that cannot be resumed: the next episode would not be the one of its seed."""
     if state.identity is None:
         return None
     recording = {name: value for name, value in state.identity["recording"].items() if name != "edited"}

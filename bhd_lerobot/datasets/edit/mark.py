@@ -1,4 +1,4 @@
-"""What a person says about episodes after they were recorded: how they ended, and where somebody intervened."""
+"""Outcomes and interventions that a person marks after the recording."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from bhd_lerobot.datasets.assembly.picks import Pick
-from bhd_lerobot.datasets.edit.edits import Change, EditReport, Tell, check_episodes, rewrite
+from bhd_lerobot.datasets.edit.edits import Change, EditReport, OnDone, check_episodes, rewrite
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.schema import as_numpy
 from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, read_frames, slot_of
@@ -17,7 +17,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
 
-_SAID = "said afterwards"
+_REASON = "marked afterwards"
 _COLUMNS: Mapping[str, pa.DataType] = {"outcome": pa.string(), "success": pa.bool_()}
 
 
@@ -29,14 +29,14 @@ def mark(
     intervention: tuple[int, int] | None = None,
     clear_interventions: bool = False,
     note: str = "",
-    tell: Tell = lambda _: None,
+    on_done: OnDone = lambda _: None,
 ) -> EditReport:
-    """Say how episodes ended, or in which of their frames somebody intervened.
+    """Mark how episodes ended, or the frames of an intervention.
 
     The columns ``event`` and ``next.success``, ``bhd/outcome`` and ``bhd/success`` of the episodes, and the statistics
-    follow; ``meta/edits.jsonl`` keeps what was said before. A dataset that another program recorded gets
-    ``bhd/outcome`` and ``bhd/success``, empty where nothing was said; its frames stay as they are. The score stays the
-    task's.
+    follow; ``meta/edits.jsonl`` keeps the former values. A dataset that another program recorded gets
+    ``bhd/outcome`` and ``bhd/success``, empty for episodes without a mark; its frames stay as they are. The score
+    stays that of the task.
 
     Args:
         root: the dataset.
@@ -45,10 +45,10 @@ def mark(
         intervention: first and last frame of an intervention.
         clear_interventions: take back all interventions.
         note: why; for the log.
-        tell: told what came out; see `bhd_lerobot.datasets.edit.edits.delete`.
+        on_done: called with the report; see `bhd_lerobot.datasets.edit.edits.delete`.
 
     Raises:
-        ConfigError: nothing is said, or an unknown outcome, one that the task or robot cannot have, or impossible
+        ConfigError: there is no mark, or an unknown outcome, one that the task or robot cannot have, or impossible
             frames.
         DatasetLockedError: the dataset is being recorded.
         DatasetError: there is no such episode or no valid, finalised dataset, the dataset has no column for it, or the
@@ -84,30 +84,30 @@ def mark(
         types = _COLUMNS if outcome is not None and "outcome" not in state.metadata_types else {}
         return Change(picks, edit, state.identity, types)
 
-    return rewrite(Path(root), request, change, tell)
+    return rewrite(Path(root), request, change, on_done)
 
 
 def possible_outcomes(state: DatasetState, row: Row) -> tuple[str, ...]:
-    """Return what an episode can have ended with, by its task and its robot; everything if nobody knows these."""
+    """Return what an episode can have ended with, by its task and its robot; all outcomes if these are unknown."""
     return outcomes_of(_task_of(state, row), state.info.get("robot_type"))
 
 
 def _task_of(state: DatasetState, row: Row) -> str | None:
-    """Return the type of an episode's task; None if nobody has said it."""
+    """Return the type of an episode's task; None if it is unknown."""
     try:
-        told = json.loads(row.get("bhd/task") or "null") or (state.identity or {})["recording"]["task"]
-        return str(told["type"])
+        task = json.loads(row.get("bhd/task") or "null") or (state.identity or {})["recording"]["task"]
+        return str(task["type"])
     except (ValueError, KeyError, TypeError):
         return None
 
 
 def _what(state: DatasetState, row: Row) -> str:
-    told = {"its robot is": state.info.get("robot_type"), "its task": _task_of(state, row)}
-    return ", ".join(f"{what} {name}" for what, name in told.items() if name)
+    known = {"its robot is": state.info.get("robot_type"), "its task": _task_of(state, row)}
+    return ", ".join(f"{what} {name}" for what, name in known.items() if name)
 
 
 class _Changes:
-    """Makes the picks of the episodes that are marked, and tells what each was before."""
+    """Makes the picks of the marked episodes, and logs their former values."""
 
     def __init__(
         self, state: DatasetState, outcome: str | None, intervention: tuple[int, int] | None, clear: bool
@@ -116,7 +116,7 @@ class _Changes:
         self._state, self._outcome, self._intervention, self._clear = state, outcome, intervention, clear
         self._slots = ordered_slots(state.rows, "data")
         self._features = state.info["features"]
-        # What a column of another program's means, this one does not know.
+        # The meaning of the columns of another program is unknown.
         self._has_events = state.identity is not None and keys.EVENT in self._features
         self._has_success = state.identity is not None and keys.SUCCESS in self._features
         if not self._has_events and (intervention is not None or clear):
@@ -129,13 +129,13 @@ class _Changes:
         length = row["length"]
         metadata: dict[str, Any] = {}
         columns: dict[str, np.ndarray] = {}
-        told: dict[str, Any] = {"episode": row["episode_index"]}
+        entry: dict[str, Any] = {"episode": row["episode_index"]}
         if self._has_events:
             events = self._column(row, keys.EVENT)
             columns[keys.EVENT] = events
-            told |= self._intervene(events, row, metadata)
+            entry |= self._intervene(events, row, metadata)
         if self._outcome is not None:
-            told["outcome"] = [row.get("bhd/outcome"), self._outcome]
+            entry["outcome"] = [row.get("bhd/outcome"), self._outcome]
             is_success = self._outcome == Event.SUCCESS.cause
             metadata["outcome"] = self._outcome
             if "success" in self._state.metadata_types or "outcome" not in self._state.metadata_types:
@@ -145,11 +145,11 @@ class _Changes:
             if self._has_success:
                 columns[keys.SUCCESS] = np.zeros(length, np.bool_)
                 columns[keys.SUCCESS][-1] = is_success
-        self.log.append(told)
+        self.log.append(entry)
         return Pick(self._state, row, metadata, columns)
 
     def _intervene(self, events: np.ndarray, row: Row, metadata: dict[str, Any]) -> dict[str, Any]:
-        """Change the events of an episode, and what its metadata tells of interventions; return what is logged."""
+        """Change the events and the intervention metadata of an episode; return the log entry."""
         if not self._clear and self._intervention is None:
             return {}
         recorded = _interventions(row)
@@ -171,7 +171,7 @@ class _Changes:
         events[(events == Event.NOTHING) & driven] = Event.INTERVENTION
         if "interventions" in self._state.metadata_types:
             reasons = {first: why for first, _, why in recorded}
-            spans = [[first, last + 1, reasons.get(first, _SAID)] for first, last in _spans(driven)]
+            spans = [[first, last + 1, reasons.get(first, _REASON)] for first, last in _spans(driven)]
             metadata["interventions"] = json.dumps(spans)
         if "intervened_frames" in self._state.metadata_types:
             metadata["intervened_frames"] = int(driven.sum())
@@ -186,16 +186,16 @@ class _Changes:
 
 
 def _interventions(row: Row) -> list[tuple[int, int, str]]:
-    """Return first frame, end and reason of each intervention that is told of an episode."""
-    told = row.get("bhd/interventions")
+    """Return first frame, end and reason of each recorded intervention of an episode."""
+    stored = row.get("bhd/interventions")
     try:
-        found = [(first, end, str(why)) for first, end, why in json.loads(told or "[]")]
+        found = [(first, end, str(why)) for first, end, why in json.loads(stored or "[]")]
     except (ValueError, TypeError, RecursionError):
         found = [(-1, 0, "")]
     if not all(isinstance(first, int) and isinstance(end, int) and 0 <= first <= end for first, end, _ in found):
         raise DatasetError(
             f"bhd/interventions of episode {row['episode_index']} is no list of first frame, end and reason: "
-            f"{told!r:.200}. Restore meta/episodes from a copy. Nothing was changed."
+            f"{stored!r:.200}. Restore meta/episodes from a copy. Nothing was changed."
         )
     return found
 

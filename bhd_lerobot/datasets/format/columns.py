@@ -8,7 +8,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.format.state import corrupt, load_state, ordered_slots, read_frames, slot_of
+from bhd_lerobot.datasets.format.state import (
+    DatasetState,
+    Row,
+    corrupt,
+    load_state,
+    ordered_slots,
+    read_frames,
+    slot_of,
+)
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError
 
@@ -27,13 +35,8 @@ def read_columns(root: Path | str, keys: Sequence[str], episode: int | None = No
     """
     root = Path(root)
     state = load_state(root)
-    if episode is not None and not 0 <= episode < state.num_episodes:
-        raise DatasetError(
-            f"There is no episode {episode} in {root}; it has {state.num_episodes}"
-            + (f", from 0 to {state.num_episodes - 1}." if state.num_episodes else ".")
-        )
     present = [key for key in keys if key in state.info["features"]]
-    rows = state.rows if episode is None else [state.rows[episode]]
+    rows = state.rows if episode is None else [_row(state, episode)]
     result: dict[int, dict[str, NDArray]] = {}
     for slot, inside in ordered_slots(rows, "data").items():
         path = root / layout.data_file(slot)
@@ -60,11 +63,7 @@ def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
     """
     root = Path(root)
     state = load_state(root)
-    if not 0 <= index < state.num_episodes:
-        raise DatasetError(
-            f"There is no episode {index} in {root}; it has {state.num_episodes}, from 0 to {state.num_episodes - 1}."
-        )
-    path = root / layout.data_file(slot_of(state.rows[index], "data"))
+    path = root / layout.data_file(slot_of(_row(state, index), "data"))
     try:
         table = pq.read_table(path, filters=[("episode_index", "=", index)], page_checksum_verification=True)
     except (OSError, pa.ArrowInvalid) as error:
@@ -74,6 +73,14 @@ def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
         for key in table.column_names
         if key in state.info["features"]
     }
+
+
+def _row(state: DatasetState, index: int) -> Row:
+    count = state.num_episodes
+    if not 0 <= index < count:
+        valid = f", from 0 to {count - 1}" if count else ""
+        raise DatasetError(f"There is no episode {index} in {state.root}; it has {count}{valid}.")
+    return state.rows[index]
 
 
 def _to_numpy(column: pa.ChunkedArray, shape: tuple[int, ...]) -> NDArray:

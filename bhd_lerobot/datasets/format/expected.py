@@ -1,6 +1,6 @@
-"""What the columns of a dataset's Parquet files have to be, for whoever reads them to be able to rely on it.
+"""Checks of the columns of a dataset's Parquet files, on which all readers rely.
 
-Every function returns what is wrong, in words, and nothing if all is well.
+Every function returns what is wrong, in words; an empty text if nothing is.
 """
 
 import math
@@ -25,7 +25,7 @@ _KINDS = {"float": _NUMBER, "int": _NUMBER, "uint": _NUMBER, "bool": (types.is_b
 def wrong_columns(schema: pa.Schema, features: Mapping[str, Mapping[str, Any]]) -> str:
     """Return in which way the columns of a data file contradict the features.
 
-    Numbers may be of another width or kind than is said, as after an edit with pandas: LeRobot casts them.
+    Numbers may be of another width or kind than described, as after an edit with pandas: LeRobot casts them.
     """
     if twice := repeated(schema):
         return twice
@@ -36,13 +36,13 @@ def wrong_columns(schema: pa.Schema, features: Mapping[str, Mapping[str, Any]]) 
             return f"it has no column {key!r}"
         kind, shape = schema.field(key).type, tuple(feature["shape"])
         if not _is_like(kind, feature["dtype"], shape):
-            return f"its column {key!r} is {kind}; {_said(feature)}"
+            return f"its column {key!r} is {kind}; {_described(feature)}"
         if key in DEFAULT_FEATURES and types.is_floating(kind) != (feature["dtype"] == "float32"):
             return f"its column {key!r} is {kind}; it must be {feature['dtype']}"
     return ""
 
 
-def _said(feature: Mapping[str, Any]) -> str:
+def _described(feature: Mapping[str, Any]) -> str:
     return f"meta/info.json says {feature['dtype']} of shape {list(feature['shape'])}"
 
 
@@ -61,7 +61,7 @@ def _is_like(kind: pa.DataType, dtype: str, shape: tuple[int, ...]) -> bool:
 
 
 def repeated(schema: pa.Schema) -> str:
-    """Return which name is that of several columns, which no reader tells apart."""
+    """Return which name several columns have; no reader can distinguish them."""
     twice = next((name for name, count in Counter(schema.names).items() if count > 1), None)
     return "" if twice is None else f"it has more than one column {twice!r}"
 
@@ -94,7 +94,7 @@ def wrong_array(array: pa.Array) -> str:
 
 
 def is_listed(kind: pa.DataType) -> bool:
-    """Tell whether a type is one of Arrow's lists."""
+    """Return whether a type is one of Arrow's lists."""
     return bool(types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind))
 
 
@@ -117,7 +117,7 @@ def wrong_types(schema: pa.Schema, cameras: Sequence[str]) -> str:
 
 
 def wrong_row(row: Mapping[str, Any], cameras: Sequence[str]) -> str:
-    """Return what is wrong with what `meta/episodes` says of an episode."""
+    """Return what is wrong with the row of an episode in `meta/episodes`."""
     tasks = row.get("tasks")
     if not isinstance(tasks, list) or not tasks or not all(isinstance(task, str) for task in tasks):
         return "has no instruction"
@@ -130,7 +130,7 @@ def wrong_row(row: Mapping[str, Any], cameras: Sequence[str]) -> str:
 
 
 def wrong_part(row: Mapping[str, Any], key: str) -> str:
-    """Return what is wrong with what `meta/episodes` says of an episode's part of a camera's video."""
+    """Return what is wrong with the place of an episode in a camera's video."""
     for name in (f"videos/{key}/chunk_index", f"videos/{key}/file_index"):
         if not _is_counted(row.get(name), name):
             return f"has {row.get(name)!r} as {name}"

@@ -88,9 +88,9 @@ def dataset_features(
         action_names: the action's floats, in order.
         images: image shapes (height, width, 3) by camera name.
         physics_names: the simulator's generalised positions and velocities, in order.
-        environment_names: what the task tells the brain, in order; no such column if there is nothing.
-        subtask: whether the brain says what it is doing.
-        language: whether that is said in LeRobot's language column, too.
+        environment_names: the values of the environment state, in order; no such column if there are none.
+        subtask: whether the brain reports its subtask.
+        language: whether the subtask is stored in LeRobot's language column, too.
     """
     features: dict[str, dict[str, Any]] = {OBSERVATION_STATE: _vector("float32", observation_names)}
     if environment_names:

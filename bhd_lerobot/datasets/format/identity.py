@@ -1,4 +1,4 @@
-"""Who recorded a dataset, and whether somebody else may continue it."""
+"""The identity of a recording, which decides whether it can be continued."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -39,11 +39,11 @@ def check_identity(
 
     Args:
         state: the dataset on disk.
-        schema: the columns asked for.
-        fps: the frame rate asked for.
-        robot_type: the robot asked for.
-        recording: the description asked for; None accepts the recorded one.
-        video: video settings asked for; None accepts the recorded ones.
+        schema: the requested columns.
+        fps: the requested frame rate.
+        robot_type: the requested robot.
+        recording: the requested description; None accepts the recorded one.
+        video: the requested video settings; None accepts the recorded ones.
 
     Raises:
         DatasetMismatchError: with every difference: key, recorded value, requested value.
@@ -62,7 +62,7 @@ def check_identity(
         name = edit.get("edit", "edit") if isinstance(edit, Mapping) else "edit"
         raise DatasetEditedError(
             f"{state.root} was edited after its recording ({name}), so it cannot be continued: its next episode would "
-            "not be the one that its seed says. Record what is missing into another root, with another seed, and merge "
+            "not be the one of its seed. Record what is missing into another root, with another seed, and merge "
             "the two."
         )
     recorded: dict[str, Any] = {"robot_type": state.info.get("robot_type"), "fps": state.info["fps"]}

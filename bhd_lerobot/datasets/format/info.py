@@ -1,4 +1,4 @@
-"""What `meta/info.json` says, read and checked in one place. Anybody may have written it.
+"""Reads and checks `meta/info.json`, which any program may have written.
 
 | key | valid | if it is left out |
 |---|---|---|
@@ -43,7 +43,7 @@ _DIMENSIONS = 5  # as many as LeRobot's columns have
 
 
 class InfoError(ValueError):
-    """The content of an `info.json` is not valid; says what is wrong, without the file's name and a remedy."""
+    """The content of an `info.json` is not valid. The message has neither the name of the file nor a remedy."""
 
 
 def parse_object(content: bytes) -> dict[str, Any]:
@@ -53,15 +53,15 @@ def parse_object(content: bytes) -> dict[str, Any]:
         InfoError: it is none.
     """
     try:
-        told = json.loads(content.decode("utf-8"))
-        json.dumps(told, ensure_ascii=False).encode()  # half a surrogate pair is JSON, and no text
+        values = json.loads(content.decode("utf-8"))
+        json.dumps(values, ensure_ascii=False).encode()  # half a surrogate pair is JSON, and no text
     except RecursionError:
         raise InfoError("it is nested too deeply to be read") from None
     except ValueError as error:
         raise InfoError(" ".join(str(error).split())) from error
-    if not isinstance(told, dict):
-        raise InfoError(f"it is {kind_of(told)} and no JSON object")
-    return told
+    if not isinstance(values, dict):
+        raise InfoError(f"it is {kind_of(values)} and no JSON object")
+    return values
 
 
 def read_info(path: Path, place: str | Path, *, features: bool = True, counts: bool = True) -> dict[str, Any]:
@@ -76,30 +76,30 @@ def read_info(path: Path, place: str | Path, *, features: bool = True, counts: b
 
 
 def checked_info(
-    told: Mapping[str, Any], place: str | Path, *, features: bool = True, counts: bool = True
+    values: Mapping[str, Any], place: str | Path, *, features: bool = True, counts: bool = True
 ) -> dict[str, Any]:
     """Return the content of an `info.json` with defaults for what may be left out.
 
     Args:
-        told: the content.
+        values: the content.
         place: the dataset, for the message about its version.
         features: check every feature, too; otherwise only that they are an object.
-        counts: whether what it counts has to be there and is looked at.
+        counts: whether the counts are required and checked.
 
     Raises:
         InfoError: a value is missing or not valid.
         DatasetError: it is of another version.
     """
     for key in _REQUIRED if counts else ("codebase_version", "features", "fps"):
-        if key not in told:
+        if key not in values:
             raise InfoError(f"it has no {key!r}")
-    if not str(told["codebase_version"]).startswith("v3."):
+    if not str(values["codebase_version"]).startswith("v3."):
         raise DatasetError(
-            f"{place} has dataset format {shown(told['codebase_version'], quoted=False)}; this program reads v3.x. "
+            f"{place} has dataset format {shown(values['codebase_version'], quoted=False)}; this program reads v3.x. "
             "LeRobot converts older ones."
         )
-    info = {**_DEFAULTS, **told}
-    info["splits"] = {} if told.get("splits") is None else told["splits"]
+    info = {**_DEFAULTS, **values}
+    info["splits"] = {} if values.get("splits") is None else values["splits"]
     for key, valid, is_valid in _RULES:
         if (counts or key not in COUNTS) and not is_valid(info[key]):
             hint = f"; left out, it is {_DEFAULTS[key]}" if _DEFAULTS.get(key) is not None else ""

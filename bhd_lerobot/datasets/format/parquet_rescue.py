@@ -1,8 +1,8 @@
 """Read a Parquet file whose writer was killed before it wrote the footer.
 
-A Parquet file is a sequence of row groups and a footer that says where each column of each of them is. Without the
-footer no reader opens it, though every row group that was written is there. Each page begins with a header that tells
-its size and number of values. So the row groups can be walked through, given the columns, and a footer can be written.
+A Parquet file is a sequence of row groups and a footer with the place of each column of each row group. No reader opens
+a file without its footer, though its row groups are complete. Each page begins with a header with its size and number
+of values. So, given the columns, the row groups can be found and a footer can be written.
 """
 
 from collections.abc import Mapping, Sequence
@@ -65,7 +65,7 @@ class _Page:
 
 
 def is_parquet(path: Path) -> bool:
-    """Tell whether a file begins like a Parquet file; of one that cannot be read nobody knows."""
+    """Return whether a file begins like a Parquet file; false if it cannot be read."""
     try:
         with open(path, "rb") as file:
             return file.read(len(MAGIC)) == MAGIC
@@ -74,7 +74,7 @@ def is_parquet(path: Path) -> bool:
 
 
 def is_cut_off(path: Path) -> bool:
-    """Tell whether a Parquet file has no footer. A writer that is killed leaves none."""
+    """Return whether a Parquet file has no footer, as after a kill of its writer."""
     try:
         with open(path, "rb") as file:
             begin = file.read(len(MAGIC))
@@ -90,7 +90,7 @@ def rescue(path: Path, schema: pa.Schema, shapes: Mapping[str, Sequence[int]] | 
     Args:
         path: the file.
         schema: its columns, in order; used only if there is no footer.
-        shapes: the shape of a row's value in columns of nested lists, whose type does not tell it.
+        shapes: the shape of a row's value in columns of nested lists, whose type does not define it.
 
     Raises:
         OSError: the file cannot be read at all.
@@ -184,8 +184,8 @@ def _group(data: memoryview, position: int, factors: Sequence[int]) -> list[_Chu
     """Return the columns of the row group at `position`; None if there is no whole one."""
     rows, first = 0, position
     while (page := _page(data, first)) is not None:
-        # How many rows the group has is told nowhere but in its pages, and a column may have several. So it is tried
-        # with the first page of the first column, then with two, until all columns fit.
+        # The number of rows of the group follows only from its pages, and a column may have several. Try the first page
+        # of the first column, then two, until all columns fit.
         if page.kind == _DICTIONARY_PAGE and rows:
             return None
         if page.kind != _DICTIONARY_PAGE:

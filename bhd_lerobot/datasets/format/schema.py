@@ -21,7 +21,7 @@ DEFAULT_FEATURES: dict[str, dict[str, Any]] = {
 """Columns that every LeRobot dataset has and that the recorder fills in."""
 
 LANGUAGE = "language_persistent"
-"""LeRobot's column for what is said in an episode and stays valid; its values are lists of rows."""
+"""LeRobot's column for language that stays valid in an episode; its values are lists of rows."""
 
 _ARROW = {
     "float32": pa.float32(),
@@ -162,7 +162,7 @@ def _checked(key: str, feature: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _language() -> tuple[pa.DataType, Any]:
-    """Return Arrow's type of LeRobot's column for what is said and stays valid, and its description for `datasets`."""
+    """Return the Arrow type of LeRobot's persistent language column, and its description for `datasets`."""
     from datasets import Features
     from lerobot.datasets import language  # seconds to import, and rarely needed
 

@@ -99,7 +99,7 @@ class DamagedFileError(DatasetCorruptError):
 
     Attributes:
         wrong: what is wrong with it, without a remedy.
-        path: the file, or the folder that lacks it; None if the message alone tells.
+        path: the file, or the folder that lacks it; None if there is none.
     """
 
     def __init__(self, message: str, path: Path | None = None, wrong: str | None = None) -> None:
@@ -129,12 +129,12 @@ def no_dataset(root: Path) -> DatasetError:
     if not root.is_dir():
         found = "is a file" if root.exists() else "is a broken link" if root.is_symlink() else "does not exist"
         return DatasetError(f"{root} is not a LeRobot dataset: it {found}.")
-    said = f"{root} is not a LeRobot dataset: it has no meta/info.json."
+    message = f"{root} is not a LeRobot dataset: it has no meta/info.json."
     if (root / "data").is_dir() or (root / "meta").is_dir():
-        return DatasetError(f"{said} {repair_with_info(root)}")
+        return DatasetError(f"{message} {repair_with_info(root)}")
     inside = sorted(path.parents[1].name for path in root.glob(f"*/{layout.INFO}"))
-    told = f" It holds some; name one: {', '.join(inside[:6])}{', …' if len(inside) > 6 else ''}." if inside else ""
-    return DatasetError(said + told)
+    hint = f" It holds some; name one: {', '.join(inside[:6])}{', …' if len(inside) > 6 else ''}." if inside else ""
+    return DatasetError(message + hint)
 
 
 def load_state(root: Path, *, videos: bool = True) -> DatasetState:
@@ -224,14 +224,14 @@ def read_tasks(path: Path) -> list[str]:
         table = pq.ParquetFile(path).read(use_threads=False)
         # LeRobot keeps the sentence in the index of a pandas table; the column name differs between its versions.
         name = next(n for n in table.column_names if n != "task_index")
-        told = dict(zip(table["task_index"].to_pylist(), table[name].to_pylist(), strict=True))
+        tasks = dict(zip(table["task_index"].to_pylist(), table[name].to_pylist(), strict=True))
     except (*UNREADABLE, KeyError, StopIteration, TypeError) as error:
         raise corrupt(path, error) from error
-    if table.num_rows != len(told) or told.keys() != set(range(len(told))):
+    if table.num_rows != len(tasks) or tasks.keys() != set(range(len(tasks))):
         raise corrupt(path, f"its numbers are not 0 to {table.num_rows - 1}, each once")
-    if not all(isinstance(task, str) for task in told.values()):
+    if not all(isinstance(task, str) for task in tasks.values()):
         raise corrupt(path, "not all of its instructions are texts")
-    return [told[index] for index in range(len(told))]
+    return [tasks[index] for index in range(len(tasks))]
 
 
 def _read_rows(state: DatasetState) -> None:
@@ -308,7 +308,7 @@ def _check_files(state: DatasetState, videos: bool) -> None:
     if start != state.info["total_frames"]:
         raise DatasetCorruptError(
             f"{state.root / layout.INFO} counts {state.info['total_frames']} frames; its episodes have {start}. "
-            f"`bhd-data check {quoted(state.root)} --fix` counts anew. Nothing was changed."
+            f"`bhd-data check {quoted(state.root)} --fix` corrects the count. Nothing was changed."
         )
     for slot, rows in ordered_slots(state.rows, "data").items():
         path = state.root / layout.data_file(slot)

@@ -99,12 +99,12 @@ def dataset_info(root: Path | str) -> DatasetSummary:
 
 
 def is_being_written(root: Path) -> bool:
-    """Tell whether a dataset is being recorded, repaired or edited by us at this moment."""
+    """Return whether a dataset is being recorded, repaired or edited by us at this moment."""
     try:
         RootLock(root).release()
     except DatasetLockedError:
         return True
-    except OSError:  # there is none, or nobody may look
+    except OSError:  # it is missing or may not be read
         return False
     return False
 

@@ -5,7 +5,7 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -268,43 +268,6 @@ def stream_signature(path: Path) -> tuple[Any, ...]:
             f"{path} is not a readable video ({error}). Restore this file from a copy; nothing was changed."
         ) from error
     return signature
-
-
-def concatenate(parts: Sequence[Path], target: Path, fps: int) -> list[int]:
-    """Join videos of the same signature into one file, without encoding again.
-
-    Args:
-        parts: files in order.
-        target: the new file.
-        fps: frames per second of all of them.
-
-    Returns:
-        The number of frames of every part.
-    """
-    import av
-
-    counts: list[int] = []
-    with av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as output:
-        joined: Any = None
-        for part in parts:
-            with av.open(str(part)) as source:
-                stream: Any = source.streams.video[0]
-                if joined is None:
-                    joined = output.add_stream_from_template(stream, opaque=True)
-                    joined.time_base = stream.time_base
-                # Every part starts where the frames before it end; counted in frames, so no rounding adds up.
-                shift = int(Fraction(sum(counts), fps) / stream.time_base)
-                frames = 0
-                packet: Any
-                for packet in source.demux(stream):
-                    if packet.dts is None:
-                        continue  # the demuxer's end marker
-                    packet.pts, packet.dts = packet.pts + shift, packet.dts + shift
-                    packet.stream = joined
-                    output.mux(packet)
-                    frames += 1
-                counts.append(frames)
-    return counts
 
 
 def video_info(path: Path, settings: VideoSettings) -> dict[str, Any]:

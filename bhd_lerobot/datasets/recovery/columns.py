@@ -20,7 +20,7 @@ _NO_STATISTICS = ("string", "language", *_IMAGES)  # of images there may be some
 
 
 def misfit(root: Path, info: Mapping[str, Any]) -> str:
-    """Return in which way a dataset's files contradict what `info.json` says of their columns; empty if they do not.
+    """Return in which way a dataset's files contradict the columns of `info.json`; empty if they do not.
 
     Data files with a footer name their columns, and `meta/stats.json` those with numbers. It is a misfit if none of
     them agrees.
@@ -47,10 +47,10 @@ def lost_cameras(root: Path, info: Mapping[str, Any]) -> list[str]:
 
 
 def read_info(path: Path) -> dict[str, Any]:
-    """Return an `info.json` that says what the columns are.
+    """Return an `info.json` that describes the columns.
 
     Raises:
-        DatasetCorruptError: it does not; its cause, or else its message, says why.
+        DatasetCorruptError: it does not; the reason is in its cause, or else in its message.
     """
     try:
         return meta_info.read_info(path, path, counts=False)
@@ -59,7 +59,7 @@ def read_info(path: Path) -> dict[str, Any]:
 
 
 def _witnesses(root: Path) -> Iterator[tuple[dict[str, int | None], bool]]:
-    """Yield what the files say of the columns: the size of each, if it is told, and whether all of them are there."""
+    """Yield the columns of the files: the size of each, if it is known, and whether all columns are there."""
     for path in sorted((root / "data").glob("chunk-*/file-*.parquet")):
         try:
             schema = pq.read_schema(path)
@@ -86,7 +86,7 @@ def _difference(info: Mapping[str, Any], sizes: Mapping[str, int | None], comple
 
     Args:
         info: describes them.
-        sizes: the columns, and how many numbers each has; None if that is not told.
+        sizes: the columns, and how many numbers each has; None if unknown.
         complete: whether they are all columns but videos; otherwise all that are numbers, and perhaps images.
     """
     features = {**DEFAULT_FEATURES, **info["features"]}
@@ -95,10 +95,10 @@ def _difference(info: Mapping[str, Any], sizes: Mapping[str, int | None], comple
     if not sizes:
         return ""
     lacks, more = sorted(sizes.keys() - features.keys()), sorted(wanted - sizes.keys())
-    said = [f"it does not describe {few(lacks)}"] if lacks else []
-    said += [f"it describes {few(more)}, which {'is' if len(more) == 1 else 'are'} not there"] if more else []
+    texts = [f"it does not describe {few(lacks)}"] if lacks else []
+    texts += [f"it describes {few(more)}, which {'is' if len(more) == 1 else 'are'} not there"] if more else []
     for key in sorted(sizes.keys() & wanted):
         shape, size = features[key]["shape"], sizes[key]
         if size is not None and len(shape) == 1 and shape[0] != size:
-            said.append(f"it says that {key} has {shape[0]} numbers, and it has {size}")
-    return "; ".join(said)
+            texts.append(f"it says that {key} has {shape[0]} numbers, and it has {size}")
+    return "; ".join(texts)

@@ -1,4 +1,4 @@
-"""What the readable files of ``meta/episodes`` of a corrupted dataset still tell."""
+"""The rows that can still be read in ``meta/episodes`` of a corrupted dataset."""
 
 import contextlib
 import re
@@ -13,7 +13,7 @@ from bhd_lerobot.datasets.format.episode_table import PREFIX, read_stats
 from bhd_lerobot.datasets.format.expected import repeated, wrong_row
 from bhd_lerobot.datasets.format.state import UNREADABLE, Row, column_types
 from bhd_lerobot.datasets.format.statistics import Stats
-from bhd_lerobot.datasets.recovery.videos import Found
+from bhd_lerobot.datasets.recovery.videos import FoundEpisode
 
 _OURS = re.compile(rb"(?<=bhd/)[a-z][a-z0-9_]*(?![a-zA-Z0-9_])")
 """Names of our columns in the bytes of a footer."""
@@ -26,7 +26,7 @@ class EpisodeRows:
         rows: by the number of the episode.
         metadata_types: Arrow types of our columns, by name without prefix.
         extra_types: Arrow types of columns of other programs.
-        torn: names without prefix of columns of ours that files tell which cannot be read.
+        torn: names without prefix of our columns in files that cannot be read.
 
     Args:
         root: the corrupted dataset.
@@ -47,7 +47,7 @@ class EpisodeRows:
                 if wrong := repeated(file.schema_arrow):
                     raise ValueError(wrong)
             except UNREADABLE:
-                # Nothing is lost by it that is not made anew, but for what only we or other programs tell.
+                # All of it is computed anew, but for our columns and those of other programs.
                 with contextlib.suppress(OSError):
                     self.torn |= {name.decode() for name in _OURS.findall(path.read_bytes())}
                 continue
@@ -62,13 +62,13 @@ class EpisodeRows:
                     key: {name: values[place] for name, values in stat.items()} for key, stat in stats.items()
                 }
 
-    def complete(self, kept: Sequence[Found], rows: Sequence[Row]) -> None:
-        """Write into the new rows what is told about their episodes by us and by other programs."""
-        for one, row in zip(kept, rows, strict=True):
-            old = self.rows.get(one.number, {}) if one.has_row else {}
+    def complete(self, recovered: Sequence[FoundEpisode], rows: Sequence[Row]) -> None:
+        """Copy our columns and those of other programs into the new rows."""
+        for episode, row in zip(recovered, rows, strict=True):
+            old = self.rows.get(episode.number, {}) if episode.has_row else {}
             row |= {PREFIX + name: old.get(PREFIX + name) for name in self.metadata_types}
             row |= {name: old.get(name) for name in self.extra_types}
 
-    def stats_of(self, kept: Sequence[Found]) -> list[dict[str, dict[str, np.ndarray]]]:
+    def stats_of(self, recovered: Sequence[FoundEpisode]) -> list[dict[str, dict[str, np.ndarray]]]:
         """Return the stored statistics of each episode; empty where there are none."""
-        return [self._stats.get(one.number, {}) if one.has_row else {} for one in kept]
+        return [self._stats.get(episode.number, {}) if episode.has_row else {} for episode in recovered]

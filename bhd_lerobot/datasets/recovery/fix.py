@@ -1,7 +1,7 @@
 """`bhd-data check --fix`: repair what follows from the rest of a dataset, and nothing else.
 
 Statistics follow from the frames, and the number of frames from the episodes. What is damaged is for `repair`, and what
-is doubtful, such as a value that is out of range, is for a person.
+is uncertain, such as a value that is out of range, is for a person.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +24,7 @@ from bhd_lerobot.datasets.validate.findings import Finding, Severity
 
 
 def is_fixable(finding: Finding) -> bool:
-    """Tell whether `fix` repairs what was found."""
+    """Return whether `fix` repairs what was found."""
     if finding.severity is Severity.NOTE:
         return False
     return finding.check == "stats" or (finding.check == "counts" and finding.where == layout.INFO)
@@ -75,9 +75,7 @@ def _count_frames(root: Path, disk: Disk) -> str:
         rows = zip(table["episode_index"].to_pylist(), table["length"].to_pylist(), strict=True)
         frames += sum(length for index, length in rows if index < info["total_episodes"])
     before = info["total_frames"]
-    disk.make_folder(root / layout.STAGING)
-    disk.write(root / layout.STAGING / "info.json", to_json({**info, "total_frames": frames}))
-    disk.move(root / layout.STAGING / "info.json", root / layout.INFO)
+    disk.publish(root / layout.INFO, to_json({**info, "total_frames": frames}), root / layout.STAGING)
     return f"{layout.INFO}: total_frames is {frames}, as the episodes say; it was {before}"
 
 

@@ -1,7 +1,7 @@
 """`meta/info.json` of another recording in the place of one that is lost.
 
-It says what the columns are and how many frames a second has, which files without a footer do not tell. What it counts
-is the other recording's and is never looked at.
+It describes the columns and the frame rate, which files without a footer do not. Its counts are those of the other
+recording and are never used.
 """
 
 from pathlib import Path
@@ -57,11 +57,11 @@ def adopt_info(root: Path, donor: Path, disk: Disk) -> tuple[str, Path | None]:
             f"--info is {donor}, which describes other data than those of {root}: {wrong}. Name a recording with the "
             "same robot and cameras. Nothing was changed."
         )
-    kept: Path | None = None
+    saved: Path | None = None
     if path.exists():
-        kept = layout.aside_of(root) / layout.INFO
-        disk.make_folder(kept.parent)
-        disk.copy(path, kept)
+        saved = layout.aside_of(root) / layout.INFO
+        disk.make_folder(saved.parent)
+        disk.copy(path, saved)
     rows = EpisodeRows(root).rows
     # Ours are numbered without a hole; what is behind one is for `salvage`, which counts by itself.
     total = next(index for index in range(len(rows) + 1) if index not in rows)
@@ -75,19 +75,17 @@ def adopt_info(root: Path, donor: Path, disk: Disk) -> tuple[str, Path | None]:
         "total_tasks": tasks,
         "splits": {"train": f"0:{total}"} if total else {},
     }
-    disk.make_folder(root / layout.STAGING)
-    disk.write(root / layout.STAGING / "info.json", to_json({**info, **counted}))
-    disk.move(root / layout.STAGING / "info.json", path)
-    return f"{layout.INFO}: columns and frame rate as in {donor}, counts from the files", kept
+    disk.publish(path, to_json({**info, **counted}), root / layout.STAGING)
+    return f"{layout.INFO}: columns and frame rate as in {donor}, counts from the files", saved
 
 
-def give_back(root: Path, kept: Path | None, disk: Disk) -> None:
+def give_back(root: Path, saved: Path | None, disk: Disk) -> None:
     """Undo what `adopt_info` did."""
-    if kept is None:
+    if saved is None:
         disk.remove(root / layout.INFO)
     else:
-        disk.move(kept, root / layout.INFO)
-        disk.remove_tree(kept.parents[1])
+        disk.move(saved, root / layout.INFO)
+        disk.remove_tree(saved.parents[1])
 
 
 def _wrong(root: Path, info: dict[str, Any]) -> str:

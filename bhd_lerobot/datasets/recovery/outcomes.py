@@ -1,4 +1,4 @@
-"""What only ``meta/episodes`` told of episodes whose rows are gone: their outcomes follow, the rest is named."""
+"""Outcomes of episodes whose rows in ``meta/episodes`` are lost, and what is lost with these rows."""
 
 import json
 from collections.abc import Sequence
@@ -12,8 +12,8 @@ from bhd_lerobot.datasets.assembly.assemble import EDITS
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
 from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
-from bhd_lerobot.datasets.recovery.videos import Found
-from bhd_lerobot.datasets.validate.findings import few
+from bhd_lerobot.datasets.recovery.videos import FoundEpisode
+from bhd_lerobot.datasets.validate.findings import Findings, few
 from bhd_lerobot.tasks.task import OUTCOMES, Event
 
 RECOVERED = "recovered"
@@ -22,74 +22,71 @@ RECOVERED = "recovered"
 _SHOWN = 30  # columns
 
 
-def recall(
-    root: Path, kept: Sequence[Found], rows: Sequence[Row], told: EpisodeRows, *, is_ours: bool
-) -> tuple[list[str], list[str]]:
-    """Write the outcomes of episodes without a row into their new rows, and name what cannot be told again.
+def restore_outcomes(
+    root: Path,
+    recovered: Sequence[FoundEpisode],
+    rows: Sequence[Row],
+    stored: EpisodeRows,
+    findings: Findings,
+    *,
+    is_ours: bool,
+) -> None:
+    """Write the outcomes of episodes without a row into their new rows, and report the columns that are lost.
 
-    An outcome is what somebody said afterwards, or else the event of the last frame, where our recorder wrote it.
+    An outcome is a person's mark, or else the event of the last frame, where our recorder wrote it.
 
     Args:
         root: the corrupted dataset.
-        kept: episodes that were recovered.
+        recovered: the recovered episodes.
         rows: their new rows; changed in place.
-        told: what could be read of the old ones; its types get those of the outcomes.
+        stored: what could be read of the old ones; its types get those of the outcomes.
+        findings: lost columns, and outcomes that are known from elsewhere, are added to it.
         is_ours: whether our recorder wrote every episode, so that each had a row with columns of ours.
-
-    Returns:
-        What is lost, and what is known from elsewhere, in lines.
     """
-    without_row = [(one, row) for one, row in zip(kept, rows, strict=True) if not one.has_row]
+    without_row = [(episode, row) for episode, row in zip(recovered, rows, strict=True) if not episode.has_row]
     marked, is_older = _marks(root)
-    if not without_row or not (is_ours or told.torn or marked or is_older):
-        return [], []
-    names = {*told.metadata_types, *told.torn}
+    if not without_row or not (is_ours or stored.torn or marked or is_older):
+        return
+    names = {*stored.metadata_types, *stored.torn}
     known: list[int] = []
-    for one, row in without_row:
-        outcome = marked.get(one.number) or (_ended_with(one) if is_ours or told.torn else None)
+    for episode, row in without_row:
+        outcome = marked.get(episode.number) or (_ended_with(episode) if is_ours or stored.torn else None)
         if outcome is not None:
-            known.append(one.number)
+            known.append(episode.number)
             row["bhd/outcome"] = outcome
             if "success" in names or "outcome" not in names:
                 row["bhd/success"] = outcome == Event.SUCCESS.cause
     if known:
-        told.metadata_types.setdefault("outcome", pa.string())
+        stored.metadata_types.setdefault("outcome", pa.string())
         if any("bhd/success" in row for row in rows):
-            told.metadata_types.setdefault("success", pa.bool_())
+            stored.metadata_types.setdefault("success", pa.bool_())
         for row in rows:
-            row |= {f"bhd/{name}": row.get(f"bhd/{name}") for name in told.metadata_types}
-    numbers = [one.number for one, _ in without_row]
-    lost = _lost(numbers, known, names, is_ours=is_ours or bool(told.torn))
-    if is_older and set(numbers) - set(known):
-        lost.append(
-            f"{EDITS}: outcomes that were marked before episodes were numbered anew. The file still tells them, under "
-            "the numbers of that time"
-        )
-    said = [f"the outcomes of {_episodes(known)} are told by {EDITS} or by their last frames"] if known else []
-    return lost, said
+            row |= {f"bhd/{name}": row.get(f"bhd/{name}") for name in stored.metadata_types}
+        what = f"it or the event of the last frame gives the outcomes of {_episodes(known)}"
+        findings.note("outcome", EDITS, what)
+    numbers = [episode.number for episode, _ in without_row]
+    others = sorted(set(numbers) - set(known))
+    if is_ours or stored.torn:
+        rest = sorted(f"bhd/{name}" for name in names - ({"outcome", "success"} if known else set()))
+        columns = few(rest, _SHOWN) if rest else "all columns bhd/… but outcome and success" if known else "all bhd/…"
+        findings.error("outcome", "meta/episodes", f"{columns} of {_episodes(numbers)}")
+        if known and others:
+            findings.error("outcome", "meta/episodes", f"bhd/outcome, bhd/success of {_episodes(others)}")
+    if is_older and others:
+        what = "outcomes that were marked before episodes were renumbered; the file has them under the old numbers"
+        findings.error("outcome", EDITS, what)
 
 
-def _lost(numbers: list[int], known: list[int], names: set[str], *, is_ours: bool) -> list[str]:
-    if not is_ours:
-        return []
-    rest = sorted(f"bhd/{name}" for name in names - ({"outcome", "success"} if known else set()))
-    columns = few(rest, _SHOWN) if rest else "all columns bhd/… but outcome and success" if known else "all bhd/…"
-    lines = [f"meta/episodes: {columns} of {_episodes(numbers)}"]
-    if known and (others := sorted(set(numbers) - set(known))):
-        lines.append(f"meta/episodes: bhd/outcome, bhd/success of {_episodes(others)}")
-    return lines
-
-
-def logged(root: Path, kept: Sequence[Found], time: str) -> bytes:
+def logged(root: Path, recovered: Sequence[FoundEpisode], time: str) -> bytes:
     """Return the content of ``meta/edits.jsonl`` with the salvage as its last line."""
     path = root / EDITS
     before = path.read_bytes() if path.is_file() else b""
-    edit = {"time": time, "edit": RECOVERED, "episodes": [one.number for one in kept]}
+    edit = {"time": time, "edit": RECOVERED, "episodes": [episode.number for episode in recovered]}
     return before + (b"\n" if before and not before.endswith(b"\n") else b"") + json.dumps(edit).encode() + b"\n"
 
 
 def _marks(root: Path) -> tuple[dict[int, str], bool]:
-    """Return the outcomes that somebody marked, by the number of the episode now, and whether there are older ones."""
+    """Return the marked outcomes, by the number of the episode now, and whether there are older ones."""
     outcomes: dict[int, str] = {}
     is_older = False
     path = root / EDITS
@@ -97,23 +94,23 @@ def _marks(root: Path) -> tuple[dict[int, str], bool]:
         try:
             edit: dict[str, Any] = json.loads(line)
             if edit["edit"] == "mark":
-                told = {one["episode"]: one["outcome"][1] for one in edit["episodes"] if "outcome" in one}
-                outcomes |= {number: outcome for number, outcome in told.items() if outcome in OUTCOMES}
+                marks = {one["episode"]: one["outcome"][1] for one in edit["episodes"] if "outcome" in one}
+                outcomes |= {number: outcome for number, outcome in marks.items() if outcome in OUTCOMES}
             elif edit["edit"] != RECOVERED or edit["episodes"] != list(range(len(edit["episodes"]))):
                 is_older |= bool(outcomes)
                 outcomes = {}
         except (ValueError, KeyError, TypeError, IndexError):
-            # Whether it numbered the episodes anew is not known.
+            # Whether this edit renumbered the episodes is not known.
             is_older |= bool(outcomes)
             outcomes = {}
     return outcomes, is_older
 
 
-def _ended_with(one: Found) -> str | None:
-    """Return the outcome that the last frame's event tells; None if the column is not what `bhd-record` writes."""
-    if keys.EVENT not in one.table.column_names:
+def _ended_with(episode: FoundEpisode) -> str | None:
+    """Return the outcome of the last frame's event; None if the column is not one that `bhd-record` writes."""
+    if keys.EVENT not in episode.table.column_names:
         return None
-    *before, last = np.asarray(one.table[keys.EVENT].to_pylist(), dtype=object).reshape(-1).tolist()
+    *before, last = np.asarray(episode.table[keys.EVENT].to_pylist(), dtype=object).reshape(-1).tolist()
     if set(before) - {Event.NOTHING, Event.INTERVENTION}:
         return None
     return next((each.cause for each in Event if each == last and each.cause in OUTCOMES), None)

@@ -1,6 +1,6 @@
 """Complete or drop what an interrupted recording left behind, and recover what is whole where files are damaged."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -24,53 +24,12 @@ from bhd_lerobot.datasets.format.state import (
 from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
 from bhd_lerobot.datasets.recovery.fix import compute_stats
 from bhd_lerobot.datasets.recovery.info import adopt_info, give_back
-from bhd_lerobot.datasets.recovery.salvage import salvage
+from bhd_lerobot.datasets.recovery.salvage import RepairReport, salvage
 from bhd_lerobot.datasets.recovery.videos import whole_frames
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import real, remove_abandoned, roll_forward
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
 from bhd_lerobot.errors import DatasetCorruptError
-
-
-@dataclass(frozen=True)
-class RepairReport:
-    """What was repaired. It is false if there was nothing to do.
-
-    Attributes:
-        root: the dataset.
-        episodes: episodes it holds now.
-        frames: frames it holds now.
-        completed: steps that had been decided before the interruption and were completed.
-        dropped: files of unfinished episodes that were removed, relative to the root.
-        lost: what of a corrupted dataset could not be recovered, and why.
-        hints: what may be so about it.
-        aside: where its damaged files lie now; None if none were damaged.
-    """
-
-    root: Path
-    episodes: int
-    frames: int
-    completed: tuple[str, ...] = ()
-    dropped: tuple[str, ...] = ()
-    lost: tuple[str, ...] = ()
-    hints: tuple[str, ...] = ()
-    aside: Path | None = None
-
-    def __bool__(self) -> bool:
-        """Whether anything was repaired."""
-        return bool(self.completed or self.dropped)
-
-    def __str__(self) -> str:
-        """Return the report for a terminal."""
-        empty = "" if self.episodes else ": it is empty"
-        lines = [f"{self.root}: {self.episodes} episodes, {self.frames} frames{empty}"]
-        lines += [f"  completed: {item}" for item in self.completed]
-        lines += [f"  dropped: {item}" for item in self.dropped]
-        lines += [f"  lost: {item}" for item in self.lost]
-        lines += ["  lost: nothing"] if self.aside is not None and not self.lost else []
-        lines += [f"  note: {item}" for item in self.hints]
-        lines += [f"  the damaged files are in {self.aside}"] if self.aside is not None else []
-        return "\n".join(lines if self else [*lines, "  nothing to do"])
 
 
 def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
@@ -83,7 +42,7 @@ def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
     Raises:
         DatasetLockedError: it is being recorded at this moment.
         DatasetCorruptError: files are damaged and no whole episode can be recovered; nothing was changed then.
-        DatasetError: there is no dataset at `root`, or the disk does not give out one of its files.
+        DatasetError: there is no dataset at `root`, or one of its files cannot be read.
         ConfigError: `info` is not needed, cannot be read or describes other data.
         DatasetWriteError: the disk refuses the repaired files.
     """
@@ -100,7 +59,7 @@ def repair(root: Path | str, info: Path | str | None = None) -> RepairReport:
             return _repair_foreign(root, disk, lock)
         return _repair_own(root, disk, lock)
     except DatasetCorruptError as error:
-        # Whoever is told to try `repair` has done that now.
+        # The advice to run `repair` is of no use any more.
         raise DatasetCorruptError(str(error).replace(REPAIR_MAY_HELP, "")) from error
     finally:
         lock.release()
@@ -116,13 +75,13 @@ def _repair_own(root: Path, disk: Disk, lock: RootLock) -> RepairReport:
             if state.identity is not None and compact(state, Schema(state.info["features"]), disk, lock):
                 what = f"compaction and statistics of {len(state.without_stats)} episodes"
                 disk.remove_tree(root / layout.STAGING)
-                done = (*report.completed, what)
-                report = RepairReport(root, report.episodes, report.frames, done, report.dropped)
+                report = replace(report, completed=(*report.completed, what))
     except DamagedFileError as error:
         # These two nothing else can replace: what the columns are, and who recorded it how.
         if error.path in (root / layout.INFO, root / layout.IDENTITY):
             raise
-        return _salvaged(root, disk, lock, error, completed=report.completed, dropped=report.dropped, is_ours=True)
+        rescued = _salvaged(root, disk, lock, error, report.completed, is_ours=True)
+        return replace(rescued, dropped=report.dropped)
     return report
 
 
@@ -131,36 +90,32 @@ def _salvaged(
     disk: Disk,
     lock: RootLock,
     error: DatasetCorruptError,
-    *,
     completed: tuple[str, ...],
-    dropped: tuple[str, ...] = (),
+    *,
     is_ours: bool = False,
 ) -> RepairReport:
     wrong = error.wrong if isinstance(error, DamagedFileError) else str(error).split(". ", 1)[0]
     rescued = salvage(root, disk, lock, wrong, is_ours=is_ours)
     what = f"{rescued.episodes} whole episodes were recovered, with new statistics. What was wrong: {wrong}"
-    done = (*completed, what)
-    return RepairReport(
-        root, rescued.episodes, rescued.frames, done, dropped, rescued.lost, rescued.hints, rescued.aside
-    )
+    return replace(rescued, completed=(*completed, what))
 
 
 def _repair_with(root: Path, donor: Path, disk: Disk, lock: RootLock) -> RepairReport:
     """Repair a dataset whose `info.json` is lost.
 
-    Frames that belong to no episode are recovered then, not dropped: nothing says any more which were saved.
+    Frames that belong to no episode are recovered then, not dropped: no file records any more which were saved.
     """
     consequence = "Its files are as they were."
     with write_errors("repair the dataset", root, consequence):
         roll_forward(root, disk)
-        adopted, kept = adopt_info(root, donor, disk)
+        adopted, saved = adopt_info(root, donor, disk)
     try:
         report = _repair_foreign(root, disk, lock, adopted)
     except BaseException:
         with write_errors("repair the dataset", root, consequence):
-            give_back(root, kept, disk)
+            give_back(root, saved, disk)
         raise
-    return report if kept is None or report.aside is not None else replace(report, aside=kept.parents[1])
+    return report if saved is None or report.aside is not None else replace(report, aside=saved.parents[1])
 
 
 def _repair_foreign(root: Path, disk: Disk, lock: RootLock, *completed: str) -> RepairReport:
@@ -179,7 +134,7 @@ def _repair_foreign(root: Path, disk: Disk, lock: RootLock, *completed: str) -> 
             raise corrupt(root / extra[0], "no episode of meta/episodes is in it")
         _check_readable(state)
     except DatasetCorruptError as error:
-        return _salvaged(root, disk, lock, error, completed=completed)
+        return _salvaged(root, disk, lock, error, completed)
     if state.rows and not _has_stats(root):
         with write_errors("repair the dataset", root, "Its files are as they were."):
             completed = (*completed, compute_stats(state, disk, lock))

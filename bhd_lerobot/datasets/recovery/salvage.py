@@ -1,15 +1,16 @@
-"""Bring back every whole episode of a dataset that cannot be read: a recorder was killed, or files are damaged.
+"""Recover every whole episode of a dataset that cannot be read: a recorder was killed, or files are damaged.
 
-LeRobot keeps one Parquet file open for a whole recording, and a file without its footer is read by nobody; it writes
-``meta/episodes`` ten episodes at a time, and ``info.json`` and a video at each. So after a kill nothing loads, though
-nearly everything is on disk. Here the frames are read without the footer, videos are counted, and an episode is kept if
-all of its frames are there in all of its columns and videos. Everything else of ``meta`` is made anew from that.
+LeRobot keeps one Parquet file open for a whole recording, and no reader opens a file without its footer; it writes
+``meta/episodes`` once in ten episodes, and ``info.json`` and a video with each. After a kill nothing loads, though
+nearly everything is on disk. Here the frames are read without the footer, the frames of videos are counted, and an
+episode is recovered if all of its frames are there in all of its columns and videos. The other files of ``meta`` are
+computed from these episodes.
 """
 
 import contextlib
 import datetime
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -25,38 +26,66 @@ from bhd_lerobot.datasets.format.parquet_rescue import rescue
 from bhd_lerobot.datasets.format.state import corrupt, read_identity, repair_with_info
 from bhd_lerobot.datasets.recovery.columns import lost_cameras, misfit, read_info
 from bhd_lerobot.datasets.recovery.evidence import EpisodeRows
-from bhd_lerobot.datasets.recovery.outcomes import RECOVERED, logged, recall
+from bhd_lerobot.datasets.recovery.outcomes import RECOVERED, logged, restore_outcomes
 from bhd_lerobot.datasets.recovery.rows import info_of, rows_of, tasks_of, write_data
 from bhd_lerobot.datasets.recovery.statistics import stats_of
-from bhd_lerobot.datasets.recovery.videos import Found, Videos
+from bhd_lerobot.datasets.recovery.videos import FoundEpisode, Videos
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import WORK, Workspace, link_others
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.datasets.storage.places import check_links
-from bhd_lerobot.datasets.validate.findings import few
+from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity, few
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError, UnsupportedDatasetError
 
 
 @dataclass(frozen=True)
-class Salvage:
-    """What became of a corrupted dataset.
+class RepairReport:
+    """The result of a repair. It is false if there was nothing to do.
 
     Attributes:
-        episodes: whole episodes that were recovered.
-        frames: their frames.
-        lost: what was lost, and why, a line each.
-        hints: what may be so, a line each.
-        aside: where the damaged files lie now.
+        root: the dataset.
+        episodes: episodes it holds now.
+        frames: frames it holds now.
+        completed: interrupted steps that were completed, and other repairs.
+        dropped: files of unfinished episodes that were removed, relative to the root.
+        findings: of a corrupted dataset: errors are losses, notes are uncertain.
+        aside: the folder of its damaged files; None if none were damaged.
     """
 
+    root: Path
     episodes: int
     frames: int
-    lost: tuple[str, ...]
-    hints: tuple[str, ...]
-    aside: Path
+    completed: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    aside: Path | None = None
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """What could not be recovered, and why, a line each."""
+        return _losses(self.findings)
+
+    def __bool__(self) -> bool:
+        """Whether anything was repaired."""
+        return bool(self.completed or self.dropped)
+
+    def __str__(self) -> str:
+        """Return the report for a terminal."""
+        empty = "" if self.episodes else ": it is empty"
+        lines = [f"{self.root}: {self.episodes} episodes, {self.frames} frames{empty}"]
+        lines += [f"  completed: {item}" for item in self.completed]
+        lines += [f"  dropped: {item}" for item in self.dropped]
+        lines += [f"  lost: {item}" for item in self.lost or ("nothing",) * (self.aside is not None)]
+        lines += [f"  note: {one}" for one in self.findings if one.severity is Severity.NOTE]
+        lines += [f"  the damaged files are in {self.aside}"] if self.aside is not None else []
+        return "\n".join(lines if self else [*lines, "  nothing to do"])
 
 
-def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool = False) -> Salvage:
+def _losses(findings: Iterable[Finding]) -> tuple[str, ...]:
+    return tuple(str(one) for one in findings if one.severity is Severity.ERROR)
+
+
+def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool = False) -> RepairReport:
     """Recover every whole episode.
 
     Damaged files go to a folder beside the dataset first, so nothing that was there is lost.
@@ -72,7 +101,7 @@ def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool
         DatasetCorruptError: no whole episode is left, or ``info.json`` is gone, which says what the columns are;
             nothing was changed.
         DatasetLockedError: a process has files of the dataset open, so perhaps records it.
-        DatasetError: the disk does not give out a file, which may be whole.
+        DatasetError: a file cannot be read at the moment, and may be whole.
         DatasetWriteError: the disk refuses; the corrupted dataset is as it was.
     """
     check_unused(root)
@@ -84,70 +113,66 @@ def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool
             f"{root / layout.INFO} describes other data than those of {root}: {other}. Perhaps it is another "
             f"recording's. {repair_with_info(root)}"
         )
-    lost: list[str] = []
-    hints: list[str] = []
-    told = EpisodeRows(root)
-    torn: list[str] = []
-    found, is_torn = _frames(root, info, lost, torn)
-    videos = Videos(root, info, told.rows)
-    kept = videos.assign(found, lost, is_torn=is_torn)
+    findings, stored = Findings(), EpisodeRows(root)
+    found, surplus, is_torn = _frames(root, info, findings)
+    videos = Videos(root, info, stored.rows)
+    recovered = videos.assign(found, findings, is_torn=is_torn)
     counted = info.get("total_episodes")
-    # Where all that was counted is there, and no more, the bytes are of a footer or of what was never saved.
-    is_all = counted == len(kept) > 0 and [one.number for one in kept] == list(range(len(kept)))
-    (hints if is_all else lost).extend(torn)
-    if not kept:
-        raise _nothing_left(root, info, wrong, lost)
-    numbers = {one.number for one in found}
-    lost += [f"episode {number}: its frames are gone" for number in sorted(told.rows.keys() - numbers)]
-    if isinstance(counted, int) and counted > len(kept) and not lost:
+    # If all counted episodes are there, and no others, these bytes are of a footer or of frames that were never saved.
+    is_all = counted == len(recovered) > 0 and [episode.number for episode in recovered] == list(range(len(recovered)))
+    for name, what in surplus.items():
+        (findings.note if is_all else findings.error)("files", name, what)
+    if not recovered:
+        raise _nothing_left(root, info, wrong, findings)
+    for number in sorted(stored.rows.keys() - {episode.number for episode in found}):
+        findings.error("files", f"episode {number}", "its frames are gone")
+    if isinstance(counted, int) and counted > len(recovered) and not _losses(findings):
         # It may be a copy of another recording's, so this is no loss.
-        hints.append(
-            f"{layout.INFO} counted {counted} episodes. No other file has a trace of more than {len(kept)}; if it is a "
-            "copy of another recording's, its counts mean nothing"
+        what = (
+            f"it counted {counted} episodes. No other file has a trace of more than {len(recovered)}; if it is a copy "
+            "of another recording's, its counts mean nothing"
         )
+        findings.note("counts", layout.INFO, what)
     with write_errors("recover the dataset", root, "The damaged files are as they were."):
         aside = _keep_aside(root, disk)
         with Workspace(root, disk, lock) as space:
             new = space.folder
-            tasks, renumbered = tasks_of(root, kept, told, lost)
-            rows = rows_of(kept, tasks, renumbered)
-            described = info_of(info, kept, len(tasks))
-            write_data(kept, rows, described, new, disk)
-            videos.write(kept, rows, described, new, disk)
-            told.complete(kept, rows)
-            forgotten, known = recall(root, kept, rows, told, is_ours=is_ours)
-            lost += forgotten
-            hints += known
-            stats = stats_of((one.table for one in kept), described["features"], new, rows, told.stats_of(kept))
+            tasks, renumbered = tasks_of(root, recovered, stored, findings)
+            rows = rows_of(recovered, tasks, renumbered)
+            described = info_of(info, recovered, len(tasks))
+            write_data(recovered, rows, described, new, disk)
+            videos.write(recovered, rows, described, new, disk)
+            stored.complete(recovered, rows)
+            restore_outcomes(root, recovered, rows, stored, findings, is_ours=is_ours)
+            stats = stats_of(
+                (episode.table for episode in recovered), described["features"], new, rows, stored.stats_of(recovered)
+            )
             link_others(root / "meta", new / "meta", disk, *WRITTEN, take=disk.copy)
             sink = pa.BufferOutputStream()
             pq.write_table(tasks_table(tasks), sink)
             disk.write(new / layout.TASKS, memoryview(sink.getvalue()))
-            write_meta(new, described, rows, told.metadata_types, stats, disk=disk, extra=told.extra_types)
+            write_meta(new, described, rows, stored.metadata_types, stats, disk=disk, extra=stored.extra_types)
             disk.write(new / layout.INFO, to_json(described))
             if identity is not None:
-                disk.write(new / layout.IDENTITY, to_json(_disowned(identity)))
+                # The recorder cannot continue it any more.
+                recording = {**(identity.get("recording") or {}), "edited": {"edit": RECOVERED}}
+                disk.write(new / layout.IDENTITY, to_json({**identity, "recording": recording}))
             if identity is not None or (root / EDITS).is_file():
                 time = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-                disk.write(new / EDITS, logged(root, kept, time))
+                disk.write(new / EDITS, logged(root, recovered, time))
             space.publish(f"what is whole of {root} had been recovered")
-        _remove_unfinished(root, disk)
-    return Salvage(len(kept), sum(one.table.num_rows for one in kept), tuple(lost), tuple(hints), aside)
+        # Folders of videos that were being made, which are among the damaged files, too.
+        for name in (layout.STAGING, "images", *(path.name for path in root.glob("tmp*") if path.is_dir())):
+            disk.try_remove_tree(root / name)
+    frames = sum(episode.table.num_rows for episode in recovered)
+    return RepairReport(root, len(recovered), frames, findings=tuple(findings), aside=aside)
 
 
-def _remove_unfinished(root: Path, disk: Disk) -> None:
-    """Remove folders of videos that were being made; they are kept aside."""
-    for name in (layout.STAGING, "images", *(path.name for path in root.glob("tmp*") if path.is_dir())):
-        disk.try_remove_tree(root / name)
-
-
-def _nothing_left(root: Path, info: dict[str, Any], wrong: str, lost: list[str]) -> DatasetCorruptError:
+def _nothing_left(root: Path, info: dict[str, Any], wrong: str, findings: Findings) -> DatasetCorruptError:
     if cameras := lost_cameras(root, info):
-        lost.append(
-            f"{layout.INFO} describes {few(cameras)}, of which there is no video and no image. If it is another "
-            f"recording's: {repair_with_info(root)}"
-        )
-    reasons = "".join(f"\n  {line}" for line in lost)
+        what = f"it describes {few(cameras)}, of which there is no video and no image. If it is another recording's: "
+        findings.error("video", layout.INFO, what + repair_with_info(root))
+    reasons = "".join(f"\n  {one}" for one in findings)
     return DatasetCorruptError(
         f"{wrong}. No whole episode of {root} can be recovered; nothing was changed. Restore this file from a copy (or "
         f"from the Hub).{reasons}"
@@ -166,17 +191,15 @@ def _info_of(root: Path) -> dict[str, Any]:
     )
 
 
-def _disowned(identity: dict[str, Any]) -> dict[str, Any]:
-    """Keep what is told about the recording, but not as one that its recorder can go on with."""
-    return {**identity, "recording": {**(identity.get("recording") or {}), "edited": {"edit": RECOVERED}}}
+def _frames(root: Path, info: dict[str, Any], findings: Findings) -> tuple[list[FoundEpisode], dict[str, str], bool]:
+    """Read the data files.
 
-
-def _frames(root: Path, info: dict[str, Any], lost: list[str], torn: list[str]) -> tuple[list[Found], bool]:
-    """Return the episodes whose frames are whole, in order, and whether some frames are missing behind them.
-
-    Bytes that belong to no whole row group are told in `torn`: whether something is lost with them is not known here.
+    Returns:
+        The episodes whose frames are whole, in order; for each file with bytes that belong to no whole row group a text
+        on these bytes, with which something may be lost; and whether frames are missing behind the episodes.
     """
-    found: list[Found] = []
+    found: list[FoundEpisode] = []
+    surplus: dict[str, str] = {}
     is_torn = False
     schema = schema_of(root, info)
     shapes = shapes_of(info)
@@ -185,25 +208,23 @@ def _frames(root: Path, info: dict[str, Any], lost: list[str], torn: list[str]) 
         try:
             rescued = rescue(path, schema, shapes)
         except OSError as error:
-            lost.append(f"{name}: {error.strerror or error}")
+            findings.error("files", name, error.strerror or str(error))
             is_torn = True
             continue
         except ValueError as error:
             raise UnsupportedDatasetError(f"{path} has no footer and cannot be read without: {error}.") from error
-        if rescued.groups and rescued.lost_bytes:
-            where = "at its end, in which no episode is whole" if rescued.is_cut else f"are damaged: {rescued.problem}"
-            torn.append(f"{name}: {rescued.lost_bytes} bytes {where}")
-        elif not rescued.groups:
-            lost.append(f"{name}: {rescued.problem}")
         is_torn |= bool(rescued.lost_bytes) or not rescued.groups
         if not rescued.groups:
+            findings.error("files", name, rescued.problem)
             continue
+        if rescued.lost_bytes:
+            where = "at its end, in which no episode is whole" if rescued.is_cut else f"are damaged: {rescued.problem}"
+            surplus[name] = f"{rescued.lost_bytes} bytes {where}"
         table = pa.concat_tables(rescued.groups).combine_chunks()
-        if missing := [column for column in schema.names if table.column_names.count(column) != 1]:
-            lost.append(f"{name}: it has no column {', '.join(missing)}, or more than one")
-            continue
-        if wrong := wrong_columns(table.schema, info["features"]) or wrong_values(table):
-            lost.append(f"{name}: {wrong}")
+        missing = [column for column in schema.names if table.column_names.count(column) != 1]
+        wrong = f"it has no column {', '.join(missing)}, or more than one" if missing else ""
+        if wrong := wrong or wrong_columns(table.schema, info["features"]) or wrong_values(table):
+            findings.error("schema", name, wrong)
             continue
         table = table.select(schema.names)
         if not table.schema.metadata:
@@ -211,10 +232,10 @@ def _frames(root: Path, info: dict[str, Any], lost: list[str], torn: list[str]) 
         for number, part in _episodes(table):
             frames = part["frame_index"].to_numpy()
             if np.array_equal(frames, np.arange(len(frames))):
-                found.append(Found(number, part))
+                found.append(FoundEpisode(number, part))
             else:
-                lost.append(f"{name}: episode {number}, whose frames are not numbered from 0 on")
-    return found, is_torn
+                findings.error("counts", name, f"episode {number}, whose frames are not numbered from 0 on")
+    return found, surplus, is_torn
 
 
 def shapes_of(info: dict[str, Any]) -> dict[str, Sequence[int]]:
@@ -273,7 +294,7 @@ def check_unused(root: Path) -> None:
     for process in Path("/proc").glob("[0-9]*"):
         if process.name == own:
             continue
-        with contextlib.suppress(OSError):  # ended meanwhile, or somebody else's
+        with contextlib.suppress(OSError):  # ended meanwhile, or of another user
             for handle in (process / "fd").iterdir():
                 with contextlib.suppress(OSError):
                     target = Path(os.readlink(handle))
@@ -286,9 +307,9 @@ def check_unused(root: Path) -> None:
 
 
 def check_readable(root: Path) -> None:
-    """Check that the disk gives out every byte below `root`.
+    """Check that every byte can be read below `root`.
 
-    A file that may not be read, or not at this moment, is not damaged: its episodes would be given up for nothing.
+    A file that cannot be read at the moment may be whole: without it, its episodes would be lost for nothing.
 
     Raises:
         DatasetError: it refuses, or a link leads out of the dataset.

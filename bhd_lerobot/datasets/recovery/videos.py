@@ -20,6 +20,7 @@ from bhd_lerobot.datasets.format.state import Row, slot_columns, slot_of
 from bhd_lerobot.datasets.format.video_splice import Span, splice
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk
+from bhd_lerobot.datasets.validate.findings import Findings
 from bhd_lerobot.errors import UnsupportedDatasetError
 
 
@@ -57,7 +58,7 @@ def encode(folder: Path, target: Path, length: int, fps: Fraction, feature: dict
     """Write the images of an episode as a video, with the settings of the others."""
     from PIL import Image
 
-    os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder tells its life otherwise; 1 leaves errors
+    os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder prints errors only
     with Image.open(folder / "frame-000000.png") as image:
         width, height = image.size  # a feature's shape may begin with the channels
     encoder = video.CameraEncoder(target, round(fps), (height, width), _settings(feature))
@@ -73,10 +74,10 @@ def encode(folder: Path, target: Path, length: int, fps: Fraction, feature: dict
 
 def _settings(feature: dict[str, Any]) -> video.VideoSettings:
     """Return the settings that the other videos were encoded with, as far as this machine has their encoder."""
-    told = feature.get("info") or {}
-    encoder = {"av1": "libsvtav1", "hevc": "hevc", "h264": "h264"}.get(str(told.get("video.codec")), "h264")
+    info = feature.get("info") or {}
+    encoder = {"av1": "libsvtav1", "hevc": "hevc", "h264": "h264"}.get(str(info.get("video.codec")), "h264")
     settings = video.VideoSettings(
-        vcodec=encoder, g=told.get("video.g", 2), crf=told.get("video.crf", 23), preset=told.get("video.preset")
+        vcodec=encoder, g=info.get("video.g", 2), crf=info.get("video.crf", 23), preset=info.get("video.preset")
     )
     try:
         settings.check()
@@ -104,7 +105,7 @@ class Part:
 
 
 @dataclass
-class Found:
+class FoundEpisode:
     """An episode whose frames were found.
 
     Attributes:
@@ -140,82 +141,83 @@ class Videos:
         self._frames: dict[Path, tuple[int, str]] = {}
         self._whole_copies: dict[Path, Path] = {}
 
-    def assign(self, found: Sequence[Found], lost: list[str], *, is_torn: bool) -> list[Found]:
-        """Find the video of every episode, and return the episodes that have all of theirs.
+    def assign(self, found: Sequence[FoundEpisode], findings: Findings, *, is_torn: bool) -> list[FoundEpisode]:
+        """Find the video of every episode, and return the episodes whose videos are complete.
 
         Args:
             found: episodes whose frames are whole, in order.
-            lost: lines about what is lost are added here.
+            findings: losses are added to it.
             is_torn: whether frames are missing behind them: then a video may show more than they need.
         """
-        for one in found:
-            one.has_row = self._rows.get(one.number, {}).get("length") == one.table.num_rows
-        found, certain = self._without_repeated(found, lost)
-        told = [one for one in found if one.has_row]
-        without_row = [one for one in found if not one.has_row]
+        for episode in found:
+            episode.has_row = self._rows.get(episode.number, {}).get("length") == episode.table.num_rows
+        found, certain = self._without_repeated(found, findings)
+        with_row = [episode for episode in found if episode.has_row]
+        without_row = [episode for episode in found if not episode.has_row]
         for key in self._keys:
-            for one in told:
-                row = self._rows[one.number]
+            for episode in with_row:
+                row = self._rows[episode.number]
                 if wrong_part(row, key):
                     continue  # a camera that these rows do not have
                 path = self._root / layout.video_file(key, slot_of(row, f"videos/{key}"))
                 start = round(row[f"videos/{key}/from_timestamp"] * self._fps)
-                if start + one.table.num_rows <= self._whole(path, lost)[0]:
-                    one.videos[key] = Part(self._whole_copies.get(path, path), start, one.table.num_rows)
-            self._assign(key, without_row, lost, certain=certain, is_torn=is_torn)
-        kept = []
-        for one in found:
-            missing = [key for key in self._keys if key not in one.videos]
+                if start + episode.table.num_rows <= self._whole(path, findings)[0]:
+                    episode.videos[key] = Part(self._whole_copies.get(path, path), start, episode.table.num_rows)
+            self._assign(key, without_row, findings, certain=certain, is_torn=is_torn)
+        recovered = []
+        for episode in found:
+            missing = [key for key in self._keys if key not in episode.videos]
             if missing:
-                lost.append(f"episode {one.number}: no whole video of {', '.join(missing)}")
+                findings.error("video", f"episode {episode.number}", f"no whole video of {', '.join(missing)}")
             else:
-                kept.append(one)
-        return kept
+                recovered.append(episode)
+        return recovered
 
-    def _without_repeated(self, found: Sequence[Found], lost: list[str]) -> tuple[list[Found], int]:
+    def _without_repeated(self, found: Sequence[FoundEpisode], findings: Findings) -> tuple[list[FoundEpisode], int]:
         """Return each episode once, and how many of those without a row have videos at known places.
 
-        An episode that could not be saved and was recorded again is there twice, under one number. The last one counts.
-        Whether a video shows the first one, too, is told nowhere.
+        An episode whose save failed and that was recorded again is stored twice under one number. The last one counts.
+        No file says whether a video shows the first one, too.
         """
-        last = {one.number: one for one in found}
-        once = [one for one in found if last[one.number] is one]
+        last = {episode.number: episode for episode in found}
+        once = [episode for episode in found if last[episode.number] is episode]
         expected = max(self._rows, default=-1) + 1
-        repeated = {one.number for one in found if last[one.number] is not one}
-        lost += [f"episode {number}: a first attempt, which was recorded again" for number in sorted(repeated)]
+        repeated = {episode.number for episode in found if last[episode.number] is not episode}
+        for number in sorted(repeated):
+            findings.error("counts", f"episode {number}", "a first attempt, which was recorded again")
         certain = 0
-        for one in (one for one in once if not one.has_row):
-            if one.number != expected + certain or one.number in repeated:
+        for episode in (episode for episode in once if not episode.has_row):
+            if episode.number != expected + certain or episode.number in repeated:
                 break
             certain += 1
         return once, certain
 
-    def _assign(self, key: str, without_row: Sequence[Found], lost: list[str], *, certain: int, is_torn: bool) -> None:
+    def _assign(
+        self, key: str, without_row: Sequence[FoundEpisode], findings: Findings, *, certain: int, is_torn: bool
+    ) -> None:
         waiting = list(without_row[:certain])
-        for path in self._following(key, lost) if waiting else []:
-            frames, problem = self._whole(path, lost)
-            taken: list[Found] = []
+        for path in self._following(key, findings) if waiting else []:
+            frames, problem = self._whole(path, findings)
+            taken: list[FoundEpisode] = []
             start = 0
             while waiting and start + waiting[0].table.num_rows <= frames:
-                one = waiting.pop(0)
-                one.videos[key] = Part(self._whole_copies.get(path, path), start, one.table.num_rows)
-                taken.append(one)
-                start += one.table.num_rows
+                episode = waiting.pop(0)
+                episode.videos[key] = Part(self._whole_copies.get(path, path), start, episode.table.num_rows)
+                taken.append(episode)
+                start += episode.table.num_rows
             if start < frames and not problem and not (is_torn or len(without_row) > certain):
-                name = path.relative_to(self._root).as_posix()
-                lost.append(
-                    f"{name}: its {frames} frames are not those of whole episodes, so whose they are is not known"
-                )
-                for one in taken:
-                    del one.videos[key]
+                what = f"its {frames} frames are not those of whole episodes, so whose they are is not known"
+                findings.error("video", path.relative_to(self._root).as_posix(), what)
+                for episode in taken:
+                    del episode.videos[key]
                 break
             if problem and waiting:
                 break  # what videos after a torn one show is not certain
-        for one in without_row:
-            if key not in one.videos:
-                self._look_aside(key, one, is_last=one is without_row[-1])
+        for episode in without_row:
+            if key not in episode.videos:
+                self._find_unjoined(key, episode, is_last=episode is without_row[-1])
 
-    def _following(self, key: str, lost: list[str]) -> Iterator[Path]:
+    def _following(self, key: str, findings: Findings) -> Iterator[Path]:
         """Yield the videos after those of the readable rows, as long as their numbers have no gap."""
         slots = [slot_of(row, f"videos/{key}") for row in self._rows.values() if not wrong_part(row, key)]
         slot: layout.Slot | None = max(slots, default=None)
@@ -230,22 +232,22 @@ class Videos:
         others = sorted(set((self._root / "videos" / key).glob("chunk-*/file-*.mp4")) - seen)
         if others:
             names = ", ".join(path.relative_to(self._root).as_posix() for path in others[:3])
-            lost.append(f"{names}: a video before is missing, so whose they are is not known")
+            findings.error("video", names, "a video before is missing, so whose they are is not known")
 
-    def _look_aside(self, key: str, one: Found, *, is_last: bool) -> None:
-        """Look for a video that was made and not joined yet, and for images that were not encoded yet."""
-        names = [f"tmp*/{key}_{one.number:03d}.mp4", *([f"tmp*/{key}_streaming.mp4"] if is_last else [])]
-        length = one.table.num_rows
+    def _find_unjoined(self, key: str, episode: FoundEpisode, *, is_last: bool) -> None:
+        """Find a video that was not joined yet, or images that were not encoded yet."""
+        names = [f"tmp*/{key}_{episode.number:03d}.mp4", *([f"tmp*/{key}_streaming.mp4"] if is_last else [])]
+        length = episode.table.num_rows
         for path in (path for name in names for path in sorted(self._root.glob(name))):
             if whole_frames(path) == (length, ""):
                 self._frames[path] = (length, "")
-                one.videos[key] = Part(path, 0, length)
+                episode.videos[key] = Part(path, 0, length)
                 return
-        folder = self._root / _FRAMES.format(key=key, episode=one.number)
+        folder = self._root / _FRAMES.format(key=key, episode=episode.number)
         if _are_whole(folder, length):
-            one.videos[key] = Part(folder, 0, length)
+            episode.videos[key] = Part(folder, 0, length)
 
-    def _whole(self, path: Path, lost: list[str]) -> tuple[int, str]:
+    def _whole(self, path: Path, findings: Findings) -> tuple[int, str]:
         if path not in self._frames:
             found = whole_frames(path)
             if found[1] and (copy := _being_moved(path)) is not None:
@@ -254,22 +256,28 @@ class Videos:
             self._frames[path] = found
             if found[1]:
                 name = path.relative_to(self._root).as_posix()
-                lost.append(f"{name}: everything from frame {found[0]} on: {found[1]}")
+                findings.error("video", name, f"everything from frame {found[0]} on: {found[1]}")
         return self._frames[path]
 
-    def write(self, kept: Sequence[Found], rows: Sequence[Row], info: dict[str, Any], new: Path, disk: Disk) -> None:
+    def write(
+        self, recovered: Sequence[FoundEpisode], rows: Sequence[Row], info: dict[str, Any], new: Path, disk: Disk
+    ) -> None:
         """Write the videos of the recovered dataset, and into `rows` where each episode is in them.
 
         A video of which all is needed stays as it is; of another the frames of these episodes are kept.
         """
         for key in self._keys:
             slot: layout.Slot | None = None
-            for path in dict.fromkeys(one.videos[key].path for one in kept):
-                members = [(one, row) for one, row in zip(kept, rows, strict=True) if one.videos[key].path == path]
+            for path in dict.fromkeys(episode.videos[key].path for episode in recovered):
+                members = [
+                    (episode, row)
+                    for episode, row in zip(recovered, rows, strict=True)
+                    if episode.videos[key].path == path
+                ]
                 slot = layout.next_slot(slot, info["chunks_size"])
                 target = new / layout.video_file(key, slot)
                 disk.make_folder(target.parent)
-                spans = [(one.videos[key].start, one.videos[key].length) for one, _ in members]
+                spans = [(episode.videos[key].start, episode.videos[key].length) for episode, _ in members]
                 if path.is_dir():
                     encode(path, target, spans[0][1], self._fps, self._features[key])
                     starts = [0]
@@ -278,10 +286,10 @@ class Videos:
                 else:
                     disk.copy(path, target)
                     starts = [start for start, _ in spans]
-                for (one, row), start in zip(members, starts, strict=True):
+                for (episode, row), start in zip(members, starts, strict=True):
                     row.update(slot_columns(f"videos/{key}", slot))
                     row[f"videos/{key}/from_timestamp"] = float(start / self._fps)
-                    row[f"videos/{key}/to_timestamp"] = float((start + one.table.num_rows) / self._fps)
+                    row[f"videos/{key}/to_timestamp"] = float((start + episode.table.num_rows) / self._fps)
             if "info" not in info["features"][key] and slot is not None:
                 first = new / layout.video_file(key, (0, 0))
                 info["features"][key]["info"] = video.video_info(first, video.VideoSettings())
@@ -304,7 +312,7 @@ def _being_moved(path: Path) -> Path | None:
 
 
 def _is_own(path: Path) -> bool:
-    """Tell whether a path is a plain file of this user: neither another's, nor a link, nor a pipe that never ends."""
+    """Return whether a path is a plain file of this user, and no link, pipe or file of another user."""
     try:
         about = path.lstat()
     except OSError:
@@ -335,7 +343,7 @@ def whole_frames(path: Path) -> tuple[int, str]:
 
 
 def _are_whole(folder: Path, length: int) -> bool:
-    """Tell whether a folder has a readable image for each of `length` frames."""
+    """Return whether a folder has a readable image for each of `length` frames."""
     from PIL import Image
 
     for frame in range(length):

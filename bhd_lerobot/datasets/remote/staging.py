@@ -55,7 +55,7 @@ class Staging:
         """Undo what version 0.1 left when it was killed between two renames; the caller has locked the folder."""
         old = self._root.with_name(f".{self._root.name}.old")
         if (old / _MARKER).is_file() and not self._root.exists() and _is_ours(old):
-            old.rename(self._root)
+            Disk().move(old, self._root)
             (self._root / _MARKER).unlink(missing_ok=True)
 
     def link(self, path: str) -> None:

@@ -31,6 +31,7 @@ from bhd_lerobot.datasets.remote.listing import (
 from bhd_lerobot.datasets.remote.local import LocalDataset
 from bhd_lerobot.datasets.remote.url import LOCAL, open_place, shown
 from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, TransferError
 
 _FOLDERS = {"file", "local", "sftp", "ssh", "ftp", "smb", "hdfs", "arrow_hdfs", "webhdfs", "webdav", "dbfs"}
@@ -131,7 +132,7 @@ class StoreDataset:
             part.parent.mkdir(parents=True, exist_ok=True)
             self._fs.get_file(self._at(path), str(part))
             refuse_damaged(part, self._there[path], self.name, path)
-            part.replace(folder / path)
+            Disk().move(part, folder / path)
 
         # A file system that is asynchronous does all downloads in one thread: ours wait for it, or make checksums.
         workers = 2 * WORKERS if self._fs.async_impl else self._workers
@@ -200,7 +201,7 @@ class StoreDataset:
         else:
             self._fs.pipe_file(part, content)
         if part != target:
-            Path(part).replace(target)
+            Disk().move(Path(part), Path(target))
 
     def _remove(self, path: str) -> None:
         # One by one: `rm` takes brackets and stars in a name for a pattern, and removes what it fits.

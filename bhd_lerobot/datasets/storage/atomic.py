@@ -1,13 +1,13 @@
-"""New content for a folder, which comes to its place completely or not at all, whenever its process is killed.
+"""Atomic publishing: new content for a folder is in place completely or not at all, whenever its process is killed.
 
-Where nothing is, it is made in a hidden folder beside the place, which then gets the place's name: one rename.
+A new folder is made in a hidden folder beside its place and renamed once.
 
-Where a dataset is, its folders `meta`, `data` and `videos` are replaced, and everything else stays what and where it
-is: the folder itself, other people's files, mount points. The new folders are made in the staging folder. Then a marker
-is written, from which on the change is decided, and each new folder exchanges its name with the old one, which Linux
-does in one step; where a file system cannot do that, with two renames. A kill in between leaves new and old side by
-side. Every command that finds the marker completes the change first, and says so. Stock LeRobot, which does not know of
-it, would mix them; so ``info.json`` has no valid version until all of them are there.
+Of an existing dataset the folders `meta`, `data` and `videos` are replaced; the folder itself, files of other programs
+and mount points stay. The new folders are made in the staging folder. Then a marker is written, with which the change
+is decided, and each new folder is swapped with the old one: atomically, or with two renames where the file system has
+no atomic swap. A kill in between leaves old and new folders side by side. Every command that finds the marker completes
+the change first and reports it. Stock LeRobot does not know the marker and would mix the folders; therefore
+``info.json`` has an invalid version until all of them are in place.
 """
 
 import contextlib
@@ -32,26 +32,26 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError
 
-WORK = Path(layout.STAGING, "compact")  # the name that versions before had, so that what they left is found
-PULL = Path(layout.STAGING, "pull")  # where a download comes together, if nothing can be put beside its place
+WORK = Path(layout.STAGING, "compact")  # the same name as in version 0.1, whose leftovers are found by it
+PULL = Path(layout.STAGING, "pull")  # downloads, if nothing can be put beside their place
 _WORKSPACES = {WORK.name, PULL.name}
 _MARKER, _INVALID = WORK / "ready", WORK / "info.json"
 _LONGEST = 240  # bytes of a name, to which a random part is added
-_NO_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP)
-_ORDER = {"data": 1, "meta": 2}  # the metadata come last; whatever else there is, first
+_NO_SWAP = (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP)
+_ORDER = {"data": 1, "meta": 2}  # the metadata last, other folders first
 UNFINISHED_VERSION = "a change was interrupted; complete it with: bhd-data repair"
-"""`codebase_version` meanwhile. LeRobot refuses a dataset of no valid version, and shows the text."""
+"""`codebase_version` meanwhile. LeRobot refuses a dataset with an invalid version and shows this text."""
 
 
 class Workspace:
-    """A hidden folder in which something is made before it comes to its place.
+    """A hidden folder in which content is made before it is published.
 
-    It is locked while this process lives. What an exception leaves in it is removed by `close`, what a kill leaves by
-    the next workspace of the same place.
+    It is locked while this process lives. `close` removes it after an exception, the next workspace of the same place
+    after a kill.
 
     Attributes:
-        place: where the content is going to lie, without symbolic links.
-        folder: what is going to lie there; it does not exist yet, and has the name of the place.
+        place: where the content is published, without symbolic links.
+        folder: the content; it has the name of the place and does not exist yet.
     """
 
     def __init__(self, place: Path, disk: Disk, lock: RootLock | None = None) -> None:
@@ -97,22 +97,22 @@ class Workspace:
         return lock
 
     def publish(self, done: str) -> None:
-        """Let the folder come to its place, or what is in it to the places of the same names.
+        """Move the folder to its place, or its content to the places of the same names.
 
         Signals that would end the process wait until it is done.
 
         Args:
-            done: what has been done then, a sentence without a full stop; see `noting_what_is_done`.
+            done: the result, a sentence without a full stop; see `noting_what_is_done`.
 
         Raises:
-            OSError: it could not be done; what was at the place is as it was.
-            DatasetWriteError: it could not be completed, and will be by the next command.
+            OSError: it failed; the place is as it was.
+            DatasetWriteError: it was decided and not completed; the next command completes it.
         """
         if self._is_inside:
             move_in(self.folder, self.place, self._disk, done=done, is_new=self._is_new)
             return
         with uninterrupted():
-            self._disk.move(self.folder, self.place)  # fails if somebody else has put something there meanwhile
+            self._disk.move(self.folder, self.place)  # fails if another program has created it meanwhile
             note_done(done)
 
     def close(self) -> None:
@@ -147,7 +147,7 @@ def making(target: Path, disk: Disk, refuse: Callable[[], None]) -> Iterator[Wor
     complete_interrupted(target)
     refuse()
     with Workspace(target, disk) as space:
-        token = _done.set(None)  # what is done in the workspace is not in force yet
+        token = _done.set(None)  # changes in the workspace are not in force yet
         try:
             yield space
         finally:
@@ -157,7 +157,7 @@ def making(target: Path, disk: Disk, refuse: Callable[[], None]) -> Iterator[Wor
 
 
 def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = False, goes: Collection[str] = ()) -> None:
-    """Let what is in a folder come to the places of the same names in another one, which the caller has locked.
+    """Move the content of a folder to the places of the same names in another one, which the caller has locked.
 
     Signals that would end the process wait until it is done.
 
@@ -165,13 +165,13 @@ def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = Fal
         new: the folder, on the same file system.
         place: the other one.
         disk: how to write.
-        done: what has been done then, a sentence without a full stop; see `noting_what_is_done`.
+        done: the result, a sentence without a full stop; see `noting_what_is_done`.
         is_new: nothing may be at these places.
-        goes: what else goes.
+        goes: names that are removed, too.
 
     Raises:
-        OSError: it could not be done; what is at the place is as it was.
-        DatasetWriteError: it could not be completed, and will be by the next command.
+        OSError: it failed; the place is as it was.
+        DatasetWriteError: it was decided and not completed; the next command completes it.
     """
     work = place / WORK
     if not new.is_relative_to(work):
@@ -202,9 +202,9 @@ def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = Fal
 
 
 def is_free(place: Path) -> bool:
-    """Tell whether something can be made at a place: nothing is there, or an empty folder.
+    """Return whether something can be made at a place: it is missing or an empty folder.
 
-    What a file system has at its root, and what a killed attempt left in a staging folder, is nothing.
+    The folder `lost+found` of a file system and leftovers of a killed attempt in a staging folder do not count.
     """
     if not place.exists():
         return not place.is_symlink()
@@ -245,12 +245,12 @@ def clean(place: Path) -> None:
 
 
 def has_unfinished_episodes(root: Path) -> bool:
-    """Tell whether there is something in a staging folder that is no workspace: what a recorder has not saved."""
+    """Return whether a staging folder holds episodes that a recorder has not saved: anything but workspaces."""
     return bool(_names(root / layout.STAGING) - _WORKSPACES)
 
 
 def is_decided(place: Path) -> bool:
-    """Tell whether a change was being carried out when its process was killed."""
+    """Return whether a change was decided and not completed."""
     return os.path.isfile(place / _MARKER)
 
 
@@ -281,7 +281,7 @@ def roll_forward(place: Path, disk: Disk) -> bool:
 
 
 def complete_interrupted(place: Path) -> bool:
-    """Complete a change that a killed process had decided, and say so; for everybody who is about to read a dataset.
+    """Complete a change that a killed process had decided, and log it; called before a dataset is read.
 
     Returns:
         Whether there was one.
@@ -323,11 +323,11 @@ def link_others(
 
 @dataclass(frozen=True)
 class _Plan:
-    """What the marker says.
+    """The content of the marker.
 
     Attributes:
-        new: inodes of what comes, by name; empty of versions before, which did not exchange names.
-        goes: names of what goes.
+        new: inodes of the new content, by name; empty in version 0.1, which did not swap folders.
+        goes: names that are removed.
         is_new: nothing may be at these places.
     """
 
@@ -337,21 +337,23 @@ class _Plan:
 
 
 def _read_plan(place: Path) -> _Plan:
-    """Read the marker. It may have come with a dataset of somebody else's, so it is believed only in its own folder.
+    """Read the marker. It may come from a copied dataset, so it is valid only in the folder in which it was written.
 
     Raises:
-        DatasetCorruptError: it is another one's.
+        DatasetCorruptError: it is the marker of another folder.
     """
     staging = place / layout.STAGING
     if any(path.is_symlink() for path in (staging, *(place / WORK / name for name in ("", "ready", "new", "old")))):
         raise _foreign_marker(place)
     content = (place / _MARKER).read_bytes()
     if not content:
-        return _Plan()  # of a version before
+        return _Plan()  # of version 0.1
     try:
-        told = json.loads(content)
-        plan = _Plan({str(k): int(v) for k, v in told["new"].items()}, tuple(map(str, told["goes"])), told["is_new"])
-        is_own = told["root"] == place.stat().st_ino
+        values = json.loads(content)
+        plan = _Plan(
+            {str(k): int(v) for k, v in values["new"].items()}, tuple(map(str, values["goes"])), values["is_new"]
+        )
+        is_own = values["root"] == place.stat().st_ino
     except (ValueError, TypeError, KeyError, AttributeError):
         raise _foreign_marker(place) from None
     if not is_own or any(name in ("", ".", "..") or "/" in name for name in (*plan.new, *plan.goes)):
@@ -361,16 +363,16 @@ def _read_plan(place: Path) -> _Plan:
 
 def _foreign_marker(place: Path) -> DatasetCorruptError:
     return DatasetCorruptError(
-        f"{place / WORK} holds a change that was interrupted in another folder, or that somebody made up; it is not "
+        f"{place / WORK} holds a change that was interrupted in another folder, or a forged marker; it is not "
         "completed here. If this is a copy of a dataset, complete the change in the original and copy that; or move "
-        f"{place / layout.STAGING} away, and look at what is left with `bhd-data check`."
+        f"{place / layout.STAGING} away, and run `bhd-data check` on the rest."
     )
 
 
 def _replace(new: Path, target: Path, old: Path, plan: _Plan, disk: Disk) -> None:
-    """Let one thing of the new content come to its place, wherever a kill has left it and what it replaces."""
+    """Move one entry of the new content to its place, wherever a kill has left it and the entry that it replaces."""
     if _is_there(target, plan.new.get(new.name)):
-        if os.path.lexists(new):  # what was there, after an exchange
+        if os.path.lexists(new):  # the old content, after a swap
             disk.move(new, _unused(old))
         return
     if not os.path.lexists(new):
@@ -386,7 +388,7 @@ def _replace(new: Path, target: Path, old: Path, plan: _Plan, disk: Disk) -> Non
         disk.swap(new, target)
         disk.move(new, _unused(old))
     except OSError as error:
-        if error.errno not in _NO_EXCHANGE:
+        if error.errno not in _NO_SWAP:
             raise
         disk.move(target, _unused(old))
         disk.move(new, target)
@@ -397,7 +399,7 @@ def _is_there(path: Path, inode: int | None) -> bool:
 
 
 def _unused(path: Path) -> Path:
-    """Return a path at which nothing is."""
+    """Return a path that does not exist."""
     number = 1
     while os.path.lexists(path):
         path, number = path.with_name(f"{path.name.partition('~')[0]}~{number}"), number + 1
@@ -405,12 +407,12 @@ def _unused(path: Path) -> Path:
 
 
 def _write_invalid_info(place: Path, disk: Disk) -> None:
-    """Write the ``info.json`` with which LeRobot refuses a dataset while its folders are exchanged."""
+    """Write the ``info.json`` with which LeRobot refuses a dataset while its folders are swapped."""
     try:
         content = json.loads((place / layout.INFO).read_bytes())
         content["codebase_version"] = UNFINISHED_VERSION
     except (OSError, ValueError, TypeError):
-        return  # nobody can load it anyhow
+        return  # no program can load it anyhow
     disk.write(place / _INVALID, to_json(content))
 
 
@@ -429,7 +431,7 @@ def _check_movable(place: Path, names: Collection[str], is_new: bool) -> None:
         if is_new:
             number = errno.EEXIST
         elif any(path == mount or path in mount.parents for mount in mounts):
-            number = errno.EBUSY  # a mount point stays, or its content would be taken for the dataset's and removed
+            number = errno.EBUSY  # its content would be removed as that of the dataset
         elif path.is_dir() and not path.is_symlink() and not os.access(path, os.W_OK):
             number = errno.EACCES
         if number:
@@ -450,7 +452,7 @@ _done: ContextVar[list[str] | None] = ContextVar("done", default=None)
 
 @contextlib.contextmanager
 def noting_what_is_done() -> Iterator[list[str]]:
-    """Collect what came into force in the block, sentences without a full stop, for who says how a command ended."""
+    """Collect what came into force in the block, sentences without a full stop, for the last message of a command."""
     sentences: list[str] = []
     token = _done.set(sentences)
     try:
@@ -469,7 +471,7 @@ def note_done(sentence: str) -> None:
 def uninterrupted() -> Iterator[None]:
     """Let Ctrl-C and the signals that end a process wait until the block has ended."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # Python handles signals in the main thread, which is elsewhere
+        yield  # Python handles signals in the main thread only
         return
     waiting: list[int] = []
     former: dict[signal.Signals, Any] = {}
@@ -478,14 +480,14 @@ def uninterrupted() -> Iterator[None]:
         waiting.append(number)
 
     for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(one) is not None:  # None: installed by another language, which nobody could restore
+        if signal.getsignal(one) is not None:  # None: installed by C code, which cannot be restored
             former[one] = signal.signal(one, wait)
     try:
         yield
     finally:
         for one, handler in former.items():
             signal.signal(one, handler)
-    for number in waiting[:1]:  # an error ends the command anyway, and says more
+    for number in waiting[:1]:  # an error ends the command anyway, with a better message
         signal.raise_signal(number)
 
 
@@ -493,17 +495,19 @@ def uninterrupted() -> Iterator[None]:
 
 
 def real(path: Path) -> Path:
-    """Return a path without symbolic links; unlike `Path.resolve`, one that leads to itself is no error here."""
+    """Return a path without symbolic links; unlike with `Path.resolve`, a link to itself is no error."""
     return Path(os.path.realpath(path))
 
 
 def is_fixed(place: Path) -> bool:
-    """Tell whether a folder, given without symbolic links, cannot be replaced, so that its content must be moved in."""
+    """Return whether a folder, given without symbolic links, cannot be replaced: its content must be moved in."""
     if not place.is_dir():
         return False
     with contextlib.suppress(FileNotFoundError):  # the current folder may have been removed
         current = Path.cwd()
-        if current == place or place in current.parents:  # a shell, too, would stand in a folder that is gone
+        if (
+            current == place or place in current.parents
+        ):  # the current folder of this process, and of its shell, would be gone
             return True
     is_long = len(os.fsencode(_prefix(place))) > _LONGEST
     return is_long or place in _mounts() or not os.access(place.parent, os.W_OK | os.X_OK)
@@ -523,7 +527,7 @@ def _make_shell(place: Path) -> tuple[Path, RootLock]:
     """Make a hidden folder beside a place and lock it."""
     while True:
         shell = Path(tempfile.mkdtemp(prefix=_prefix(place), dir=place.parent))
-        with contextlib.suppress(FileNotFoundError, DatasetLockedError):  # somebody who cleans up was quicker
+        with contextlib.suppress(FileNotFoundError, DatasetLockedError):  # another process that cleans up was quicker
             return shell, RootLock(shell, shown_as=place)
 
 
@@ -537,7 +541,7 @@ def _names(folder: Path) -> set[str]:
 
 @contextlib.contextmanager
 def _decided(place: Path) -> Iterator[None]:
-    """Say of an error that the change goes on as soon as its cause is removed."""
+    """Add to an error that the next command completes the change."""
     consequence = "The change is decided, and the next command completes it."
     with write_errors("complete a change", place, consequence):
         yield

@@ -35,7 +35,7 @@ _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 
 def _before_step(action: str, path: Path) -> None:
-    """Called before every change of the disk. Tests replace it to end the process there."""
+    """Do nothing; called before every change of the disk. Tests replace it to end the process there."""
 
 
 class Disk:
@@ -89,6 +89,14 @@ class Disk:
         os.replace(source, target)
         self._flush_folder(target.parent)
 
+    def publish(self, path: Path, content: bytes, staging: Path | None = None) -> None:
+        """Write a file beside its place, or in a staging folder, and rename it: it is there completely or as before."""
+        folder = staging or path.parent
+        self.make_folder(folder)
+        part = folder / f".{path.name}.part"
+        self.write(part, content)
+        self.move(part, path)
+
     def swap(self, one: Path, other: Path) -> None:
         """Exchange the names of two folders, in one step.
 
@@ -138,7 +146,7 @@ class Disk:
         shutil.rmtree(path)
 
     def try_remove_tree(self, path: Path) -> None:
-        """Remove a folder that nothing needs any more; what cannot be removed stays for whoever cleans up later."""
+        """Remove a folder that is not needed any more; what cannot be removed stays for a later command."""
         with contextlib.suppress(OSError):
             self.remove_tree(path)
 
@@ -158,7 +166,7 @@ def to_json(content: Mapping[str, Any]) -> bytes:
 
 @contextlib.contextmanager
 def write_errors(action: str, root: Path, consequence: str) -> Iterator[None]:
-    """Turn an operating-system error into a `DatasetWriteError` that says what failed and what is still intact.
+    """Turn an operating-system error into a `DatasetWriteError` with the failed action and the state of the dataset.
 
     Args:
         action: what was being done, for example ``"save episode 3"``.
@@ -188,7 +196,7 @@ class RootLock:
         Args:
             root: an existing folder.
             shown_as: the path to name in an error, if `root` is a temporary one.
-            is_choice: whether another root would do as well, which is said then.
+            is_choice: whether the error proposes another root, too.
 
         Raises:
             DatasetLockedError: another process records, repairs or edits it.

@@ -1,4 +1,4 @@
-"""Where the files of a dataset lie, in LeRobot's v3.0 layout plus the two names that are ours."""
+"""Where the files of a dataset lie: LeRobot's v3.0 layout and our own names."""
 
 from pathlib import Path
 
@@ -8,10 +8,10 @@ INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
 IDENTITY = "meta/bhd.json"
-"""What was recorded and by whom; its presence says that a dataset was written by this package."""
+"""The identity of the recording; it exists only in datasets of this package."""
 
 UNREPORTED = "meta/bhd_unreported.json"
-"""Which edit made a dataset what it is, until whoever asked for it has been told."""
+"""The last edit, until its report has been printed."""
 
 STAGING = ".bhd"
 """Folder inside the root that holds everything unfinished. It is absent from a finalised dataset."""
@@ -67,7 +67,7 @@ def slot_in(path: Path) -> Slot:
 def recorded_files(root: Path) -> set[str]:
     """Return every data, video and episode-metadata file below `root`, as relative POSIX paths.
 
-    Only names that fit the layout are returned, so notes that somebody put beside them are never touched.
+    Only names that fit the layout are returned, so other files beside them are never touched.
     """
     patterns = ("data/chunk-*/file-*.parquet", "meta/episodes/chunk-*/file-*.parquet", "videos/*/chunk-*/file-*.mp4")
     return {path.relative_to(root).as_posix() for pattern in patterns for path in root.glob(pattern)}

@@ -1,4 +1,4 @@
-"""What a dataset may name: no file outside of it. Names and links come from whoever made the dataset."""
+"""A dataset must not name a file outside of it: its names and links are untrusted input."""
 
 import contextlib
 import os
@@ -77,7 +77,7 @@ def check_inside(root: Path, path: Path) -> Path:
         DatasetError: a link leads elsewhere; names both, and the remedy.
     """
     try:
-        # Unlike Path.resolve, it takes a link that leads to itself: whoever opens that says what is wrong.
+        # Unlike Path.resolve, it accepts a link to itself; opening that fails later with a message.
         whole, target = Path(os.path.realpath(root)), Path(os.path.realpath(path))
     except ValueError as error:
         raise DatasetError(f"{root} names a file {str(path)!r}, which no file can be called ({error}).") from error
@@ -94,8 +94,8 @@ def check_links(root: Path) -> None:
     """Check that no link among the files of a dataset leads out of it.
 
     Args:
-        root: the dataset, whose folders are looked through: `meta`, `data`, `videos`, and those of videos that LeRobot
-            had not encoded yet, `images` and `tmp…`.
+        root: the dataset. Searched are `meta`, `data`, `videos`, and the folders of videos that LeRobot has not encoded
+            yet, `images` and `tmp…`.
 
     Raises:
         DatasetError: one does.
@@ -108,7 +108,7 @@ def check_links(root: Path) -> None:
         if target in seen or not target.is_dir():
             continue
         seen.add(target)
-        with contextlib.suppress(OSError), os.scandir(path) as entries:  # whoever reads in it says what is wrong
+        with contextlib.suppress(OSError), os.scandir(path) as entries:  # reading it fails later with a message
             pending += [Path(one.path) for one in entries if one.is_symlink() or one.is_dir()]
 
 

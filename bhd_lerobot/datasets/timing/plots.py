@@ -12,7 +12,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.timing.report import TimingReport, quantiles
 from bhd_lerobot.datasets.timing.tables import ms, ticks
 
-# Okabe and Ito's colours, which colour-blind people tell apart; what is late also has a mark of its own.
+# Okabe and Ito's colours, which colour-blind people can distinguish; what is late also has a mark of its own.
 _LINE, _LATE, _LIMIT, _WANTED = "#0072B2", "#D55E00", "#555555", "#009E73"
 
 # What is drawn over the frames: heading, and name of its limit.
@@ -100,7 +100,7 @@ def _draw_series(axes: Axes, values: NDArray, late: NDArray[np.intp], *, label: 
 
 
 def _thinned(values: NDArray) -> tuple[NDArray, NDArray]:
-    """Return at most so many points that can be told apart: of each group of frames the largest value."""
+    """Return at most so many points that can be distinguished: of each group of frames the largest value."""
     group = -(-len(values) // _POINTS)
     if group <= 1:
         return np.arange(len(values), dtype=np.float64), values
@@ -118,10 +118,10 @@ def _draw_intervals(axes: Axes, report: TimingReport) -> None:
         axes.text(0.5, 0.5, "there is only one frame", transform=axes.transAxes, ha="center", color=_LIMIT)
         return
     limits = report.total.summary.tolerated
-    # A range of at least a tenth of a frame: what is the same to the microsecond is to look the same.
+    # A range of at least a tenth of a frame: equal to the microsecond must look equal.
     reach = 1.1 * max(float(np.abs(intervals - wanted).max()), 0.05 * wanted)
     axes.hist(intervals, bins=np.linspace(wanted - reach, wanted + reach, 62).tolist(), color=_LINE)
-    axes.set_yscale("symlog", linthresh=1)  # one odd frame among thousands is what one looks for
+    axes.set_yscale("symlog", linthresh=1)  # one odd frame among thousands must be visible
     axes.set_xlim(wanted - reach, wanted + reach)
     axes.axvline(wanted, color=_WANTED, linewidth=1.5, label=f"1 / fps = {wanted:g} ms")
     if "jitter" in limits and 1e3 * limits["jitter"] < reach:

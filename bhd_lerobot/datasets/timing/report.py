@@ -1,4 +1,4 @@
-"""What a dataset says about its timing, read and summed up."""
+"""The timing of a dataset, read and summed up."""
 
 import json
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _MOST = 1e18  # of counts and seconds: beyond it is no measurement
 CLOCKS = ("lockstep", "realtime")
 
 SIMULATED = (
-    "Time was simulated (clock: lockstep). It stood still while the brain thought and while a tick was computed, so "
+    "Time was simulated (clock: lockstep). It stood still during inference and while a tick was computed, so "
     "nothing could be late; how punctual this machine is does not show in this dataset."
 )
 
@@ -37,7 +37,7 @@ class EpisodeTiming:
         summary: what was stored about it.
         columns: the timing columns by key, each of shape (frames,).
         intervals: time between one observation and the next of the same episode [s], shape (frames - 1,).
-        grants: what was asked of the operating system for the control loop, each with `name`, `wanted`, `granted`,
+        grants: what the control loop requested from the operating system, each with `name`, `wanted`, `granted`,
             `detail` and `remedy`; empty on a simulated clock.
     """
 
@@ -64,7 +64,7 @@ class TimingReport:
     Attributes:
         root: where it lies.
         fps: frames per second.
-        episodes: those that were asked for.
+        episodes: the requested ones.
     """
 
     root: Path
@@ -110,7 +110,7 @@ class TimingReport:
 
     @property
     def grants(self) -> list[tuple[str, tuple[dict[str, Any], ...]]]:
-        """What the operating system was asked for and granted, with the episodes of which it is true."""
+        """What was requested from the operating system and granted, with the episodes of each."""
         found: dict[str, list[EpisodeTiming]] = {}
         for one in self.episodes:
             if one.grants:
@@ -177,7 +177,7 @@ def load_timing(root: Path | str, episode: int | None = None) -> TimingReport:
         summary = timing_of(one)
         if summary is None or keys.TIME not in stored:
             raise DatasetError(
-                f"{info.root} says nothing about its timing: it has no column {keys.TIME!r} or no timing summaries, so "
+                f"{info.root} has no timing: it has no column {keys.TIME!r} or no timing summaries, so "
                 "another program recorded it. `bhd-record` stores both."
             )
         # Columns that a version before this did not know: it recorded on the simulated clock only.

@@ -106,7 +106,7 @@ def _episodes(report: TimingReport, width: int) -> Table:
 
 
 def fitting(columns: Sequence[tuple[str, list[str]]], width: int) -> list[tuple[str, list[str]]]:
-    """Return the first columns of a table, as many as fit: one whose every word is cut off tells nothing.
+    """Return the first columns of a table, as many as fit: a column is never cut off.
 
     Args:
         columns: of each the heading and the cells.

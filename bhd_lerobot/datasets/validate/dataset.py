@@ -94,7 +94,7 @@ def _check_videos(files: Files, findings: Findings) -> None:
             name = layout.video_file(key, slot)
             path = files.root / name
             if not path.is_file():
-                continue  # said already
+                continue  # reported already
             lengths = np.array([files.episodes["length"][i] for i in positions])
             try:
                 found = video.count_frames(path)
@@ -110,7 +110,7 @@ def _check_videos(files: Files, findings: Findings) -> None:
             off = (np.abs(begin - expected) > 0.5 / fps) | (np.abs(end - begin - lengths / fps) > 0.5 / fps)
             for position in np.flatnonzero(off)[:3]:
                 what = (
-                    f"episode {files.episodes['episode_index'][positions[position]]} is said to be from "
+                    f"episode {files.episodes['episode_index'][positions[position]]} has the place from "
                     f"{begin[position]:.3f} to {end[position]:.3f} s, and its {lengths[position]} frames begin at "
                     f"{expected[position]:.3f} s"
                 )
@@ -121,10 +121,10 @@ def _judge_outcomes(files: Files, findings: Findings) -> None:
     outcomes = files.episodes.get(f"{PREFIX}outcome")
     if not outcomes:
         return
-    counts = Counter("not said" if outcome is None else str(outcome) for outcome in outcomes)
-    told = ", ".join(f"{name} {count}" for name, count in counts.most_common())
+    counts = Counter("unknown" if outcome is None else str(outcome) for outcome in outcomes)
+    summary = ", ".join(f"{name} {count}" for name, count in counts.most_common())
     if counts.get("success"):
-        findings.note("outcome", f"{len(outcomes)} episodes", told)
+        findings.note("outcome", f"{len(outcomes)} episodes", summary)
     else:
-        remedy = "Nothing shows how it is done: do not imitate them as they are."
-        findings.warning("outcome", f"{len(outcomes)} episodes", f"none succeeded: {told}", remedy)
+        remedy = "Do not train an imitation policy on it."
+        findings.warning("outcome", f"{len(outcomes)} episodes", f"none succeeded: {summary}", remedy)

@@ -1,7 +1,7 @@
 """Whether the files of a dataset are there, can be read, and agree on what they count.
 
-`state.load_state` asks the same and stops at the first contradiction, because a recorder must not go on from it. Here
-all of them are wanted, also in datasets that another program left behind.
+`state.load_state` checks the same and stops at the first contradiction, because a recorder must not continue from it.
+Here all of them are reported, in datasets of other programs, too.
 """
 
 import contextlib
@@ -16,16 +16,19 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format.expected import wrong_types
 from bhd_lerobot.datasets.format.info import InfoError, parse_object, read_info, wrong_feature
+from bhd_lerobot.datasets.format.parquet_rescue import is_cut_off
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.datasets.format.state import UNREADABLE, no_dataset, repair_with_info
 from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.storage.atomic import WORK, is_decided
+from bhd_lerobot.datasets.storage.places import check_links
 from bhd_lerobot.datasets.validate.findings import Findings, few, one_line
-from bhd_lerobot.datasets.validate.names import check_names
 from bhd_lerobot.datasets.validate.statistics import UNREAD
 from bhd_lerobot.errors import DatasetError
 
 _COPY = "Restore it from a copy, or try bhd-data repair."
 RESTORE = "Restore it from a copy, or run bhd-data repair, which recovers the episodes that are whole."
+_RECORD = "Restore it from a copy; bhd-data repair goes on without what is lost with it."
 _LIGHT = (
     *("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index"),
     "tasks",
@@ -95,7 +98,7 @@ def read_files(root: Path, findings: Findings) -> Files:
     _read_tasks(files, findings)
     _read_episodes(files, findings)
     _check_counts(files, findings)
-    check_names(files, findings)
+    _check_names(files, findings)
     _read_stats(files, findings)
     return files
 
@@ -119,7 +122,7 @@ def _check_features(files: Files, findings: Findings) -> None:
     for key, feature in list(files.features.items()):
         if wrong := wrong_feature(feature):
             findings.error("schema", f"{layout.INFO}: {key}", f"it {wrong}", _COPY)
-            del files.features[key]  # nothing can be said about it
+            del files.features[key]  # it cannot be checked further
             continue
         names, size = feature.get("names"), feature["shape"][0]
         if feature["dtype"] not in ("video", "image") and isinstance(names, list) and len(names) != size:
@@ -131,7 +134,7 @@ def _read_tasks(files: Files, findings: Findings) -> None:
     if not path.is_file() and not files.info["total_episodes"]:
         return
     try:
-        # All of it, though one column is looked at: what is damaged elsewhere shows in the pages' checksums.
+        # All columns, though one is checked: the checksums of the pages show other damage.
         table = pq.ParquetFile(path, page_checksum_verification=True).read()
         indices = table["task_index"].to_pylist()
         are_numbered = set(indices) == set(range(len(indices)))
@@ -213,6 +216,51 @@ def _check_counts(files: Files, findings: Findings) -> None:
         findings.error("counts", layout.INFO, what, "bhd-data check --fix counts them.")
 
 
+def _check_names(files: Files, findings: Findings) -> None:
+    """Compare the files that there are with those that the episodes name."""
+    wanted = {layout.data_file(slot) for slot in files.slots("data")}
+    for key in files.cameras:
+        wanted |= {layout.video_file(key, slot) for slot in files.slots(f"videos/{key}")}
+    there = {name for name in layout.recorded_files(files.root) if not name.startswith("meta/")}
+    try:
+        check_links(files.root)
+    except DatasetError as error:
+        findings.error("files", layout.INFO, "a link leads out of the dataset, which no command follows", str(error))
+    for name in sorted(wanted - there):
+        findings.error("files", name, "it is missing", _RECORD)
+    leftovers = sorted(there - wanted)
+    described = len(files.episodes.get("episode_index", ()))
+    if described < files.info["total_episodes"]:
+        remedy = "It may hold an episode that is not described: bhd-data repair recovers those that are whole."
+    elif files.is_ours:
+        remedy = "bhd-data repair removes it."
+    else:
+        remedy = "Inspect it; it may hold unfinished episodes."
+    torn = [name for name in leftovers if name.endswith(".parquet") and is_cut_off(files.root / name)]
+    if torn:
+        what = "its writer was killed; an episode may be in it, and LeRobot loads nothing while it is there"
+        findings.error("files", few(torn, 3), what, "bhd-data repair recovers what is whole.")
+    elif leftovers:
+        findings.warning("files", few(leftovers, 3), "no described episode is in it", remedy)
+    if (files.root / layout.STAGING).exists():
+        findings.warning("files", layout.STAGING, *_interrupted(files))
+
+
+def _interrupted(files: Files) -> tuple[str, str]:
+    """Return what the staging folder is left of, and what to do."""
+    if is_decided(files.root):
+        return (
+            "an edit, or the merging of a recording's files, was interrupted at its end",
+            "bhd-data repair completes it.",
+        )
+    is_whole = not files.is_ours or (bool(files.episodes) and files.has_stats)
+    if is_whole and {path.name for path in (files.root / layout.STAGING).iterdir()} == {WORK.name}:
+        # A recording whose files are being merged has episodes without statistics.
+        return "an edit was interrupted; nothing of it was done", "bhd-data repair drops it. Repeat the edit."
+    what = "a recording was interrupted; what it saved is complete, and not yet merged"
+    return what, "bhd-data repair finishes it."
+
+
 def stats_remedy(files: Files) -> str:
     """Return what computes missing or wrong statistics."""
     unfinished = (files.root / layout.STAGING).exists()
@@ -235,8 +283,8 @@ def _read_stats(files: Files, findings: Findings) -> None:
     for key, feature in files.features.items():
         if feature["dtype"] in ("string", "language"):
             continue
-        told = stats.get(key)
-        known = files.stats[key] = _vectors(told if isinstance(told, dict) else {})
+        stored = stats.get(key)
+        known = files.stats[key] = _vectors(stored if isinstance(stored, dict) else {})
         lacking = [one for one in _STATISTICS if one not in known]
         report = findings.warning if key in UNREAD else findings.error
         if lacking:
@@ -248,10 +296,10 @@ def _read_stats(files: Files, findings: Findings) -> None:
                 report("stats", f"{name}: {key}", what, remedy)
 
 
-def _vectors(told: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+def _vectors(stored: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
     """Return what there are numbers for, flat."""
     vectors: dict[str, NDArray[np.float64]] = {}
-    for name, value in told.items():
+    for name, value in stored.items():
         with contextlib.suppress(TypeError, ValueError, OverflowError):
             values = np.asarray(value, np.float64).reshape(-1)
             if values.size:

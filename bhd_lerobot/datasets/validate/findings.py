@@ -1,4 +1,4 @@
-"""What a check of a dataset finds."""
+"""What a check or a repair of a dataset finds."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,15 +21,15 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a check found.
+    """One fact about a dataset that a check or a repair found.
 
     Attributes:
-        severity: error: a program stumbles over it, or learns something wrong; warning: somebody should look at it;
-            note: good to know.
-        check: which check found it.
+        severity: error: a program fails on it or learns something wrong, or data are lost; warning: to be inspected by
+            a person; note: for information.
+        check: the check that found it, one of `CHECKS`.
         where: the file, or the feature and the place in it.
-        what: what is so, with the numbers.
-        remedy: what to do about it; empty for notes.
+        what: the fact, with its numbers.
+        remedy: what to do about it; empty for notes and for losses.
     """
 
     severity: Severity
@@ -38,18 +38,22 @@ class Finding:
     what: str
     remedy: str = ""
 
+    def __str__(self) -> str:
+        """Return place and fact on one line."""
+        return f"{self.where}: {self.what}"
+
 
 @dataclass
 class Findings:
-    """Findings, as they come."""
+    """Findings in the order in which they were added."""
 
     items: list[Finding] = field(default_factory=list)
 
     def __iter__(self) -> Iterator[Finding]:
-        """Iterate over them, the worst first, otherwise as they came."""
+        """Iterate over the findings, the worst first, otherwise in the order in which they were added."""
         return iter(sorted(self.items, key=lambda one: -one.severity))
 
-    def error(self, check: str, where: str, what: str, remedy: str) -> None:
+    def error(self, check: str, where: str, what: str, remedy: str = "") -> None:
         """Add an error."""
         self.items.append(Finding(Severity.ERROR, check, where, what, remedy))
 
@@ -82,5 +86,5 @@ def name_of(feature: Mapping[str, Any], element: int) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return what an error says, on one line."""
+    """Return the message of an error on one line."""
     return " ".join(str(error).split()).rstrip(".")

@@ -37,7 +37,7 @@ class FrozenCheck:
         self._features = features
         self._columns: dict[str, _Column] = {}
 
-    def look(
+    def add(
         self,
         key: str,
         values: NDArray[Any],
@@ -45,7 +45,7 @@ class FrozenCheck:
         lengths: NDArray[np.int64],
         episodes: Sequence[int],
     ) -> None:
-        """Look at a feature in some episodes.
+        """Add the values of a feature in some episodes.
 
         Args:
             key: the feature.
@@ -63,7 +63,7 @@ class FrozenCheck:
         known.episodes += episodes
 
     def judge(self, findings: Findings) -> None:
-        """Say what was found."""
+        """Add what was found to the findings."""
         for key, column in self._columns.items():
             self._judge(key, column, findings)
 
@@ -74,7 +74,7 @@ class FrozenCheck:
             return
         dead = column.low == column.high
         if dead.all():
-            findings.warning("frozen", key, "none of its numbers ever changes", "Look whether it was connected.")
+            findings.warning("frozen", key, "none of its numbers ever changes", "Check that it was connected.")
             return
         if dead.any():
             names = few(name_of(self._features[key], int(i)) for i in np.flatnonzero(dead))
@@ -92,13 +92,13 @@ class FrozenCheck:
             episodes = few(column.episodes[i] for i in np.flatnonzero(still[:, element]))
             what = f"it does not change in episode {episodes}, and does in most others"
             where = f"{key}: {name_of(self._features[key], element)}"
-            findings.warning("frozen", where, what, "Look at the sensor.")
+            findings.warning("frozen", where, what, "Check the sensor.")
 
 
 def _frozen(values: NDArray[Any], starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return which numbers do not change in each episode, shape (episodes, d)."""
     first = values[starts]
-    # Most numbers differ between the first frame and one in the middle or the last, so few are left to look at.
+    # Most numbers differ between the first frame and one in the middle or the last, so few are left to compare.
     same = (first == values[starts + lengths // 2]) & (first == values[starts + lengths - 1])
     for episode, element in zip(*np.nonzero(same), strict=True):
         rows = slice(starts[episode], starts[episode] + lengths[episode])

@@ -1,4 +1,4 @@
-"""Whether statistics are those of the data, as far as single precision can tell.
+"""Whether statistics are those of the data, within the rounding of single precision.
 
 LeRobot adds the frames of an episode up in the precision of the column, float32 as a rule, one after the other, and
 takes a variance as the mean of the squares minus the square of the mean. Of n numbers the rounding is at most n / 2
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 UNREAD = ("index", "episode_index", "task_index")
-"""Columns that LeRobot numbers anew when it merges, splits or deletes, without their statistics. No policy reads them,
+"""Columns that LeRobot renumbers when it merges, splits or deletes, without their statistics. No policy reads them,
 so nothing wrong is learned from these."""
 
 _RANGE = 1e-3  # of the range: histograms and samples of other programs
@@ -53,11 +53,11 @@ class Moments:
         self.squares += other.squares
 
 
-def wrong_statistic(told: Mapping[str, Array], found: Moments, frames: int, longest: int) -> str | None:
+def wrong_statistic(stored: Mapping[str, Array], found: Moments, frames: int, longest: int) -> str | None:
     """Return the name of the first statistic that is not that of the data; None if all are.
 
     Args:
-        told: statistics by name, each of shape (d,); what is not there is not judged.
+        stored: statistics by name, each of shape (d,); what is not there is not judged.
         found: what was read.
         frames: how many frames that was.
         longest: frames of the longest episode; LeRobot computes the statistics of one at a time.
@@ -77,8 +77,10 @@ def wrong_statistic(told: Mapping[str, Array], found: Moments, frames: int, long
         "std": (np.sqrt(np.maximum(variance - of_variance, 0)), np.sqrt(variance + of_variance)),
     }
     for name, (least, most) in bounds.items():
-        if name not in told:
+        if name not in stored:
             continue
-        if told[name].shape != mean.shape or not np.all((least - slack <= told[name]) & (told[name] <= most + slack)):
+        if stored[name].shape != mean.shape or not np.all(
+            (least - slack <= stored[name]) & (stored[name] <= most + slack)
+        ):
             return name
     return None

@@ -41,8 +41,8 @@ class StepCheck:
         self._flips: dict[tuple[str, str], _Steps] = {}  # by feature and name
         self._jumps: dict[tuple[str, str], _Steps] = {}
 
-    def look(self, key: str, values: NDArray[Any], starts: NDArray[np.int64], episodes: Sequence[int]) -> None:
-        """Look at a feature in some episodes.
+    def add(self, key: str, values: NDArray[Any], starts: NDArray[np.int64], episodes: Sequence[int]) -> None:
+        """Add the values of a feature in some episodes.
 
         Args:
             key: the feature.
@@ -66,7 +66,7 @@ class StepCheck:
             return
         span = values.max(axis=0) - values.min(axis=0)
         large = np.abs(step) > _JUMP_OF_RANGE * span
-        # A gripper is told to close once in an episode, and that is usual. There and back again in two frames is not.
+        # One command to close a gripper in an episode is usual. Two opposite steps in two frames are not.
         back = np.zeros_like(large)
         back[:-1] = large[:-1] & large[1:] & (step[:-1] * step[1:] < 0)
         back[1:] |= back[:-1]
@@ -78,16 +78,16 @@ class StepCheck:
             _add(self._jumps, (key, name), np.flatnonzero(jumps[:, element]), starts, episodes)
 
     def judge(self, findings: Findings) -> None:
-        """Say what was found."""
+        """Add what was found to the findings."""
         for (key, name), steps in self._flips.items():
             what = (
                 f"the quaternion changes its sign {steps}: the same orientation, written with other numbers; a network "
                 "that learns both predicts what lies between them"
             )
-            findings.warning("jumps", f"{key}: {name}", what, "Mind it where a policy is to predict it.")
+            findings.warning("jumps", f"{key}: {name}", what, "Use one sign if a policy is to predict it.")
         for (key, name), steps in self._jumps.items():
             what = f"it jumps by more than half its range {steps}"
-            findings.warning("jumps", f"{key}: {name}", what, "Look at the episode.")
+            findings.warning("jumps", f"{key}: {name}", what, "Check the episode with bhd-data view.")
 
 
 def _add(

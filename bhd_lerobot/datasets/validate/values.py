@@ -29,7 +29,7 @@ Limits = Mapping[str, Mapping[str, tuple[float, float]]]
 _TIMESTAMP_TOLERANCE = 1e-4  # [s] LeRobot's own
 _INDEX = ("index", "episode_index", "frame_index", "timestamp", "task_index")
 _LEAVE = "Leave the episode out (dataset.episodes), or record it again."
-_MOVING = (keys.OBSERVATION_STATE, keys.ACTION)  # what is to change; what a task tells often does not, by design
+_MOVING = (keys.OBSERVATION_STATE, keys.ACTION)  # these should change; the environment state often does not, by design
 _LIMIT_TOLERANCE = 0.01  # of the limits' distance: a joint gives way a little at its end
 _LATE_SHARE = 0.01
 
@@ -64,7 +64,7 @@ class ValueCheck:
             for slot, positions in self._files.slots("data").items()
             if (self._files.root / layout.data_file(slot)).is_file()
         ]
-        # The next file is read while one is looked at. Findings are added to a list, which threads may do.
+        # The next file is read while one is checked. Findings are added to a list, which is thread-safe.
         with ThreadPoolExecutor(1) as reader:
             tables = deque(reader.submit(self._read, name) for name, _ in slots[:1])
             for (name, positions), following in zip(slots, [*slots[1:], None], strict=False):
@@ -79,7 +79,7 @@ class ValueCheck:
         self._judge_stats()
         if self.frames and self._counted[keys.LATE] > _LATE_SHARE * self.frames:
             what = f"{self._counted[keys.LATE]} of {self.frames} frames were late"
-            self._findings.warning("timing", keys.LATE, what, "bhd-data timing says which.")
+            self._findings.warning("timing", keys.LATE, what, "bhd-data timing lists them.")
         if self._counted[keys.SKIPPED]:
             self._findings.note("timing", keys.SKIPPED, f"{self._counted[keys.SKIPPED]} control ticks were skipped")
 
@@ -115,7 +115,7 @@ class ValueCheck:
         lengths = np.array([episodes["length"][i] for i in positions])
         starts = np.array([episodes["dataset_from_index"][i] for i in positions])
         if (lengths < 1).any():
-            return False  # said already, of meta/episodes
+            return False  # reported already, of meta/episodes
         if len(table) != lengths.sum():
             what = f"it has {len(table)} frames; its episodes have {lengths.sum()}"
             self._findings.error("counts", name, what, "bhd-data repair, or restore it from a copy.")
@@ -204,8 +204,8 @@ class ValueCheck:
             known.add(found)
         if key in _MOVING:
             episodes = self._episodes[len(self._episodes) - len(starts) :]
-            self._frozen.look(key, values, starts, lengths, episodes)
-            self._steps.look(key, values, starts, episodes)
+            self._frozen.add(key, values, starts, lengths, episodes)
+            self._steps.add(key, values, starts, episodes)
 
     def _note_broken(self, key: str, values: NDArray[Any], starts: NDArray[np.int64]) -> None:
         rows, elements = np.nonzero(~np.isfinite(values))
@@ -238,7 +238,7 @@ class ValueCheck:
         found, room = (column.low[element], column.high[element]), _LIMIT_TOLERANCE * (high - low)
         if found[0] < low - room or found[1] > high + room:
             what = f"it goes from {found[0]:.4g} to {found[1]:.4g}; the robot's limits are {low:.4g} and {high:.4g}"
-            self._findings.warning("limits", f"{key}: {name}", what, "Look whether units and robot are right.")
+            self._findings.warning("limits", f"{key}: {name}", what, "Check the units and the robot type.")
 
     def _judge_stats(self) -> None:
         """Compare `meta/stats.json` with what was read."""

@@ -16,7 +16,8 @@ from bhd_lerobot.datasets.format.identity import FORMAT, as_json, check_identity
 from bhd_lerobot.datasets.format.schema import Schema
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.format.video import VideoSettings
-from bhd_lerobot.datasets.recovery.repair import RepairReport, settle
+from bhd_lerobot.datasets.recovery.repair import settle
+from bhd_lerobot.datasets.recovery.salvage import RepairReport
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, write_errors
 from bhd_lerobot.datasets.writer.commit import Committer, EpisodeContent
@@ -124,7 +125,7 @@ class DatasetRecorder:
         Raises:
             DatasetMismatchError: another robot, frame rate, feature set or recording; the message shows the difference.
             DatasetCorruptError: a file of a saved episode cannot be read; nothing was changed.
-            DatasetLockedError: somebody else is writing it.
+            DatasetLockedError: another process is writing it.
             DatasetError: there is no dataset at `root`.
         """
         schema, settings = _checked(fps, features, video)
@@ -211,7 +212,7 @@ class DatasetRecorder:
         tasks = self._state.tasks if task in self._state.tasks else [*self._state.tasks, task]
         columns = self._with_defaults(episode, tasks.index(task))
         stats = statistics.column_stats({key: columns[key] for key in self._schema.float_keys})
-        # From here on an exception, an interrupt too, may come between any two steps: what the disk says counts then.
+        # From here on an exception may come between any two steps: then the state on the disk counts.
         self._is_uncertain = True
         try:
             with write_errors(f"save episode {index}", self.root, _INTACT):
@@ -290,7 +291,7 @@ class DatasetRecorder:
                 self._disk.remove_tree(episode.folder)
 
     def _settle_if_is_uncertain(self) -> None:
-        # A failed `finalize` gave the lock back, so that `repair` can be used; somebody may have done that.
+        # A failed `finalize` gave the lock back, so that `repair` can be used; it may have been.
         self._is_uncertain |= self._lock.acquire()
         if self._is_uncertain:
             self._state, _ = settle(self.root, self._disk, keep_staging=True)

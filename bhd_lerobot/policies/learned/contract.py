@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from importlib import metadata
@@ -18,6 +17,7 @@ from lerobot.utils.constants import (
 )
 
 from bhd_lerobot import __version__
+from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.checkpoint import CONFIG_FILE, WEIGHT_FILES, find_checkpoint
 
@@ -114,10 +114,7 @@ class PolicyContract:
     def save(self, folder: str | Path) -> Path:
         """Write `bhd.json` into a folder, in one step; return the file."""
         file = Path(folder) / CONTRACT_FILE
-        file.parent.mkdir(parents=True, exist_ok=True)
-        part = file.with_name(f".{CONTRACT_FILE}.{os.getpid()}")
-        part.write_text(json.dumps({"format": FORMAT, **asdict(self)}, indent=2) + "\n", encoding="utf-8")
-        part.replace(file)
+        Disk().publish(file, (json.dumps({"format": FORMAT, **asdict(self)}, indent=2) + "\n").encode())
         return file
 
     def check(

@@ -32,17 +32,14 @@ def broken(recorded: Path, tmp_path: Path, value: float) -> Path:
     return root
 
 
-def test_what_was_just_recorded_is_sound(recorded: Path, capsys) -> None:
+def test_a_recorded_dataset_is_valid(recorded: Path, capsys) -> None:
     assert main.main(["check", str(recorded)]) == 0
     assert "valid, no errors" in capsys.readouterr().out
-
-
-def test_as_json(recorded: Path, capsys) -> None:
     assert main.main(["check", str(recorded), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["valid"] is True
-    assert told["episodes"] == 3
-    assert {one["severity"] for one in told["findings"]} <= {"note", "warning"}
+    values = json.loads(capsys.readouterr().out)
+    assert values["valid"] is True
+    assert values["episodes"] == 3
+    assert {one["severity"] for one in values["findings"]} <= {"note", "warning"}
 
 
 def test_errors_and_with_strict_warnings_end_with_status_1(recorded: Path, tmp_path: Path, capsys, monkeypatch) -> None:
@@ -65,33 +62,28 @@ def test_no_dataset_is_status_2(tmp_path: Path, capsys) -> None:
     assert "is not a LeRobot dataset" in capsys.readouterr().err
 
 
-def test_limits_are_those_of_the_robots() -> None:
-    assert limits_of("turtlebot3")["control.applied_action"]["x.vel"] == (-0.22, 0.22)
-    arm = limits_of("ur5")
-    low, high = arm["observation.state"]["shoulder_pan.pos"]
-    assert low == -high
-    assert 6.2 < high < 6.3
-    assert arm["observation.state"]["gripper.pos"] == (0.0, 0.085)
-    assert limits_of("so101_follower") == limits_of(None) == {}
-
-
 def test_every_robot_of_ours_has_the_limits_of_its_configuration() -> None:
     for kind in ROBOTS:
         limits = kind().body().limits
-        told = limits_of(kind.get_choice_name(kind))["control.applied_action"]
-        assert list(told) == list(limits.names)
-        for index, (low, high) in enumerate(told.values()):
+        ranges = limits_of(kind.get_choice_name(kind))["control.applied_action"]
+        assert list(ranges) == list(limits.names)
+        for index, (low, high) in enumerate(ranges.values()):
             arm = hasattr(limits, "upper")
             assert high == (limits.upper if arm else limits.velocity)[index]
             assert low == (limits.lower[index] if arm else -high)
+    assert limits_of("turtlebot3")["control.applied_action"]["x.vel"] == (-0.22, 0.22)
+    assert limits_of("ur5")["observation.state"]["gripper.pos"] == (0.0, 0.085)
+    assert limits_of("so101_follower") == limits_of(None) == {}
 
 
-@pytest.mark.parametrize(("command", "said"), [("check", "nothing was changed"), ("repair", "run it again to finish")])
-def test_ctrl_c_is_a_line_and_status_130(recorded: Path, capsys, monkeypatch, command: str, said: str) -> None:
+@pytest.mark.parametrize(
+    ("command", "message"), [("check", "nothing was changed"), ("repair", "run it again to finish")]
+)
+def test_ctrl_c_is_a_line_and_status_130(recorded: Path, capsys, monkeypatch, command: str, message: str) -> None:
     def interrupted(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
     module = {"check": check, "repair": repair}[command]
     monkeypatch.setattr(module, command, interrupted)
     assert main.main([command, str(recorded)]) == 130
-    assert capsys.readouterr().err == f"Stopped; {said}.\n"
+    assert capsys.readouterr().err == f"Stopped; {message}.\n"

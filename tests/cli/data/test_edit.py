@@ -44,11 +44,6 @@ def test_merge_filter_delete_split_mark(recorded: Path, tmp_path: Path, capsys) 
     assert content(recorded) == whole
 
 
-def test_repair_of_a_sound_dataset(recorded: Path, capsys) -> None:
-    assert main.main(["repair", str(recorded)]) == 0
-    assert "nothing to do" in capsys.readouterr().out
-
-
 def test_check_with_fix(recorded: Path, tmp_path: Path, capsys) -> None:
     root = shutil.copytree(recorded, tmp_path / "d")
     (root / "meta/stats.json").unlink()

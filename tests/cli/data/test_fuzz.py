@@ -45,8 +45,8 @@ def sources(tmp_path_factory) -> list[Path]:
     main.main(["mark", str(folder / "recorded"), "--episodes=2", "--outcome=stuck"])
     (path,) = (folder / "recorded/meta/episodes").rglob("*.parquet")
     table = pq.read_table(path)
-    for name, told in (("interventions", [[1, 3, "a person"]]), ("realtime", [dict.fromkeys(GRANT, "x")])):
-        table = table.append_column(f"bhd/{name}", pa.array([json.dumps(told)] * table.num_rows))
+    for name, values in (("interventions", [[1, 3, "a person"]]), ("realtime", [dict.fromkeys(GRANT, "x")])):
+        table = table.append_column(f"bhd/{name}", pa.array([json.dumps(values)] * table.num_rows))
     pq.write_table(table, path)
     run_record(
         folder / "video_dataset", dataset__episode_time_s=0.5, robot__camera="true", n_envs=1, dataset__num_episodes=2
@@ -95,11 +95,11 @@ def test_a_damaged_dataset_ends_no_command_in_a_traceback(sources: list[Path], t
             status = view(root) if name == "view" else run(arguments)
         except Exception as error:
             raise AssertionError(f"{where} ends in {error!r}") from error
-        told = capsys.readouterr()
+        output = capsys.readouterr()
         assert status in (0, 1, 2), where
-        assert status == 0 or len((told.err or told.out).strip()) > 20 or name == "view", where
-        assert "Traceback" not in told.err, where
-        if name not in CHANGES or ("nothing was changed" in told.err.lower() and status == 2):
+        assert status == 0 or len((output.err or output.out).strip()) > 20 or name == "view", where
+        assert "Traceback" not in output.err, where
+        if name not in CHANGES or ("nothing was changed" in output.err.lower() and status == 2):
             assert fuzz_support.contents(root.parent) == before, where
         if status == 2 and name in (*READS, "merge"):  # which may have made a part of them
             assert not out.exists() or not any(out.rglob("info.json")), where

@@ -62,9 +62,9 @@ def test_info_of_several_datasets(recorded, tmp_path, capsys):
     assert main.main(["info", "--json", str(recorded), str(other)]) == 0
     assert [one["root"] for one in json.loads(capsys.readouterr().out)] == [str(recorded), str(other)]
     assert main.main(["info", str(other), str(recorded)]) == 0
-    told = capsys.readouterr().out
-    assert str(other) in told.replace("\n", "")
-    assert told.count("Features") == 2
+    output = capsys.readouterr().out
+    assert str(other) in output.replace("\n", "")
+    assert output.count("Features") == 2
 
 
 def test_an_empty_dataset_is_called_empty(tmp_path, capsys):
@@ -111,7 +111,7 @@ def test_help_names_every_value_by_what_it_is():
             assert "_" not in str(action.metavar)
 
 
-def test_repair_of_a_sound_dataset_has_nothing_to_do(recorded, capsys):
+def test_repair_of_a_valid_dataset_has_nothing_to_do(recorded, capsys):
     assert main.main(["repair", str(recorded)]) == 0
     assert "nothing to do" in capsys.readouterr().out
 
@@ -145,16 +145,8 @@ def test_a_corrupted_file_is_named_left_alone_and_repaired(recorded, tmp_path, c
     assert main.main(["check", str(root)]) == 0
 
 
-def test_no_dataset_and_no_argument(tmp_path, capsys):
-    assert main.main(["info", str(tmp_path / "none")]) == 2
-    assert "does not exist" in capsys.readouterr().err
-    with pytest.raises(SystemExit) as stop:
-        main.main(["info"])
-    assert stop.value.code == 2
-
-
 @pytest.mark.parametrize("arguments", [["info"], ["info", "--json"], ["check"]])
-def test_output_that_nobody_reads_ends_the_command_without_a_word(recorded, arguments):
+def test_a_closed_output_ends_the_command_without_a_message(recorded, arguments):
     command = [sys.executable, "-m", "bhd_lerobot.cli.data.main", *arguments, str(recorded)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     reading, writing = os.pipe()
@@ -168,15 +160,15 @@ def test_output_that_nobody_reads_ends_the_command_without_a_word(recorded, argu
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
 
 
-def test_a_recording_that_goes_on_is_no_interrupted_one(tmp_path, capsys, monkeypatch):
+def test_a_recording_in_progress_is_not_called_interrupted(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     root = tmp_path / "d"
     recorder = support.create(root)
     support.record(recorder)
-    told = "not finalised: it is being recorded or changed at this moment"
+    message = "not finalised: it is being recorded or changed at this moment"
     for command in (["info"], ["info", "--short"]):
         assert main.main([*command, str(root)]) == 0
-        assert told in capsys.readouterr().out
+        assert message in capsys.readouterr().out
     for command in ("check", "repair", "view"):
         assert main.main([command, str(root)]) == 2
         assert "being" in capsys.readouterr().err
@@ -191,7 +183,7 @@ def test_a_recording_that_goes_on_is_no_interrupted_one(tmp_path, capsys, monkey
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("chek x", "Did you mean 'check'?"),
         ("view x --prt 0", "Did you mean '--port'?"),
@@ -199,8 +191,8 @@ def test_a_recording_that_goes_on_is_no_interrupted_one(tmp_path, capsys, monkey
         ("check a b", "an argument too many: b"),
     ],
 )
-def test_a_slip_of_the_keyboard_is_told_the_nearest_name(line, said, capsys):
+def test_a_misspelt_command_or_option_gets_the_nearest_name(line, message, capsys):
     with pytest.raises(SystemExit) as ended:
         main.main(line.split())
     assert ended.value.code == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err

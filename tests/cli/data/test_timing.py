@@ -1,11 +1,13 @@
 """bhd-data timing: what it says of a recording on the wall clock, of one in simulated time, and of what is neither."""
 
+import io
 import json
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.cli.data import main
@@ -14,7 +16,7 @@ from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_fra
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.timing import report as timing_report
 from bhd_lerobot.datasets.timing.plots import draw_timing
-from bhd_lerobot.datasets.timing.tables import fitting, ms, ticks
+from bhd_lerobot.datasets.timing.tables import fitting, ms, print_timing, ticks
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
 from tests.recording.support import data_columns, run_record
@@ -113,21 +115,11 @@ def test_all_episodes_together_are_sums_maxima_and_bounds(measured):
         assert getattr(total, name) == max(getattr(one, name) for one in parts)
     assert len(report.total.intervals) == 3 * (FRAMES - 1)  # from one episode to the next there is none
     assert total.tolerated == parts[0].tolerated
-
-
-def test_of_rate_errors_the_largest_is_shown_with_its_sign(measured):
-    report = timing_report.load_timing(measured)
-    errors = (0.5, -2.0, 1.0)
-    pairs = zip(report.episodes, errors, strict=True)
-    episodes = tuple(replace(one, summary=replace(one.summary, rate_error=error)) for one, error in pairs)
-    assert replace(report, episodes=episodes).total.summary.rate_error == -2.0
-
-
-def test_limits_that_differ_are_not_shown_as_one(measured):
-    report = timing_report.load_timing(measured)
-    first, *rest = report.episodes
-    other = replace(first, summary=replace(first.summary, tolerated={"lateness": 1.0}))
-    assert replace(report, episodes=(other, *rest)).total.summary.tolerated == {}
+    changes = ({"rate_error": 0.5}, {"rate_error": -2.0}, {"rate_error": 1.0, "tolerated": {"lateness": 1.0}})
+    pairs = zip(report.episodes, changes, strict=True)
+    episodes = tuple(replace(one, summary=replace(one.summary, **change)) for one, change in pairs)
+    total = replace(report, episodes=episodes).total.summary
+    assert (total.rate_error, total.tolerated) == (-2.0, {})  # the largest, and no limit where they differ
 
 
 def test_the_tables_hold_what_was_measured(measured, tmp_path, capsys, monkeypatch):
@@ -143,15 +135,16 @@ def test_the_tables_hold_what_was_measured(measured, tmp_path, capsys, monkeypat
     assert min(Image.open(image).size) > 500
 
 
-@pytest.mark.parametrize("width", [20, 80, 100, 170])
-def test_a_narrow_terminal_gets_fewer_columns_and_none_cut_off(measured, tmp_path, capsys, monkeypatch, width):
-    monkeypatch.setenv("COLUMNS", str(width))
-    assert main.main(["timing", str(measured), "--output", str(tmp_path / "t.svg")]) == 0
-    text = capsys.readouterr().out
-    assert max(map(len, text.splitlines())) <= max(width, len(str(tmp_path)) + 20)
-    assert ("inference [ms]" in text) == (width >= 170)
-    if width >= 80:
-        assert "…" not in text[text.index("Episodes") : text.index("granted")]
+def test_a_narrow_terminal_gets_fewer_columns_and_none_cut_off(measured):
+    report = timing_report.load_timing(measured)
+    for width in (20, 80, 100, 170):
+        console = Console(width=width, record=True, file=io.StringIO())
+        print_timing(report, console)
+        text = console.export_text()
+        assert max(map(len, text.splitlines())) <= width
+        assert ("inference [ms]" in text) == (width >= 170)
+        if width >= 80:
+            assert "…" not in text[text.index("Episodes") : text.index("granted")]
 
 
 def test_one_episode(measured, tmp_path, capsys, monkeypatch):
@@ -190,7 +183,7 @@ def test_a_simulated_recording_says_so(simulated, tmp_path, capsys, monkeypatch)
     assert np.asarray(Image.open(tmp_path / "t.png")).std() > 1
 
 
-def test_info_tells_the_timing_where_there_is_room(measured, simulated, capsys, monkeypatch):
+def test_info_shows_the_timing_that_fits_the_terminal(measured, simulated, capsys, monkeypatch):
     for width, seen in ((80, ("late frames", "skipped")), (170, ("late frames", "late p99", "drops", "age max"))):
         monkeypatch.setenv("COLUMNS", str(width))
         assert main.main(["info", str(measured)]) == 0
@@ -222,13 +215,13 @@ def test_a_dataset_from_before_these_columns_loads(tmp_path, capsys, monkeypatch
 @pytest.mark.parametrize(
     ("metadata", "words"),
     [
-        ({"other": "x"}, "says nothing about its timing"),
+        ({"other": "x"}, "has no timing"),
         ({"timing": "{"}, "not JSON"),
         ({"timing": '{"overruns": 0}'}, "not complete"),
         ({"timing": "[]"}, "not complete"),
     ],
 )
-def test_what_holds_no_timing_is_named(tmp_path, metadata, words):
+def test_a_missing_or_invalid_timing_is_named(tmp_path, metadata, words):
     columns, _ = make_episode(0)
     save(tmp_path / "d", [(columns, metadata)])
     with pytest.raises(DatasetError, match=words):
@@ -273,18 +266,18 @@ def test_bad_arguments_are_named_and_nothing_is_written(measured, tmp_path, caps
 # --- the image, and words ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("frames", [1, 2, 3, 5000])
-def test_episodes_of_any_length_are_drawn(measured, tmp_path, frames):
+def test_episodes_of_any_length_are_drawn(measured, tmp_path):
     report = timing_report.load_timing(measured, 0)
     (one,) = report.episodes
-    columns = {key: np.resize(column, frames) for key, column in one.columns.items()}
-    columns[keys.TIME] = np.arange(frames) / RATES.fps
-    changed = replace(one, columns=columns, intervals=np.diff(columns[keys.TIME]))
-    draw_timing(replace(report, episodes=(changed,)), tmp_path / "t.png")
-    assert np.asarray(Image.open(tmp_path / "t.png")).std() > 1
+    for frames in (1, 2, 5000):
+        columns = {key: np.resize(column, frames) for key, column in one.columns.items()}
+        columns[keys.TIME] = np.arange(frames) / RATES.fps
+        changed = replace(one, columns=columns, intervals=np.diff(columns[keys.TIME]))
+        draw_timing(replace(report, episodes=(changed,)), tmp_path / "t.png")
+        assert np.asarray(Image.open(tmp_path / "t.png")).std() > 1
 
 
-def test_small_words():
+def test_number_formats():
     assert [ms(seconds) for seconds in (0, 0.00999, 0.009999, 0.1234, 2)] == ["0.00", "9.99", "10.0", "123", "2000"]
     assert [ticks(number) for number in (-0.001, 0.3, -2)] == ["+0.00", "+0.30", "-2.00"]
     columns = [("ab\nabc", ["1"]), ("d", ["12345"])]

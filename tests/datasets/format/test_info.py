@@ -45,7 +45,7 @@ def info(recorded: Path) -> dict[str, Any]:
     return json.loads((recorded / "meta/info.json").read_text())
 
 
-def test_what_is_left_out_has_lerobots_default(info) -> None:
+def test_missing_keys_have_lerobots_defaults(info) -> None:
     required = {key: info[key] for key in REQUIRED}
     theirs = DatasetInfo.from_dict(copy.deepcopy(required)).to_dict()
     assert checked_info(required, "d") == theirs
@@ -67,16 +67,16 @@ def test_datasets_without_the_optional_keys_can_be_edited_and_repaired(recorded:
         shutil.rmtree(tmp_path / "kept")
 
 
-def test_what_is_not_valid_is_named_with_its_value_and_changes_nothing(recorded: Path, info, tmp_path: Path) -> None:
+def test_invalid_values_are_named_and_nothing_is_changed(recorded: Path, info, tmp_path: Path) -> None:
     root = Path(shutil.copytree(recorded, tmp_path / "d"))
     cases = [(key, value) for key, values in WRONG.items() for value in values]
     for key, value in [*cases, *((key, KeyError) for key in REQUIRED)]:
-        told = {**info, key: value}
+        changed = {**info, key: value}
         if value is KeyError:
-            del told[key]
+            del changed[key]
         with pytest.raises(InfoError, match=key if key != "features" else "feature"):
-            checked_info(told, "d")
-        (root / "meta/info.json").write_text(json.dumps(told))
+            checked_info(changed, "d")
+        (root / "meta/info.json").write_text(json.dumps(changed))
         before = {path: path.read_bytes() for path in root.rglob("*.*")}
         for action in (dataset_info, open_metadata, lambda root: keep(root, [0], tmp_path / "new")):
             with pytest.raises(DatasetError, match=r"info\.json is corrupt: ") as error:
@@ -89,7 +89,7 @@ def test_what_is_not_valid_is_named_with_its_value_and_changes_nothing(recorded:
     assert not (tmp_path / "new").exists()
 
 
-def test_what_is_no_json_object_is_refused_with_a_reason() -> None:
+def test_anything_but_a_json_object_is_refused_with_a_reason() -> None:
     for content, reason in (
         (b"", "Expecting value"),
         (b"[1]", "a list and no JSON object"),
@@ -102,7 +102,7 @@ def test_what_is_no_json_object_is_refused_with_a_reason() -> None:
             parse_object(content)
 
 
-def test_another_version_is_told_before_anything_else() -> None:
+def test_another_version_is_reported_first() -> None:
     for version in ("v2.1", 3.0, None):
         with pytest.raises(DatasetError, match=rf"dataset format {version}; this program reads v3\.x"):
             checked_info({"codebase_version": version, "features": 3, "fps": "x"}, "d", counts=False)

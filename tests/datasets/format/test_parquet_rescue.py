@@ -76,7 +76,7 @@ def test_without_the_footer_everything_is_found(tmp_path: Path, rows: list[int],
     assert (found.problem, found.lost_bytes) == ("it has no footer", 0)
 
 
-def test_with_the_footer_too(tmp_path: Path) -> None:
+def test_a_file_with_a_footer_is_read(tmp_path: Path) -> None:
     tables = [table(5, 0), table(6, 1)]
     with pq.ParquetWriter(tmp_path / "f.parquet", SCHEMA) as writer:
         for one in tables:
@@ -86,7 +86,7 @@ def test_with_the_footer_too(tmp_path: Path) -> None:
     assert not found.problem
 
 
-def test_of_a_torn_file_only_whole_row_groups_are_found(tmp_path: Path) -> None:
+def test_only_whole_row_groups_of_a_truncated_file_are_found(tmp_path: Path) -> None:
     tables = [table(5 + seed, seed) for seed in range(4)]
     ends = write(tmp_path / "f.parquet", tables)
     data = (tmp_path / "f.parquet").read_bytes()
@@ -114,7 +114,7 @@ def test_damage_never_raises(tmp_path: Path) -> None:
         assert all(one.schema.equals(SCHEMA) for one in found.groups)
 
 
-def test_another_file_is_none(tmp_path: Path) -> None:
+def test_a_file_of_another_format_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "f.parquet").write_bytes(b"hello")
     found = rescue(tmp_path / "f.parquet", SCHEMA)
     assert found.groups == []
@@ -144,7 +144,7 @@ STRUCTS = st.recursive(
 
 
 @given(STRUCTS)
-def test_structs_come_back(struct: dict[int, Field]) -> None:
+def test_encoded_structs_are_decoded_to_the_same(struct: dict[int, Field]) -> None:
     data = encode(struct)
     reader = Reader(data + b"rest")
     assert reader.struct() == struct

@@ -12,6 +12,7 @@ import pytest
 
 from bhd_lerobot.datasets.format import statistics, video
 from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
+from bhd_lerobot.datasets.format.video_splice import splice
 from bhd_lerobot.errors import FrameError
 
 SIZE = (32, 48)
@@ -38,10 +39,10 @@ def test_joined_files_hold_every_frame_at_its_time(tmp_path: Path, settings: Vid
     paths = [encode(tmp_path / f"{i}.mp4", greys, settings) for i, greys in enumerate(parts)]
     assert len({video.stream_signature(path) for path in paths}) == 1
     joined = tmp_path / "joined.mp4"
-    assert video.concatenate(paths, joined, 10) == [3, 1, 5]
+    splice([(path, [(0, len(greys))]) for path, greys in zip(paths, parts, strict=True)], joined, 10)
     # Joining what was joined before, as resuming does.
     twice = tmp_path / "twice.mp4"
-    assert video.concatenate([joined, paths[0]], twice, 10) == [9, 3]
+    splice([(joined, [(0, 9)]), (paths[0], [(0, 3)])], twice, 10)
     wanted = [*parts[0], *parts[1], *parts[2], *parts[0]]
     with av.open(str(twice)) as container:
         frames: list[Any] = list(container.decode(container.streams.video[0]))
@@ -106,7 +107,7 @@ def test_images_are_copied(tmp_path: Path) -> None:
     assert histograms.argmax(axis=2)[:, 0].tolist() == list(range(10))
 
 
-def test_an_encoder_that_fails_is_heard(tmp_path: Path) -> None:
+def test_an_error_of_the_encoder_is_raised(tmp_path: Path) -> None:
     encoder = CameraEncoder(tmp_path / "missing" / "a.mp4", 10, SIZE, VideoSettings(queue_size=1))
 
     def add_many() -> None:

@@ -41,29 +41,29 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("ours", [True, False])
-@pytest.mark.parametrize("name", DAMAGES)
-def test_it_is_as_it_was(tmp_path: Path, name: str, ours: bool) -> None:
+def test_fix_restores_statistics_and_counts(tmp_path: Path, ours: bool) -> None:
     root = record(tmp_path / "d", [0, 1, 2], video=not ours)
     if not ours:
         stock(root)
     before, stats = content(root), json.loads((root / STATS).read_text())
-    DAMAGES[name](root)
-    assert errors(root)
-    assert fix(root, check_dataset(root).findings)
-    assert errors(root) == []
-    assert content(root) == before
-    after = json.loads((root / STATS).read_text())
-    assert after.keys() == stats.keys()
-    for key, stat in stats.items():
-        for statistic in ("min", "max", "mean", "std", "count"):
-            # Videos are encoded, so what is computed from them may differ in the last bits.
-            tolerance = 0.01 if "images" in key else 1e-6
-            np.testing.assert_allclose(after[key][statistic], stat[statistic], rtol=0, atol=tolerance, err_msg=key)
-    assert fix(root, check_dataset(root).findings) == []
-    assert not (root / ".bhd").exists()
+    for name, damage_it in DAMAGES.items():
+        damage_it(root)
+        assert errors(root), name
+        assert fix(root, check_dataset(root).findings), name
+        assert errors(root) == []
+        assert content(root) == before
+        after = json.loads((root / STATS).read_text())
+        assert after.keys() == stats.keys()
+        for key, stat in stats.items():
+            for statistic in ("min", "max", "mean", "std", "count"):
+                # Videos are encoded, so statistics of their images may differ in the last bits.
+                tolerance = 0.01 if "images" in key else 1e-6
+                np.testing.assert_allclose(after[key][statistic], stat[statistic], rtol=0, atol=tolerance, err_msg=key)
+        assert fix(root, check_dataset(root).findings) == []
+        assert not (root / ".bhd").exists()
 
 
-def test_nothing_is_mended_while_something_else_is_wrong(tmp_path: Path) -> None:
+def test_nothing_is_fixed_while_there_is_another_error(tmp_path: Path) -> None:
     """Statistics of wrong data would hide what is wrong."""
     root = record(tmp_path / "d", [0, 1, 2])
     DAMAGES["wrong mean"](root)

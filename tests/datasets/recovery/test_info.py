@@ -27,11 +27,6 @@ def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("info") / "other", [5], video=True)
 
 
-@pytest.fixture
-def datasets(recorded: Path, other: Path) -> tuple[Path, Path]:
-    return recorded, other
-
-
 def torn(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:40])
 
@@ -40,17 +35,16 @@ def without_features(path: Path) -> None:
     path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "features"}))
 
 
-@pytest.mark.parametrize("command", ["info", "check", "repair", "view", "timing"])
 @pytest.mark.parametrize("break_it", [torn, without_features, Path.unlink, lambda path: path.write_text("[]")])
 def test_the_advice_works(
-    datasets: tuple[Path, Path], tmp_path: Path, capsys, command: str, break_it: Callable[[Path], object]
+    recorded: Path, other: Path, tmp_path: Path, capsys, break_it: Callable[[Path], object]
 ) -> None:
-    recorded, other = datasets
     root = Path(shutil.copytree(recorded, tmp_path / "d"))
     break_it(root / "meta/info.json")
-    assert main.main([command, str(root)]) == 2
-    advice = re.search(r"`bhd-data (repair .* --info) OTHER`", capsys.readouterr().err)
-    assert advice is not None
+    for command in ("info", "check", "repair", "view", "timing"):
+        assert main.main([command, str(root)]) == 2
+        advice = re.search(r"`bhd-data (repair .* --info) OTHER`", capsys.readouterr().err)
+        assert advice is not None, command
     assert main.main([*advice[1].split(), str(other)]) == 0
     assert "3 episodes, 18 frames" in capsys.readouterr().out
     assert content(root) == content(recorded)
@@ -80,19 +74,19 @@ def test_info_that_is_not_needed_or_cannot_be_used_changes_nothing(recorded: Pat
     DatasetRecorder.create("t/none", 10, features, robot_type="toy", root=stranger, recording={}).finalize()
     (tmp_path / "v2.json").write_text((root / "meta/info.json").read_text().replace("v3.0", "v2.1"))
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
-    for donor, told in ((other, "can be read and fits"), (root, "is the dataset's own")):
-        with pytest.raises(ConfigError, match=told):
+    for donor, message in ((other, "can be read and fits"), (root, "is the dataset's own")):
+        with pytest.raises(ConfigError, match=message):
             repair(root, donor)
     (root / "meta/info.json").unlink()
     (tmp_path / "list.json").write_text("[1]")
-    for donor, told in (
+    for donor, message in (
         (stranger, "does not describe event, next.done, note"),
         (tmp_path / "none", "No such file"),
         (tmp_path, "No such file"),
         (tmp_path / "list.json", "no JSON object"),
         (tmp_path / "v2.json", "this program reads v3.x"),
     ):
-        with pytest.raises(ConfigError, match=told):
+        with pytest.raises(ConfigError, match=message):
             repair(root, donor)
     del before[root / "meta/info.json"]
     assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
@@ -111,17 +105,17 @@ def test_a_wrong_count_of_frames_leads_to_check_fix(recorded: Path, tmp_path: Pa
     assert content(root) == content(recorded)
 
 
-def test_repair_never_sends_to_repair(recorded: Path, tmp_path: Path) -> None:
+def test_repair_never_advises_repair(recorded: Path, tmp_path: Path) -> None:
     for pattern in ("data/*/*.parquet", "meta/episodes/*/*.parquet", "videos/*/*/*.mp4", "meta/tasks.parquet"):
         root = Path(shutil.copytree(recorded, tmp_path / pattern[:4]))
         path = next(root.glob(pattern))
         path.write_bytes(bytes(30) if path.suffix == ".parquet" else b"video")
         try:
-            told = str(repair(root))
+            message = str(repair(root))
         except DatasetError as error:
-            told = str(error)
-        assert "bhd-data repair" not in told
-        assert path.name in told
+            message = str(error)
+        assert "bhd-data repair" not in message
+        assert path.name in message
         shutil.rmtree(root)
 
 

@@ -145,8 +145,8 @@ def test_a_snapshot_by_hard_links_stays_as_it_was(root: Path, tmp_path: Path) ->
 def test_what_a_kill_leaves_below_a_folder_is_no_part_of_the_dataset(root: Path, tmp_path: Path, monkeypatch) -> None:
     shelf = tmp_path / "shelf"
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "replace", _killed)
-        patch.setattr(Path, "unlink", lambda path, missing_ok=False: None)  # nothing cleans up after a kill
+        patch.setattr(os, "replace", _killed)
+        patch.setattr(Path, "unlink", lambda path, missing_ok=False: None)  # a kill leaves no time to clean up
         with pytest.raises(KeyboardInterrupt):
             push(root, StoreDataset(f"file://{shelf}"))
     assert any(name.endswith(".bhd-part") for name in content(shelf))

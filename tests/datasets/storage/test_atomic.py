@@ -28,9 +28,14 @@ from tests.datasets.edit_support import content, record
 from tests.datasets.sweeps.operations import leftovers
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("atomic") / "d", [0, 1, 2])
+
+
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
-    return record(tmp_path / "d", [0, 1, 2])
+def root(recorded: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recorded, tmp_path / "d"))
 
 
 def names(root: Path) -> list[str]:
@@ -40,7 +45,7 @@ def names(root: Path) -> list[str]:
 # --- the place --------------------------------------------------------------------------------------------------------
 
 
-def test_what_others_put_into_a_dataset_stays_as_it_was(root: Path) -> None:
+def test_files_of_others_in_a_dataset_stay_unchanged(root: Path) -> None:
     (root / "README.md").write_text("mine")
     (root / "own/deep/empty").mkdir(parents=True)
     (root / "own/secret").write_text("mine")
@@ -58,7 +63,7 @@ def test_what_others_put_into_a_dataset_stays_as_it_was(root: Path) -> None:
     assert leftovers(root.parent) == []
 
 
-def test_what_others_write_during_an_edit_stays(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_others_write_during_an_edit_stay(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Anywhere below the dataset but in its own three folders; also by a rename, as editors save."""
     (root / "own").mkdir()
     (root / "own/notes").write_text("old")
@@ -80,13 +85,13 @@ def test_what_others_write_during_an_edit_stays(root: Path, monkeypatch: pytest.
     assert root.stat().st_ino == inode, "who stands in it, or has mounted it, sees the new content"
 
 
-def test_nobody_ever_takes_a_mixture_for_the_dataset(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mixture_of_old_and_new_never_loads(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between any two changes of the disk a stock LeRobot finds the old dataset or the new one, or is refused."""
     old = content(root)
     new = [old[0], old[2]]
     seen: list[int] = []
 
-    def look(action: str, path: Path) -> None:
+    def observe(action: str, path: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(disk, "_before_step", lambda *_: None)
             if json.loads((root / "meta/info.json").read_text())["codebase_version"].startswith("v3."):
@@ -98,12 +103,12 @@ def test_nobody_ever_takes_a_mixture_for_the_dataset(root: Path, monkeypatch: py
                     LeRobotDatasetMetadata("t/t", root=root)
                 seen.append(0)
 
-    monkeypatch.setattr(disk, "_before_step", look)
+    monkeypatch.setattr(disk, "_before_step", observe)
     delete(root, [1])
     assert list(dict.fromkeys(seen)) == [3, 0, 2]
 
 
-def test_the_current_folder_is_not_put_aside(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_current_folder_is_edited_in_place(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(root)
     inode = root.stat().st_ino
     assert main.main(["delete", ".", "--episodes=1"]) == 0
@@ -130,7 +135,7 @@ def test_a_link_to_an_empty_folder_and_one_to_a_dataset_stay_links(root: Path, t
         keep(root, [0], tmp_path / "dangling")
 
 
-def test_a_mount_point_is_a_place_like_any_other(root: Path, tmp_path: Path) -> None:
+def test_all_commands_work_at_a_mount_point(root: Path, tmp_path: Path) -> None:
     """Of a container, for example, whose volume is the dataset."""
     folder = Path(__file__).parents[3]
     program = f"""
@@ -196,7 +201,7 @@ print("all of it")
     assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["all of it"]), done.stderr
 
 
-def test_where_names_cannot_be_exchanged_the_content_is_moved_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_atomic_swap_the_content_is_moved_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise OSError(22, "Invalid argument")
 
@@ -206,7 +211,7 @@ def test_where_names_cannot_be_exchanged_the_content_is_moved_in(root: Path, mon
     assert leftovers(root.parent) == []
 
 
-def test_odd_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unusual_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(DatasetExistsError, match="link to nothing"):
         keep(root, [0], tmp_path / "loop")
@@ -232,7 +237,7 @@ def test_odd_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 # --- who else is there ------------------------------------------------------------------------------------------------
 
 
-def test_what_somebody_else_makes_at_the_same_place_stays(
+def test_files_that_another_program_creates_at_the_place_stay(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     move = Disk.move
@@ -257,7 +262,7 @@ def test_what_somebody_else_makes_at_the_same_place_stays(
         assert not (place / "meta/info.json").exists()
 
 
-def test_workspaces_of_killed_processes_are_removed_and_those_of_living_ones_stay(root: Path) -> None:
+def test_workspaces_of_killed_processes_only_are_removed(root: Path) -> None:
     (root.parent / ".d.bhd-0a1b2c3_/d/data").mkdir(parents=True)
     (root.parent / ".d.bhd-notes").mkdir()  # of somebody else
     living = root.parent / ".d.bhd-00000000"
@@ -270,7 +275,7 @@ def test_workspaces_of_killed_processes_are_removed_and_those_of_living_ones_sta
     assert leftovers(root.parent) == [".d.bhd-notes"]
 
 
-def test_two_that_move_into_one_folder_do_not_meet(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_moves_into_one_folder_exclude_each_other(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = root.with_name("parts")
     (folder / "mine").mkdir(parents=True)
     write = Disk.write
@@ -318,7 +323,7 @@ def half_moved(root: Path) -> None:
     ],
     ids=["info", "check", "loader", "merge", "split", "bhd-data info", "export", "repair"],
 )
-def test_whoever_comes_next_completes_it_and_says_so(root: Path, read, caplog, capsys) -> None:
+def test_the_next_command_completes_the_change_and_reports_it(root: Path, read, caplog, capsys) -> None:
     half_moved(root)
     with caplog.at_level(logging.WARNING):
         read(root)
@@ -327,7 +332,7 @@ def test_whoever_comes_next_completes_it_and_says_so(root: Path, read, caplog, c
     assert leftovers(root.parent) == []
 
 
-def test_while_its_process_lives_it_is_waited_for(root: Path) -> None:
+def test_a_change_of_a_living_process_is_locked(root: Path) -> None:
     half_moved(root)
     lock = RootLock(root)
     with pytest.raises(DatasetLockedError, match="Wait until it ends"):
@@ -336,7 +341,7 @@ def test_while_its_process_lives_it_is_waited_for(root: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["of another folder", "a path", "a link", "a link to the staging folder", "no JSON"])
-def test_a_marker_that_came_with_a_dataset_of_somebody_else_moves_nothing(root: Path, how: str) -> None:
+def test_a_foreign_marker_moves_nothing(root: Path, how: str) -> None:
     victim = root.parent / "victim"
     (victim / "meta").mkdir(parents=True)
     half_moved(root)
@@ -360,7 +365,7 @@ def test_a_marker_that_came_with_a_dataset_of_somebody_else_moves_nothing(root: 
     assert names(root.parent) == before
 
 
-# --- an edit that nobody was told of ----------------------------------------------------------------------------------
+# --- an edit that was not reported ------------------------------------------------------------------------------------
 
 
 class KilledError(Exception):
@@ -371,7 +376,7 @@ def killed(report: object) -> None:
     raise KilledError
 
 
-def test_an_edit_that_nobody_was_told_of_is_recognised(root: Path, tmp_path: Path, capsys) -> None:
+def test_an_edit_that_was_not_reported_is_recognised(root: Path, tmp_path: Path, capsys) -> None:
     """With the numbers of another state, the next one would delete a good episode."""
     first, _, last = content(root)
     with pytest.raises(KilledError):
@@ -384,12 +389,12 @@ def test_an_edit_that_nobody_was_told_of_is_recognised(root: Path, tmp_path: Pat
 
     with pytest.raises(KilledError):
         delete(record(tmp_path / "e", [0, 1, 2]), [1], killed)
-    told = json.loads((tmp_path / "e" / layout.UNREPORTED).read_text())
-    (root / layout.UNREPORTED).write_text(json.dumps({**told, "time": "2001"}))  # it is not about this content
+    unreported = json.loads((tmp_path / "e" / layout.UNREPORTED).read_text())
+    (root / layout.UNREPORTED).write_text(json.dumps({**unreported, "time": "2001"}))  # it is not about this content
     mark(root, [0], outcome="success")
 
     with pytest.raises(KilledError):
-        mark(root, [0], outcome="failure", note="why", tell=killed)
+        mark(root, [0], outcome="failure", note="why", on_done=killed)
     assert mark(root, [0], outcome="failure", note="why").is_repeated
     assert not mark(root, [0], outcome="failure", note="why").is_repeated
 
@@ -404,7 +409,7 @@ def test_an_edit_that_nobody_was_told_of_is_recognised(root: Path, tmp_path: Pat
     ],
     ids=["delete", "mark", "filter", "split"],
 )
-def test_other_numbers_of_episodes_are_refused_once_after_it(root: Path, other) -> None:
+def test_after_an_unreported_edit_other_episode_numbers_are_refused_once(root: Path, other) -> None:
     with pytest.raises(KilledError):
         delete(root, [1], killed)
     before = names(root)
@@ -419,7 +424,7 @@ def test_other_numbers_of_episodes_are_refused_once_after_it(root: Path, other) 
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signals_wait_until_it_is_done(root: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals) -> None:
+def test_signals_are_deferred(root: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals) -> None:
     seen: list[int] = []
     former = signal.signal(number, lambda got, frame: seen.append(len(content(root))))
     swap = Disk.swap
@@ -439,7 +444,7 @@ def test_signals_wait_until_it_is_done(root: Path, monkeypatch: pytest.MonkeyPat
     assert seen == [2]
 
 
-def test_ctrl_c_at_the_end_of_an_edit_says_that_it_was_made(root: Path, monkeypatch, capsys) -> None:
+def test_ctrl_c_at_the_end_of_an_edit_reports_the_edit(root: Path, monkeypatch, capsys) -> None:
     swap = Disk.swap
 
     def disturbed(self: Disk, one: Path, other: Path) -> None:
@@ -448,13 +453,13 @@ def test_ctrl_c_at_the_end_of_an_edit_says_that_it_was_made(root: Path, monkeypa
 
     monkeypatch.setattr(Disk, "swap", disturbed)
     assert main.main(["delete", str(root), "--episodes=1"]) == 130
-    said = capsys.readouterr().err
-    assert "had been completed" in said
-    assert "nothing was changed" not in said
+    message = capsys.readouterr().err
+    assert "had been completed" in message
+    assert "nothing was changed" not in message
     assert len(content(root)) == 2
 
 
-def test_an_error_and_ctrl_c_at_once_do_not_say_that_nothing_was_changed(root: Path, monkeypatch, capsys) -> None:
+def test_an_error_with_ctrl_c_reports_a_decided_change(root: Path, monkeypatch, capsys) -> None:
     def refuse(*_: object) -> None:
         signal.raise_signal(signal.SIGINT)
         raise OSError(5, "Input/output error")
@@ -462,14 +467,14 @@ def test_an_error_and_ctrl_c_at_once_do_not_say_that_nothing_was_changed(root: P
     with monkeypatch.context() as patch:
         patch.setattr(Disk, "swap", refuse)
         assert main.main(["delete", str(root), "--episodes=1"]) == 2
-    said = capsys.readouterr().err
-    assert "The change is decided, and the next command completes it." in said
-    assert "nothing was changed" not in said
+    message = capsys.readouterr().err
+    assert "The change is decided, and the next command completes it." in message
+    assert "nothing was changed" not in message
     assert main.main(["info", str(root), "--short"]) == 0
     assert len(content(root)) == 2
 
 
-def test_in_another_thread_signals_are_somebody_elses(root: Path) -> None:
+def test_an_edit_in_another_thread_leaves_signals_alone(root: Path) -> None:
     failed: list[BaseException] = []
 
     def run() -> None:

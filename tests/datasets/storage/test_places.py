@@ -51,7 +51,7 @@ def root(video_dataset: Path, tmp_path: Path) -> Path:
 
 
 @given(NAMES)
-def test_a_name_that_is_taken_is_one_part_of_a_path(name: str) -> None:
+def test_a_valid_name_is_one_part_of_a_path(name: str) -> None:
     whole = Path("/d/videos")
     if not wrong_name(name):
         name.encode()
@@ -65,13 +65,13 @@ def test_a_name_that_is_taken_is_one_part_of_a_path(name: str) -> None:
 
 
 @given(st.lists(PARTS | st.sampled_from(["{chunk_index:03d}", "{file_index}", "{x.y}", "{x[0]}", "{}"])).map("/".join))
-def test_a_template_that_is_taken_stays_inside(template: str) -> None:
+def test_a_valid_template_stays_inside(template: str) -> None:
     if not wrong_info({"data_path": template}):
         path = template.format(chunk_index=1, file_index=2)
         assert os.path.normpath(Path("/d") / path).startswith("/d/")
 
 
-def test_names_are_refused_by_all_who_read_them(root: Path, tmp_path: Path) -> None:
+def test_all_readers_refuse_names_that_lead_outside(root: Path, tmp_path: Path) -> None:
     camera = support.CAMERA
     outside = tmp_path / "victim"
     outside.mkdir()
@@ -132,14 +132,14 @@ class Listing:
         return {path: RemoteFile(1, None) for path in (layout.INFO, *self._paths)}
 
 
-def test_files_that_a_remote_place_lists(tmp_path: Path) -> None:
+def test_file_names_of_a_remote_place_are_checked(tmp_path: Path) -> None:
     for path in ("/etc/x", "../x", "data/../../x", "data//x", "a\\..\\x", "data/\0", "./x", "data/."):
         with pytest.raises(BhdError, match="no path within the dataset"):
             pull(Listing([path]), tmp_path / "d")  # type: ignore[arg-type]
         assert not any(tmp_path.iterdir())
 
 
-def test_a_pull_does_not_come_together_in_a_folder_of_somebody_else(tmp_path: Path) -> None:
+def test_a_pull_refuses_a_staging_folder_of_another_user(tmp_path: Path) -> None:
     """In a folder that is everybody's, as /tmp, its name can be foreseen, and what is in it could change later."""
     staging = tmp_path / ".d.pull"
     (tmp_path / "elsewhere").mkdir()
@@ -193,12 +193,12 @@ def test_no_command_follows_a_link_out_of_the_dataset(root: Path, tmp_path: Path
 
 def test_links_within_and_to_declared_places(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = content(root)
-    (root / "videos").rename(root / "videos")
-    (root / "videos").symlink_to("videos")
+    (root / "videos").rename(root / "media")
+    (root / "videos").symlink_to("media")
     (root / "data" / "again").symlink_to("..")  # a circle
     (root / "meta" / "itself").symlink_to("itself")
     load_state(root)
-    (root / "videos").rename(tmp_path / "big")
+    (root / "media").rename(tmp_path / "big")
     (root / "videos").unlink()
     (root / "videos").symlink_to(tmp_path / "big")
     with pytest.raises(DatasetError, match="outside of the dataset"):
@@ -213,7 +213,7 @@ def test_links_within_and_to_declared_places(root: Path, tmp_path: Path, monkeyp
     load_state(link)
 
 
-def test_a_cache_that_is_none(root: Path, tmp_path: Path) -> None:
+def test_a_folder_that_only_looks_like_a_cache(root: Path, tmp_path: Path) -> None:
     """Folders named as the Hub's cache lead nowhere else by a link of their own."""
     repository = tmp_path / "datasets--me--d"
     snapshot = repository / "snapshots" / "abc"

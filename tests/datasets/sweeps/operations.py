@@ -216,8 +216,8 @@ def _digest(found: list[Path]) -> str:
             raise ValueError("episodes are missing")
         if data.num_rows < info["total_frames"]:
             raise ValueError("frames are missing")
-        told = [data.slice(0, info["total_frames"]).to_pydict(), rows, info["total_episodes"], info["features"]]
-        digest.update(json.dumps([root.name, told], default=str).encode())
+        values = [data.slice(0, info["total_frames"]).to_pydict(), rows, info["total_episodes"], info["features"]]
+        digest.update(json.dumps([root.name, values], default=str).encode())
     return digest.hexdigest()
 
 

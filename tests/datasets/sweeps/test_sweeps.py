@@ -1,4 +1,4 @@
-"""Whatever happens to a command, and whenever: nothing is lost, and what it said of that is true.
+"""Whatever happens to a command, and whenever: nothing is lost, and its messages about that are true.
 
 Every command that writes a dataset or a bag is killed, interrupted, or meets a full disk, before each of its changes of
 the file system. Here some of them are tried; ``make sweep`` tries all.
@@ -99,7 +99,7 @@ CASES = [
 
 @pytest.mark.timeout(0 if IS_FULL else 900)  # all changes of one command: an hour on a busy machine
 @pytest.mark.parametrize(("operation", "place"), CASES, ids=[f"{one.name}, {place}" for one, place in CASES])
-def test_nothing_is_lost_and_what_is_said_is_true(
+def test_nothing_is_lost_and_messages_are_true(
     runner: Runner, tmp_path: Path, operation: Operation, place: str
 ) -> None:
     origin = tmp_path / "origin"
@@ -114,8 +114,8 @@ def test_nothing_is_lost_and_what_is_said_is_true(
 
     target, argv = fresh(), operation.argv(folder)
     before = content(target)
-    status, said, steps = runner.run(argv, folder, place=place, target=target)
-    assert status == 0, said
+    status, output, steps = runner.run(argv, folder, place=place, target=target)
+    assert status == 0, output
     after = content(target)
     assert after not in ("nothing", "broken")
     assert leftovers(folder) == []
@@ -123,12 +123,12 @@ def test_nothing_is_lost_and_what_is_said_is_true(
     for number, fault in enumerate(FAULTS):
         for step in chosen(steps, number):
             target = fresh()
-            status, said, _ = runner.run(argv, folder, place=place, target=target, fault=fault, step=step)
-            where = f"{fault} before change {step} of {steps}: status {status}, {said!r}"
-            assert "Traceback" not in said, where
-            check_state(Outcome(operation, place, target, status, said), before, after, where)
-            was_told = status == 0 or bool(NEW.search(said))
-            finish(runner, Outcome(operation, place, target, status, said), was_told, after, where)
+            status, output, _ = runner.run(argv, folder, place=place, target=target, fault=fault, step=step)
+            where = f"{fault} before change {step} of {steps}: status {status}, {output!r}"
+            assert "Traceback" not in output, where
+            check_state(Outcome(operation, place, target, status, output), before, after, where)
+            was_reported = status == 0 or bool(NEW.search(output))
+            finish(runner, Outcome(operation, place, target, status, output), was_reported, after, where)
             for path in origin.rglob(NOTES):
                 assert (folder / path.relative_to(origin)).read_text(encoding="utf-8") == "mine", where
 
@@ -141,28 +141,30 @@ class Outcome:
     place: str
     target: Path
     status: int
-    said: str
+    output: str
 
 
 def check_state(outcome: Outcome, before: str, after: str, where: str) -> None:
     """Check that the old or the new content is there, and that it is the one that the command speaks of."""
-    name, said, found = outcome.operation.name, outcome.said, content(outcome.target)
-    if outcome.status < 0 or DECIDED in said:  # whoever comes next completes it; until then LeRobot mixes nothing
+    name, output, found = outcome.operation.name, outcome.output, content(outcome.target)
+    if outcome.status < 0 or DECIDED in output:  # the next command completes it; until then LeRobot mixes nothing
         if outcome.place == "no exchange" or name == "split into a folder" or outcome.place == "fixed":
             return
         assert found in (before, after, REFUSED) or name in ("record", "resume", "repair"), where
         return
     if name in ("record", "resume", "repair"):
-        printed = len(re.findall(r"^saved \d+", said, re.MULTILINE))
+        printed = len(re.findall(r"^saved \d+", output, re.MULTILINE))
         assert printed + 3 * (name != "record") <= saved_in(outcome.target), where
         return
     assert found in (before, after), where
-    if OLD.search(said):
+    if OLD.search(output):
         assert found == before, where
-    if NEW.search(said) or outcome.status == 0:
+    if NEW.search(output) or outcome.status == 0:
         assert found == after, where
     if outcome.status not in (0, -signal.SIGKILL):
-        assert OLD.search(said) or NEW.search(said) or "kept beside it" in said or "exists already" in said, where
+        assert OLD.search(output) or NEW.search(output) or "kept beside it" in output or "exists already" in output, (
+            where
+        )
 
 
 def saved_in(root: Path) -> int:
@@ -170,21 +172,21 @@ def saved_in(root: Path) -> int:
     return json.loads(info.read_text(encoding="utf-8"))["total_episodes"] if info.exists() else 0
 
 
-def finish(runner: Runner, outcome: Outcome, was_told: bool, after: str, where: str) -> None:
+def finish(runner: Runner, outcome: Outcome, was_reported: bool, after: str, where: str) -> None:
     """Check that the same command again leads to the new content, once, and leaves nothing behind."""
     operation, target = outcome.operation, outcome.target
     folder = target.parent
     if not operation.is_new and operation.name != "split into a folder" and content(target) != after:
-        status, said, _ = runner.run(["info", str(target)], folder)
-        assert status == 0, (where, said)
+        status, output, _ = runner.run(["info", str(target)], folder)
+        assert status == 0, (where, output)
     was_done = content(target) == after
-    if not was_told or operation.is_new:
-        status, said, _ = runner.run(operation.argv(folder), folder, place=outcome.place, target=target)
-        if "completed a change" in said or "nothing was changed now" in said:
-            assert status in (0, operation.repeated), (where, said)  # completed now, as what it had been
+    if not was_reported or operation.is_new:
+        status, output, _ = runner.run(operation.argv(folder), folder, place=outcome.place, target=target)
+        if "completed a change" in output or "nothing was changed now" in output:
+            assert status in (0, operation.repeated), (where, output)  # completed now
         elif was_done and operation.repeated:
-            assert (status, operation.says in said) == (operation.repeated, True), (where, said)
+            assert (status, operation.says in output) == (operation.repeated, True), (where, output)
         else:
-            assert status == 0, (where, said)
+            assert status == 0, (where, output)
         assert leftovers(folder) == [], where
     assert content(target) == after, where

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -45,54 +46,50 @@ def stats_errors(root: Path) -> list[str]:
     return [f"{one.where}: {one.what}" for one in found if (one.severity, one.check) == (Severity.ERROR, "stats")]
 
 
-def test_a_stock_dataset_is_sound_though_its_statistics_are_rounded(stock: Path) -> None:
-    told = json.loads((stock / "meta/stats.json").read_text())["observation.state"]
-    assert abs(told["mean"][0] - np.float32(1.57)) > 1e-6, "the case that is to pass"
-    assert told["std"][0] > 1e-5
-    assert abs(told["mean"][1] - 1000.3) > 1e-6
+def test_rounded_statistics_of_stock_lerobot_are_valid(stock: Path) -> None:
+    stored = json.loads((stock / "meta/stats.json").read_text())["observation.state"]
+    assert abs(stored["mean"][0] - np.float32(1.57)) > 1e-6, "the case that is to pass"
+    assert stored["std"][0] > 1e-5
+    assert abs(stored["mean"][1] - 1000.3) > 1e-6
     assert stats_errors(stock) == []
     assert check_dataset(stock).worst < Severity.WARNING
 
 
-def swap(told: dict[str, Any], name: str) -> None:
-    told[name][2], told[name][3] = told[name][3], told[name][2]
+def swap(stored: dict[str, Any], name: str) -> None:
+    stored[name][2], stored[name][3] = stored[name][3], stored[name][2]
 
 
-def move(told: dict[str, Any], name: str, number: int, by: float) -> None:
-    told[name][number] += by
+def move(stored: dict[str, Any], name: str, number: int, by: float) -> None:
+    stored[name][number] += by
 
 
 WRONG: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "min of another": (lambda told: swap(told, "min"), "min"),
-    "max of another": (lambda told: swap(told, "max"), "max"),
-    "mean of another": (lambda told: swap(told, "mean"), "mean"),
-    "std of another": (lambda told: swap(told, "std"), "std"),
-    "a resting joint elsewhere": (lambda told: move(told, "mean", 0, 1e-3), "mean"),
-    "a resting joint that moves": (lambda told: move(told, "std", 0, 0.02), "std"),
-    "a dead joint that moves": (lambda told: move(told, "std", 3, 1e-3), "std"),
-    "an offset": (lambda told: move(told, "max", 1, 0.01), "max"),
-    "a mean far from zero": (lambda told: move(told, "mean", 1, 0.1), "mean"),
-    "no number": (lambda told: move(told, "mean", 2, float("nan")), "mean"),
-    "too few": (lambda told: told["std"].pop(), "std"),
+    "min of another": (lambda stored: swap(stored, "min"), "min"),
+    "max of another": (lambda stored: swap(stored, "max"), "max"),
+    "mean of another": (lambda stored: swap(stored, "mean"), "mean"),
+    "std of another": (lambda stored: swap(stored, "std"), "std"),
+    "a resting joint elsewhere": (lambda stored: move(stored, "mean", 0, 1e-3), "mean"),
+    "a resting joint that moves": (lambda stored: move(stored, "std", 0, 0.02), "std"),
+    "a dead joint that moves": (lambda stored: move(stored, "std", 3, 1e-3), "std"),
+    "an offset": (lambda stored: move(stored, "max", 1, 0.01), "max"),
+    "a mean far from zero": (lambda stored: move(stored, "mean", 1, 0.1), "mean"),
+    "no number": (lambda stored: move(stored, "mean", 2, float("nan")), "mean"),
+    "too few": (lambda stored: stored["std"].pop(), "std"),
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_statistics_are_found(stock: Path, case: str) -> None:
-    change, name = WRONG[case]
-    path = stock / "meta/stats.json"
+def test_wrong_statistics_are_found(stock: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(stock, tmp_path / "d"))
+    path = root / "meta/stats.json"
     before = path.read_text()
-    stats = json.loads(before)
-    change(stats["observation.state"])
-    path.write_text(json.dumps(stats))
-    try:
-        assert stats_errors(stock) == [f"meta/stats.json: observation.state: {name} is not that of the data"]
-    finally:
-        path.write_text(before)
+    for case, (change, name) in WRONG.items():
+        stats = json.loads(before)
+        change(stats["observation.state"])
+        path.write_text(json.dumps(stats))
+        assert stats_errors(root) == [f"meta/stats.json: observation.state: {name} is not that of the data"], case
 
 
-@pytest.mark.parametrize("missing", range(len(LENGTHS)))
-def test_statistics_without_an_episode_are_found(stock: Path, missing: int) -> None:
+def test_statistics_without_an_episode_are_found() -> None:
     """Also where the number of frames was made to fit."""
     from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
 
@@ -105,16 +102,17 @@ def test_statistics_without_an_episode_are_found(stock: Path, missing: int) -> N
         found.add(Moments.of(part))
 
     def judged(chosen: list[Any]) -> str | None:
-        told = {name: np.asarray(value, np.float64) for name, value in chosen[0]["observation.state"].items()}
-        return wrong_statistic(told, found, frames, max(map(len, parts)))
+        stored = {name: np.asarray(value, np.float64) for name, value in chosen[0]["observation.state"].items()}
+        return wrong_statistic(stored, found, frames, max(map(len, parts)))
 
     assert judged([aggregate_stats(copy.deepcopy(each))]) is None
-    assert judged([aggregate_stats(copy.deepcopy(each[:missing] + each[missing + 1 :]))]) is not None
+    for missing in range(len(LENGTHS)):
+        assert judged([aggregate_stats(copy.deepcopy(each[:missing] + each[missing + 1 :]))]) is not None
 
 
-@pytest.mark.parametrize("n", [2, 30, 700, 5000, 60_000])
-@pytest.mark.parametrize("value", [1e-7, 0.1, 1.57, -3.14159, 1000.1, 123456.7])
-def test_no_length_of_an_episode_is_rounded_too_much(n: int, value: float) -> None:
+@pytest.mark.parametrize("n", [2, 30, 700, 60_000])
+@pytest.mark.parametrize("value", [1e-7, 1.57, -3.14159, 123456.7])
+def test_the_rounding_of_lerobots_statistics_is_within_the_bounds(n: int, value: float) -> None:
     from lerobot.datasets.compute_stats import compute_episode_stats
 
     rng = np.random.default_rng(1)
@@ -125,5 +123,5 @@ def test_no_length_of_an_episode_is_rounded_too_much(n: int, value: float) -> No
         value * (1 + 1e-4 * rng.normal(size=n)),
     ]
     values = np.stack(kinds, axis=1).astype(np.float32)
-    told = compute_episode_stats({"observation.state": values}, FEATURES)["observation.state"]
-    assert wrong_statistic(told, Moments.of(values), n, n) is None
+    stored = compute_episode_stats({"observation.state": values}, FEATURES)["observation.state"]
+    assert wrong_statistic(stored, Moments.of(values), n, n) is None
