@@ -12,6 +12,7 @@ from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3_simulation import observation_names
+from tests.cases import each_case
 from tests.cli.data.import_support import TASK, imported, refused, run
 from tests.rosbag import support as bags
 from tests.rosbag.support import NANO, START, drive, without, write
@@ -444,7 +445,7 @@ def test_an_exported_bag_can_be_read_as_a_robots(tmp_path, plain, capsys):
     assert "--robot=turtlebot3" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("arguments", "told"),
     [
         (["--robot=ur5"], "Unknown robot 'ur5'"),

@@ -24,6 +24,7 @@ from bhd_lerobot.errors import TransferError
 from bhd_lerobot.evaluation.statistics import wilson
 from bhd_lerobot.hub.transfer import repeat_line
 from bhd_lerobot.recording import record as record_module
+from tests.cases import each_case
 from tests.hub_server.fixtures import content
 from tests.hub_server.server import Fault, HubServer
 from tests.recording.support import options as record_options
@@ -140,7 +141,7 @@ def test_a_url(recorded: Path, tmp_path: Path, capsys) -> None:
     assert content(tmp_path / "e").items() >= content(recorded).items()
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("arguments", "words"),
     [
         (["push"], "Say where to"),

@@ -13,6 +13,7 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
+from tests.cases import each_case
 from tests.datasets import support
 from tests.datasets.edit_support import assert_valid, content, record
 
@@ -40,8 +41,8 @@ def without_features(path: Path) -> None:
     path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "features"}))
 
 
-@pytest.mark.parametrize("command", ["info", "check", "repair", "view", "timing"])
-@pytest.mark.parametrize("break_it", [torn, without_features, Path.unlink, lambda path: path.write_text("[]")])
+@each_case("command", ["info", "check", "repair", "view", "timing"])
+@each_case("break_it", [torn, without_features, Path.unlink, lambda path: path.write_text("[]")])
 def test_the_advice_works(
     datasets: tuple[Path, Path], tmp_path: Path, capsys, command: str, break_it: Callable[[Path], object]
 ) -> None:

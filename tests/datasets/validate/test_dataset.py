@@ -20,6 +20,7 @@ from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Finding, Severity, check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError
+from tests.cases import each_case
 from tests.datasets.loader import support as loader_support
 
 FPS, EPISODES, CAMERA = 10, 6, "observation.images.front"
@@ -207,7 +208,7 @@ def lost_row(rows: dict[str, Any]) -> None:
 ERROR, WARNING = Severity.ERROR, Severity.WARNING
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("damage", "expected"),
     [
         (nan, (ERROR, "finite", "observation.state", "2 frames .* first in episode 1, frame 4: b.pos is nan")),
@@ -319,7 +320,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], Any], str, str, str]] = {
 }
 
 
-@pytest.mark.parametrize("case", DAMAGE)
+@each_case("case", DAMAGE)
 def test_damaged_files_are_found(valid: Path, tmp_path: Path, case: str) -> None:
     root = copy(valid, tmp_path)
     damage, check, where, what = DAMAGE[case]
@@ -373,7 +374,7 @@ def test_what_cannot_be_checked_is_an_error(valid: Path, tmp_path: Path) -> None
         check_dataset(root)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@each_case("seed", range(40))
 def test_whatever_happened_to_a_file_is_a_finding_or_a_clear_error(
     video_dataset: Path, tmp_path: Path, seed: int
 ) -> None:
@@ -406,8 +407,8 @@ def nodes(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from nodes(one, (*path, key))
 
 
-@pytest.mark.parametrize("name", ["meta/info.json", "meta/stats.json"])
-@pytest.mark.parametrize("wrong", [None, "x", -1, 0, True, [], {}, ["a"], math.nan, 10**20, [[1]]])
+@each_case("name", ["meta/info.json", "meta/stats.json"])
+@each_case("wrong", [None, "x", -1, 0, True, [], {}, ["a"], math.nan, 10**20, [[1]]])
 def test_a_value_of_any_other_kind_is_a_finding_or_a_clear_error(valid: Path, tmp_path: Path, name, wrong) -> None:
     root = copy(valid, tmp_path)
     whole = json.loads((root / name).read_text())

@@ -13,6 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.validate.findings import Severity
 from bhd_lerobot.datasets.validate.statistics import Moments, wrong_statistic
+from tests.cases import each_case
 
 NAMES = ["wrist_2.pos", "offset.pos", "swing.pos", "zero.pos", "steady.pos"]
 FEATURES = {"observation.state": {"dtype": "float32", "shape": (5,), "names": NAMES}}
@@ -77,7 +78,7 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
+@each_case("case", WRONG)
 def test_wrong_statistics_are_found(stock: Path, case: str) -> None:
     change, name = WRONG[case]
     path = stock / "meta/stats.json"
@@ -112,8 +113,8 @@ def test_statistics_without_an_episode_are_found(stock: Path, missing: int) -> N
     assert judged([aggregate_stats(copy.deepcopy(each[:missing] + each[missing + 1 :]))]) is not None
 
 
-@pytest.mark.parametrize("n", [2, 30, 700, 5000, 60_000])
-@pytest.mark.parametrize("value", [1e-7, 0.1, 1.57, -3.14159, 1000.1, 123456.7])
+@each_case("n", [2, 30, 700, 5000, 60_000])
+@each_case("value", [1e-7, 0.1, 1.57, -3.14159, 1000.1, 123456.7])
 def test_no_length_of_an_episode_is_rounded_too_much(n: int, value: float) -> None:
     from lerobot.datasets.compute_stats import compute_episode_stats
 

@@ -19,6 +19,7 @@ from bhd_lerobot.policies.learned.contract import CONTRACT_FILE, PolicyContract
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.registry import action_names_of, brains_for, make_brain, robot_of_brain
+from tests.cases import each_case
 from tests.policies.learned import rig
 
 
@@ -101,7 +102,7 @@ def test_a_device_that_is_not_there(folder: Path, device: str) -> None:
     assert "--brain.device=cpu" in message
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "message"),
     [
         ({"n_action_steps": 7}, "brain.n_action_steps is 7; this 'bhd_mlp' predicts chunks of 6"),

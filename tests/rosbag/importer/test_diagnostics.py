@@ -5,6 +5,7 @@ import pytest
 
 from bhd_lerobot.rosbag.importer.diagnostics import pace, pace_warnings, speed_warnings
 from bhd_lerobot.rosbag.importer.resample import NANO
+from tests.cases import each_case
 
 RECEIVED = np.arange(300) * NANO // 5  # a minute at 5 Hz
 
@@ -38,7 +39,7 @@ def drive(seconds=30.0, rate=30):
     return (t * NANO).astype(np.int64), speeds, np.stack([x, y, yaw], axis=1)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("factors", "told"),
     [
         ((1, 1), []),

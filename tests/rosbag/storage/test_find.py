@@ -9,6 +9,7 @@ import yaml
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.storage.find import find_bags, publishers_of
 from bhd_lerobot.rosbag.storage.qos import offered
+from tests.cases import each_case
 from tests.rosbag.support import STORE, drive, write
 
 TOPICS = ("/cmd_vel", "/odom", "/scan")
@@ -138,7 +139,7 @@ PROFILE = {
 NAMED = {**PROFILE, "history": "keep_last", "reliability": "reliable", "durability": "volatile"}
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("profiles", "count"),
     [
         (yaml.safe_dump([PROFILE]), 1),  # versions 4 to 8: a text
