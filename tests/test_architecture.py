@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import bhd_lerobot
+from tests.cases import each_case
 
 PACKAGE = "bhd_lerobot"
 MOST_FILES = 15
@@ -182,7 +183,7 @@ def test_every_import_follows_an_arrow() -> None:
     assert wrong_imports(SOURCE) == []
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("module", "statement"),
     [
         ("control/fifo.py", "from bhd_lerobot.sim.world import World"),
@@ -219,7 +220,7 @@ def test_a_planted_wrong_import_is_found(tmp_path: Path, module: str, statement:
     assert len(wrong_imports(tmp_path / PACKAGE)) == 1
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("module", "statement"),
     [
         ("control/fifo.py", "from bhd_lerobot.bodies.body import Body"),

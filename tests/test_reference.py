@@ -24,6 +24,7 @@ from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.rl.config import is_rl, parse_rl
+from tests.cases import each_case
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -98,12 +99,12 @@ def broken_references(document: Path) -> list[str]:
     return broken
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=by_name)
+@each_case("document", DOCUMENTS)
 def test_every_link_and_every_file_exists(document: Path) -> None:
     assert broken_references(document) == []
 
 
-@pytest.mark.parametrize(
+@each_case(
     "planted",
     ["[x](no.md)", "[x](README.md#no-such-heading)", '<img src="no.png">', "`docs/no.md`", "`make nothing`"],
 )
@@ -181,12 +182,12 @@ def test_the_documents_quote_commands() -> None:
     }
 
 
-@pytest.mark.parametrize(("path", "line"), COMMANDS, ids=[f"{by_name(path)}: {line}" for path, line in COMMANDS])
+@each_case(("path", "line"), COMMANDS)
 def test_every_quoted_command_parses(path: Path, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     parse_command(line, monkeypatch)
 
 
-@pytest.mark.parametrize(
+@each_case(
     "line",
     [
         *("bhd-record --seed=1", "bhd-replay --mode=sideways", "bhd-data inform x", "bhd-fly x"),

@@ -21,6 +21,7 @@ from benchmarks.realtime import (
     summarise,
     walk,
 )
+from tests.cases import each_case
 
 PERIOD = 1_000_000
 
@@ -130,7 +131,7 @@ def test_a_loop_that_cannot_be_measured_is_left_out_with_the_reason_and_the_rest
     assert "not to be quoted" in shown
 
 
-@pytest.mark.parametrize("option", ["--blocks=0", "--seconds=nan", "--robots=kuka"])
+@each_case("option", ["--blocks=0", "--seconds=nan", "--robots=kuka"])
 def test_options_that_make_no_sense_are_refused(option: str) -> None:
     with pytest.raises(SystemExit, match="2"):
         main([option])

@@ -21,6 +21,7 @@ from bhd_lerobot.bodies.arenas import (
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.scene import POOL_SIZE
+from tests.cases import each_case
 
 SEEDS = (*range(24), 2**31, 2**62 + 12345)
 EVERY_ARENA = [pytest.param(random_arena(seed), id=f"random-{seed}") for seed in SEEDS] + [
@@ -61,7 +62,7 @@ def inner_corners(arena: Arena) -> np.ndarray:
     return np.array([(x_min, y_min), (x_max, y_min), (x_max, y_max), (x_min, y_max)])
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@each_case("seed", SEEDS)
 def test_equal_seeds_give_equal_arenas(seed: int) -> None:
     assert random_arena(seed) == random_arena(seed)
 
@@ -71,12 +72,12 @@ def test_different_seeds_give_different_arenas() -> None:
     assert len({random_arena(seed).start for seed in range(40)}) == 40
 
 
-@pytest.mark.parametrize("arena", EVERY_ARENA)
+@each_case("arena", EVERY_ARENA)
 def test_it_fits_into_the_pool_of_a_world(arena: Arena) -> None:
     assert len(arena.shapes) <= POOL_SIZE
 
 
-@pytest.mark.parametrize("arena", EVERY_ARENA)
+@each_case("arena", EVERY_ARENA)
 def test_it_is_closed(arena: Arena) -> None:
     """The middle of every outer wall, walked once around: obstacle everywhere, without a gap."""
     corners = inner_corners(arena)
@@ -89,7 +90,7 @@ def test_it_is_closed(arena: Arena) -> None:
         assert arena.clearance(edge + normal * WALL)[20:-20].max() < -WALL / 2
 
 
-@pytest.mark.parametrize("arena", EVERY_ARENA)
+@each_case("arena", EVERY_ARENA)
 def test_the_start_is_free(arena: Arena) -> None:
     x, y, yaw = arena.start
     outlines = np.concatenate([boundary(shape) for shape in arena.shapes])
@@ -98,7 +99,7 @@ def test_the_start_is_free(arena: Arena) -> None:
     assert -np.pi <= yaw <= np.pi
 
 
-@pytest.mark.parametrize("arena", EVERY_ARENA)
+@each_case("arena", EVERY_ARENA)
 def test_all_free_space_is_connected(arena: Arena) -> None:
     """On another grid than the generator's, with free space as the outlines tell it."""
     x_min, x_max, y_min, y_max = arena.extent
@@ -121,7 +122,7 @@ def test_all_free_space_is_connected(arena: Arena) -> None:
         assert tree.query(part)[0].max() <= RESOLUTION  # every free place is one that can be reached from the start
 
 
-@pytest.mark.parametrize("seed", range(6))
+@each_case("seed", range(6))
 def test_clearance_is_the_distance_to_the_outlines(seed: int) -> None:
     arena = random_arena(seed)
     rng = np.random.default_rng(seed)
@@ -138,7 +139,7 @@ def test_clearance_is_the_distance_to_the_outlines(seed: int) -> None:
     assert (distance < 0).any()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@each_case("seed", range(3))
 def test_clearance_changes_by_no_more_than_the_way(seed: int) -> None:
     arena = random_arena(seed)
     rng = np.random.default_rng(seed)
@@ -148,8 +149,8 @@ def test_clearance_changes_by_no_more_than_the_way(seed: int) -> None:
     assert (change <= np.hypot(*np.moveaxis(a - b, -1, 0)) + 1e-12).all()
 
 
-@pytest.mark.parametrize("arena", EVERY_ARENA)
-@pytest.mark.parametrize("size", [0.25, 0.4])
+@each_case("arena", EVERY_ARENA)
+@each_case("size", [0.25, 0.4])
 def test_free_cells_are_cells_of_the_grid(arena: Arena, size: float) -> None:
     columns, rows = arena.cells(size)
     x_min, x_max, y_min, y_max = arena.extent

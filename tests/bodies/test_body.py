@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.body import CommandLimits, Rates, Shape
 from bhd_lerobot.errors import BhdError, ConfigError
+from tests.cases import each_case
 
 WHOLE = st.integers(1, 2000)
 
@@ -33,8 +34,8 @@ def test_the_error_about_a_rate_lists_rates_that_would_do(physics: int, control:
         assert valid == [rate for rate in range(1, control + 1) if control % rate == 0]
 
 
-@pytest.mark.parametrize("value", [0, -1, 10.0, True, "10", None, math.nan])
-@pytest.mark.parametrize("name", ["physics_hz", "control_hz", "fps"])
+@each_case("value", [0, -1, 10.0, True, "10", None, math.nan])
+@each_case("name", ["physics_hz", "control_hz", "fps"])
 def test_a_rate_is_a_positive_whole_number(name: str, value: object) -> None:
     rates = {"physics_hz": 400, "control_hz": 200, "fps": 10, name: value}
     with pytest.raises(ConfigError, match=rf"{name} is .*positive whole number"):
@@ -52,22 +53,20 @@ def limits(**changes: object) -> CommandLimits:
     return CommandLimits(**{**values, **changes})  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("bad", [(0.2,), (0.2, 2.0, 1.0), (0.2, 0.0), (-0.2, 2.0), (0.2, math.inf), (math.nan, 2.0)])
-@pytest.mark.parametrize("name", ["velocity", "acceleration", "stop_deceleration"])
+@each_case("bad", [(0.2,), (0.2, 2.0, 1.0), (0.2, 0.0), (-0.2, 2.0), (0.2, math.inf), (math.nan, 2.0)])
+@each_case("name", ["velocity", "acceleration", "stop_deceleration"])
 def test_limits_are_positive_finite_and_as_many_as_the_names(name: str, bad: tuple[float, ...]) -> None:
     with pytest.raises(ConfigError, match=name):
         limits(**{name: bad})
 
 
-@pytest.mark.parametrize("timeout", [0, 0.0, -0.5, math.inf, math.nan])
+@each_case("timeout", [0, 0.0, -0.5, math.inf, math.nan])
 def test_the_watchdog_cannot_be_turned_off(timeout: float) -> None:
     with pytest.raises(ConfigError, match="cannot be turned off"):
         limits(command_timeout_s=timeout)
 
 
-@pytest.mark.parametrize(
-    "change", [{"kind": "sphere"}, {"size_x": 0.0}, {"size_y": -1.0}, {"height": 0.0}, {"size_x": math.nan}]
-)
+@each_case("change", [{"kind": "sphere"}, {"size_x": 0.0}, {"size_y": -1.0}, {"height": 0.0}, {"size_x": math.nan}])
 def test_a_shape_is_a_box_or_a_cylinder_of_positive_size(change: dict[str, object]) -> None:
     values = {"kind": "box", "x": 0.0, "y": 0.0, "yaw": 0.0, "size_x": 0.1, "size_y": 0.1, **change}
     with pytest.raises(BhdError):

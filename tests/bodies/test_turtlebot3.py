@@ -9,6 +9,7 @@ import pytest
 from bhd_lerobot.bodies.arenas import ROBOT_RADIUS
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 
 BODY = turtlebot3_burger()
 
@@ -147,7 +148,7 @@ def test_the_inertia_is_that_of_a_possible_body(model: mujoco.MjModel) -> None:
         assert a + b >= c * (1 - 1e-6)
 
 
-@pytest.mark.parametrize("noise", [-0.01, math.inf, math.nan])
+@each_case("noise", [-0.01, math.inf, math.nan])
 def test_impossible_noise_is_refused(noise: float) -> None:
     with pytest.raises(ConfigError, match="lidar_noise_std"):
         turtlebot3_burger(lidar_noise_std=noise)

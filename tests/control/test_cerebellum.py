@@ -13,6 +13,7 @@ from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Setpoint
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 from tests.control.support import BODY, HZ, TICK_NS, PerfectPlant, Rig
 
 VELOCITY = np.array([0.22, 2.84])
@@ -246,7 +247,7 @@ def test_a_history_gives_the_same_bytes_twice() -> None:
 # --- commands --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each_case(
     "values",
     [
         np.zeros(2),
@@ -315,7 +316,7 @@ def test_a_command_given_as_whole_numbers_is_a_command() -> None:
 # --- limits ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("sequence", "expected"),
     [
         ([(0.0, 0.0)], Limit.NONE),

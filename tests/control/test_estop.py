@@ -18,6 +18,7 @@ import pytest
 from bhd_lerobot.control.estop import SIGNALS, EstopInputs, estop_signal
 from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 from tests.control.support import Rig
 from tests.waiting import until
 
@@ -198,7 +199,7 @@ def test_a_signal_outside_of_the_main_thread_is_refused(inputs):
     assert "'worker'" in errors[0]
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL", "SIGTERM", "", "9", "SIGFOO"])
+@each_case("name", ["SIGINT", "SIGKILL", "SIGTERM", "", "9", "SIGFOO"])
 def test_a_signal_that_means_something_else_is_refused(name):
     with pytest.raises(ConfigError, match="Valid: SIGUSR1"):
         estop_signal(name)

@@ -1,10 +1,10 @@
 import numpy as np
-import pytest
 
 from bhd_lerobot.control.messages import Limit, Mode, Reason, SendResult, Watchdog
+from tests.cases import each_case
 
 
-@pytest.mark.parametrize("reason", list(Reason))
+@each_case("reason", list(Reason))
 def test_every_reason_has_an_explanation_of_its_own(reason: Reason) -> None:
     assert len(reason.explanation) > 5
     assert [other for other in Reason if other.explanation == reason.explanation] == [reason]

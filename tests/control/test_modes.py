@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Watchdog
+from tests.cases import each_case
 from tests.control import support
 from tests.control.support import HZ, TICK_NS, Rig
 
@@ -54,8 +55,8 @@ REQUESTS = {
 }
 
 
-@pytest.mark.parametrize("request_", list(Request), ids=lambda request: request.name)
-@pytest.mark.parametrize("mode", list(Mode), ids=lambda mode: mode.name)
+@each_case("request_", list(Request))
+@each_case("mode", list(Mode))
 def test_every_request_in_every_mode(mode: Mode, request_: Request) -> None:
     rig = in_mode(mode)
     before = rig.cerebellum.refusals.sum()
@@ -71,7 +72,7 @@ def test_every_request_in_every_mode(mode: Mode, request_: Request) -> None:
         assert rig.cerebellum.refusals.sum() == before + 1
 
 
-@pytest.mark.parametrize("mode", list(Mode), ids=lambda mode: mode.name)
+@each_case("mode", list(Mode))
 def test_a_setpoint_in_every_mode(mode: Mode) -> None:
     rig = in_mode(mode)
     before = rig.cerebellum.refusals.copy()
@@ -93,7 +94,7 @@ def test_a_setpoint_in_every_mode(mode: Mode) -> None:
         assert rig.refused(refusal) == before[refusal, 0] + 1
 
 
-@pytest.mark.parametrize("mode", list(Mode), ids=lambda mode: mode.name)
+@each_case("mode", list(Mode))
 def test_an_emergency_stop_in_every_mode(mode: Mode) -> None:
     rig = in_mode(mode)
     rig.cerebellum.estop_word[0] = 1
@@ -104,7 +105,7 @@ def test_an_emergency_stop_in_every_mode(mode: Mode) -> None:
     assert rig.mode == Mode.ESTOP
 
 
-@pytest.mark.parametrize("mode", list(Mode), ids=lambda mode: mode.name)
+@each_case("mode", list(Mode))
 def test_a_plant_fault_in_every_mode(mode: Mode) -> None:
     rig = in_mode(mode)
     rig.plant.fault[0] = True

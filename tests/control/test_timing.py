@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 
 PERIOD = 5_000_000
 BIN = 10 ** (1 / 20)  # 20 bins a decade
@@ -23,8 +24,8 @@ def collect(lateness: np.ndarray, duration: np.ndarray | int = 100) -> TimingSta
     return statistics
 
 
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("scale", [3e3, 5e4, 2e6])
+@each_case("seed", range(6))
+@each_case("scale", [3e3, 5e4, 2e6])
 def test_quantiles_are_at_most_one_bin_too_high_and_never_too_low(seed: int, scale: float) -> None:
     lateness = np.random.default_rng(seed).lognormal(np.log(scale), 1.0, 997).astype(np.int64)
     summary = collect(lateness).summary()

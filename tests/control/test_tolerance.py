@@ -12,6 +12,7 @@ from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames, verdict
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 
 RATES = Rates(500, 500, 25)
 PERIOD_S, FRAME_S = 1 / 500, 1 / 25
@@ -95,7 +96,7 @@ def test_flags_are_set_where_a_limit_is_violated_and_nowhere_else(
         assert late[k] == over
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("values", "words"),
     [
         ({"max_lateness_s": 0.0}, "max_lateness_s is 0.0"),
@@ -125,7 +126,7 @@ def summary(late: int, frames: int, **changes: float) -> TimingSummary:
     return replace(measured, **changes)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("share", "frames", "allowed"),
     [(0.01, 99, 0), (0.01, 100, 1), (0.29, 100, 29), (0.07, 100, 7), (0.0, 100, 0), (1.0, 100, 100), (0.5, 1, 0)],
 )

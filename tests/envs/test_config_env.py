@@ -16,6 +16,7 @@ from bhd_lerobot.envs.config_env import BhdEnvConfig
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.task import episode_seed
+from tests.cases import each_case
 from tests.envs.support import NAMES, assert_same, some_actions
 
 AVOID = "TurtleBot3Avoid-v0"
@@ -31,7 +32,7 @@ def test_lerobot_finds_it_by_its_type() -> None:
     assert EnvConfig.get_choice_class("bhd") is BhdEnvConfig
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_case("name", NAMES)
 def test_the_features_are_those_of_the_datasets(name: str) -> None:
     config = BhdEnvConfig(task=name)
     with_state = {"observation.state": FeatureType.STATE, "action": FeatureType.ACTION}
@@ -54,7 +55,7 @@ def test_images_are_features_too() -> None:
 KINDS = {"bhd": BhdVectorEnv, "sync": SyncVectorEnv, "async": AsyncVectorEnv}
 
 
-@pytest.mark.parametrize("vector", KINDS)
+@each_case("vector", KINDS)
 def test_all_kinds_of_vector_environments_do_the_same(vector: str) -> None:
     envs = make_env(BhdEnvConfig(task=AVOID, vector=vector, seed=3, **SHORT), n_envs=2, use_async_envs=True)
     env = envs["bhd"][0]
@@ -117,7 +118,7 @@ def test_lerobots_rollout_sees_the_same_with_ours_and_with_gymnasiums() -> None:
     assert np.abs(results[0]["reward"]).sum() > 0
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("arguments", "message"),
     [
         ({"task": "Avoid-v0"}, "Unknown environment 'Avoid-v0'"),

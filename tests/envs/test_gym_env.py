@@ -15,6 +15,7 @@ from bhd_lerobot.envs.register import ENVIRONMENTS, register
 from bhd_lerobot.envs.stage import ClosedError, ResetNeededError
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.tasks.task import episode_seed
+from tests.cases import each_case
 from tests.envs.support import NAMES, assert_same, short, some_actions
 
 AVOID = "TurtleBot3Avoid-v0"
@@ -103,7 +104,7 @@ def test_it_renders_when_asked_to() -> None:
     assert make().render() is None
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("arguments", "message"),
     [
         ({"environment": "TurtleBot3Avoyd-v0"}, "Did you mean 'TurtleBot3Avoid-v0'"),
@@ -132,7 +133,7 @@ def test_what_cannot_be_honoured_is_named(arguments: dict[str, Any], message: st
     assert message in str(caught.value)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("action", "message"),
     [
         ([0.1, np.nan], "'theta.vel' of environment 0 is nan"),

@@ -14,6 +14,7 @@ from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.task import Event, episode_seed
+from tests.cases import each_case
 from tests.envs.support import NAMES, short, some_actions
 
 ONE = np.zeros(1, np.intp)
@@ -45,7 +46,7 @@ class Script:
         return {}
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_case("name", NAMES)
 def test_an_episode_is_that_of_the_loop_bit_for_bit(name: str) -> None:
     arguments = short(name)
     settings = make_settings(name, arguments.get("robot"), arguments["task"])

@@ -13,6 +13,7 @@ from bhd_lerobot.envs.gym_env import BhdEnv
 from bhd_lerobot.envs.stage import ClosedError, ResetNeededError
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import ActionError, ConfigError
+from tests.cases import each_case
 from tests.envs.support import NAMES, assert_same, short, some_actions
 
 AVOID = "TurtleBot3Avoid-v0"
@@ -171,7 +172,7 @@ def test_gymnasium_makes_ours_by_itself() -> None:
     assert env.reset(seed=0)[0]["agent_pos"].shape == (2, 38)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("arguments", "message"),
     [
         ({"num_envs": 0}, "num_envs is 0"),

@@ -9,6 +9,7 @@ from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
 from bhd_lerobot.rollout.configuration import describe, encode, parse
+from tests.cases import each_case
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "eval").glob("*.yaml"))
 BASE = ["--robot.type=turtlebot3", "--task.type=avoid"]
@@ -55,7 +56,7 @@ def test_one_brain_has_a_short_form():
     assert config.brain is None
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("arguments", "message"),
     [
         (BASE, "no brain to evaluate"),

@@ -17,6 +17,7 @@ from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.reach import ReachConfig
+from tests.cases import each_case
 
 BASE = turtlebot3_burger().limits.names
 ARM = ur5().limits.names
@@ -56,7 +57,7 @@ def test_a_new_episode_is_held_where_it_begins() -> None:
     assert brain.act(Observation(("other", *ARM), np.ones((2, 8))))[1] == pytest.approx(1)
 
 
-@pytest.mark.parametrize("kind", ["ur5", "ur5 tool", "turtlebot3"])
+@each_case("kind", ["ur5", "ur5 tool", "turtlebot3"])
 def test_a_robot_that_does_nothing_stays_where_it_is(kind: str) -> None:
     for episode in run(kind, NoopBrain(), 2):
         state = episode.columns["observation.state"]
@@ -64,8 +65,8 @@ def test_a_robot_that_does_nothing_stays_where_it_is(kind: str) -> None:
         assert np.abs(state[:, columns] - state[0, columns]).max() < 1e-3
 
 
-@pytest.mark.parametrize("names", [BASE, ARM])
-@pytest.mark.parametrize(("period", "scale"), [(0, 1), (0.7, 1), (0.7, 0.25)])
+@each_case("names", [BASE, ARM])
+@each_case(("period", "scale"), [(0, 1), (0.7, 1), (0.7, 0.25)])
 def test_random_actions_stay_within_the_limits(names: tuple[str, ...], period: float, scale: float) -> None:
     limits: Any = turtlebot3_burger().limits if names == BASE else ur5().limits
     upper = np.array(limits.upper if names == ARM else limits.velocity)

@@ -8,6 +8,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Brain, Observation, find_columns, find_scan
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
+from tests.cases import each_case
 
 ACTIONS = ("x.vel", "theta.vel")
 BRAINS = (AvoidanceBrain, GapFollowerBrain)
@@ -33,7 +34,7 @@ def test_a_long_list_of_features_is_cut_in_the_message() -> None:
         find_columns(scan_names(360), ("x.vel",), "rule", "observation")
 
 
-@pytest.mark.parametrize("beams", [1, 3, 36, 90, 360])
+@each_case("beams", [1, 3, 36, 90, 360])
 def test_beams_go_once_around_counter_clockwise_from_straight_ahead(beams: int) -> None:
     columns, angles = find_scan(("x.vel", *scan_names(beams), "theta.vel"), "rule")
     assert (columns.start, columns.stop) == (1, 1 + beams)
@@ -42,7 +43,7 @@ def test_beams_go_once_around_counter_clockwise_from_straight_ahead(beams: int) 
     assert_allclose(np.unwrap(angles), 2 * np.pi * np.arange(beams) / beams, atol=1e-12)
 
 
-@pytest.mark.parametrize(
+@each_case(
     "names",
     [(), ("x.vel", "theta.vel"), ("scan_000.pos", "x.vel", "scan_001.pos"), ("scan_000.vel",)],
 )

@@ -19,6 +19,7 @@ from bhd_lerobot.recording import record as record_module
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.configuration import encode, parse
 from bhd_lerobot.rollout.episode import EpisodeLoop
+from tests.cases import each_case
 from tests.recording.support import data_columns, episode_rows, options, run_record
 
 
@@ -268,7 +269,7 @@ def test_episodes_come_in_order_and_are_dropped_when_told_to_stop(tmp_path):
     assert list(loop.run(specs, stop)) == []
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("change", "message"),
     [
         ({"dataset__num_episodes": 0}, "num_episodes is 0"),

@@ -14,6 +14,7 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, RenderingError
 from bhd_lerobot.rollout.provenance import scene_from_json
 from bhd_lerobot.rollout.replay import Replay
+from tests.cases import each_case
 from tests.recording.support import data_columns, episode_rows, options, run_record
 
 PICK = {
@@ -203,7 +204,7 @@ def test_cameras_are_recorded(tmp_path):
     assert len(list(root.rglob("*.mp4"))) == 2
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("change", "message"),
     [
         ({"task__type": "avoid", "brain__type": "avoidance"}, "is for robot.type = 'turtlebot3'"),

@@ -14,6 +14,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.conformance import ConformanceError, check_robot
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+from tests.cases import each_case
 from tests.robots.fake_feetech import START, so101
 
 
@@ -325,7 +326,7 @@ def test_a_good_robot_passes(config):
     assert check_robot(lambda: GoodRobot(config), adversarial=True) == ()
 
 
-@pytest.mark.parametrize("robot", BROKEN, ids=lambda cls: cls.__name__)
+@each_case("robot", BROKEN)
 def test_a_broken_robot_is_found(robot, config):
     with pytest.raises(ConformanceError, match=robot.breach):
         check_robot(lambda: robot(config), adversarial=getattr(robot, "adversarial", False))

@@ -13,6 +13,7 @@ from bhd_lerobot.control.messages import Limit, Mode, Reason
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.robots.ur5_simulation import TOOL_NAMES, UR5Simulation, pose_matrices
+from tests.cases import each_case
 
 DOWN = [0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0]
 
@@ -43,7 +44,7 @@ def test_a_network_s_quaternion_need_not_be_quite_of_unit_length(length: float) 
     assert np.allclose(matrix, pose_matrices(np.array([0, 0, 0, 0.5, 0.5, -0.5, 0.5]))[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("length", [0.0, 0.79, 1.21, 1e9, np.nan, np.inf])
+@each_case("length", [0.0, 0.79, 1.21, 1e9, np.nan, np.inf])
 def test_what_is_no_orientation_is_not_guessed_at(length: float) -> None:
     quaternion = length * np.array([0.5, 0.5, -0.5, 0.5])
     _, problem = pose_matrices(np.array([0, 0, 0, *quaternion]))
@@ -119,8 +120,8 @@ def test_one_arm_s_impossible_pose_is_refused_in_words_and_the_others_go_on(simu
     assert report.applied[2, 2] == pytest.approx(action[2, 2], abs=1e-4)
 
 
-@pytest.mark.parametrize("column", [0, 5, 7])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@each_case("column", [0, 5, 7])
+@each_case("value", [np.nan, np.inf])
 def test_what_is_not_finite_is_refused_and_nothing_moves(simulation, column: int, value: float) -> None:
     before = start(simulation)
     action = before.copy()

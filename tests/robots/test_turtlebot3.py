@@ -13,6 +13,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError, RenderingError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+from tests.cases import each_case
 
 GO = {"x.vel": 0.2, "theta.vel": 0.0}
 
@@ -27,7 +28,7 @@ def robot(tmp_path):
         yield robot
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("action", "message"),
     [
         ({"x.vel": 0.1}, "lacks 'theta.vel'"),
@@ -121,7 +122,7 @@ def test_emergency_stop_is_latched_until_reset_and_activate(robot):
         robot.reset()  # nothing to clear
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "message"),
     [
         ({"fps": 7}, "valid values of fps: 1, 2, 4, 5"),

@@ -15,6 +15,7 @@ from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, UR5Simulation
+from tests.cases import each_case
 
 FIRST = np.zeros(1, np.intp)
 DOWN = (0.0, 1.0, 0.0, 0.0)
@@ -235,7 +236,7 @@ def test_noise_and_latency_belong_to_the_episode(tmp_path):
     assert np.array_equal(simulation.observe().state[0], seen[0, 0])  # the same seed, the same noise
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "message"),
     [
         ({"fps": 7}, "valid values of fps"),
@@ -352,7 +353,7 @@ def test_an_arm_that_presses_on_the_table_stops_and_lets_go(robot):
     assert simulation.bridge.state().joint_positions[0] == pytest.approx(start[0], abs=2e-3)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("goal", "code"),
     [
         ({"max_velocity": 1e-7}, ResultCode.PLANNING_FAILED),

@@ -5,6 +5,7 @@ import pytest
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.configuration import describe, encode, parse, run
+from tests.cases import each_case
 
 REQUIRED = ["--robot.type=turtlebot3", "--dataset.repo_id=a/b", "--brain.type=avoidance", "--task.type=avoid"]
 
@@ -85,7 +86,7 @@ def test_help_lists_every_option():
         assert option in text
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("name", "content", "message"),
     [
         ("a.yaml", b"", "found nothing"),

@@ -12,6 +12,7 @@ from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ConfigError, SimulationError
 from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.world import World
+from tests.cases import each_case
 
 BODY = turtlebot3_burger(lidar_noise_std=0.0)
 LIDAR_BEHIND_AXIS = 0.032  # [m]
@@ -82,7 +83,7 @@ def scan(shapes: tuple[Shape, ...], pose: tuple[float, float, float], beams: int
     return lidar.ranges[0].copy()
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each_case("seed", range(5))
 def test_ranges_are_the_distances_to_the_shapes(seed: int) -> None:
     arena = random_arena(seed)
     measured, expected = scan(arena.shapes, arena.start), expected_scan(arena.shapes, arena.start, 360)
@@ -133,7 +134,7 @@ def test_an_obstacle_that_is_too_near_reads_the_shortest_range() -> None:
     assert ranges[60] == pytest.approx(0.092 / math.cos(math.pi / 3), abs=1e-6)
 
 
-@pytest.mark.parametrize("yaw", [0.0, 1.0, 3.0])
+@each_case("yaw", [0.0, 1.0, 3.0])
 def test_the_robot_does_not_see_itself_nor_the_floor(yaw: float) -> None:
     world = World(BODY)
     world.reset(poses=np.array([[0.3, -0.2, yaw]]))
@@ -154,14 +155,14 @@ def test_only_what_is_as_high_as_the_lidar_is_seen(height: float) -> None:
     assert seen == (height > 0.182)
 
 
-@pytest.mark.parametrize("beams", [1, 24, 90, 180])
+@each_case("beams", [1, 24, 90, 180])
 def test_fewer_beams_are_evenly_spaced_ones_of_all(beams: int) -> None:
     arena = random_arena(3)
     some, every = scan(arena.shapes, arena.start, beams), scan(arena.shapes, arena.start)[:: 360 // beams]
     np.testing.assert_allclose(some, every, atol=1e-9)
 
 
-@pytest.mark.parametrize("beams", [0, -1, 7, 361, 36.0, True])
+@each_case("beams", [0, -1, 7, 361, 36.0, True])
 def test_a_number_of_beams_that_does_not_divide_is_refused(beams: int) -> None:
     with pytest.raises(ConfigError, match=r"must divide 360. Valid: 1, 2, 3, 4, .*180, 360\."):
         Lidar(World(BODY), spec_with(), beams)

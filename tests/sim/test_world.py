@@ -12,6 +12,7 @@ from bhd_lerobot.errors import ConfigError, SimulationError
 from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.world import World
+from tests.cases import each_case
 
 BODY = turtlebot3_burger()
 RADIUS, SEPARATION = 0.033, 0.160
@@ -148,7 +149,7 @@ def test_reset_of_some_leaves_the_others_alone() -> None:
     assert (world.time[ids] == 0).all()
 
 
-@pytest.mark.parametrize("poses", [np.zeros((2, 3)), np.zeros(3), np.array([[0.0, math.nan, 0.0]])])
+@each_case("poses", [np.zeros((2, 3)), np.zeros(3), np.array([[0.0, math.nan, 0.0]])])
 def test_impossible_start_poses_are_refused(poses: np.ndarray) -> None:
     with pytest.raises(SimulationError, match="Start poses"):
         World(BODY).reset(poses=poses)
@@ -380,7 +381,7 @@ def test_the_gyro_measures_the_yaw_rate() -> None:
     np.testing.assert_allclose(world.sensor("imu_accelerometer")[0], (0, 0, 9.81), atol=0.1)
 
 
-@pytest.mark.parametrize("speed", [1e3, -1e3, 7.0])
+@each_case("speed", [1e3, -1e3, 7.0])
 def test_the_wheel_torque_never_exceeds_its_limit(speed: float) -> None:
     world = World(BODY)
     model = world.copy_model(0)
@@ -484,7 +485,7 @@ def test_a_low_obstacle_stops_a_wheel() -> None:
     assert touched
 
 
-@pytest.mark.parametrize("broken", [math.nan, math.inf, 1e20])
+@each_case("broken", [math.nan, math.inf, 1e20])
 def test_diverged_physics_is_an_error_that_names_the_simulation(broken: float) -> None:
     world, healthy = World(BODY, 4), World(BODY, 4)
     for each in (world, healthy):

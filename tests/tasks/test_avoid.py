@@ -13,6 +13,7 @@ from bhd_lerobot.bodies.arenas import make_arena, random_arena
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.avoid import TRAIL, AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import BaseTruth, Event
+from tests.cases import each_case
 
 FPS = 10
 EMPTY = make_arena("empty", 0)  # 6 m by 6 m, start in the middle
@@ -85,7 +86,7 @@ def test_the_path_is_walked_not_the_way_from_the_start() -> None:
     assert run.outcome().details["path_m"] == pytest.approx(200 * 0.02)
 
 
-@pytest.mark.parametrize("when", [1, 7, 200])
+@each_case("when", [1, 7, 200])
 def test_a_touch_is_a_collision_at_once_even_in_the_last_frame(when: int) -> None:
     run = Run(AvoidConfig(duration_s=20.0))
     for frame in range(1, when + 1):
@@ -106,7 +107,7 @@ def test_nothing_counts_in_the_frame_of_the_contact_or_after_it() -> None:
     assert run.outcome().score == score
 
 
-@pytest.mark.parametrize(("step", "stuck_after"), [(0.0, 100), (0.0009, 100), (0.0011, None)])
+@each_case(("step", "stuck_after"), [(0.0, 100), (0.0009, 100), (0.0011, None)])
 def test_less_than_a_tenth_of_a_metre_in_ten_seconds_is_stuck(step: float, stuck_after: int | None) -> None:
     run = Run(AvoidConfig())
     for frame in range(1, 251):
@@ -173,7 +174,7 @@ def test_visiting_every_free_cell_scores_one() -> None:
     assert run.first[0] + run.rewards[0] == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("place", [(9.0, 0.0), (-9.0, 0.0), (0.0, 9.0), (0.0, -9.0), (2.99, 3.01), (9.0, 9.0)])
+@each_case("place", [(9.0, 0.0), (-9.0, 0.0), (0.0, 9.0), (0.0, -9.0), (2.99, 3.01), (9.0, 9.0)])
 def test_outside_the_arena_is_no_cell(place: tuple[float, float]) -> None:
     run = Run(AvoidConfig())
     run.frame(np.array([place]))
@@ -227,8 +228,8 @@ def test_a_long_path_in_the_episode_before_does_not_make_a_robot_stuck() -> None
     assert run.events[0] == Event.NOTHING
 
 
-@pytest.mark.parametrize("arena", ["random", "turtlebot3_world", "empty"])
-@pytest.mark.parametrize("random_start", [False, True])
+@each_case("arena", ["random", "turtlebot3_world", "empty"])
+@each_case("random_start", [False, True])
 def test_equal_seeds_give_equal_episodes(arena: str, random_start: bool) -> None:
     task = AvoidTask(AvoidConfig(arena=arena, random_start=random_start), 1, FPS)
     for seed in (0, 1, 2**62 + 1):
@@ -236,7 +237,7 @@ def test_equal_seeds_give_equal_episodes(arena: str, random_start: bool) -> None
         assert (task.sample(seed) != task.sample(seed + 1)) == (arena == "random" or random_start)
 
 
-@pytest.mark.parametrize(
+@each_case(
     "change",
     [
         {"duration_s": 0.0},

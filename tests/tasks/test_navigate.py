@@ -15,6 +15,7 @@ from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
 from bhd_lerobot.tasks.geodesic import WayField, interpolate, way_lengths
 from bhd_lerobot.tasks.navigate import ENVIRONMENT, NavigateConfig, NavigateTask, goal_in_robot
 from bhd_lerobot.tasks.task import BaseTruth, Event
+from tests.cases import each_case
 
 FPS = 10
 GOAL = (2.025, 0.025, 1.0)  # a grid point
@@ -61,7 +62,7 @@ def drive_to_goal(run: Run, steps: int = 50) -> None:
 # --- scenes ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each_case(
     "config",
     [
         NavigateConfig(),
@@ -84,7 +85,7 @@ def test_goals_are_reachable_far_enough_and_free(config: NavigateConfig) -> None
         assert np.hypot(*(goal - start)[:2]) - 0.05 <= shortest < 20
 
 
-@pytest.mark.parametrize("arena", ["random", "turtlebot3_world", "empty"])
+@each_case("arena", ["random", "turtlebot3_world", "empty"])
 def test_equal_seeds_give_equal_scenes_and_others_do_not(arena: str) -> None:
     one, other = (NavigateTask(NavigateConfig(arena=arena), n, FPS) for n in (1, 3))
     for seed in (0, 1, 2**62 + 1):
@@ -187,7 +188,7 @@ def test_the_hold_begins_again_after_a_break() -> None:
     assert run.events[0] == Event.SUCCESS
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("off", "event"),
     [
         ((0.099, 0.0, 0.0), Event.SUCCESS),
@@ -347,7 +348,7 @@ def test_between_grid_points_lengths_are_linear_and_outside_as_at_the_border() -
 # --- wrong inputs ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each_case(
     "change",
     [
         {"tolerance_m": 0.0},
@@ -373,7 +374,7 @@ def test_an_unknown_arena_is_an_error_with_the_near_miss() -> None:
         NavigateConfig(arena="randon")
 
 
-@pytest.mark.parametrize("goal", [None, (math.nan, 0.0, 0.0), (1.0, 0.0, math.inf)])
+@each_case("goal", [None, (math.nan, 0.0, 0.0), (1.0, 0.0, math.inf)])
 def test_a_scene_without_a_goal_or_with_one_that_is_no_number_is_refused(goal: tuple[float, ...] | None) -> None:
     with pytest.raises(ConfigError, match="The goal of the arena 'empty' is"):
         Run(None, replace(OPEN, goal=goal))

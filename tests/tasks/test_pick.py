@@ -18,6 +18,7 @@ from bhd_lerobot.policies.manipulation.skills import scene_object
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import ArmTruth, Event
 from bhd_lerobot.tasks.variation import RandomisationConfig
+from tests.cases import each_case
 
 FPS = 10
 WILD = RandomisationConfig(enabled=True)
@@ -111,7 +112,7 @@ def corners(one: TableObject) -> np.ndarray:
 HUGE = RandomisationConfig(enabled=True, size=0.6)
 
 
-@pytest.mark.parametrize("randomisation", [RandomisationConfig(), WILD, HUGE], ids=["nominal", "randomised", "huge"])
+@each_case("randomisation", [RandomisationConfig(), WILD, HUGE])
 def test_objects_stand_apart_in_reach_differ_and_fit_the_gripper(randomisation: RandomisationConfig) -> None:
     task = PickTask(PickConfig(randomisation=randomisation), 1, FPS)
     counts = set()
@@ -151,14 +152,14 @@ def test_equal_seeds_give_equal_episodes_and_others_others() -> None:
         assert len({scene.objects for scene in scenes}) == 3
 
 
-@pytest.mark.parametrize(("least", "most"), [(1, 1), (3, 3), (2, 5)])
+@each_case(("least", "most"), [(1, 1), (3, 3), (2, 5)])
 def test_the_number_of_objects_is_as_asked_for(least: int, most: int) -> None:
     task = PickTask(PickConfig(min_objects=least, max_objects=most), 1, FPS)
     assert {len(task.sample(seed).objects) for seed in range(60)} == set(range(least, most + 1))
 
 
-@pytest.mark.parametrize("randomisation", [RandomisationConfig(), WILD], ids=["nominal", "randomised"])
-@pytest.mark.parametrize("language", ["en", "zh", "any"])
+@each_case("randomisation", [RandomisationConfig(), WILD])
+@each_case("language", ["en", "zh", "any"])
 def test_the_instruction_means_the_target_and_nothing_else(language: str, randomisation: RandomisationConfig) -> None:
     """Also by the colours that a brain sees, which randomisation has changed."""
     task = PickTask(PickConfig(language=language, randomisation=randomisation), 1, FPS)
@@ -307,8 +308,8 @@ def test_to_lift_another_object_is_wrong_whatever_else_happens_and_to_brush_it_i
     assert not both.outcome().success
 
 
-@pytest.mark.parametrize("touch", ["arm_on_table", "arm_on_object", "self_contact"])
-@pytest.mark.parametrize("when", [1, 10, 50])
+@each_case("touch", ["arm_on_table", "arm_on_object", "self_contact"])
+@each_case("when", [1, 10, 50])
 def test_a_touch_is_a_collision_at_once_even_in_the_last_frame_or_that_of_success(touch: str, when: int) -> None:
     run = Run(PickConfig(duration_s=5.0, hold_s=1.0))
     for frame in range(1, when + 1):
@@ -318,7 +319,7 @@ def test_a_touch_is_a_collision_at_once_even_in_the_last_frame_or_that_of_succes
     assert run.outcome().score <= 0.9
 
 
-@pytest.mark.parametrize("at", [(0.81, 0.0), (0.58, 0.58), (-0.4, -0.7)])
+@each_case("at", [(0.81, 0.0), (0.58, 0.58), (-0.4, -0.7)])
 def test_pushed_out_of_reach_is_unreachable(at: tuple[float, float]) -> None:
     run = Run()
     run.frame(at=(0.79, 0.0))
@@ -372,14 +373,14 @@ def test_episodes_are_independent_and_start_from_nothing() -> None:
 # --- configuration ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["duration_s", "lift_m", "hold_s"])
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+@each_case("name", ["duration_s", "lift_m", "hold_s"])
+@each_case("value", [0.0, -1.0, math.nan, math.inf])
 def test_impossible_values_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=f"task.{name} is {value}; it must be positive and finite"):
         PickConfig(**{name: value})
 
 
-@pytest.mark.parametrize(("least", "most"), [(0, 3), (1, 6), (3, 2), (-1, -1)])
+@each_case(("least", "most"), [(0, 3), (1, 6), (3, 2), (-1, -1)])
 def test_an_impossible_number_of_objects_is_refused(least: int, most: int) -> None:
     with pytest.raises(ConfigError, match=f"min_objects is {least} and task.max_objects is {most}.*between 1 and 5"):
         PickConfig(min_objects=least, max_objects=most)

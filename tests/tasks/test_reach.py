@@ -17,6 +17,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import ArmTruth, Event
 from bhd_lerobot.tasks.variation import RandomisationConfig
+from tests.cases import each_case
 
 FPS = 20
 ARM = ur5()
@@ -160,7 +161,7 @@ def test_success_needs_the_whole_hold_time() -> None:
     assert run.outcome().score == 1.0
 
 
-@pytest.mark.parametrize(("away", "degrees"), [(0.0051, 0.0), (0.0, 2.01), (0.0051, 2.01)])
+@each_case(("away", "degrees"), [(0.0051, 0.0), (0.0, 2.01), (0.0051, 2.01)])
 def test_a_break_starts_the_hold_time_anew(away: float, degrees: float) -> None:
     run = Run(ReachConfig(hold_s=0.25))
     for _ in range(4):
@@ -193,8 +194,8 @@ def test_too_late_is_a_time_out_and_the_last_frame_is_not_too_late() -> None:
     assert not late.outcome().success
 
 
-@pytest.mark.parametrize("touch", ["arm_on_table", "self_contact"])
-@pytest.mark.parametrize("when", [1, 7, 40])
+@each_case("touch", ["arm_on_table", "self_contact"])
+@each_case("when", [1, 7, 40])
 def test_a_touch_is_a_collision_at_once_even_in_the_last_frame_or_that_of_success(touch: str, when: int) -> None:
     run = Run(ReachConfig(duration_s=2.0, hold_s=0.35))
     for frame in range(1, when + 1):
@@ -235,14 +236,14 @@ def test_episodes_are_independent_and_start_from_nothing() -> None:
 # --- configuration ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["duration_s", "tolerance_m", "tolerance_deg", "hold_s"])
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+@each_case("name", ["duration_s", "tolerance_m", "tolerance_deg", "hold_s"])
+@each_case("value", [0.0, -1.0, math.nan, math.inf])
 def test_impossible_values_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=f"task.{name} is {value}; it must be positive and finite"):
         ReachConfig(**{name: value})
 
 
-@pytest.mark.parametrize("value", [-0.1, 1.1, math.nan])
+@each_case("value", [-0.1, 1.1, math.nan])
 def test_a_start_too_far_from_home_is_refused(value: float) -> None:
     with pytest.raises(ConfigError, match=f"task.start_spread_rad is {value}; it must be between 0 and 1"):
         ReachConfig(start_spread_rad=value)

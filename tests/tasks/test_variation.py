@@ -26,6 +26,7 @@ from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.variation import MAX_LATENCY_S, RandomisationConfig, draw_object_changes, draw_variation
+from tests.cases import each_case
 
 ON = RandomisationConfig(enabled=True)
 FIXED = ("enabled", "camera_error_m")
@@ -99,8 +100,8 @@ def test_a_recorded_scene_comes_back_equal(task: PickTask | ReachTask) -> None:
     assert scene.variation != Variation() or task.name == "reach"
 
 
-@pytest.mark.parametrize("name", RANGES)
-@pytest.mark.parametrize("value", [-0.1, math.nan, math.inf, -math.inf])
+@each_case("name", RANGES)
+@each_case("value", [-0.1, math.nan, math.inf, -math.inf])
 def test_impossible_ranges_are_refused_by_name(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=rf"randomisation.{name} is {value}; it must be 0 \(off\) or positive"):
         RandomisationConfig(**{name: value})
@@ -185,7 +186,7 @@ def test_a_scene_that_was_recorded_before_there_were_camera_errors_has_none() ->
     assert scene_from_json(json.dumps(fields)) == scene
 
 
-@pytest.mark.parametrize(
+@each_case(
     "error",
     [(0.0, 0.0), (0.0,) * 4, (), (math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, -math.inf), (0.0, -0.201, 0.0)],
 )

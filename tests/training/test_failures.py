@@ -15,6 +15,7 @@ from bhd_lerobot.training import output
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.log import MetricsFile
 from bhd_lerobot.training.train import main
+from tests.cases import each_case
 from tests.training.support import ACT, MLP, curve, make_dataset, options, poison, run_train
 
 
@@ -292,7 +293,7 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
         run_train(options(data, tmp_path / ("x" * 300)))
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("change", "match"),
     [
         ({"policy.type": "akt"}, r"'akt'. Did you mean 'act'\? Valid: .*bhd_mlp.*diffusion"),

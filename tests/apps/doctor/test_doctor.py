@@ -18,6 +18,7 @@ from bhd_lerobot.apps.doctor import checks, doctor, latency_test, trials
 from bhd_lerobot.apps.doctor.checks import ROWS, Finding, Status, markdown_table, wrong
 from bhd_lerobot.apps.doctor.trials import Outcome, run_trials
 from bhd_lerobot.realtime.privileges import GRANT_BANDWIDTH
+from tests.cases import each_case
 
 ROOT = Path(__file__).resolve().parents[3]
 GIB = 2**30
@@ -225,7 +226,7 @@ HEALTHY: dict[str, Callable[[Path], list[Finding]]] = {
 }
 
 
-@pytest.mark.parametrize("name", HEALTHY)
+@each_case("name", HEALTHY)
 def test_nothing_is_wrong_with_a_healthy_machine(name: str, tmp_path: Path) -> None:
     findings = HEALTHY[name](tmp_path)
     assert findings
@@ -304,7 +305,7 @@ def test_every_row_has_its_test() -> None:
     assert set(BROKEN) == set(ROWS)
 
 
-@pytest.mark.parametrize("key", ROWS)
+@each_case("key", ROWS)
 def test_what_is_wrong_is_said_with_symptom_cause_and_remedy(key: str, tmp_path: Path) -> None:
     check, part = BROKEN[key]
     findings = [finding for finding in check(tmp_path) if finding.status is not Status.OK]

@@ -4,7 +4,6 @@ import dataclasses
 import io
 from typing import Any
 
-import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
@@ -13,6 +12,7 @@ from bhd_lerobot.apps.monitor.state import CELLS, DECADES, Count, Dimension, Mon
 from bhd_lerobot.apps.monitor.view import KEYS, bars, duration, one_line, render, unit
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 from bhd_lerobot.robots.host.state import LIMITS, WATCHDOGS
+from tests.cases import each_case
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "gripper")
 
@@ -108,8 +108,8 @@ def lines(shown: MonitorState, width: int = 80, height: int | None = None, **opt
     return console.file.getvalue().splitlines()
 
 
-@pytest.mark.parametrize("shown", [state(), EXTREME, EMPTY], ids=["usual", "extreme", "empty"])
-@pytest.mark.parametrize(("width", "height"), [(80, 24), (120, 40), (80, 10), (200, 60)])
+@each_case("shown", [state(), EXTREME, EMPTY])
+@each_case(("width", "height"), [(80, 24), (120, 40), (80, 10), (200, 60)])
 def test_it_fits_and_the_keys_are_always_there(shown: MonitorState, width: int, height: int) -> None:
     printed = lines(shown, width, height)
     assert len(printed) <= height
@@ -177,7 +177,7 @@ def test_progress_of_a_goal() -> None:
     assert "2-down           executing ██████████░░░░░░░░░░  50%,   1.2 s left" in text(state(goal=goal))
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("changes", "message"),
     [
         ({"estop": True}, "e-stop not latched yet"),
@@ -220,7 +220,7 @@ def test_a_message_takes_the_place_of_the_keys() -> None:
     assert KEYS not in "\n".join(lines(state(), keys=""))
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("seconds", "shown"),
     [
         (None, "–"), (0.0, "0 µs"), (1e-6, "1 µs"), (999e-6, "999 µs"), (0.9996e-3, "1.00 ms"), (1.234e-3, "1.23 ms"),

@@ -9,12 +9,13 @@ from bhd_lerobot.apps.view.groups import MAX_LINES, names_of, scan_of, sections,
 from bhd_lerobot.apps.view.packing import pack, unpack
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.datasets.format.columns import read_episode
+from tests.cases import each_case
 from tests.datasets.loader.support import length, record_ours
 
 COUNTERS = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 
 
-@pytest.mark.parametrize(
+@each_case(
     "array",
     [
         np.arange(7, dtype=np.float32).reshape(7, 1),
@@ -99,7 +100,7 @@ def test_an_arm_is_rigid_its_fingers_are_as_far_apart_as_its_opening(arm) -> Non
     assert [run[0] for run in header["bands"][0]["runs"][1:]] == [run[1] for run in header["bands"][0]["runs"][:-1]]
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 8, 9, 17, 300])
+@each_case("count", [0, 1, 2, 8, 9, 17, 300])
 def test_plots_have_few_lines_and_every_number(count) -> None:
     found = sections({"x": {"names": None}}, {"x": count}, None)
     lines = [line["number"] for one in found for plot in one["plots"] for line in plot["lines"]]

@@ -28,6 +28,7 @@ from bhd_lerobot.cli.data import main, view
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.errors import DatasetError
 from tests.apps.view.support import Served, episode, served
+from tests.cases import each_case
 from tests.datasets.loader.support import PHOTO, images, length
 
 # -- videos and images ------------------------------------------------------------------------------------------------
@@ -81,7 +82,7 @@ def test_a_link_out_of_the_dataset_is_not_served(base: Path, stock: Path, tmp_pa
             assert (status, b"password" in said) == (409, False)
 
 
-@pytest.mark.parametrize(
+@each_case(
     "path",
     [
         "/videos/observation.images.rear/0/0.mp4",
@@ -116,7 +117,7 @@ def test_images_in_the_data_files(stock) -> None:
 # -- who is served -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("host", "is_ours"),
     [
         *((host, True) for host in ("127.0.0.1", "127.0.0.1:8766", "localhost:1", "LOCALHOST", "[::1]:8766")),
@@ -230,7 +231,7 @@ def server_stamp(server: Served) -> bytes:
     return json.dumps({"stamp": server.json("/api/stamp")["now"]}).encode()
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("what", "status", "told"),
     [
         (b"{", 400, "not JSON"),

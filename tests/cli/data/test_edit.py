@@ -11,6 +11,7 @@ from bhd_lerobot.cli.data.edit import parts_of
 from bhd_lerobot.cli.data.episode_list import parse_episodes, short
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 from tests.datasets.edit_support import content, record
 
 
@@ -55,7 +56,7 @@ def test_check_with_fix(recorded: Path, tmp_path: Path, capsys) -> None:
     assert captured.err.startswith("fixed meta/stats.json")
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("arguments", "words"),
     [
         (["merge", "R", "--output", "X"], "at least two"),

@@ -11,6 +11,7 @@ from bhd_lerobot.control.arm.rotations import rotation_matrices, rotation_vector
 from bhd_lerobot.control.arm.wrench import ContactObserver, tool_wrench
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 
 Array = NDArray[np.float64]
 ARM = ur5(actuation="torque")
@@ -58,7 +59,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("message", BAD)
+@each_case("message", BAD)
 def test_an_impossible_compliance_is_refused(message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Compliance(**BAD[message])  # type: ignore[arg-type]

@@ -12,6 +12,7 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 
 ARM = ur5()
 CHAIN = ARM.chain
@@ -33,7 +34,7 @@ def point_to_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> 
     return np.linalg.norm(points - start - share[:, None] * way, axis=1)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("points", "distance"),
     [
         (((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)), 1.0),  # parallel, side by side

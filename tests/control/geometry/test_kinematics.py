@@ -14,6 +14,7 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 
 ARM = ur5()
 CHAIN = ARM.chain
@@ -218,7 +219,7 @@ FOLDED = np.array([0.0, -1.5, 2.9, 0.5, 1.5, 0.0])
 STRAIGHT = np.array([0.3, -1.2, 1e-4, -0.4, 1.0, 0.0])
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("kinematics", "pose", "code", "words"),
     [
         (KINEMATICS, moved(TOOL, x=0.7), ResultCode.UNREACHABLE, "short of the pose.*towards"),
@@ -285,7 +286,7 @@ def test_a_line_has_to_start_where_the_arm_is() -> None:
     assert (result.code, result.index) == (ResultCode.UNREACHABLE, 0)
 
 
-@pytest.mark.parametrize(
+@each_case(
     "change",
     [
         {"a": (0.1, -0.4, -0.4, 0.0, 0.0, 0.0)},

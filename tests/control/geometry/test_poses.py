@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.control.commands import Pose
 from bhd_lerobot.control.geometry.poses import pose_vectors, quaternion_columns
+from tests.cases import each_case
 
 DOWN = np.array([0.0, 1.0, 0.0, 0.0])  # wxyz: half a turn about x
 
@@ -38,8 +39,8 @@ def test_numbers_and_matrices_are_the_same_pose(seed: int) -> None:
         assert np.allclose(Pose(tuple(vector[:3]), tuple(vector[3:])).matrix(), matrix, atol=1e-12)
 
 
-@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (0, 1, 1), (1, 1, 1), (1, -1, 0)])
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-4, np.pi - 1e-9, np.pi, 2 * np.pi - 1e-9])
+@each_case("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (0, 1, 1), (1, 1, 1), (1, -1, 0)])
+@each_case("angle", [0.0, 1e-9, 1e-4, 1.0, np.pi - 1e-4, np.pi - 1e-9, np.pi, 2 * np.pi - 1e-9])
 def test_no_turn_loses_precision(axis: tuple[int, int, int], angle: float) -> None:
     """Also turns of next to nothing and of next to half a turn, where a single formula fails."""
     rotation = Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis))
@@ -87,7 +88,7 @@ def test_any_number_of_leading_axes(shape: tuple[int, ...]) -> None:
     assert np.array_equal(pose_vectors(several).reshape(-1, 7), pose_vectors(rotations)[:count])
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("names", "columns"),
     [
         (["x", "a_qw", "a_qx", "a_qy", "a_qz"], [1]),

@@ -24,6 +24,7 @@ from bhd_lerobot.control.motion.goal_codec import (
     goal_dtype,
 )
 from bhd_lerobot.errors import ActionError
+from tests.cases import each_case
 from tests.control.goal_rig import ARM, joints, moved
 
 DOF = 6
@@ -100,7 +101,7 @@ def test_a_name_comes_out_as_it_went_in(name: str) -> None:
 FULL: dict[str, Any] = {"task_id": "a", "joint_target": joints(0.1)}
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("fields", "code", "words"),
     [
         ({"task_id": "x" * 65}, ResultCode.BAD_TARGET, "65 bytes"),

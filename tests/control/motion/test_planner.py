@@ -10,6 +10,7 @@ from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics, IkResult
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan, PlanFailure
 from bhd_lerobot.control.motion.trajectory import State
+from tests.cases import each_case
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, LIMITS, ZEROS, joints, moved
 
 PLANNER = GoalPlanner(ARM, HZ, KINEMATICS)
@@ -67,7 +68,7 @@ REFUSALS: list[tuple[dict[str, Any], ResultCode, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("fields", "code", "words"), REFUSALS)
+@each_case(("fields", "code", "words"), REFUSALS)
 def test_what_is_wrong_with_a_goal_is_named(fields: dict[str, Any], code: ResultCode, words: str) -> None:
     failure = PLANNER.check(BrainCommand("a", **fields))
     assert failure is not None
@@ -82,7 +83,7 @@ def test_a_goal_needs_a_name(task_id: Any) -> None:
     assert failure.code == ResultCode.BAD_TARGET
 
 
-@pytest.mark.parametrize(
+@each_case(
     "fields",
     [
         {"joint_target": joints(), "max_velocity": 3.1415, "max_acceleration": 15.0},

@@ -17,6 +17,7 @@ from bhd_lerobot.control.motion.planning import MIN_LEAD, MOST_LEADS, InlinePlan
 from bhd_lerobot.control.motion.trajectory import PlanFailure, State
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, broken_limit, joints, moved
 from tests.control.motion.test_goal_properties import actions, follow
 
@@ -223,8 +224,8 @@ def test_a_goal_that_preempts_and_is_cancelled_while_it_is_planned_leaves_a_brak
     assert rig.results() == [("a", ResultCode.PREEMPTED), ("b", ResultCode.CANCELLED)]
 
 
-@pytest.mark.parametrize("ticks", [0, 50], ids=["at rest", "moving"])
-@pytest.mark.parametrize("way", ["stop", "estop", "setpoint", "retreat", "restart", "preempt"])
+@each_case("ticks", [0, 50])
+@each_case("way", ["stop", "estop", "setpoint", "retreat", "restart", "preempt"])
 def test_what_ends_a_goal_while_it_is_planned_drops_the_request(way: str, ticks: int) -> None:
     rig, planning = rig_of(NEVER, ticks=ticks)
     rig.go("b", joint_target=BACK, preempt=True)
@@ -343,8 +344,8 @@ def test_planned_inline_is_what_it_is_without_saying(script: list) -> None:
 # --- setpoints first -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("preempt", [False, True])
-@pytest.mark.parametrize("latency", [1, LEAD + 2, 200])
+@each_case("preempt", [False, True])
+@each_case("latency", [1, LEAD + 2, 200])
 def test_a_goal_that_comes_while_setpoints_are_followed_begins_with_a_brake(latency: int, preempt: bool) -> None:
     controller = ArmController(ARM, 1, HZ, 20, planning=LatePlanning([latency, latency]))
     reading = PlantReading(1, 7)

@@ -14,6 +14,7 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
+from tests.cases import each_case
 from tests.datasets import support
 from tests.datasets.edit_support import assert_valid, content, record, stack
 
@@ -146,7 +147,7 @@ def test_bad_requests_change_nothing(tmp_path: Path) -> None:
     assert edits_of(root) == []
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("robot", "task", "impossible", "possible"),
     [
         ("turtlebot3", "avoid", ("dropped", "wrong_object", "unreachable"), ("stuck", "collision", "failure")),

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.datasets.format.parquet_rescue import rescue
 from bhd_lerobot.datasets.format.thrift_compact import Field, Reader, encode
+from tests.cases import each_case
 
 SCHEMA = pa.schema(
     [
@@ -55,7 +56,7 @@ def write(path: Path, tables: list[pa.Table], **options: Any) -> list[int]:
     return ends
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("rows", "image", "options"),
     [
         ([1], 20, {}),

@@ -13,6 +13,7 @@ from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.datasets.loader import frame_cache
 from bhd_lerobot.datasets.loader.loader import BatchLoader, FrameTable, TableDataset, make_loader
 from bhd_lerobot.errors import DatasetError
+from tests.cases import each_case
 from tests.datasets.loader import support
 from tests.datasets.loader.support import FPS, FRONT, PHOTO, WRIST
 
@@ -56,8 +57,8 @@ def assert_equal_datasets(root: Path, **options: Any) -> TableDataset:
     return ours
 
 
-@pytest.mark.parametrize("episodes", [None, [0], [4, 1], [2, 3, 4]])
-@pytest.mark.parametrize(
+@each_case("episodes", [None, [0], [4, 1], [2, 3, 4]])
+@each_case(
     "deltas",
     [None, {"action": CHUNK}, {"action": CHUNK, "observation.state": WINDOW, "event": WINDOW}, {"action": [0.0]}],
 )
@@ -65,8 +66,8 @@ def test_tables_are_those_of_lerobot(plain: Path, episodes: list[int] | None, de
     assert_equal_datasets(plain, episodes=episodes, delta_timestamps=deltas)
 
 
-@pytest.mark.parametrize("return_uint8", [False, True])
-@pytest.mark.parametrize("deltas", [None, {"action": CHUNK, FRONT: WINDOW}, {FRONT: [0.0], WRIST: [-0.1]}])
+@each_case("return_uint8", [False, True])
+@each_case("deltas", [None, {"action": CHUNK, FRONT: WINDOW}, {FRONT: [0.0], WRIST: [-0.1]}])
 def test_frames_of_our_recorder_are_those_of_lerobot(
     video_dataset: Path, return_uint8: bool, deltas: dict[str, list[float]] | None
 ) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bhd_lerobot.datasets.loader.order import BatchOrder
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 
 SAMPLES = torch.arange(100, 137)
 
@@ -142,7 +143,7 @@ def test_samples_of_weight_zero_are_left_out_and_the_rest_drawn_once() -> None:
     ]
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "message"),
     [
         ({"batch_size": 0}, "batch_size must be at least 1; got 0"),

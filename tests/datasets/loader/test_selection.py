@@ -26,6 +26,7 @@ from bhd_lerobot.datasets.loader.loader import (
 from bhd_lerobot.datasets.loader.table import open_metadata
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetError
+from tests.cases import each_case
 from tests.datasets.loader import support
 from tests.datasets.loader.support import FPS, FRONT, WRIST
 
@@ -46,7 +47,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return support.record_stock(tmp_path_factory.mktemp("foreign") / "d")
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "wanted"),
     [
         ({}, [0, 1, 4]),
@@ -113,8 +114,8 @@ def described(instructions: list[str]) -> Any:
     return SimpleNamespace(root=Path("toy"), total_episodes=n, total_frames=n, episodes=episodes)
 
 
-@pytest.mark.parametrize("kinds", [1, 2, 7, 100])
-@pytest.mark.parametrize("share", [0.01, 0.1, 0.25, 0.9])
+@each_case("kinds", [1, 2, 7, 100])
+@each_case("share", [0.01, 0.1, 0.25, 0.9])
 def test_a_share_of_all_episodes_is_held_out(kinds: int, share: float) -> None:
     meta = described([f"pick object {i % kinds}" for i in range(100)])
     train, held_out = split_episodes(meta, None, share)
@@ -180,7 +181,7 @@ def test_a_sound_dataset_passes(plain: Path, video_dataset: Path) -> None:
     check(TableDataset("t/t", video_dataset), ["action", FRONT])
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("features", "options", "message"),
     [
         (
@@ -236,7 +237,7 @@ def test_no_dataset(tmp_path: Path) -> None:
         FrameTable.open(tmp_path)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "message"),
     [
         ({"episodes": [7]}, "There is no episode 7 .* it has 5, from 0 to 4"),

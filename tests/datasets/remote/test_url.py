@@ -6,9 +6,10 @@ import pytest
 
 from bhd_lerobot.datasets.remote.store import StoreDataset
 from bhd_lerobot.errors import BhdError, ConfigError, TransferError
+from tests.cases import each_case
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("url", "words"),
     [
         ("foo://b/d", r"Protocol not known: foo\. Known protocols: .*s3"),

@@ -14,6 +14,7 @@ from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.datasets.storage.places import wrong_name
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError, FrameError
+from tests.cases import each_case
 from tests.datasets import support
 
 CAMERA = support.CAMERA
@@ -382,7 +383,7 @@ def test_values_that_no_policy_can_learn_from_are_refused(tmp_path: Path) -> Non
             recorder.save(writer, task="t", metadata={})
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("features", "words"),
     [
         ({}, "at least one"),

@@ -28,6 +28,7 @@ from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
 from bhd_lerobot.registry import make_brain, robot_of_brain
 from bhd_lerobot.tasks.pick import ENVIRONMENT
+from tests.cases import each_case
 from tests.policies.arm_desk import BOX, CUP, Desk, scene
 
 BASE = ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36)))
@@ -140,8 +141,8 @@ def test_a_simulation_that_is_not_running_is_not_flagged() -> None:
 # --- what is refused -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["collision_s", "stall_s", "disagreement", "disagreement_s", "patience_s", "hold_s"])
-@pytest.mark.parametrize("value", [0, -1.0, math.inf, math.nan])
+@each_case("name", ["collision_s", "stall_s", "disagreement", "disagreement_s", "patience_s", "hold_s"])
+@each_case("value", [0, -1.0, math.inf, math.nan])
 def test_times_and_shares_are_positive(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=rf"brain\.{name} is .*must be positive"):
         config(**{name: value})

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,6 +11,7 @@ from bhd_lerobot.bodies.tabletop import COLOURS, KINDS
 from bhd_lerobot.policies.language.grounding import DISTANCE_MARGIN, SIZE_MARGIN, Description, descriptions, fitting
 from bhd_lerobot.policies.language.lexicon import Relation
 from bhd_lerobot.policies.manipulation.skills import SceneObject
+from tests.cases import each_case
 
 SIDES = (Relation.LEFT, Relation.RIGHT)
 MOST: dict[Relation, Callable[[SceneObject], float]] = {
@@ -75,7 +75,7 @@ def test_mirroring_the_table_swaps_left_and_right_and_nothing_else(scene: list[S
         assert [o.index for o in before] == [o.index for o in after]
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("measure", "relation", "further"),
     [
         ("y", Relation.LEFT, 1),
@@ -86,7 +86,7 @@ def test_mirroring_the_table_swaps_left_and_right_and_nothing_else(scene: list[S
         ("edge", Relation.SMALLEST, 0),
     ],
 )
-@pytest.mark.parametrize(("factor", "decided"), [(0.0, False), (0.99, False), (1.01, True)])
+@each_case(("factor", "decided"), [(0.0, False), (0.99, False), (1.01, True)])
 def test_a_difference_counts_from_the_margin_on(
     measure: str, relation: Relation, further: int, factor: float, decided: bool
 ) -> None:

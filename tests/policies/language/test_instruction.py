@@ -21,6 +21,7 @@ from bhd_lerobot.policies.language.instruction import (
 )
 from bhd_lerobot.policies.language.lexicon import CHINESE, ENGLISH, Relation
 from bhd_lerobot.policies.manipulation.skills import Plan, Planner, SceneObject, Skill
+from tests.cases import each_case
 
 COMMA, STOP, ASK, SHOUT = "\uff0c", "\u3002", "\uff1f", "\uff01"  # full width
 
@@ -71,7 +72,7 @@ def scenes(draw: Callable[..., Any], smallest: int = 1) -> list[SceneObject]:
 HOLD, GIVE = Skill.HOLD, Skill.HAND_OVER
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("instruction", "target", "last"),
     [
         ("pick up the red cup", RED_CUP, HOLD),
@@ -170,7 +171,7 @@ def test_what_cannot_be_told_apart_has_no_instruction() -> None:
     assert "No words known here tell them apart" in refusal("pick up the left cup", twins)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("arguments", "message"),
     [
         ((9,), r"target is 9; the scene has objects \[0, 1, 2, 3\]"),
@@ -186,7 +187,7 @@ def test_impossible_requests_for_instructions_are_refused(arguments: tuple[Any, 
 # --- names -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("colour", "kind"), list(itertools.product(COLOURS, KINDS)))
+@each_case(("colour", "kind"), list(itertools.product(COLOURS, KINDS)))
 def test_every_colour_and_kind_can_be_said_in_both_languages(colour: str, kind: str) -> None:
     one = thing(0, f"{colour} {kind}")
     what = Description(kind, colour)
@@ -205,7 +206,7 @@ def test_names_are_those_that_people_use() -> None:
 # --- what is refused -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("instruction", "message"),
     [
         ("not the red cup", "Negations are not known: 'not'"),
@@ -256,7 +257,7 @@ def test_what_could_be_misread_is_refused(instruction: Any, message: str) -> Non
     assert message in refusal(instruction)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("instruction", "unknown", "known"),
     [
         ("pick up the pink cup", "Unknown colour or property 'pink'", "red, green, blue, yellow"),
@@ -290,9 +291,7 @@ def test_nothing_fits() -> None:
     assert refusal("pick up the cup", []).endswith("On the table: (nothing).")
 
 
-@pytest.mark.parametrize(
-    ("instruction", "count"), [("pick up the blue box", 2), ("把盒子递给我", 3), ("take the thing", 4)]
-)
+@each_case(("instruction", "count"), [("pick up the blue box", 2), ("把盒子递给我", 3), ("take the thing", 4)])
 def test_an_ambiguous_instruction_is_answered_with_exact_ones(instruction: str, count: int) -> None:
     message = refusal(instruction)
     assert f"fits {count} objects: " in message

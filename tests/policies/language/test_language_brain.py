@@ -18,6 +18,7 @@ from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
+from tests.cases import each_case
 from tests.policies.arm_desk import BOX, CUP, Desk, scene
 
 BLUE_CUP = TableObject("cup", "blue", 0.03, 0.03, 0.10, 0.6, -0.2)
@@ -47,7 +48,7 @@ def carry_out(one: Desk, sim: int = 0) -> list[str]:
     return one.steps(sim)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("instruction", "meant"),
     [
         ("pick up the blue box", BOX),
@@ -79,7 +80,7 @@ def test_it_does_not_look_at_which_object_the_task_marks() -> None:
     assert goals[0] == goals[1] == goals[2] == goals[3]
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("instruction", "why"),
     [
         ("pick up the cup", "fits 2 objects"),
@@ -160,7 +161,7 @@ def test_what_is_to_be_put_down_is_put_down_where_it_stood_and_let_go(skills: tu
     assert one.brain.subtasks()[0] == "done"
 
 
-@pytest.mark.parametrize("skills", [(Skill.HOLD,), (Skill.HOLD, Skill.HAND_OVER), (Skill.HAND_OVER,)])
+@each_case("skills", [(Skill.HOLD,), (Skill.HOLD, Skill.HAND_OVER), (Skill.HAND_OVER,)])
 def test_every_plan_that_can_be_built_is_carried_out_to_its_end(skills: tuple[Skill, ...]) -> None:
     one = desk("anything", planner=planned(*GRASP, *skills))
     one.look()

@@ -10,6 +10,7 @@ import pytest
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE, PolicyContract, find_checkpoint
+from tests.cases import each_case
 
 CONTRACT = PolicyContract(
     robot_type="turtlebot3",
@@ -107,7 +108,7 @@ def test_a_stock_checkpoint_without_its_dataset_is_not_known(tmp_path: Path, tex
     assert not PolicyContract.load(folder).is_known
 
 
-@pytest.mark.parametrize(
+@each_case(
     "text",
     ["", "[]", '{"fps": 10', '{"format": 9}', '{"fps": "ten"}', '{"action_names": "x.vel"}', '{"cameras": {"a": [1]}}'],
 )
@@ -125,7 +126,7 @@ def test_what_fits_is_accepted() -> None:
     PolicyContract().check(("a",), ("b",), 3, ("c",), "ur5", cameras={})
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("here", "parts"),
     [
         ({"robot_type": "ur5"}, ("'turtlebot3'", "'ur5'", "--robot.type=turtlebot3")),

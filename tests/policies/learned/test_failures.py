@@ -101,7 +101,7 @@ def test_a_device_that_is_not_there(folder: Path, device: str) -> None:
     assert "--brain.device=cpu" in message
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "message"),
     [
         ({"n_action_steps": 7}, "brain.n_action_steps is 7; this 'bhd_mlp' predicts chunks of 6"),

@@ -12,6 +12,7 @@ from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.policies.manipulation.grasp import SeenObject, neutral_yaw, plan_grasp, pointing_down, read_objects
+from tests.cases import each_case
 
 angles = st.floats(-math.pi, math.pi)
 
@@ -43,7 +44,7 @@ def test_the_fingers_take_the_side_that_fits(yaw: float, wide: float, narrow: fl
         assert narrow < grasp.opening <= MAX_OPENING
 
 
-@pytest.mark.parametrize("one", [box(0.09, 0.079), cup(0.079), box(0.3, 0.3)])
+@each_case("one", [box(0.09, 0.079), cup(0.079), box(0.3, 0.3)])
 def test_what_fits_on_no_side_has_no_grasp(one: SeenObject) -> None:
     assert plan_grasp(one, [], MAX_OPENING) is None
 
@@ -167,8 +168,8 @@ def test_the_yaw_is_the_quaternion_s_whatever_its_sign(yaw: float) -> None:
         assert math.cos(read_objects(table)[0].yaw - yaw) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("name", OBJECT_FIELDS)
-@pytest.mark.parametrize("value", [math.nan, math.inf])
+@each_case("name", OBJECT_FIELDS)
+@each_case("value", [math.nan, math.inf])
 def test_what_is_not_a_number_was_not_seen(name: str, value: float) -> None:
     assert [one.index for one in read_objects(np.array([row(**{name: value}), row()]))] == [1]
 

@@ -19,6 +19,7 @@ from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
+from tests.cases import each_case
 from tests.policies.arm_desk import BOX, CUP, OBSERVED, Desk, scene
 
 GRASPED = 0.06  # [m] the opening when the cup is between the fingers
@@ -175,7 +176,7 @@ def test_what_slipped_out_on_the_way_up_is_tried_again() -> None:
     assert desk.brain.plan(0)["problem"] == "the object was not lifted"
 
 
-@pytest.mark.parametrize("when", ["above", "down", "close", "lift"])
+@each_case("when", ["above", "down", "close", "lift"])
 def test_a_failed_goal_is_tried_again(when: str) -> None:
     desk = Desk(PickBrain(), [scene(CUP)])
     desk.look()
@@ -189,7 +190,7 @@ def test_a_failed_goal_is_tried_again(when: str) -> None:
     assert desk.steps()[-1] == "above"
 
 
-@pytest.mark.parametrize("attempts", [1, 2, 5])
+@each_case("attempts", [1, 2, 5])
 def test_when_every_goal_fails_it_gives_up_in_the_end(attempts: int) -> None:
     desk = Desk(PickBrain(PickBrainConfig(attempts=attempts)), [scene(CUP)])
     desk.look()
@@ -202,7 +203,7 @@ def test_when_every_goal_fails_it_gives_up_in_the_end(attempts: int) -> None:
     assert len(desk.steps()) <= 2 * attempts
 
 
-@pytest.mark.parametrize("what", ["absent", "unmarked", "nan"])
+@each_case("what", ["absent", "unmarked", "nan"])
 def test_without_a_target_it_does_nothing_and_says_why(what: str) -> None:
     desk = Desk(PickBrain(), [scene(CUP, BOX), scene(CUP)])
     if what == "nan":
@@ -271,7 +272,7 @@ def test_a_new_episode_starts_from_nothing() -> None:
     assert desk.steps(1) == ["above"]
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("name", "value"),
     [("max_velocity", 0.0), ("line_velocity", -1.0), ("lift_m", math.nan), ("max_acceleration", math.inf)],
 )

@@ -17,6 +17,7 @@ from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.reach import ENVIRONMENT, ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
+from tests.cases import each_case
 
 TARGET = np.array([0.5, 0.1, 0.3, 0.0, 0.6, 0.8, 0.0])
 
@@ -112,7 +113,7 @@ def test_a_second_attempt_may_succeed() -> None:
     assert desk.brain.subtasks()[0] == "hold"
 
 
-@pytest.mark.parametrize("target", [[np.nan] * 7, [0] * 7, [0.5, np.nan, 0.3, 0, 1, 0, 0], [np.inf, 0, 0, 0, 1, 0, 0]])
+@each_case("target", [[np.nan] * 7, [0] * 7, [0.5, np.nan, 0.3, 0, 1, 0, 0], [np.inf, 0, 0, 0, 1, 0, 0]])
 def test_what_is_no_pose_is_not_reached_for(target: list[float]) -> None:
     desk = Desk(2)
     desk.targets[0] = target
@@ -145,7 +146,7 @@ def test_a_new_episode_starts_from_nothing() -> None:
     assert desk.brain.subtasks()[0] == "hold"
 
 
-@pytest.mark.parametrize(
+@each_case(
     "change",
     [{"max_velocity": 0.0}, {"max_acceleration": float("nan")}, {"max_velocity": float("inf")}, {"attempts": 0}],
 )

@@ -23,6 +23,7 @@ from bhd_lerobot.policies.manipulation.skills import (
     make_plan,
     prompt,
 )
+from tests.cases import each_case
 
 CUP = SceneObject(3, "cup", "red", (0.5, 0.2, 0.05), (0.07, 0.07, 0.1))
 BOX = SceneObject(7, "box", "blue", (0.4, -0.2, 0.03), (0.06, 0.05, 0.06))
@@ -43,7 +44,7 @@ def planned(text: Any, instruction: str = "hand me the red cup") -> Plan:
 # --- plans -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("end", [(Skill.HOLD,), (Skill.PLACE,), (Skill.HAND_OVER,), (Skill.HOLD, Skill.PLACE)])
+@each_case("end", [(Skill.HOLD,), (Skill.PLACE,), (Skill.HAND_OVER,), (Skill.HOLD, Skill.PLACE)])
 def test_a_plan_in_order_can_be_built(end: tuple[Skill, ...]) -> None:
     plan = make_plan("x", CUP, [*LIFT, *end])
     assert [step.skill for step in plan.steps] == [*LIFT, *end]
@@ -66,7 +67,7 @@ def test_nothing_is_lifted_before_it_is_grasped_or_left_in_the_middle(skills: li
         assert not {Skill.PLACE, Skill.HAND_OVER} & set(skills[:-1])
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("skills", "message"),
     [
         ((), "no steps"),
@@ -109,7 +110,7 @@ def test_an_object_on_the_table_is_told_by_its_centre_and_its_edges() -> None:
     assert told.size == (0.06, 0.04, 0.05)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("change", "message"),
     [
         ({"kind": "spoon"}, "Unknown kind of object 'spoon'"),
@@ -129,12 +130,12 @@ def test_impossible_objects_are_refused(change: dict[str, Any], message: str) ->
 # --- a language model ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("text", [answer(), answer(obj=None), f"```json\n{answer()}\n```", f"\n```\n{answer()}\n```\n"])
+@each_case("text", [answer(), answer(obj=None), f"```json\n{answer()}\n```", f"\n```\n{answer()}\n```\n"])
 def test_a_good_answer_becomes_a_plan(text: str) -> None:
     assert planned(text) == make_plan("hand me the red cup", CUP, GOOD)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("text", "message"),
     [
         ("Sure! I will hand you the cup.", "is not JSON .*Sure!"),

@@ -19,6 +19,7 @@ from bhd_lerobot.policies.mlp.configuration_mlp import ACTIVATIONS, MlpConfig, S
 from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder
 from bhd_lerobot.policies.mlp.yaw_mlp import harmonics, yaw
+from tests.cases import each_case
 
 NAMES = ["x.vel", *(f"scan_{i:03}.pos" for i in range(8)), "theta.vel"]
 
@@ -81,8 +82,8 @@ def test_beams_are_transformed_and_the_rest_is_not() -> None:
         assert policy.feature_size == seen.shape[1] == 26
 
 
-@pytest.mark.parametrize("steps", [1, 3])
-@pytest.mark.parametrize("scan", [ScanConfig(), ScanConfig(transform="inverse"), ScanConfig(channels=[4])])
+@each_case("steps", [1, 3])
+@each_case("scan", [ScanConfig(), ScanConfig(transform="inverse"), ScanConfig(channels=[4])])
 def test_what_is_ignored_changes_nothing_and_everything_else_does(steps: int, scan: ScanConfig) -> None:
     made = config(ignore=["*.vel"], n_obs_steps=steps, scan=scan)
     policy = MlpPolicy(made).eval()
@@ -415,7 +416,7 @@ def test_it_is_saved_and_loaded_as_a_lerobot_policy(tmp_path: Path) -> None:
 # --- refused ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "message"),
     [
         ({"n_obs_steps": 0}, "policy.n_obs_steps is 0"),

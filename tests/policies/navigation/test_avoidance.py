@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain, AvoidanceConfig
+from tests.cases import each_case
 
 ACTIONS = ("x.vel", "theta.vel")
 NAMES = tuple(f"scan_{beam:03d}.pos" for beam in range(360))
@@ -35,18 +36,18 @@ def test_defaults_are_those_of_the_articles() -> None:
     assert (config.forward_speed, config.turn_speed) == (0.2, 0.5)
 
 
-@pytest.mark.parametrize("degrees", range(-180, 180, 5))
+@each_case("degrees", range(-180, 180, 5))
 def test_only_the_front_sector_counts(degrees: int) -> None:
     expected = LEFT if abs(degrees) <= 30 else AHEAD
     assert tuple(decide(one_reading(degrees, 0.3))[0]) == expected
 
 
-@pytest.mark.parametrize(("degrees", "expected"), [(-31, AHEAD), (-30, LEFT), (30, LEFT), (31, AHEAD)])
+@each_case(("degrees", "expected"), [(-31, AHEAD), (-30, LEFT), (30, LEFT), (31, AHEAD)])
 def test_the_edges_belong_to_the_sector(degrees: int, expected: tuple[float, float]) -> None:
     assert tuple(decide(one_reading(degrees, 0.49))[0]) == expected
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("distance", "expected"),
     [
         (np.nextafter(0.5, 0), LEFT),
@@ -68,7 +69,7 @@ def test_exactly_the_safe_distance_is_free_and_invalid_readings_are_not_there(
     assert tuple(decide(one_reading(0, distance))[0]) == expected
 
 
-@pytest.mark.parametrize("blind", [np.nan, np.inf, -np.inf, 0.0, 0.11, 3.6])
+@each_case("blind", [np.nan, np.inf, -np.inf, 0.0, 0.11, 3.6])
 def test_without_a_valid_reading_in_front_it_stops(blind: float) -> None:
     scan = np.full(360, blind)
     assert tuple(decide(scan)[0]) == STOP
@@ -78,7 +79,7 @@ def test_without_a_valid_reading_in_front_it_stops(blind: float) -> None:
     assert tuple(decide(scan)[0]) == AHEAD
 
 
-@pytest.mark.parametrize("beams", [1, 4, 12, 36, 90, 360])
+@each_case("beams", [1, 4, 12, 36, 90, 360])
 def test_any_number_of_beams(beams: int) -> None:
     scan = np.full(beams, 3.5)
     assert tuple(decide(scan)[0]) == AHEAD
@@ -114,7 +115,7 @@ def test_parameters_are_used() -> None:
     assert tuple(decide(one_reading(91, 0.9), config)[0]) == (0.1, 0.0)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("name", "value"),
     [("front_sector_deg", 0.0), ("front_sector_deg", 181.0), ("turn_speed", np.nan), ("safe_distance_m", np.inf)],
 )

@@ -17,6 +17,7 @@ from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import Outcome, episode_seed
+from tests.cases import each_case
 
 ACTIONS = ("x.vel", "theta.vel")
 BEAMS = (36, 40, 45, 60, 72, 90, 120, 180, 360)
@@ -63,12 +64,12 @@ def random_scans(n: int, beams: int = 360, seed: int = 0) -> np.ndarray:
 # --- decisions -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("beams", BEAMS)
+@each_case("beams", BEAMS)
 def test_it_drives_straight_in_the_open(beams: int) -> None:
     assert tuple(decide(np.full(beams, 3.5))[0]) == (0.22, 0.0)
 
 
-@pytest.mark.parametrize("beams", BEAMS)
+@each_case("beams", BEAMS)
 def test_it_turns_to_the_free_side(beams: int) -> None:
     open_left = inside_box(beams, front=0.4, back=3.0, left=3.0, right=0.3)
     open_right = inside_box(beams, front=0.4, back=3.0, left=0.3, right=3.0)
@@ -88,8 +89,8 @@ def test_it_never_asks_for_more_than_the_robot_can() -> None:
         assert (np.abs(action[:, 0]) + np.abs(action[:, 1]) * WHEEL_SEPARATION / 2 <= rim + 1e-9).all()
 
 
-@pytest.mark.parametrize("beams", [36, 360])
-@pytest.mark.parametrize("distance", [0.12, 0.2])
+@each_case("beams", [36, 360])
+@each_case("distance", [0.12, 0.2])
 def test_it_does_not_drive_into_a_wall(beams: int, distance: float) -> None:
     assert decide(inside_box(beams, front=distance, back=3.0, left=1.0, right=1.0))[0, 0] <= 0
     assert decide(inside_box(beams, front=distance, back=distance, left=distance, right=distance))[0, 0] <= 0
@@ -101,7 +102,7 @@ def test_wedged_in_a_slot_it_backs_off() -> None:
     assert turn == 0
 
 
-@pytest.mark.parametrize("blind", [np.nan, np.inf, -np.inf, 0.0, 0.11, 3.6])
+@each_case("blind", [np.nan, np.inf, -np.inf, 0.0, 0.11, 3.6])
 def test_blind_it_stops_and_sees_again(blind: float) -> None:
     brain = bound(90, 2)
     scan = np.full((2, 90), 3.5)
@@ -111,7 +112,7 @@ def test_blind_it_stops_and_sees_again(blind: float) -> None:
     assert see(brain, scan).tolist() == [[0.22, 0]] * 2
 
 
-@pytest.mark.parametrize("beams", [36, 90, 360])
+@each_case("beams", [36, 90, 360])
 def test_one_lost_beam_does_not_matter_a_lost_quarter_does(beams: int) -> None:
     scan = np.full((2, beams), 3.5)
     scan[0, beams // 4] = np.nan
@@ -172,7 +173,7 @@ def test_an_unexpected_number_of_robots_is_refused() -> None:
 # --- configuration ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("beams", [1, 12, 30])
+@each_case("beams", [1, 12, 30])
 def test_too_few_beams_are_refused(beams: int) -> None:
     with pytest.raises(ConfigError, match=f"needs at least 36 beams; this robot has {beams}"):
         bound(beams, 1)
@@ -183,7 +184,7 @@ def test_the_measured_twist_is_needed() -> None:
         GapFollowerBrain().bind(("x.vel", *names_of(90)[2:]), ACTIONS, 10)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("name", "value"),
     [
         ("forward_speed", 0),

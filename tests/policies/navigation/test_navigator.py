@@ -19,6 +19,7 @@ from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, episode_seed
+from tests.cases import each_case
 
 ACTIONS = ("x.vel", "theta.vel")
 OPEN = np.full(360, 3.5)
@@ -61,15 +62,15 @@ def run(scenes: list[Arena] | list[int], n: int = 8) -> list[Episode]:
 # --- decisions -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("beams", [36, 90, 360])
+@each_case("beams", [36, 90, 360])
 def test_it_drives_to_a_goal_ahead(beams: int) -> None:
     forward, turn = see(bound(beams=beams), goal_at(3.0, 0.0), np.full(beams, 3.5))[0]
     assert forward > 0.19
     assert abs(turn) < 0.4  # at most to the heading beside it: the map's cells do not tell the two apart
 
 
-@pytest.mark.parametrize("side", [-1, 1])
-@pytest.mark.parametrize("distance", [0.5, 2.0])
+@each_case("side", [-1, 1])
+@each_case("distance", [0.5, 2.0])
 def test_it_turns_to_a_goal_beside_it(side: int, distance: float) -> None:
     assert side * see(bound(), goal_at(0.0, side * distance))[0, 1] > 0.5
 
@@ -117,8 +118,8 @@ def test_it_does_not_drive_into_a_wall_before_the_goal(distance: float) -> None:
     assert see(bound(), goal_at(2.0, 0.0), scan)[0, 0] <= 0
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-@pytest.mark.parametrize("column", range(4))
+@each_case("bad", [math.nan, math.inf])
+@each_case("column", range(4))
 def test_without_a_goal_it_stands_and_goes_on_with_one(bad: float, column: int) -> None:
     brain, goal = bound(2), np.vstack([goal_at(2.0, 0.0)] * 2)
     lost = goal.copy()
@@ -130,7 +131,7 @@ def test_without_a_goal_it_stands_and_goes_on_with_one(bad: float, column: int) 
     assert (see(brain, goal, scan)[:, 0] > 0.19).all()
 
 
-@pytest.mark.parametrize("blind", [np.nan, np.inf, 0.0, 3.6])
+@each_case("blind", [np.nan, np.inf, 0.0, 3.6])
 def test_blind_it_stops_and_sees_again(blind: float) -> None:
     brain = bound()
     assert see(brain, goal_at(2.0, 0.0), np.full(360, blind)).tolist() == [[0.0, 0.0]]
@@ -224,7 +225,7 @@ def test_another_number_of_robots_than_it_was_reset_for_is_refused() -> None:
         see(bound(), np.vstack([goal_at(1, 0)] * 2), np.vstack([OPEN] * 2))
 
 
-@pytest.mark.parametrize(
+@each_case(
     "change",
     [
         {"forward_speed": 0.0},

@@ -9,6 +9,7 @@ from PIL import Image
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.messages.images import COMPRESSED, IMAGE, decode_image, encode_image
 from bhd_lerobot.rosbag.messages.parts import Frames
+from tests.cases import each_case
 from tests.rosbag.support import STORE, T, header
 
 rng = np.random.default_rng(0)
@@ -39,7 +40,7 @@ def file(image, kind, mode=None):
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("encoding", "pixels", "seen"),
     [
         ("rgb8", PREVIEW, PREVIEW),
@@ -49,7 +50,7 @@ def file(image, kind, mode=None):
         ("mono8", GREY[:, :, :1], GREY),
     ],
 )
-@pytest.mark.parametrize("padding", [0, 16])
+@each_case("padding", [0, 16])
 def test_raw_images(encoding, pixels, seen, padding):
     message = raw(encoding, np.ascontiguousarray(pixels), padding=padding)
     assert np.array_equal(decode_image("/c", IMAGE, message), seen)
@@ -67,7 +68,7 @@ def test_compressed_images(kind, mode, seen, within):
         assert np.abs(found.astype(int) - seen).mean() <= within
 
 
-@pytest.mark.parametrize("encoding", ["16UC1", "mono16", "32FC1", "bayer_rggb8", "yuv422_yuy2", ""])
+@each_case("encoding", ["16UC1", "mono16", "32FC1", "bayer_rggb8", "yuv422_yuy2", ""])
 def test_raw_images_of_another_encoding_are_refused_with_the_valid_ones(encoding):
     with pytest.raises(DatasetError, match=r"/c have the encoding .* valid: rgb8, bgr8"):
         decode_image("/c", IMAGE, raw(encoding, np.zeros((4, 6, 2), np.uint8)))

@@ -140,7 +140,7 @@ PROFILE = {
 NAMED = {**PROFILE, "history": "keep_last", "reliability": "reliable", "durability": "volatile"}
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("profiles", "count"),
     [
         (yaml.safe_dump([PROFILE]), 1),  # versions 4 to 8: a text
