@@ -13,7 +13,6 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
-from tests.cases import each_case
 from tests.datasets import support
 from tests.datasets.edit_support import assert_valid, content, record
 

@@ -20,7 +20,6 @@ from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Finding, Severity, check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetError
-from tests.cases import each_case
 from tests.datasets.loader import support as loader_support
 
 FPS, EPISODES, CAMERA = 10, 6, "observation.images.front"

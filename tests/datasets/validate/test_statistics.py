@@ -14,7 +14,6 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.validate.findings import Severity
 from bhd_lerobot.datasets.validate.statistics import Moments, wrong_statistic
-from tests.cases import each_case
 
 NAMES = ["wrist_2.pos", "offset.pos", "swing.pos", "zero.pos", "steady.pos"]
 FEATURES = {"observation.state": {"dtype": "float32", "shape": (5,), "names": NAMES}}

@@ -19,6 +19,7 @@ from bhd_lerobot.policies.learned.contract import CONTRACT_FILE, PolicyContract
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import action_names_of, brains_for, make_brain, robot_of_brain
 from bhd_lerobot.rollout.configuration import parse
+from tests.cases import each_case
 from tests.policies.learned import rig
 
 

@@ -5,7 +5,6 @@ import pytest
 
 from bhd_lerobot.rosbag.importer.diagnostics import pace, pace_warnings, speed_warnings
 from bhd_lerobot.rosbag.importer.resample import NANO
-from tests.cases import each_case
 
 RECEIVED = np.arange(300) * NANO // 5  # a minute at 5 Hz
 

@@ -11,7 +11,6 @@ from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.importer.resample import NANO, apart, clock_jumps, grids, message_times, newest
 from bhd_lerobot.rosbag.importer.scan import Sweep, clean_ranges, nearest_beams, resampled_scans
-from tests.cases import each_case
 
 MS = 10**6
 START = 1_700_000_000 * NANO

@@ -9,6 +9,7 @@ import yaml
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.rosbag.storage.find import find_bags, publishers_of
 from bhd_lerobot.rosbag.storage.read import publishers_in
+from tests.cases import each_case
 from tests.rosbag.support import STORE, drive, write
 
 TOPICS = ("/cmd_vel", "/odom", "/scan")
