@@ -39,7 +39,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "tasks": _TASKS,
     "robots.host": ("bodies.body", "sim", "control.*", "realtime"),
     "robots": ("tasks", "bodies", "sim", "control.*", "robots.host"),
-    "envs": ("tasks", "bodies", "sim", "robots.*"),
+    "envs": ("tasks", "bodies", "sim", "robots.*", "rollout.configuration"),
     "policies": _TASKS,
     "policies.mlp": ("control.geometry",),
     "policies.learned": ("__version__", "policies", "policies.mlp"),

@@ -64,7 +64,7 @@ def test_every_number_of_an_episode_is_sent_once(name, request) -> None:
     assert {number for key, number in drawn if key == "action"} == set(range(arrays["action"].shape[1]))
 
 
-def test_a_base_is_where_the_simulator_says(base) -> None:
+def test_a_base_is_where_the_simulator_had_it(base) -> None:
     header, arrays = unpack(ViewedDataset(base).packed(0))
     physics = read_episode(base, 0)["simulation.state"]
     np.testing.assert_allclose(arrays["view.base"][:, :2], physics[:, :2], atol=1e-6)
@@ -118,7 +118,7 @@ def test_names_and_units() -> None:
     assert unit_of("elbow.pos", "so101") == ""  # degrees, or a share of its range: it does not say
 
 
-def test_the_language_column_tells_subtasks_where_no_other_does(tmp_path) -> None:
+def test_subtasks_come_from_the_language_column_where_no_other_has_them(tmp_path) -> None:
     root = record_ours(tmp_path / "d", 1, language=True)
     dataset = ViewedDataset(root)
     header, _ = unpack(dataset.packed(0))
