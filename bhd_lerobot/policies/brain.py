@@ -202,7 +202,7 @@ class Intervening(Protocol):
         """Return which robots are driven by the one who takes over, shape (n,)."""
 
     def causes(self) -> Sequence[str]:
-        """Return why, in words, of each simulation; empty where nobody took over in this episode."""
+        """Return why, in words, of each simulation; empty without a takeover in this episode."""
 
 
 def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: str) -> NDArray[np.intp]:

@@ -18,7 +18,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
 
 Arrays = dict[str, NDArray]
-_AWAY_M = 10.0  # an object this high floats where nobody sees it: it is not there
+_AWAY_M = 10.0  # an object this high is absent: it floats out of sight
 _ARM_STATE = 6 + 2 + 7 * MAX_OBJECTS  # numbers of a UR5's position state
 _BASE_STATE = 9  # numbers of a TurtleBot3's
 
