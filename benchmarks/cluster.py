@@ -123,8 +123,8 @@ def main() -> int:
         "met": gain["median"] >= GOAL,
     }
     write(options.json, results)
-    for name, said in (("alone", "in one process"), ("one", "one worker"), ("two", "two workers")):
-        print(f"{said}: {statistics.median(speeds[name]):.1f} episodes/s of {options.episode_s:g} s")
+    for name, label in (("alone", "in one process"), ("one", "one worker"), ("two", "two workers")):
+        print(f"{label}: {statistics.median(speeds[name]):.1f} episodes/s of {options.episode_s:g} s")
     print(
         f"two workers against one: {shown(gain)}, goal {GOAL}; one worker against one process, ms an episode: "
         f"{shown(overhead_ms, '+.1f')}; start {start_s:.1f} s"

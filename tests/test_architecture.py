@@ -42,7 +42,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "robots.host": ("bodies.body", "sim", "control.*", "realtime"),
     "robots": ("tasks", "bodies", "sim", "control.*", "robots.host"),
     "registry": ("tasks", "robots.*", "policies.*"),
-    "envs": ("registry", "tasks", "bodies", "sim", "robots.*"),
+    "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "rollout.configuration"),
     "policies": _TASKS,
     "policies.mlp": ("control.geometry",),
     "policies.learned": ("__version__", "datasets.storage", "policies", "policies.mlp"),

@@ -19,7 +19,7 @@ from benchmarks.results.speed import navigate, speed
 MEASURES = (
     ("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),
     ("reach", "Reach: a UR5 brings its tool to a pose", reach),
-    ("pick", "Pick, from state: a UR5 picks up what it is told to", pick),
+    ("pick", "Pick, from state: a UR5 picks up what an instruction names", pick),
     ("fine_tune", "Fine-tune: 10 episodes of a shifted world", fine_tune),
     ("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),
     ("speed", "Speed", speed),

@@ -11,7 +11,7 @@ from benchmarks.results.section import Row, Section, rate
 GOAL = 0.5
 SHOWN = 10  # episodes of the shifted world that are learned from
 _RESAMPLES, _SEED = 10_000, 0
-# The camera that tells where the target is is not where it is taken to be: 18 mm off, the same way in every episode.
+# The camera that locates the target is not where it is taken to be: 18 mm off, the same way in every episode.
 # Nothing else differs.
 _ERROR = "camera_error_m=[0.012,-0.009,0.01]"
 SHIFT = (
@@ -25,7 +25,7 @@ _SHIFTED = "camera 18 mm off"
 def fine_tune(run: Runner, section: Section) -> None:
     """Adapt the policy of the reach section, which is made if it was not yet, to a camera that is off.
 
-    The policy is told where the target is by that camera. The rule that shows the episodes knows by how much it is off.
+    The policy gets the target from that camera. The rule that shows the episodes knows by how much it is off.
     """
     reach(run, Section("reach", ""))
     record(

@@ -32,9 +32,9 @@ def avoid(run: Runner, section: Section) -> None:
     )
     ppo_seconds = train(run, "avoid_ppo", "ppo_turtlebot3", "avoid/ppo", options=start)
     results = evaluate(run, "avoid_eval", "turtlebot3_avoid", {"bc": "avoid/bc"}, rules=_ROAMING, baseline="avoidance")
-    # The task tells these two more; the episodes are the same.
+    # The task reports more to these two; the episodes are the same.
     brains = {"gap_bc": "avoid/gap_bc", "ppo": "avoid/ppo/checkpoints/best"}
-    told = evaluate(
+    with_trail = evaluate(
         run,
         "avoid_trail_eval",
         "turtlebot3_avoid",
@@ -43,11 +43,11 @@ def avoid(run: Runner, section: Section) -> None:
         baseline="gap_follower",
         options=_TRAIL,
     )
-    if _scores(told, "gap_follower") != _scores(results, "gap_follower"):
-        raise FailedError("A rule that does not look at the trail did something else where the task tells it.")
+    if _scores(with_trail, "gap_follower") != _scores(results, "gap_follower"):
+        raise FailedError("A rule that does not use the trail did something else where the task reports it.")
     for name in brains:
-        results["brains"][name] = told["brains"][name]
-    results["episodes"] += [one for one in told["episodes"] if one["brain"] in brains]
+        results["brains"][name] = with_trail["brains"][name]
+    results["episodes"] += [one for one in with_trail["episodes"] if one["brain"] in brains]
     for name in (*_ROAMING, "bc", *brains):
         section.rows.append(_success_row(results, name))
         section.rows.append(Row(f"{name}: mean score", mean(results["brains"][name]["means"]["score"])))
@@ -81,8 +81,8 @@ def avoid(run: Runner, section: Section) -> None:
     section.rows.append(Row("ppo / avoidance, the rule of the articles: mean score, paired", mean(asdict(over))))
     section.remarks.append(
         "`bc` imitates `avoidance`, `gap_bc` imitates `gap_follower`. That rule remembers where it has been; a network "
-        "does not, so the task tells `gap_bc` and `ppo`, which starts from it, what ground around them they have "
-        "visited (`task.trail`)."
+        "does not, so the task reports to `gap_bc` and `ppo`, which starts from it, what ground around them "
+        "they have visited (`task.trail`)."
     )
 
 

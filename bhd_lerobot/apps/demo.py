@@ -1,7 +1,6 @@
-"""`make demo`: record, replay, train and evaluate two robots in a few minutes, and say where everything is.
+"""`make demo`: record, replay, train and evaluate two robots in a few minutes, and print where the results are.
 
-How well the networks do is measured, not known beforehand: a minute is too short for a good policy, and the demo says
-how far it got.
+A minute of training is too short for a good policy; the demo measures how good it is.
 """
 
 import logging
@@ -13,17 +12,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from bhd_lerobot.command_line import Parser, exit_status
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.evaluation.results import EvalResults
-from bhd_lerobot.evaluation.text import number, percent, verdict
+from bhd_lerobot.evaluation.text import sentences
 from bhd_lerobot.recording import record
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout import replay
@@ -47,7 +43,7 @@ _SHOWN = (
 
 @dataclass(frozen=True)
 class Lesson:
-    """Episodes that a brain drives, and a network that learns from them and is compared with it.
+    """Episodes that a brain drives, and a network that learns from them and is evaluated beside it.
 
     Attributes:
         name: of its folder, and of its dataset: `bhd/demo_NAME`.
@@ -83,8 +79,8 @@ class Lesson:
     score: str = ""
     recipe: str = ""
 
-    def recorded(self, folder: Path) -> list[str]:
-        """Return the command line of `bhd-record`; the dataset is in `folder`/dataset."""
+    def record_options(self, folder: Path) -> list[str]:
+        """Return the options of `bhd-record`; the dataset is in `folder`/dataset."""
         return [
             *self.world,
             f"--brain.type={self.brain}",
@@ -98,8 +94,8 @@ class Lesson:
             *self.options,
         ]
 
-    def trained(self, folder: Path) -> list[str]:
-        """Return the command line of `bhd-train`."""
+    def train_options(self, folder: Path) -> list[str]:
+        """Return the options of `bhd-train`."""
         return [
             f"--dataset.repo_id=bhd/demo_{self.name}",
             f"--dataset.root={folder / 'dataset'}",
@@ -118,13 +114,13 @@ class Lesson:
             "--threads=1",  # a second one gains little with so small a network, and loses on a busy machine
         ]
 
-    def evaluated(self, folder: Path, checkpoint: Path, videos: int | None) -> list[str]:
-        """Return the command line of `bhd-eval`.
+    def eval_options(self, folder: Path, checkpoint: Path, videos: int | None) -> list[str]:
+        """Return the options of `bhd-eval`.
 
         Args:
             folder: gets the folder `eval`.
             checkpoint: what was learned.
-            videos: videos of each brain; None leaves the choice to `bhd-eval`, which says why there are none.
+            videos: videos of each brain; None leaves the choice to `bhd-eval`, which prints why there are none.
         """
         options = [
             *self.world,
@@ -146,7 +142,7 @@ class Lesson:
 
 PICK = Lesson(
     name="ur5_pick",
-    what="a UR5 picks up what it is told to",
+    what="a UR5 picks up what an instruction names",
     world=("--robot.type=ur5", "--task.type=pick", "--task.language=any"),
     brain="language",
     episodes=6,
@@ -232,82 +228,74 @@ class Demo:
             BhdError: a step failed. What was finished before is intact.
         """
         self._head("1. Record: rules drive simulated robots, and every frame goes into a LeRobotDataset")
-        for one in LESSONS:
-            self._record(one)
-        self._head("2. Look: a recorded episode of each robot again, and a dataset as LeRobot reads it")
-        for one in (LESSONS[0], LESSONS[-1]):
-            self._replay(one)
+        for lesson in LESSONS:
+            self._record(lesson)
+        self._head("2. Replay: a recorded episode of each robot again, and a dataset as LeRobot reads it")
+        for lesson in (LESSONS[0], LESSONS[-1]):
+            self._replay(lesson)
         self._read(LESSONS[-1])
         self._head("3. Train: a small network imitates each rule, from the dataset alone")
-        trained = [(one, self._train(one)) for one in LESSONS if one.policy]
+        trained = [(lesson, self._train(lesson)) for lesson in LESSONS if lesson.policy]
         self._head("4. Evaluate: the network beside the rule, in scenes that it was not trained on")
-        return [self._evaluate(one, checkpoint) for one, checkpoint in trained]
+        return [self._evaluate(lesson, checkpoint) for lesson, checkpoint in trained]
 
     def files(self) -> list[Path]:
         """Return what there is to see."""
-        folders = [self.folder / one.name for one in LESSONS]
+        folders = [self.folder / lesson.name for lesson in LESSONS]
         return [path for folder in folders for name in _SHOWN for path in sorted(folder.glob(name))]
 
-    def _record(self, one: Lesson) -> None:
-        folder = self.folder / one.name
-        with self._step(one, f"records {one.episodes} episodes") as end:
-            result = record.record(parse(RecordConfig, one.recorded(folder)), self._log)
+    def _record(self, lesson: Lesson) -> None:
+        folder = self.folder / lesson.name
+        with self._step(lesson, f"records {lesson.episodes} episodes") as lines:
+            result = record.record(parse(RecordConfig, lesson.record_options(folder)), self._log)
             counts = f"{result.recorded} episodes, {result.frames:,} frames, {result.successes} successes"
-            end["result"] = f"{one.what}; {counts}"
-        _check(result.exit_status)
-        if one.video and not (folder / "record/episode.mp4").exists():
-            self._print(f"no video: images cannot be rendered here; {self.folder / LOG} says why")
+            lines.append(f"{lesson.what}; {counts}")
+            _check(result.exit_status)
+            if lesson.video and not (folder / "record/episode.mp4").exists():
+                lines.append(f"no video: images cannot be rendered here; {self.folder / LOG} has the reason")
 
-    def _replay(self, one: Lesson) -> None:
-        folder = self.folder / one.name
+    def _replay(self, lesson: Lesson) -> None:
+        folder = self.folder / lesson.name
         options = [f"--dataset.root={folder / 'dataset'}", f"--output_dir={folder / 'replay'}"]
-        with self._step(one, "replays an episode") as end:
-            results = replay.replay(parse(replay.ReplayConfig, options), self._log)
-            names = {"open_loop": "the recorded commands again", "state": "the recorded states again"}
-            end["result"] = "; ".join(
-                f"{names[each.mode]}: "
-                + ("same bits" if each.identical else f"up to {1000 * each.position_m.max():.3g} mm away")
-                for each in results
-            )
+        with self._step(lesson, "replays an episode") as lines:
+            for result in replay.replay(parse(replay.ReplayConfig, options), self._log):
+                same = "same bits" if result.identical else f"up to {1000 * result.position_m.max():.3g} mm away"
+                lines.append(f"replay of the {result.mode.replace('_', ' ')}: {same}")
 
-    def _read(self, one: Lesson) -> None:
+    def _read(self, lesson: Lesson) -> None:
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        root = self.folder / one.name / "dataset"
-        dataset = LeRobotDataset(f"bhd/demo_{one.name}", root=root, video_backend="pyav")
+        root = self.folder / lesson.name / "dataset"
+        dataset = LeRobotDataset(f"bhd/demo_{lesson.name}", root=root, video_backend="pyav")
         frame = dataset[dataset.num_frames // 2]
         self._print(
-            f"LeRobotDataset({str(root)!r}): {dataset.num_episodes} episodes, {dataset.num_frames} frames; one of them:"
+            f"LeRobotDataset({str(root)!r}): {dataset.num_episodes} episodes, {dataset.num_frames} frames; one of them "
+            f"is of the task {frame['task']!r}, at {frame['subtask']!r}, with an action of {frame['action'].numel()} "
+            "numbers"
         )
-        for key in ("task", "subtask"):
-            self._print(f"  {key}: {frame[key]}")
-        for key in ("observation.state", "observation.environment_state", "action"):
-            self._print(f"  {key}: {frame[key].numel()} numbers")
 
-    def _train(self, one: Lesson) -> Path:
-        with self._step(one, f"trains for {one.steps:,} steps") as end:
-            result = train.train(parse_train(one.trained(self.folder / one.name)), self._log)
+    def _train(self, lesson: Lesson) -> Path:
+        folder = self.folder / lesson.name
+        with self._step(lesson, f"trains for {lesson.steps:,} steps") as lines:
+            result = train.train(parse_train(lesson.train_options(folder)), self._log)
             losses = [row["held_out_loss"] for row in result.rows if row.get("held_out_loss") is not None]
             shown = f"; loss on held-out episodes {losses[0]:.3g} at first, {losses[-1]:.3g} at the end"
-            end["result"] = f"{result.step:,} steps{shown if losses else ''}"
-        _check(result.exit_status)
-        self._print(f"  curve: {result.output_dir / 'loss.png'}")
+            lines.append(f"{result.step:,} steps{shown if losses else ''}; curve: {result.output_dir / 'loss.png'}")
+            _check(result.exit_status)
         assert result.checkpoint is not None
         return result.checkpoint
 
-    def _evaluate(self, one: Lesson, checkpoint: Path) -> Path:
-        # Two videos of each brain would take too long; where there can be none, the report is to say why.
+    def _evaluate(self, lesson: Lesson, checkpoint: Path) -> Path:
+        # Two videos of each brain would take too long; where there can be none, the report has the reason.
         pick = LESSONS[-1]
         can_render = (self.folder / pick.name / "record/episode.mp4").exists()
         videos = (1 if can_render else None) if pick.video else 0
-        options = one.evaluated(self.folder / one.name, checkpoint, videos)
-        with self._step(one, f"evaluates on {one.trials} episodes") as end:
+        options = lesson.eval_options(self.folder / lesson.name, checkpoint, videos)
+        with self._step(lesson, f"evaluates on {lesson.trials} episodes") as lines:
             result = evaluate.evaluate(parse(EvalConfig, options), self._log)
-            end["result"] = f"{one.what}; {one.trials} held-out episodes of each brain"
-        _check(result.exit_status)
-        self._console.print(_table(result.results, one))
-        self._print(f"learned, beside the rule: {verdict(result.results.paired['learned'])}.")
-        self._print(f"score: {one.score}. Training in full: {one.recipe}, docs/training.md")
+            _check(result.exit_status)
+            lines += [f"{lesson.what}, on {lesson.trials} held-out episodes", *sentences(result.results)]
+            lines.append(f"score: {lesson.score}. Training in full: {lesson.recipe}, docs/training.md")
         return result.report
 
     def _head(self, text: str) -> None:
@@ -318,26 +306,15 @@ class Demo:
         self._console.print(f"  {escape(text)}", soft_wrap=True, highlight=False)
 
     @contextmanager
-    def _step(self, one: Lesson, doing: str) -> Iterator[dict[str, str]]:
-        """Show that something is going on, then its result, and how long it took."""
-        end: dict[str, str] = {}
+    def _step(self, lesson: Lesson, doing: str) -> Iterator[list[str]]:
+        """Show that something is going on, then how long it took, and the lines that the step gave."""
+        lines: list[str] = []
         started = time.perf_counter()
-        with self._console.status(f"{one.name} {doing}"):
-            yield end
-        self._print(f"{one.name}: {end['result']} ({time.perf_counter() - started:.0f} s)")
-
-
-def _table(results: EvalResults, one: Lesson) -> Table:
-    whats = {"rule": one.brain, "learned": f"{one.steps:,} steps", "early": f"{one.early_steps:,} steps"}
-    table = Table(box=SIMPLE_HEAD)
-    for heading in ("brain", "", "success", "95 % interval", "score"):
-        table.add_column(heading, no_wrap=True)
-    for label, each in results.brains.items():
-        rate, _, interval = percent(each.success).partition(" (")
-        score = number(each.means["score"], 2).partition(" (")[0]
-        count = f"{each.successes} of {each.episodes}, {rate}"
-        table.add_row(label, whats.get(label, ""), count, interval.rstrip(")"), score)
-    return table
+        with self._console.status(f"{lesson.name} {doing}"):
+            yield lines
+        self._print(f"{lesson.name}: {lines[0]} ({time.perf_counter() - started:.0f} s)")
+        for line in lines[1:]:
+            self._print(f"  {line}")
 
 
 def _check(status: int) -> None:
@@ -349,18 +326,15 @@ def new_folder(path: Path) -> Path:
     """Make the folder that a demo goes to.
 
     Raises:
-        ConfigError: there is something in it, or it cannot be made.
+        ConfigError: it holds something, or cannot be made.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        there = sorted(one.name for one in path.iterdir())
+        held = sorted(entry.name for entry in path.iterdir())
     except OSError as error:
         raise ConfigError(f"The folder {path} cannot be used: {error.strerror}. Name another.") from error
-    if there:
-        raise ConfigError(
-            f"The folder {path} is not empty: it holds {', '.join(there[:3])}{', …' if there[3:] else ''}. Name "
-            "another; without a name the demo makes a new one."
-        )
+    if held:
+        raise ConfigError(f"The folder {path} is not empty: it holds {held[0]}. Name another or none.")
     return path
 
 

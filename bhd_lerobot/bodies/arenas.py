@@ -32,7 +32,7 @@ class Arena:
         shapes: all obstacles, outer walls included.
         extent: x_min, x_max, y_min, y_max of the inside [m].
         start: x [m], y [m], yaw [rad] of the robot, world frame.
-        goal: likewise, where a task tells the robot to go.
+        goal: likewise, where a task sends the robot.
     """
 
     name: str
@@ -241,7 +241,7 @@ def _stays_connected(before: NDArray[np.bool_], free: NDArray[np.bool_]) -> bool
     if not len(rows):
         return True
     # Where the places just around the lost ones are connected, every way through those has a way around them: most
-    # obstacles are small, and all of the floor need not be looked at.
+    # obstacles are small, and all of the floor need not be checked.
     around = tuple(slice(max(0, lines[0] - 1), lines[-1] + 2) for lines in (rows, columns))
     return bool(ndimage.label(free[around], _NEXT)[1] == 1 or ndimage.label(free, _NEXT)[1] == 1)
 

@@ -26,9 +26,8 @@ OBJECT_FIELDS = (
     *("present", "target", "box", "x", "y", "z", "qw", "qx", "qy", "qz"),
     *("length", "width", "height", "red", "green", "blue"),
 )
-"""What a task tells a brain about each place of an object, in order: whether there is one, whether it is the one that
-the task is about, whether it is a box; its pose in the base frame [m, unit quaternion]; its measures [m]; its colour, 0
-to 1."""
+"""What a task reports about each place of an object, in order: whether there is one, whether it is the target, whether
+it is a box; its pose in the base frame [m, unit quaternion]; its measures [m]; its colour, 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +89,8 @@ class Variation:
             [rad/s].
         latency_s: time by which what the cerebellum commands reaches the servos late, in whole control ticks [s].
         finger_friction: factor on the fingers' friction.
-        camera_error: what is added to every position that the task tells, x, y, z in the base frame [m]: in front of a
-            real arm these come from a camera, whose place may be known wrongly. Nothing else is where it is not, and
-            images stay as they are.
+        camera_error: added to every position that the task reports, x, y, z in the base frame [m]: in front of a real
+            arm these come from a camera, whose place may be known wrongly. Images stay as they are.
     """
 
     light: float = 1.0

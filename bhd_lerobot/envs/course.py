@@ -6,11 +6,11 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.tasks.task import SPLITS, Split, episode_seed
 
 STREAM = 2**32
-"""How many episodes further an environment goes each time, unless told otherwise.
+"""How many episodes further an environment goes each time by default.
 
-Clients seed environment i of n with seed + i, and only once. What follows must lead into nobody else's episodes, so the
-numbers of an environment with seed k are k, k + 2**32, k + 2 * 2**32, …: two seeds below 2**32, to which
-Stable-Baselines3 and NumPy's own seeds are limited, never meet.
+Clients seed environment i of n with seed + i, and only once. What follows must not be an episode of another
+environment, so the numbers of an environment with seed k are k, k + 2**32, k + 2 * 2**32, …: two seeds below 2**32, to
+which Stable-Baselines3 and NumPy's own seeds are limited, never meet.
 """
 
 _END = 2**63  # infos of vector environments hold the numbers as int64
@@ -29,7 +29,7 @@ class Course:
     Args:
         seed: the run's seed.
         split: which of two disjoint sets of episodes.
-        first: number of the first episode, if it is not told one; drawn at random below `STREAM` if None, so that
+        first: number of the first episode, if `advance` gets none; drawn at random below `STREAM` if None, so that
             environments that do not know of each other run different ones.
         stride: how many episodes further each next one is.
 

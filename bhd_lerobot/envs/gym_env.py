@@ -44,7 +44,7 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         obs_type: what an observation holds: one of `settings.OBS_TYPES`; all that there is if None.
         normalise_actions: take actions in [-1, 1], mapped to the bounds.
         render_mode: ``"rgb_array"`` or None.
-        first_episode: number of the first episode, if `reset` is not told one; drawn at random below 2**32 if None.
+        first_episode: number of the first episode, if `reset` gets none; drawn at random below 2**32 if None.
         episode_stride: how many episodes further the next one is.
 
     Raises:
@@ -81,7 +81,7 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def task_description(self) -> str:
-        """What is asked for in this episode, in words."""
+        """The instruction of this episode."""
         return self.stage.instruction(0)
 
     @property

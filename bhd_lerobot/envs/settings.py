@@ -1,7 +1,7 @@
 """From an environment's name and some overrides to the configurations of its robot and its task."""
 
+import copy
 import dataclasses
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,9 +9,8 @@ from typing import Any
 from bhd_lerobot.envs.register import ENVIRONMENTS, NAMESPACE
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.registry import robot_configs, robot_of_task
+from bhd_lerobot.rollout.configuration import decode
 from bhd_lerobot.tasks.task import TaskConfig
-
-Overrides = Mapping[str, Any] | None
 
 OBS_TYPES: dict[str, tuple[str, ...]] = {
     "state": ("agent_pos", "environment_state"),
@@ -95,34 +94,4 @@ def _configuration(kind: Any, given: Any, prefix: str, type_name: str) -> Any:
         raise ConfigError(f"{prefix} is {given!r}; it must be a {kind.__name__} or options of one, by name.")
     if values.pop("type", type_name) != type_name:
         raise ConfigError(f"{prefix}.type is {given['type']!r}; this environment's is {type_name!r}.")
-    return _build(kind, values, prefix)
-
-
-def _build(kind: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    """Return a dataclass with some options set; names and types are checked, as on a command line."""
-    hints = typing.get_type_hints(kind)
-    names = [field.name for field in dataclasses.fields(kind) if field.init]
-    made = {}
-    for name, value in values.items():
-        key = f"{prefix}.{name}"
-        if name not in names:
-            raise ConfigError(unknown_name("option", key, [f"{prefix}.{one}" for one in names]))
-        hint = hints[name]
-        if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
-            made[name] = _build(hint, value, key)
-        elif _fits(value, hint):
-            made[name] = value
-        else:
-            raise ConfigError(f"{key} is {value!r}; it must be {getattr(hint, '__name__', hint)}.")
-    return kind(**made)
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Tell whether a value is of a plain type; what is not plain is checked by the configuration itself."""
-    if isinstance(value, bool):
-        return hint not in (int, float, str)
-    if hint is float:
-        return isinstance(value, int | float)
-    if hint in (int, str, bool):
-        return isinstance(value, hint)
-    return not dataclasses.is_dataclass(hint) or type(value) is hint
+    return decode(kind, copy.deepcopy(values), f"{prefix}.")

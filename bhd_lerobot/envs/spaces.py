@@ -15,7 +15,7 @@ from bhd_lerobot.tasks.task import Task
 def observation_space(simulation: Simulation, task: Task, parts: tuple[str, ...]) -> spaces.Dict:
     """Return the space of one simulation's observations, with LeRobot's keys.
 
-    `agent_pos`: the robot's floats, shape (k,). `environment_state`: what the task tells, shape (e,), if it tells
+    `agent_pos`: the robot's floats, shape (k,). `environment_state`: what the task reports, shape (e,), if it reports
     anything. `pixels`: images by camera name, shape (height, width, 3), if cameras are observed.
     """
     members: dict[str, spaces.Space[Any]] = {}

@@ -1,4 +1,4 @@
-"""n simulations of a robot with a task: the episodes of `runs/episode.py`, stepped from outside."""
+"""n simulations of a robot with a task: the episodes of `rollout/episode.py`, stepped from outside."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -36,8 +36,8 @@ class Seen:
 
     Attributes:
         state: the robots' floats, shape (n, k).
-        environment_state: what the task tells, shape (n, e), or None.
-        images: by camera name, shape (n, height, width, 3); only those of the simulations that were asked for.
+        environment_state: what the task reports, shape (n, e), or None.
+        images: by camera name, shape (n, height, width, 3); only those of the requested simulations.
     """
 
     state: NDArray[np.float32]
@@ -115,7 +115,7 @@ class Stage:
         """Return what the robots see now. Call it once a frame: noisy sensors read something else each time.
 
         Args:
-            ids: the simulations to look at, all that run if None; rows of others mean nothing.
+            ids: the simulations to observe, all that run if None; rows of others mean nothing.
         """
         simulation, running = self.simulation, self.simulation.running
         if ids is not None:
@@ -126,12 +126,12 @@ class Stage:
             images = self._images(np.flatnonzero(simulation.running)) if simulation.camera_names else {}
         finally:
             simulation.running = running
-        told = None
+        reported = None
         if self.task.environment_names:
             # What is true at the end of a frame is so at the beginning of the next, unless an episode began in between.
             truth = simulation.truth() if self._truth is None else self._truth
-            told = self.task.environment_state(truth).astype(np.float32)
-        return Seen(state, told, images)
+            reported = self.task.environment_state(truth).astype(np.float32)
+        return Seen(state, reported, images)
 
     def step(self, actions: NDArray[np.float64]) -> Stepped:
         """Let one frame go by. Simulations whose episodes ended go on running until `rest` or `reset`.
@@ -157,7 +157,7 @@ class Stage:
         return self.task.outcome(sim, event)
 
     def instruction(self, sim: int) -> str:
-        """Return what is asked for in the episode of one simulation; nothing before its first."""
+        """Return the instruction of the episode of one simulation; nothing before its first."""
         scene = self.scenes[sim]
         return "" if scene is None else self.task.instruction(scene)
 

@@ -46,7 +46,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         normalise_actions: take actions in [-1, 1], mapped to the bounds.
         render_mode: ``"rgb_array"`` or None.
         autoreset_mode: when an environment whose episode is over starts the next.
-        first_episode: number of the first environment's first episode, if `reset` is not told one; each draws its own
+        first_episode: number of the first environment's first episode, if `reset` gets none; each draws its own
             at random below 2**32 if None.
         episode_stride: how many episodes further an environment's next one is.
         threads: threads that step the physics; all processors if None.

@@ -10,6 +10,13 @@ from bhd_lerobot.envs.course import Course
 from bhd_lerobot.envs.stage import Stage
 from bhd_lerobot.errors import ConfigError, unknown_name
 
+# Attributes of a `BhdEnv` that are the vector environment's or the course's, by their names there.
+_OF_THE_VECTOR = {
+    **{name: name for name in ("task", "render_mode", "metadata", "spec")},
+    "observation_space": "single_observation_space",
+    "action_space": "single_action_space",
+}
+_OF_THE_COURSE = {"seed": "seed", "split": "split", "episode_index": "episode"}
 _SETTABLE = ("seed", "split", "stride", "render_mode")
 
 
@@ -30,59 +37,20 @@ class Member:
         self.stage, self.course = stage, course
         self._sim, self._vector = sim, vector
 
-    @property
-    def task(self) -> str:
-        """Name of the environment."""
-        return str(self._vector.task)
+    def __getattr__(self, name: str) -> Any:
+        for source, names in ((self._vector, _OF_THE_VECTOR), (self.course, _OF_THE_COURSE)):
+            if name in names:
+                return getattr(source, names[name])
+        raise AttributeError(f"An environment has no attribute {name!r}.", name=name, obj=self)
 
     @property
     def task_description(self) -> str:
-        """What is asked for in this episode, in words."""
+        """The instruction of this episode."""
         return self.stage.instruction(self._sim)
 
     @property
     def _max_episode_steps(self) -> int:
         return self.stage.frames
-
-    @property
-    def render_mode(self) -> str | None:
-        """``"rgb_array"`` or None."""
-        return self._vector.render_mode
-
-    @property
-    def metadata(self) -> dict[str, Any]:
-        """Gymnasium's metadata."""
-        return dict(self._vector.metadata)
-
-    @property
-    def spec(self) -> Any:
-        """Gymnasium's specification, if it was made by `gymnasium.make_vec`."""
-        return self._vector.spec
-
-    @property
-    def observation_space(self) -> Any:
-        """The space of its observations."""
-        return self._vector.single_observation_space
-
-    @property
-    def action_space(self) -> Any:
-        """The space of its actions."""
-        return self._vector.single_action_space
-
-    @property
-    def seed(self) -> int:
-        """The run's seed."""
-        return self.course.seed
-
-    @property
-    def split(self) -> str:
-        """Which of two disjoint sets of episodes."""
-        return self.course.split
-
-    @property
-    def episode_index(self) -> int:
-        """Number of the present episode."""
-        return self.course.episode
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the scene from outside, shape (height, width, 3); None without a render mode."""
@@ -106,7 +74,7 @@ class Member:
 
 
 class Images(Sequence[NDArray[np.uint8]]):
-    """Renderings of all simulations, each made when it is asked for."""
+    """Renderings of all simulations, each made when it is read."""
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage

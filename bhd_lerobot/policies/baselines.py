@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Observation, find_columns
+from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, ConfiguredBrain, Observation, find_columns
 
 _SPEED, _POSITION = ".vel", ".pos"
 
@@ -45,7 +44,7 @@ class RandomConfig(BrainConfig):
             raise ConfigError(f"brain.scale is {self.scale}; it must be in (0, 1].")
 
 
-class NoopBrain:
+class NoopBrain(ConfiguredBrain):
     """Holds: speeds are 0, and positions are those that the episode began with.
 
     Args:
@@ -54,11 +53,14 @@ class NoopBrain:
 
     name = "noop"
     robot_type = ANY_ROBOT
-    uses_images = False
-    has_plan = False
 
-    def __init__(self, config: NoopConfig | None = None) -> None:
-        self._start = _Start(self.name)
+    def __init__(self, config: BrainConfig | None = None) -> None:
+        self.config = config or NoopConfig()
+        self._held: NDArray[np.float64] = np.zeros((0, 0))  # the actions that hold, shape (n, actions)
+        self._fresh = np.zeros(0, np.bool_)  # whose episode has not been seen yet
+        self._targets: NDArray[np.intp] = np.zeros(0, np.intp)
+        self._sources: NDArray[np.intp] = np.zeros(0, np.intp)
+        self._width = 0
 
     def bind(
         self,
@@ -67,32 +69,36 @@ class NoopBrain:
         fps: int,
         environment_names: Sequence[str] = (),
     ) -> None:
-        """Find what is to be held."""
-        self._start.bind(observation_names, action_names)
+        """Find the positions among the observations.
+
+        Raises:
+            ConfigError: an action is neither a speed nor a position that is observed.
+        """
+        held = [name for name in action_names if not name.endswith(_SPEED)]
+        odd = [name for name in held if not name.endswith(_POSITION)]
+        if odd:
+            raise ConfigError(f"The brain {self.name!r} does not know how to hold the action {odd[0]!r}.")
+        self._sources = find_columns(observation_names, held, self.name, "observation")
+        self._targets = find_columns(action_names, held, self.name, "action")
+        self._width = len(action_names)
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Hold what is seen next."""
-        self._start.reset(ids, n)
+        if len(self._fresh) != n:
+            self._fresh, self._held = np.ones(n, np.bool_), np.zeros((n, self._width))
+        self._fresh[ids] = True
 
     def act(self, observation: Observation) -> NDArray[np.float64]:
         """Return the actions that hold, shape (n, actions)."""
-        self._start.see(observation)
-        return self._start.actions.copy()
-
-    def subtasks(self) -> Sequence[str]:
-        """It has no plan."""
-        return ()
-
-    def plan(self, sim: int) -> dict[str, Any]:
-        """It has no plan."""
-        return {}
-
-    def parameters(self) -> dict[str, Any]:
-        """Return the name."""
-        return {"type": self.name}
+        running = np.ones(len(self._fresh), np.bool_) if observation.running is None else observation.running
+        new = np.flatnonzero(self._fresh & running)
+        if len(new):
+            self._held[new[:, None], self._targets] = observation.state[new[:, None], self._sources]
+            self._fresh[new] = False
+        return self._held.copy()
 
 
-class RandomBrain:
+class RandomBrain(NoopBrain):
     """Goes from one random action to the next, within the limits of the robot's body.
 
     Args:
@@ -100,13 +106,10 @@ class RandomBrain:
     """
 
     name = "random"
-    robot_type = ANY_ROBOT
-    uses_images = False
-    has_plan = False
+    config: RandomConfig
 
     def __init__(self, config: RandomConfig | None = None) -> None:
-        self.config = config or RandomConfig()
-        self._start = _Start(self.name)
+        super().__init__(config or RandomConfig())
         self._period = 1
         self._lower: NDArray[np.float64] = np.zeros(0)
         self._upper: NDArray[np.float64] = np.zeros(0)
@@ -126,7 +129,7 @@ class RandomBrain:
         Raises:
             ConfigError: these are not the actions of a body that it knows.
         """
-        self._start.bind(observation_names, action_names)
+        super().bind(observation_names, action_names, fps, environment_names)
         self._period = max(1, round(self.config.period_s * fps))
         for body in (turtlebot3_burger(), ur5()):
             limits = body.limits
@@ -142,7 +145,7 @@ class RandomBrain:
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Start anew from each episode's seed."""
-        self._start.reset(ids, n)
+        super().reset(ids, seeds, n, instructions)
         if len(self._frame) != n:
             self._frame = np.zeros(n, np.int64)
             self._from, self._to = np.zeros((n, len(self._upper))), np.zeros((n, len(self._upper)))
@@ -152,76 +155,17 @@ class RandomBrain:
 
     def act(self, observation: Observation) -> NDArray[np.float64]:
         """Return the actions, shape (n, actions)."""
-        self._start.see(observation)
+        super().act(observation)
         n = len(self._frame)
         running = np.arange(n) if observation.running is None else np.flatnonzero(observation.running)
         for sim in running[self._frame[running] % self._period == 0].tolist():
-            self._from[sim] = self._to[sim] if self._frame[sim] else self._start.actions[sim]
+            self._from[sim] = self._to[sim] if self._frame[sim] else self._held[sim]
             self._to[sim] = self._draw(sim)
         share = ((self._frame % self._period + 1) / self._period)[:, None]
         self._frame[running] += 1
         return self._from * (1 - share) + self._to * share
 
-    def subtasks(self) -> Sequence[str]:
-        """It has no plan."""
-        return ()
-
-    def plan(self, sim: int) -> dict[str, Any]:
-        """It has no plan."""
-        return {}
-
-    def parameters(self) -> dict[str, Any]:
-        """Return the parameters."""
-        return {"type": self.name, **asdict(self.config)}
-
     def _draw(self, sim: int) -> NDArray[np.float64]:
-        middle, half = self._start.actions[sim], self.config.scale * (self._upper - self._lower) / 2
+        middle, half = self._held[sim], self.config.scale * (self._upper - self._lower) / 2
         lower, upper = np.maximum(middle - half, self._lower), np.minimum(middle + half, self._upper)
         return self._generators[sim].uniform(lower, upper)
-
-
-class _Start:
-    """The actions with which each robot stays as it was when its episode began.
-
-    Attributes:
-        actions: shape (n, actions).
-
-    Args:
-        who: name of the brain, for messages.
-    """
-
-    def __init__(self, who: str) -> None:
-        self._who = who
-        self.actions = np.zeros((0, 0))
-        self._fresh = np.zeros(0, np.bool_)
-        self._targets: NDArray[np.intp] = np.zeros(0, np.intp)
-        self._sources: NDArray[np.intp] = np.zeros(0, np.intp)
-        self._width = 0
-
-    def bind(self, observation_names: Sequence[str], action_names: Sequence[str]) -> None:
-        """Find the positions among the observations.
-
-        Raises:
-            ConfigError: an action is neither a speed nor a position that is observed.
-        """
-        held = [name for name in action_names if not name.endswith(_SPEED)]
-        odd = [name for name in held if not name.endswith(_POSITION)]
-        if odd:
-            raise ConfigError(f"The brain {self._who!r} does not know how to hold the action {odd[0]!r}.")
-        self._sources = find_columns(observation_names, held, self._who, "observation")
-        self._targets = find_columns(action_names, held, self._who, "action")
-        self._width = len(action_names)
-
-    def reset(self, ids: NDArray[np.intp], n: int) -> None:
-        """Take what is seen next for the start."""
-        if len(self._fresh) != n:
-            self._fresh, self.actions = np.ones(n, np.bool_), np.zeros((n, self._width))
-        self._fresh[ids] = True
-
-    def see(self, observation: Observation) -> None:
-        """Look at the robots whose episode has just begun."""
-        running = np.ones(len(self._fresh), np.bool_) if observation.running is None else observation.running
-        new = np.flatnonzero(self._fresh & running)
-        if len(new):
-            self.actions[new[:, None], self._targets] = observation.state[new[:, None], self._sources]
-            self._fresh[new] = False

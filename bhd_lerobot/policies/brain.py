@@ -1,7 +1,7 @@
-"""What a brain is: it looks at an observation a few times a second and says what it wants."""
+"""What a brain is: a few times a second it receives an observation and returns a setpoint or a goal."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import draccus
@@ -62,7 +62,7 @@ class Observation:
         names: feature names of the columns of `state`.
         state: the robots' floats, shape (n, len(names)), read-only.
         images: by camera name, shape (n, height, width, 3), RGB.
-        environment_state: what the task tells the brain, shape (n, k), or None.
+        environment_state: what the task reports to the brain, shape (n, k), or None.
         results: how goals ended since the last observation, by simulation.
         running: which simulations are in an episode, shape (n,); all if None. What the others see means nothing.
     """
@@ -78,7 +78,7 @@ class Observation:
 class Brain(Protocol):
     """A rule or a network that drives n robots.
 
-    A brain is told once which features it will see and which it must command; it finds its inputs by name and fails at
+    A brain learns once which features it will see and which it must command; it finds its inputs by name and fails at
     once, with the names it misses, if they are not there.
     """
 
@@ -86,7 +86,7 @@ class Brain(Protocol):
     robot_type: str
     """The robots that it is for; `ANY_ROBOT` if it finds out when it is bound."""
     uses_images: bool
-    """Whether `act` looks at the observation's images. If not, it is not kept waiting for them and may not get any."""
+    """Whether `act` uses the observation's images. If not, it is not kept waiting for them and may not get any."""
     has_plan: bool
     """Whether it works step by step, and `subtasks` and `plan` say what it does."""
 
@@ -110,7 +110,7 @@ class Brain(Protocol):
             ids: the simulations.
             seeds: a seed for each of them; all that is random in the brain follows from it.
             n: number of simulations that `act` will be called for.
-            instructions: what is asked for in each of them, if anything is.
+            instructions: the instruction of each of them, if there are any.
         """
 
     def subtasks(self) -> Sequence[str]:
@@ -129,6 +129,31 @@ class Brain(Protocol):
         """Return everything that defines the brain, as plain values."""
 
 
+class ConfiguredBrain:
+    """What brains have in common that are defined by their configuration; without images and without a plan.
+
+    Attributes:
+        config: the parameters.
+    """
+
+    name: str
+    uses_images = False
+    has_plan = False
+    config: Any
+
+    def subtasks(self) -> Sequence[str]:
+        """Return nothing: there is no plan."""
+        return ()
+
+    def plan(self, sim: int) -> dict[str, Any]:
+        """Return nothing: there is no plan."""
+        return {}
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the type and the parameters."""
+        return {"type": self.name, **asdict(self.config)}
+
+
 class Intervening(Protocol):
     """A brain in which somebody sometimes takes over; what it says is about the frame that `act` decided last."""
 
@@ -136,7 +161,7 @@ class Intervening(Protocol):
         """Return which robots are driven by the one who takes over, shape (n,)."""
 
     def causes(self) -> Sequence[str]:
-        """Return why, in words, of each simulation; empty where nobody took over in this episode."""
+        """Return why, in words, of each simulation; empty without a takeover in this episode."""
 
 
 def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: str) -> NDArray[np.intp]:
@@ -155,7 +180,7 @@ def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: st
     missing = [name for name in wanted if name not in index]
     if missing:
         shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
-        whose = "task or scene does not tell" if what == "environment" else "robot does not have"
+        whose = "task or scene does not report" if what == "environment" else "robot does not have"
         raise ConfigError(
             f"The brain {who!r} needs the {what} feature(s) {shown}, which this {whose}. "
             f"There is: {', '.join(names[:8]) or 'nothing'}{', …' if len(names) > 8 else ''}."

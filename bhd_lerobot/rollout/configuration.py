@@ -44,18 +44,19 @@ def parse[T](config_class: type[T], arguments: Sequence[str]) -> T:
     return decode(config_class, values)
 
 
-def decode[T](config_class: type[T], values: dict[str, Any]) -> T:
+def decode[T](config_class: type[T], values: dict[str, Any], prefix: str = "") -> T:
     """Return the configuration that plain values stand for.
 
     Args:
         config_class: a dataclass.
         values: by the names of its fields, nested; values with an exponent and entries that are nothing are replaced.
+        prefix: what stands before the fields' names in messages, ``"robot."``, for example.
 
     Raises:
         ConfigError: an unknown or missing key, a value that cannot be honoured, or names of version 0.1.
     """
     check_values(values)
-    _check_keys(config_class, values, "")
+    _check_keys(config_class, values, prefix)
     try:
         return draccus.decode(config_class, values)
     except ConfigError:

@@ -2,7 +2,7 @@
 
 MuJoCo opens the OpenGL backend that MUJOCO_GL names when it is imported, and the import fails if that does not work
 or if there is no such backend: on a machine without OpenGL even a simulation that renders nothing could not start. So
-it is imported without the variable; `camera.py` reads it when an image is asked for, and says what is wrong with it.
+it is imported without the variable; `camera.py` reads it when an image is rendered, and reports what is wrong with it.
 """
 
 import os

@@ -13,7 +13,7 @@ from bhd_lerobot.sim.table_stage import add_table_stage
 # geometry that a simulation does not use is parked far below the floor, where the broad phase drops it at once.
 POOL_SIZE = 32
 PARKED_Z = -100.0
-PARKED_GROUP = 5  # neither the range finder nor the camera looks at this group
+PARKED_GROUP = 5  # neither the range finder nor the camera sees this group
 
 _FLOOR_BIT, _SCENE_BIT = 1, 2
 _PLACED = ("obstacle_", "object_")  # how the names of geometries begin that simulations place themselves
@@ -79,7 +79,7 @@ def _add_arena_stage(spec: mujoco.MjSpec, body: MobileBase, pool_size: int) -> N
 
 
 def _add_stage(spec: mujoco.MjSpec) -> None:
-    """Add floor, sky, light and the cameras that look at the scene from outside."""
+    """Add floor, sky, light and the cameras that show the scene from outside."""
     add_backdrop(
         spec,
         sky=((0.78, 0.86, 0.95), (0.95, 0.97, 1.0)),

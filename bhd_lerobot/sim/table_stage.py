@@ -98,7 +98,7 @@ def _add_room(spec: mujoco.MjSpec) -> None:
 
 
 def _add_table(spec: mujoco.MjSpec) -> None:
-    """Add a table to look at, and a plane to touch: it has no edges, and contacts with it are cheap and exact."""
+    """Add a table that is only rendered, and a plane to touch, without edges: contacts with it are cheap and exact."""
     spec.add_material(name="table", rgba=[0.70, 0.56, 0.40, 1.0], specular=0.15, shininess=0.3)
     spec.add_material(name="leg", rgba=[0.25, 0.26, 0.28, 1.0], specular=0.3)
     table = spec.worldbody.add_body(name="table")
@@ -144,7 +144,7 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
 
 
 def _add_object(spec: mujoco.MjSpec, number: int) -> None:
-    """Add a free body with one geometry to touch and some to look at; each simulation gives them their size."""
+    """Add a free body with one geometry to touch and some only rendered; each simulation gives them their size."""
     body = spec.worldbody.add_body(name=f"object_{number}", pos=PARKED[number], gravcomp=1.0)
     body.add_freejoint(name=f"object_{number}")
     # As long as the inertia is a sphere's, the compiler turns no axes; simulations write theirs for the body's.
@@ -274,7 +274,7 @@ def _visual(
 
 
 def _towards(position: tuple[float, ...], target: tuple[float, ...]) -> list[float]:
-    """Return a camera's x and y axis, side by side, when it looks from one point to another and stands upright."""
+    """Return a camera's x and y axis, side by side, when it points from one point to another and stands upright."""
     ahead: NDArray[np.float64] = np.subtract(target, position)
     right = np.array([ahead[1], -ahead[0], 0.0]) / math.hypot(ahead[0], ahead[1])
     up = np.cross(right, ahead)

@@ -15,7 +15,7 @@ from bhd_lerobot.sim.table_stage import HANDLE_PARTS, PADS, PARKED
 from bhd_lerobot.sim.world import Ids, World
 
 _TYPES = {name: int(getattr(mujoco.mjtGeom, f"mjGEOM_{name.upper()}")) for name in ("box", "capsule", "cylinder")}
-_HIDDEN, _SEEN, _TOUCHED = 5, 1, 0  # geometry groups: the camera looks at 0 and 1
+_HIDDEN, _SEEN, _TOUCHED = 5, 1, 0  # geometry groups: the camera renders 0 and 1
 _FIELDS = (
     *("geom_type", "geom_size", "geom_pos", "geom_quat", "geom_rbound", "geom_group", "geom_rgba", "geom_friction"),
     *("body_mass", "body_inertia", "body_gravcomp", "body_pos", "body_quat"),
@@ -145,7 +145,7 @@ class Tabletop:
         field["body_quat"][sim, self._target] = pose[3:]
 
     def _object(self, sim: int, number: int, thing: TableObject) -> None:
-        """Set shape, looks, inertia and weight of an object."""
+        """Set shape, appearance, inertia and weight of an object."""
         field, body, geoms = self._field, self._bodies[number], self._geoms[number]
         field["geom_group"][sim, geoms] = _HIDDEN
         field["body_gravcomp"][sim, body] = _HEAVY

@@ -213,7 +213,7 @@ class World:
         Raises:
             SimulationError: names the simulations.
         """
-        # The engine resets a simulation that diverged, so that its state looks healthy: its warning count tells.
+        # The engine resets a simulation that diverged, so that its state looks healthy: its warning count shows it.
         if not np.count_nonzero(self._warnings) and np.isfinite(self.qpos).all():
             return
         diverged = self._batch.warning[:, _DIVERGED, _WARNING_COUNT].any(axis=1)

@@ -1,16 +1,14 @@
 """Roam without touching anything."""
 
-import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import ARENAS, Arena, make_arena
-from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.tasks.task import BaseTruth, Event, Outcome, TaskConfig
+from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
+from bhd_lerobot.tasks.task import BaseTruth, ConfiguredTask, Event, Outcome, PathLengths, TaskConfig
 
 _BEARINGS_DEG = np.arange(0.0, 360.0, 22.5)
 _DISTANCES_M = np.arange(1, 9) * 0.25
@@ -35,8 +33,8 @@ class AvoidConfig(TaskConfig):
         cell_m: edge length of the cells that the score counts [m].
         stuck_path_m: a path shorter than this in `stuck_time_s` means stuck [m].
         stuck_time_s: see `stuck_path_m` [s].
-        trail: tell the brain which ground around the robot it has visited: `TRAIL`, the task's memory for brains that
-            have none of their own.
+        trail: report which ground around the robot it has visited: `TRAIL`, the task's memory for brains that have none
+            of their own.
     """
 
     arena: str = "random"
@@ -51,15 +49,11 @@ class AvoidConfig(TaskConfig):
     def __post_init__(self) -> None:
         if self.arena not in ARENAS:
             raise ConfigError(unknown_name("arena", self.arena, ARENAS))
-        for name in ("duration_s", "cell_m", "stuck_time_s"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"task.{name} is {getattr(self, name)}; it must be positive and finite.")
-        for name in ("min_path_m", "stuck_path_m"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"task.{name} is {getattr(self, name)}; it must be 0 or positive, and finite.")
+        check_positive("task", self, ("duration_s", "cell_m", "stuck_time_s"))
+        check_positive("task", self, ("min_path_m", "stuck_path_m"), or_zero=True)
 
 
-class AvoidTask:
+class AvoidTask(ConfiguredTask):
     """The avoid task for n simulations.
 
     Success: the whole time without a contact, and a path of at least `min_path_m`. Score: the number of distinct cells
@@ -68,7 +62,7 @@ class AvoidTask:
     `timeout` when the time is over and the path too short.
 
     Args:
-        config: what is asked for.
+        config: the parameters.
         n: number of simulations.
         fps: frames a second [Hz].
     """
@@ -78,21 +72,16 @@ class AvoidTask:
     environment_names: tuple[str, ...]
 
     def __init__(self, config: AvoidConfig, n: int, fps: int) -> None:
-        self.config = config
+        super().__init__(config, n, fps)
         self.environment_names = TRAIL if config.trail else ()
-        self.duration_s = config.duration_s
-        self.frames = max(1, round(config.duration_s * fps))
-        self._window = max(1, round(config.stuck_time_s * fps))
-        self._sims = np.arange(n)
+        self._window = self._in_frames(config.stuck_time_s)
         # Cells by number, a row for each simulation; the rows grow with the largest arena seen.
         self._free: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
         self._visited: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
         self._origin, self._end = np.zeros((n, 2)), np.zeros((n, 2))
         self._columns = np.ones(n, np.int64)
         self._pose = np.zeros((n, 2))
-        self._path = np.zeros(n)
-        self._history = np.zeros((self._window, n))  # path lengths of the last frames, a ring
-        self._frame = np.zeros(n, np.int64)
+        self._path = PathLengths(n, self._window)
 
     def sample(self, seed: int) -> Arena:
         """Return the arena of the episode with this seed."""
@@ -128,24 +117,20 @@ class AvoidTask:
         started = np.zeros(len(self._sims), np.bool_)
         started[ids] = True
         self._count_cells(started)
-        self._path[ids] = 0.0
-        self._history[:, ids] = 0.0
+        self._path.begin(ids)
         self._frame[ids] = 0
 
     def judge(self, truth: BaseTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""
         event = np.full(len(running), int(Event.NOTHING))
         position = truth.base_pose_in_world[:, :2]
-        self._path += np.where(running, np.hypot(*(position - self._pose).T), 0.0)
+        recent = self._path.add(np.where(running, np.hypot(*(position - self._pose).T), 0.0), self._frame)
         self._pose[running] = position[running]
-        slot = self._frame % self._window
-        recent = self._path - self._history[slot, self._sims]  # the ring's oldest entry: the path one window ago
-        self._history[slot, self._sims] = self._path
         self._frame[running] += 1
         clean = running & ~truth.touched
         reward = self._count_cells(clean)
         over = clean & (self._frame >= self.frames)
-        far = self._path >= self.config.min_path_m
+        far = self._path.total >= self.config.min_path_m
         event[over & far] = Event.SUCCESS
         event[over & ~far] = Event.TIMEOUT
         stuck = clean & ~over & (self._frame >= self._window) & (recent < self.config.stuck_path_m)
@@ -161,15 +146,11 @@ class AvoidTask:
             event=event,
             score=visited / free,
             details={
-                "path_m": float(self._path[sim]),
+                "path_m": float(self._path.total[sim]),
                 "cells_visited": float(visited),
                 "cells_free": float(free),
             },
         )
-
-    def parameters(self) -> dict[str, Any]:
-        """Return everything that defines the task."""
-        return {"type": self.name, **asdict(self.config)}
 
     def _count_cells(self, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Count the cells that robots are in, and return what they add to the scores, shape (n,)."""

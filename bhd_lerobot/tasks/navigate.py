@@ -2,16 +2,15 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import ARENAS, Arena, make_arena
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
 from bhd_lerobot.tasks.geodesic import WayField, interpolate
-from bhd_lerobot.tasks.task import BaseTruth, Event, Outcome, TaskConfig
+from bhd_lerobot.tasks.task import BaseTruth, ConfiguredTask, Event, Outcome, PathLengths, TaskConfig
 
 ENVIRONMENT = ("goal_x", "goal_y", "goal_cos", "goal_sin")
 
@@ -59,12 +58,8 @@ class NavigateConfig(TaskConfig):
         if self.arena not in ARENAS:
             raise ConfigError(unknown_name("arena", self.arena, ARENAS))
         positive = ("duration_s", "tolerance_m", "tolerance_deg", "rest_speed", "rest_turn_speed", "hold_s")
-        for name in (*positive, "stuck_time_s"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"task.{name} is {getattr(self, name)}; it must be positive and finite.")
-        for name in ("min_distance_m", "goal_clearance_m", "stuck_path_m"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"task.{name} is {getattr(self, name)}; it must be 0 or positive, and finite.")
+        check_positive("task", self, (*positive, "stuck_time_s"))
+        check_positive("task", self, ("min_distance_m", "goal_clearance_m", "stuck_path_m"), or_zero=True)
         if self.tolerance_deg > 180:
             raise ConfigError(f"task.tolerance_deg is {self.tolerance_deg}; 180 already allows every heading.")
         if self.tolerance_m >= self.min_distance_m:
@@ -79,7 +74,7 @@ class NavigateConfig(TaskConfig):
             )
 
 
-class NavigateTask:
+class NavigateTask(ConfiguredTask):
     """The navigate task for n simulations.
 
     Success: within the tolerances of the goal pose and at rest, for `hold_s` without a break. Failures: `collision`,
@@ -96,7 +91,7 @@ class NavigateTask:
     m, so it may be up to 2.8 % longer than the shortest one that there is.
 
     Args:
-        config: what is asked for.
+        config: the parameters.
         n: number of simulations.
         fps: frames a second [Hz].
 
@@ -109,12 +104,8 @@ class NavigateTask:
     environment_names: tuple[str, ...] = ENVIRONMENT
 
     def __init__(self, config: NavigateConfig, n: int, fps: int) -> None:
-        self.config, self._fps = config, fps
-        self.duration_s = config.duration_s
-        self.frames = max(1, round(config.duration_s * fps))
-        self._hold = max(1, round(config.hold_s * fps))
-        self._window = max(1, round(config.stuck_time_s * fps))
-        self._sims = np.arange(n)
+        super().__init__(config, n, fps)
+        self._hold, self._window = self._in_frames(config.hold_s), self._in_frames(config.stuck_time_s)
         # Lengths of ways, a grid for each simulation; the grids grow with the largest arena seen.
         self._ways: NDArray[np.float64] = np.zeros((n, 2, 2))
         self._origin = np.zeros((n, 2))
@@ -122,9 +113,8 @@ class NavigateTask:
         self._pose: NDArray[np.float64] = np.zeros((n, 3))
         self._shortest, self._first = np.zeros(n), np.ones(n)
         self._left: NDArray[np.float64] = np.ones(n)
-        self._path, self._sum = np.zeros(n), np.zeros(n)
-        self._history = np.zeros((self._window, n))  # path lengths of the last frames, a ring
-        self._within, self._frame = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._path, self._sum = PathLengths(n, self._window), np.zeros(n)
+        self._within = np.zeros(n, np.int64)
         if config.arena != "random":  # better now than in the middle of a run
             self.sample(0)
 
@@ -189,8 +179,8 @@ class NavigateTask:
                 )
             self._keep(int(sim), field)
             self._goal[sim], self._pose[sim] = goal, arena.start
-        self._path[ids] = self._sum[ids] = 0.0
-        self._history[:, ids] = 0.0
+        self._path.begin(ids)
+        self._sum[ids] = 0.0
         self._within[ids] = self._frame[ids] = 0
         self._shortest[ids] = interpolate(self._ways, self._origin, self._pose[:, :2])[ids]
         self._first[ids] = self._left[ids] = np.maximum(self._way_left(), self.config.tolerance_m)[ids]
@@ -207,11 +197,8 @@ class NavigateTask:
         config = self.config
         pose = np.where(running[:, None], truth.base_pose_in_world, self._pose)
         step, turn = np.hypot(*(pose - self._pose)[:, :2].T), np.abs(_wrap(pose[:, 2] - self._pose[:, 2]))
-        self._path += step
         self._pose = pose
-        slot = self._frame % self._window
-        recent = self._path - self._history[slot, self._sims]  # the ring's oldest entry: the path one window ago
-        self._history[slot, self._sims] = self._path
+        recent = self._path.add(step, self._frame)
         self._frame[running] += 1
         distance, angle = self._errors()
         there = (distance <= config.tolerance_m) & (angle <= math.radians(config.tolerance_deg))
@@ -238,7 +225,7 @@ class NavigateTask:
         """Return how an episode ended."""
         success = event == Event.SUCCESS
         distance, angle = self._errors()
-        shortest, path = float(self._shortest[sim]), float(self._path[sim])
+        shortest, path = float(self._shortest[sim]), float(self._path.total[sim])
         return Outcome(
             success=success,
             event=event,
@@ -251,10 +238,6 @@ class NavigateTask:
                 "error_rad": float(angle[sim]),
             },
         )
-
-    def parameters(self) -> dict[str, Any]:
-        """Return everything that defines the task."""
-        return {"type": self.name, **asdict(self.config)}
 
     def _keep(self, sim: int, field: WayField) -> None:
         """Store the ways to the goal of a simulation."""

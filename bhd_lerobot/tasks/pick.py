@@ -2,23 +2,22 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.tasks.task import ArmTruth, Event, Outcome, TaskConfig
+from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
+from bhd_lerobot.tasks.task import ArmTruth, ConfiguredTask, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
 
 # Where objects stand, in the base frame [m]: what a tool that points down reaches with room to spare.
 _AREA = np.array([[0.35, -0.30], [0.65, 0.30]])
 _APART = 0.05  # [m] free space between the circles around two objects: an open finger fits between them
 _LIFTED, _FALLEN = 0.05, 0.015  # [m] above and below which an object counts as in the gripper, and as back on the table
-_STRAY = 0.03  # [m] an object that nobody asked for and that is lifted this far was picked up, not brushed
+_STRAY = 0.03  # [m] another object than the target that is lifted this far was picked up, not brushed
 _REACH = 0.80  # [m] horizontal distance from the base beyond which a tool that points down does not get
 _WIDEST = 0.076  # [m] the narrow side of an object fits between the fingers, however it is randomised
 _TRIES = 1000
@@ -60,9 +59,7 @@ class PickConfig(TaskConfig):
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
     def __post_init__(self) -> None:
-        for name in ("duration_s", "lift_m", "hold_s"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"task.{name} is {getattr(self, name)}; it must be positive and finite.")
+        check_positive("task", self, ("duration_s", "lift_m", "hold_s"))
         if not 1 <= self.min_objects <= self.max_objects <= MAX_OBJECTS:
             raise ConfigError(
                 f"task.min_objects is {self.min_objects} and task.max_objects is {self.max_objects}; "
@@ -72,7 +69,7 @@ class PickConfig(TaskConfig):
             raise ConfigError(unknown_name("task.language", self.language, (*INSTRUCTIONS, "any")))
 
 
-class PickTask:
+class PickTask(ConfiguredTask):
     """The pick task for n simulations.
 
     Success: the object that the instruction names, and no other, lifted by `lift_m` and held for `hold_s`. Failures:
@@ -82,7 +79,7 @@ class PickTask:
     reward of a frame is what it adds to the score.
 
     Args:
-        config: what is asked for.
+        config: the parameters.
         n: number of simulations.
         fps: frames a second [Hz].
     """
@@ -92,18 +89,15 @@ class PickTask:
     environment_names = ENVIRONMENT
 
     def __init__(self, config: PickConfig, n: int, fps: int) -> None:
-        self.config = config
-        self.duration_s = config.duration_s
-        self.frames = max(1, round(config.duration_s * fps))
-        self._hold = max(1, round(config.hold_s * fps))
-        self._sims = np.arange(n)
+        super().__init__(config, n, fps)
+        self._hold = self._in_frames(config.hold_s)
         self._target = np.zeros(n, np.int64)
         self._present = np.zeros((n, MAX_OBJECTS), np.bool_)
         self._start = np.zeros((n, MAX_OBJECTS))  # height of the objects' centres at the start [m]
         self._fixed = np.zeros((n, MAX_OBJECTS, len(OBJECT_FIELDS)))
         self._camera_error = np.zeros((n, 1, 3))
         self._best, self._height = np.zeros(n), np.zeros(n)
-        self._held, self._frame = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._held = np.zeros(n, np.int64)
 
     # --- scenes ------------------------------------------------------------------------------------------------------
 
@@ -160,8 +154,8 @@ class PickTask:
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
         """Return what is on the table, as a camera sees it: 16 numbers for each place of an object, shape (n, 80).
 
-        The first is the one asked for; the others follow, at the start the nearest to it first.
-        Of each: whether there is one, whether it is the one asked for, whether it is a box; its pose in the base frame
+        The first is the target; the others follow, at the start the nearest to it first.
+        Of each: whether there is one, whether it is the target, whether it is a box; its pose in the base frame
         (x, y, z [m], quaternion wxyz); length, width and height [m]; red, green and blue. Zeros, and the identity, for
         places without one.
         """
@@ -216,10 +210,6 @@ class PickTask:
             details={"lifted_m": float(self._best[sim]), "objects": float(self._present[sim].sum())},
         )
 
-    def parameters(self) -> dict[str, Any]:
-        """Return everything that defines the task."""
-        return {"type": self.name, **asdict(self.config)}
-
     def _share(self, height: NDArray[np.float64]) -> NDArray[np.float64]:
         return 0.9 * np.minimum(np.maximum(height, 0.0) / self.config.lift_m, 1.0)
 
@@ -228,10 +218,10 @@ _HOME = ur5().home
 
 
 def _target_first(objects: Sequence[TableObject], target: int) -> list[TableObject]:
-    """Return the object asked for, then the others, the nearest to it first.
+    """Return the target, then the others, the nearest to it first.
 
     A network then finds what it has to grasp, and what stands in the way of that, always in the same inputs. The order
-    tells nothing that the environment state does not tell anyway.
+    reports nothing that the environment state does not report anyway.
     """
     at = objects[target]
     others = [one for number, one in enumerate(objects) if number != target]

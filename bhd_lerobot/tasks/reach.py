@@ -2,9 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +13,8 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
-from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.tasks.task import ArmTruth, Event, Outcome, TaskConfig
+from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.tasks.task import ArmTruth, ConfiguredTask, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_variation
 
 # Where targets are, in the base frame [m]: before the arm, over the table.
@@ -50,14 +49,12 @@ class ReachConfig(TaskConfig):
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
     def __post_init__(self) -> None:
-        for name in ("duration_s", "tolerance_m", "tolerance_deg", "hold_s"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"task.{name} is {getattr(self, name)}; it must be positive and finite.")
+        check_positive("task", self, ("duration_s", "tolerance_m", "tolerance_deg", "hold_s"))
         if not 0 <= self.start_spread_rad <= 1:
             raise ConfigError(f"task.start_spread_rad is {self.start_spread_rad}; it must be between 0 and 1.")
 
 
-class ReachTask:
+class ReachTask(ConfiguredTask):
     """The reach task for n simulations.
 
     Success: the tool within the tolerances of the target for `hold_s`. Failures: `collision` (the arm touches the table
@@ -65,7 +62,7 @@ class ReachTask:
     The reward of a frame is by how much the distance to the target fell, as a share of the distance at the start.
 
     Args:
-        config: what is asked for.
+        config: the parameters.
         n: number of simulations.
         fps: frames a second [Hz].
     """
@@ -75,15 +72,13 @@ class ReachTask:
     environment_names = ENVIRONMENT
 
     def __init__(self, config: ReachConfig, n: int, fps: int) -> None:
-        self.config = config
-        self.duration_s = config.duration_s
-        self.frames = max(1, round(config.duration_s * fps))
-        self._hold = max(1, round(config.hold_s * fps))
+        super().__init__(config, n, fps)
+        self._hold = self._in_frames(config.hold_s)
         self._target = np.zeros((n, 7))
         self._camera_error = np.zeros((n, 3))
         self._first, self._last = np.ones(n), np.ones(n)
         self._angle = np.zeros(n)
-        self._within, self._frame = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._within = np.zeros(n, np.int64)
         self._started = np.zeros(n, np.bool_)
 
     def sample(self, seed: int) -> TableScene:
@@ -115,9 +110,9 @@ class ReachTask:
 
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
         """Return the targets in the base frame, as a camera sees them: position [m], quaternion wxyz, shape (n, 7)."""
-        told = self._target.copy()
-        told[:, :3] += self._camera_error
-        return told
+        reported = self._target.copy()
+        reported[:, :3] += self._camera_error
+        return reported
 
     def judge(self, truth: ArmTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""
@@ -149,10 +144,6 @@ class ReachTask:
             score=float(covered),
             details={"error_m": float(self._last[sim]), "error_rad": float(self._angle[sim])},
         )
-
-    def parameters(self) -> dict[str, Any]:
-        """Return everything that defines the task."""
-        return {"type": self.name, **asdict(self.config)}
 
     def _errors(self, truth: ArmTruth) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return distance [m] and angle [rad] between tool and target, each of shape (n,)."""

@@ -1,7 +1,7 @@
 """What a task is: it makes episodes from seeds and judges them on the simulator's truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import IntEnum
 from typing import Any, Literal, Protocol
 
@@ -148,7 +148,7 @@ class Task(Protocol):
         name: its name.
         robot_type: the robot that it is for.
         duration_s: longest duration of an episode [s].
-        environment_names: names of what the task tells the brain, in order; empty if nothing.
+        environment_names: names of what the task reports to the brain, in order; empty if nothing.
     """
 
     name: str
@@ -166,7 +166,7 @@ class Task(Protocol):
         """Start episodes in some simulations."""
 
     def environment_state(self, truth: Any) -> NDArray[np.float64]:
-        """Return what the task tells the brain now, shape (n, len(environment_names))."""
+        """Return what the task reports to the brain now, shape (n, len(environment_names))."""
 
     def judge(self, truth: Any, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the reward and the `Event` of the frame that just ended, each of shape (n,).
@@ -179,3 +179,70 @@ class Task(Protocol):
 
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the task, as plain values."""
+
+
+class ConfiguredTask:
+    """What the tasks have in common: parameters, and the number of frames so far.
+
+    Attributes:
+        config: the parameters.
+        duration_s: longest duration of an episode [s].
+        frames: the same [frames].
+
+    Args:
+        config: the parameters, with a `duration_s`.
+        n: number of simulations.
+        fps: frames a second [Hz].
+    """
+
+    name: str
+
+    def __init__(self, config: Any, n: int, fps: int) -> None:
+        self.config = config
+        self.duration_s: float = config.duration_s
+        self._fps = fps
+        self.frames = self._in_frames(config.duration_s)
+        self._sims = np.arange(n)
+        self._frame: NDArray[np.int64] = np.zeros(n, np.int64)  # of each episode
+
+    def _in_frames(self, seconds: float) -> int:
+        """Return a time in frames, at least 1."""
+        return max(1, round(seconds * self._fps))
+
+    def parameters(self) -> dict[str, Any]:
+        """Return everything that defines the task."""
+        return {"type": self.name, **asdict(self.config)}
+
+
+class PathLengths:
+    """How far n robots have driven in their episodes, in all and lately.
+
+    Attributes:
+        total: in all [m], shape (n,).
+
+    Args:
+        n: number of robots.
+        window: how many frames `add` looks back.
+    """
+
+    def __init__(self, n: int, window: int) -> None:
+        self.total = np.zeros(n)
+        self._history = np.zeros((window, n))  # totals of the last frames, a ring
+
+    def begin(self, ids: NDArray[np.intp]) -> None:
+        """Start episodes in some simulations."""
+        self.total[ids] = 0.0
+        self._history[:, ids] = 0.0
+
+    def add(self, step: NDArray[np.float64], frame: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Add what each robot drove in a frame [m], and return what it drove in the last `window` frames [m].
+
+        Args:
+            step: shape (n,).
+            frame: number of each episode's frame, from 0, shape (n,).
+        """
+        self.total += step
+        at = frame % len(self._history), np.arange(len(step))
+        recent = self.total - self._history[at]  # the ring's oldest entry: the path one window ago
+        self._history[at] = self.total
+        return recent

@@ -30,7 +30,7 @@ class RandomisationConfig:
             times that [rad/s].
         latency_s: the servos get their commands up to this late, at most 0.05 [s].
         latency_min_s: and at least this late; with `latency_s` as large, always [s].
-        camera_error_m: added to the positions that the task tells, the same in every episode: x, y, z in the base
+        camera_error_m: added to the positions that the task reports, the same in every episode: x, y, z in the base
             frame, each at most 0.2 [m]. As if the camera that sees target and objects were not where it is taken to be.
     """
 

@@ -65,7 +65,7 @@ class GoalStreamer:
 class BhdBrain(Teleoperator):
     """A brain in place of a person: its actions follow from what the robot in this process last observed.
 
-    LeRobot asks a teleoperator for actions and shows it nothing; this one looks at the simulated robot that is
+    LeRobot asks a teleoperator for actions and shows it nothing; this one observes the simulated robot that is
     connected in the same process.
 
     Args:
@@ -149,9 +149,9 @@ class BhdBrain(Teleoperator):
         seen = robot.last_observation
         state = np.array([[seen[name] for name in robot.observation_names]])
         images = {name: seen[name][None] for name in robot.camera_shapes}
-        names, told = robot.environment
+        names, reported = robot.environment
         observation = Observation(
-            robot.observation_names, state, images, told[None] if names else None, {0: self._results}
+            robot.observation_names, state, images, reported[None] if names else None, {0: self._results}
         )
         wanted = self._brain.act(observation)
         if isinstance(wanted, Mixed):

@@ -48,7 +48,7 @@ def test_points_without_a_tick_are_missed_and_the_warm_up_does_not_count() -> No
     assert (found["ticks"], found["missed"]) == (697, 3)
 
 
-def test_what_says_nothing_is_not_a_number() -> None:
+def test_a_missing_value_is_not_a_number() -> None:
     with pytest.raises(NotMeasuredError, match="no tick"):
         summarise(Ticks(series([0, 1], 0, 0), PERIOD), 0.3)
     with pytest.raises(NotMeasuredError, match="left its grid"):

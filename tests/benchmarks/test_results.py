@@ -43,7 +43,7 @@ def test_all_sections_have_names_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("is_met", [True, False])
-def test_loader_rows_say_whether_the_goals_are_met(is_met: bool) -> None:
+def test_loader_rows_show_whether_the_goals_are_met(is_met: bool) -> None:
     one = {"samples_per_s": {"ours": RATIO}, "ratio": RATIO, "goal": 200.0, "met": is_met}
     rows = loader_rows({"state": one})
     assert [row.met for row in rows] == [None, is_met, False]  # the cameras' dataset was not recorded
@@ -52,7 +52,7 @@ def test_loader_rows_say_whether_the_goals_are_met(is_met: bool) -> None:
     assert "not measured" in rows[2].value
 
 
-def test_what_did_not_come_up_is_said_with_its_reason() -> None:
+def test_what_did_not_come_up_is_listed_with_its_reason() -> None:
     speeds = {OURS: [70.0, 90.0], "SyncVectorEnv": [10.0, 10.0], BARE: [100.0, 100.0]}
     results = summary(speeds, {"AsyncVectorEnv": "64 environments did not come up within 300 s"}, 64)
     assert results["met"]
@@ -128,8 +128,8 @@ def test_the_interval_gets_narrower_with_more_seeds() -> None:
 
 
 def test_outcomes_are_in_the_order_of_the_episodes() -> None:
-    told = [("a", 1, True), ("b", 0, True), ("a", 0, False)]
-    results = {"episodes": [{"brain": name, "episode": number, "success": good} for name, number, good in told]}
+    rows = [("a", 1, True), ("b", 0, True), ("a", 0, False)]
+    results = {"episodes": [{"brain": name, "episode": number, "success": good} for name, number, good in rows]}
     assert values(results, "a", "success") == [False, True]
 
 

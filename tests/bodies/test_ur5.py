@@ -270,7 +270,7 @@ def test_no_command_drives_a_joint_beyond_its_torque() -> None:
 
 
 @pytest.mark.parametrize("actuation", ["position", "torque"])
-def test_the_actuators_are_what_the_arm_says(actuation: str) -> None:
+def test_the_actuators_are_those_of_the_arm(actuation: str) -> None:
     body = ur5(actuation=actuation)  # type: ignore[arg-type]
     model = World(body).model
     for number, name in enumerate(body.actuators):

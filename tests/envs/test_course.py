@@ -10,7 +10,7 @@ from bhd_lerobot.tasks.task import episode_seed
 
 
 def played(course: Course, seed: int | None, resets: int = 20) -> set[int]:
-    """Return the seeds of the episodes of some resets, of which only the first is told a number, as clients do."""
+    """Return the seeds of the episodes of some resets, of which only the first gets a number, as clients do."""
     return {course.advance(seed), *(course.advance() for _ in range(resets - 1))}
 
 

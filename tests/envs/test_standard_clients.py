@@ -52,11 +52,11 @@ def test_stable_baselines3_learns(learner: Any, name: str) -> None:
 
 def starts(envs: VecEnv, resets: int = 3) -> list[list[int]]:
     """Return the seeds of the first episodes of each environment."""
-    told = []
+    seeds = []
     for _ in range(resets):
         envs.reset()
-        told.append([info["seed"] for info in envs.reset_infos])
-    return np.transpose(told).tolist()
+        seeds.append([info["seed"] for info in envs.reset_infos])
+    return np.transpose(seeds).tolist()
 
 
 @pytest.mark.parametrize("seed", [0, 3, None])
@@ -171,6 +171,8 @@ def test_wrappers_of_vector_environments(kind: str, mode: AutoresetMode) -> None
     for name, wrap in VECTOR.items():
         if mode == AutoresetMode.SAME_STEP and name in NEXT_STEP_ONLY:
             continue
+        if kind == "sync" and name != "everything":
+            continue  # under Gymnasium's own vector environment, the wrappers never meet ours
         options = {"autoreset_mode": mode}
         made = gymnasium.make_vec(
             AVOID, N, kind, **(BRIEF | options if kind != "sync" else BRIEF | {"vector_kwargs": options})
@@ -181,9 +183,9 @@ def test_wrappers_of_vector_environments(kind: str, mode: AutoresetMode) -> None
         ended: list[dict[str, Any]] = []
         for _ in range(3 * FRAMES):
             _, _, terminated, truncated, infos = env.step(env.action_space.sample())
-            told = infos if isinstance(infos, list) else DictInfoToList(made)._convert_info_to_list(infos)
-            assert all({"episode_index", "seed", "event"} <= info.keys() for info in told), name
-            ended += [told[i] for i in np.flatnonzero(np.asarray(terminated) | np.asarray(truncated))]
+            listed = infos if isinstance(infos, list) else DictInfoToList(made)._convert_info_to_list(infos)
+            assert all({"episode_index", "seed", "event"} <= info.keys() for info in listed), name
+            ended += [listed[i] for i in np.flatnonzero(np.asarray(terminated) | np.asarray(truncated))]
         assert len(ended) >= 2 * N, name
         if name in ("RecordEpisodeStatistics", "everything"):
             assert all(info["episode"]["l"] == FRAMES for info in ended), name
@@ -193,16 +195,23 @@ def test_wrappers_of_vector_environments(kind: str, mode: AutoresetMode) -> None
 # --- how an environment is found --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "env = gymnasium.make('bhd_lerobot.envs.register:{id}')",
-        "import bhd_lerobot.envs.register; env = gymnasium.make('{id}')",
-        "env = gymnasium.make_vec('bhd_lerobot.envs.register:{id}', 2)",
-    ],
-)
-def test_a_fresh_interpreter_makes_them_as_the_documentation_says(code: str) -> None:
+FORGET = """
+env.reset(seed=0)
+env.close()
+del sys.modules["bhd_lerobot.envs.register"]
+for name in [name for name in gymnasium.registry if name.startswith("bhd_lerobot/")]:
+    del gymnasium.registry[name]
+"""
+
+
+def test_every_documented_way_registers_and_makes_an_environment_where_nothing_was_imported() -> None:
+    """In one interpreter that forgets the registration after each, because starting one takes seconds."""
     name = f"bhd_lerobot/{next(iter(ENVIRONMENTS))}"
-    text = f"import gymnasium; {code.format(id=name)}; env.reset(seed=0); env.close()"
+    ways = [
+        f"env = gymnasium.make('bhd_lerobot.envs.register:{name}')",
+        f"import bhd_lerobot.envs.register; env = gymnasium.make('{name}')",
+        f"env = gymnasium.make_vec('bhd_lerobot.envs.register:{name}', 2)",
+    ]
+    text = "import gymnasium, sys\n" + FORGET.join([*ways, ""])
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", text], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

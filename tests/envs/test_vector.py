@@ -38,8 +38,10 @@ def play(env: VectorEnv, actions: np.ndarray, **reset: Any) -> Iterator[Any]:
         yield env.step(action)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [*((name, AutoresetMode.SAME_STEP) for name in NAMES), *((name, AutoresetMode.NEXT_STEP) for name in NAMES[::3])],
+)
 def test_it_is_the_single_environments_bit_for_bit(name: str, mode: AutoresetMode) -> None:
     ours, sync = make(name=name, autoreset_mode=mode), SyncVectorEnv(makers(name), autoreset_mode=mode)
     actions = some_actions(name, 60, N)
@@ -47,7 +49,7 @@ def test_it_is_the_single_environments_bit_for_bit(name: str, mode: AutoresetMod
     for mine, theirs in zip(play(ours, actions), play(sync, actions), strict=True):
         assert_same(mine, theirs)
         ends += int((mine[2] | mine[3]).sum()) if len(mine) == 5 else 0
-    assert ends > N  # otherwise nothing was said about what follows an end
+    assert ends > N  # otherwise nothing that follows an end was compared
     assert ours.observation_space == sync.observation_space
     assert ours.action_space == sync.action_space
     ours.close()

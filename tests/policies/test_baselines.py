@@ -53,7 +53,7 @@ def test_a_new_episode_is_held_where_it_begins() -> None:
     brain.reset(np.array([1]), [5], 2)
     held = brain.act(Observation(("other", *ARM), np.ones((2, 8)), running=np.array([True, False])))
     assert held[0] == pytest.approx(0)
-    assert held[1] == pytest.approx(0.01)  # not looked at before it runs
+    assert held[1] == pytest.approx(0.01)  # not observed before it runs
     assert brain.act(Observation(("other", *ARM), np.ones((2, 8))))[1] == pytest.approx(1)
 
 

@@ -79,12 +79,3 @@ def test_a_brain_refuses_a_robot_without_its_features(
         brain.bind(ACTIONS, ACTIONS, 10)
     with pytest.raises(ConfigError, match=f"{brain.name!r} needs the action feature.*theta.vel"):
         brain.bind((*ACTIONS, *scan_names(360)), ("x.vel",), 10)
-
-
-@pytest.mark.parametrize("brain_type", BRAINS)
-def test_parameters_are_plain_and_complete(brain_type: type[AvoidanceBrain] | type[GapFollowerBrain]) -> None:
-    brain = brain_type()
-    parameters = brain.parameters()
-    assert parameters.pop("type") == brain.name
-    assert all(isinstance(value, int | float | str | bool) for value in parameters.values())
-    assert type(brain.config)(**parameters) == brain.config

@@ -353,7 +353,7 @@ def test_an_arm_that_presses_on_the_table_stops_and_lets_go(robot):
     assert simulation.bridge.state().joint_positions[0] == pytest.approx(start[0], abs=2e-3)
 
 
-@each_case(
+@pytest.mark.parametrize(
     ("goal", "code"),
     [
         ({"max_velocity": 1e-7}, ResultCode.PLANNING_FAILED),

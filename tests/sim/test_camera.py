@@ -1,3 +1,4 @@
+import json
 import math
 import os
 import subprocess
@@ -41,7 +42,7 @@ def empty(world: World) -> None:
 
 
 @pytest.mark.parametrize("name", ["front", "overview"])
-def test_an_image_has_the_size_asked_for_and_bytes(camera: Camera, name: str) -> None:
+def test_an_image_has_the_requested_size_and_bytes(camera: Camera, name: str) -> None:
     image = camera.render(0, name)
     assert image.shape == (HEIGHT, WIDTH, 3)
     assert image.dtype == np.uint8
@@ -110,7 +111,7 @@ def test_two_cameras_work_in_one_process(world: World, camera: Camera) -> None:
         large.render(0, "front")
 
 
-def test_images_are_copies_or_go_where_the_caller_says(world: World, camera: Camera) -> None:
+def test_images_are_copies_or_go_into_the_caller_s_array(world: World, camera: Camera) -> None:
     first = camera.render(0, "front")
     kept = first.copy()
     world.place([[POST], []])
@@ -156,64 +157,44 @@ def test_an_unknown_camera_is_an_error_with_the_near_miss(camera: Camera) -> Non
 
 # --- without OpenGL: in processes of their own, because a backend is chosen for the whole process --------------------
 
-PREAMBLE = """
-import sys
+FORK = """
+import json, os, sys
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.sim.world import World
-world = World(turtlebot3_burger())
-world.step(10)
-assert world.time[0] > 0
 import bhd_lerobot.sim.camera as camera
+
+def run(program):
+    world = World(turtlebot3_burger())
+    world.step(10)
+    assert world.time[0] > 0
+    exec(program, globals())
+    try:
+        camera.Camera(world)
+    except RenderingError as error:
+        print(error)
+
+printed = {}
+for name, (program, environment) in json.loads(sys.argv[1]).items():
+    reading, writing = os.pipe()
+    child = os.fork()
+    if not child:
+        os.dup2(writing, 1)
+        os.environ.update(environment)
+        try:
+            run(program)
+            sys.stdout.flush()
+        finally:
+            os._exit(sys.exc_info()[0] is not None)
+    os.close(writing)
+    with open(reading) as pipe:
+        printed[name] = [pipe.read(), os.waitpid(child, 0)[1]]
+print(json.dumps(printed))
 """
-
-
-def run(program: str, **environment: str) -> str:
-    inherited = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY")}
-    done = subprocess.run(
-        [sys.executable, "-c", PREAMBLE + program],
-        env={**inherited, **environment},
-        cwd=Path(__file__).resolve().parents[2],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-RENDER = """
-try:
-    camera.Camera(world)
-except RenderingError as error:
-    print(error)
-"""
-
-
-@pytest.mark.parametrize("chosen", [{}, {"MUJOCO_GL": "egl"}, {"MUJOCO_GL": "osmesa"}])
-def test_without_opengl_the_physics_runs_and_the_error_names_the_remedy(chosen: dict[str, str]) -> None:
-    message = run("sys.modules['OpenGL'] = None\n" + RENDER, **chosen)
-    for backend in chosen.values() or ("egl", "osmesa"):
-        assert f"{backend}: " in message
-    assert "apt-get install libegl1" in message
-    assert "turn the cameras off" in message
-
-
-def test_a_backend_that_does_not_exist_is_an_error_that_lists_the_choices() -> None:
-    message = run(RENDER, MUJOCO_GL="nonsense")
-    assert "'nonsense'. Valid: egl, glfw, osmesa." in message
-
-
-def test_a_window_system_that_is_not_there_is_an_error_that_names_the_remedy() -> None:
-    assert "apt-get install libegl1" in run(RENDER, MUJOCO_GL="glfw")
-
-
-def test_a_backend_that_fails_leaves_nothing_behind_for_the_next() -> None:
-    """MuJoCo's OSMesa refuses to load when PyOpenGL was bound to EGL before."""
-    program = (
-        """
-import os, types
+ABSENT = "sys.modules['OpenGL'] = None"
+# MuJoCo's OSMesa refuses to load when PyOpenGL was bound to EGL before.
+FAILING = """
+import types
 def open_(backend, width, height):
     if backend == "egl":
         os.environ["PYOPENGL_PLATFORM"] = "egl"
@@ -221,9 +202,51 @@ def open_(backend, width, height):
         raise ImportError("no EGL")
     assert "PYOPENGL_PLATFORM" not in os.environ and "OpenGL" not in sys.modules
     print(backend)
-    sys.exit()
+    raise RenderingError("stop")
 camera._open = open_
 """
-        + RENDER
+PROGRAMS = {
+    "absent": (ABSENT, {}),
+    "absent egl": (ABSENT, {"MUJOCO_GL": "egl"}),
+    "absent osmesa": (ABSENT, {"MUJOCO_GL": "osmesa"}),
+    "nonsense": ("", {"MUJOCO_GL": "nonsense"}),
+    "no window system": ("", {"MUJOCO_GL": "glfw"}),
+    "failing egl": (FAILING, {}),
+}
+
+
+@pytest.fixture(scope="module")
+def messages() -> dict[str, str]:
+    """Return what the programs print, each in a process forked from one that has imported MuJoCo."""
+    inherited = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY")}
+    done = subprocess.run(
+        [sys.executable, "-c", FORK, json.dumps(PROGRAMS)],
+        env=inherited,
+        cwd=Path(__file__).resolve().parents[2],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=True,
     )
-    assert run(program).strip() == "osmesa"
+    printed = json.loads(done.stdout)
+    assert all(status == 0 for _, status in printed.values()), done.stderr
+    return {name: text for name, (text, _) in printed.items()}
+
+
+def test_without_opengl_the_physics_runs_and_the_error_names_the_remedy(messages: dict[str, str]) -> None:
+    for name, backends in (("absent", ("egl", "osmesa")), ("absent egl", ("egl",)), ("absent osmesa", ("osmesa",))):
+        assert all(f"{backend}: " in messages[name] for backend in backends)
+        assert "apt-get install libegl1" in messages[name]
+        assert "turn the cameras off" in messages[name]
+
+
+def test_a_backend_that_does_not_exist_is_an_error_that_lists_the_choices(messages: dict[str, str]) -> None:
+    assert "'nonsense'. Valid: egl, glfw, osmesa." in messages["nonsense"]
+
+
+def test_a_window_system_that_is_not_there_is_an_error_that_names_the_remedy(messages: dict[str, str]) -> None:
+    assert "apt-get install libegl1" in messages["no window system"]
+
+
+def test_a_backend_that_fails_leaves_nothing_behind_for_the_next(messages: dict[str, str]) -> None:
+    assert messages["failing egl"].split()[0] == "osmesa"

@@ -247,7 +247,7 @@ def test_variations_reach_light_camera_and_fingers() -> None:
         table.place(scenes)
 
 
-def test_cameras_turn_by_what_the_scene_says_and_the_model_s_other_fields_stay() -> None:
+def test_cameras_turn_by_the_scene_s_angles_and_the_model_s_other_fields_stay() -> None:
     world = World(BODY, 2)
     table = Tabletop(world)
     turns = {"camera_turn": (0.02, -0.01, 0.03), "wrist_turn": (0.0, 0.05, 0.0)}
@@ -321,7 +321,7 @@ def touches(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[bool, bool, boo
     return table, own, link, grip
 
 
-def test_the_flags_say_what_the_list_of_contacts_says() -> None:
+def test_the_flags_agree_with_the_list_of_contacts() -> None:
     world, table = laid(16, count=5)
     rng = np.random.default_rng(2)
     models = [world.copy_model(sim) for sim in range(16)]

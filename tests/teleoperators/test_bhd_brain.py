@@ -11,6 +11,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
 from bhd_lerobot.teleoperators.bhd_brain import BhdBrain
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
@@ -73,31 +74,41 @@ def test_its_lifecycle(tmp_path):
     assert not teleop.is_connected
 
 
-def test_stock_record_and_replay_work(tmp_path):
-    """`lerobot-record` and `lerobot-replay`, in one process because importing LeRobot takes seconds."""
-    root = tmp_path / "stock"
-    code = f"""
+STOCK = """
 import sys
-from lerobot.scripts import lerobot_record, lerobot_replay
-common = ["--robot.type=turtlebot3", "--play_sounds=false", "--dataset.root={root}"]
-sys.argv = ["lerobot-record", *common, "--dataset.repo_id=test/stock", "--teleop.type=bhd_brain",
-            "--dataset.single_task=Roam.", "--dataset.fps=10", "--dataset.num_episodes=1",
-            "--dataset.episode_time_s=1", "--dataset.reset_time_s=0", "--dataset.push_to_hub=false"]
-lerobot_record.main()
 from lerobot.datasets import LeRobotDataset
-dataset = LeRobotDataset("test/stock", root="{root}")
-name = dataset.repo_id
-assert dataset.meta.robot_type == "turtlebot3", dataset.meta.robot_type
-assert dataset[0]["observation.state"].shape == (362,)
-print("FRAMES", dataset.num_frames, dataset[3]["action"].tolist())
-sys.argv = ["lerobot-replay", *common, "--dataset.repo_id=test/stock", "--dataset.episode=0"]
-lerobot_replay.main()
-print("REPLAYED")
+from lerobot.scripts import lerobot_record, lerobot_replay
+
+def run(robot, fps, *options):
+    common = [f"--robot.type={robot}", "--play_sounds=false", f"--dataset.root={robot}"]
+    common += [f"--dataset.repo_id=test/{robot}", *(one for one in options if one.startswith("--robot"))]
+    sys.argv = ["lerobot-record", *common, "--teleop.type=bhd_brain", "--dataset.single_task=Go.",
+                f"--dataset.fps={fps}", "--dataset.num_episodes=1", "--dataset.episode_time_s=1",
+                "--dataset.reset_time_s=0", "--dataset.push_to_hub=false",
+                *(one for one in options if one.startswith("--teleop"))]
+    lerobot_record.main()
+    dataset = LeRobotDataset(f"test/{robot}", root=robot)
+    assert dataset.meta.robot_type == robot, dataset.meta.robot_type
+    width, last = dataset[0]["observation.state"].shape[0], dataset[dataset.num_frames - 1]["action"].tolist()
+    print("RECORDED", dataset.num_frames, width, last)
+    sys.argv = ["lerobot-replay", *common, "--dataset.episode=0"]
+    lerobot_replay.main()
+    print("REPLAYED")
+
+run("turtlebot3", 10)
+run("ur5", 25, "--robot.scene=pick", "--teleop.brain.type=pick")
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
+
+
+def test_stock_record_and_replay_work(tmp_path):
+    """`lerobot-record` and `lerobot-replay` of both robots, in one process because importing LeRobot takes seconds."""
+    result = subprocess.run([sys.executable, "-c", STOCK], capture_output=True, text=True, cwd=tmp_path, check=False)
     assert result.returncode == 0, result.stderr[-3000:]
-    line = next(line for line in result.stdout.splitlines() if line.startswith("FRAMES"))
-    frames = int(line.split()[1])
-    assert 5 <= frames <= 11
-    assert np.allclose(json.loads(line.split(" ", 2)[2]), [0.2, 0.0])
-    assert "REPLAYED" in result.stdout
+    recorded = [line.split(" ", 3) for line in result.stdout.splitlines() if line.startswith("RECORDED")]
+    assert [int(width) for _, _, width, _ in recorded] == [362, 14]
+    for (_, frames, _, _), fps in zip(recorded, (10, 25), strict=True):
+        assert 5 <= int(frames) <= fps + 1
+    base, arm = (json.loads(action) for *_, action in recorded)
+    assert np.allclose(base, [0.2, 0.0])
+    assert not np.allclose(arm, UR5Config().body().home, atol=0.05)  # it was on its way
+    assert result.stdout.count("REPLAYED") == 2

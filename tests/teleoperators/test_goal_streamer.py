@@ -1,9 +1,5 @@
 """Goals as setpoints: what a brain that gives goals does to a robot that takes setpoints only."""
 
-import json
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -29,9 +25,9 @@ def drive(tmp_path, brain, frames=125, **options):
         assert list(teleop.action_features) == list(robot.action_features)
         for _ in range(frames):
             robot.get_observation()
-            asked = teleop.get_action()
-            applied = robot.send_action(asked)
-            assert applied == pytest.approx(asked, abs=5e-3)  # goals never ask for more than the limits
+            requested = teleop.get_action()
+            applied = robot.send_action(requested)
+            assert applied == pytest.approx(requested, abs=5e-3)  # goals never ask for more than the limits
         return robot.simulation.truth(), robot._scene, teleop._brain
 
 
@@ -50,7 +46,7 @@ def test_a_reach_brain_reaches_through_setpoints(tmp_path):
     assert truth.tool_pose[0, :3] == pytest.approx(scene.target_pose[:3], abs=1e-3)
 
 
-def test_a_goal_that_fails_is_told_to_the_brain(tmp_path):
+def test_the_brain_receives_a_refused_goal(tmp_path):
     _, _, brain = drive(tmp_path, LanguageBrainConfig(instruction="pick up the elephant"), frames=3, scene="pick")
     assert "elephant" in brain.plan(0)["problem"]
 
@@ -90,32 +86,3 @@ def test_refusals_and_tolerances_come_back():
     assert [one.code for one in drain(GoalStreamer(ARM, RATES, HOME), [far], 60, stuck)[1]] == [
         ResultCode.PATH_TOLERANCE
     ]
-
-
-def test_stock_record_and_replay_work(tmp_path):
-    """`lerobot-record` and `lerobot-replay`, in one process because importing LeRobot takes seconds."""
-    root = tmp_path / "stock"
-    code = f"""
-import sys
-from lerobot.scripts import lerobot_record, lerobot_replay
-common = ["--robot.type=ur5", "--robot.scene=pick", "--play_sounds=false", "--dataset.root={root}"]
-sys.argv = ["lerobot-record", *common, "--dataset.repo_id=test/stock", "--teleop.type=bhd_brain",
-            "--teleop.brain.type=pick", "--dataset.single_task=Pick it up.", "--dataset.fps=25",
-            "--dataset.num_episodes=1", "--dataset.episode_time_s=1", "--dataset.reset_time_s=0",
-            "--dataset.push_to_hub=false"]
-lerobot_record.main()
-from lerobot.datasets import LeRobotDataset
-dataset = LeRobotDataset("test/stock", root="{root}")
-assert dataset.meta.robot_type == "ur5", dataset.meta.robot_type
-assert dataset[0]["observation.state"].shape == (14,)
-print("FRAMES", dataset.num_frames, dataset[dataset.num_frames - 1]["action"].tolist())
-sys.argv = ["lerobot-replay", *common, "--dataset.repo_id=test/stock", "--dataset.episode=0"]
-lerobot_replay.main()
-print("REPLAYED")
-"""
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert result.returncode == 0, result.stderr[-3000:]
-    line = next(line for line in result.stdout.splitlines() if line.startswith("FRAMES"))
-    assert 5 <= int(line.split()[1]) <= 26
-    assert not np.allclose(json.loads(line.split(" ", 2)[2]), HOME, atol=0.05)  # it was on its way
-    assert "REPLAYED" in result.stdout

@@ -88,7 +88,7 @@ ROWS: dict[str, Finding] = {
         "Python",
         _P,
         "packages cannot be installed or imported",
-        "Python {version} is not one of those supported, {asked}",
+        "Python {version} is not supported; required: {required}",
         "make the environment with Python 3.12 or 3.13: `PYTHON=/path/to/python3.12 make test`",
     ),
     "package.missing": Finding(
@@ -102,15 +102,8 @@ ROWS: dict[str, Finding] = {
         "versions",
         _P,
         "errors about arguments, attributes or types that there are not",
-        "`{name}` is {version}; asked for is {asked}",
+        "`{name}` is {version}; required: {required}",
         _REINSTALL,
-    ),
-    "package.extra": Finding(
-        "versions",
-        _W,
-        "errors about arguments, attributes or types that there are not, where the extra {extra} is used",
-        "`{name}` is {version}; the extra {extra} asks for {asked}",
-        "nothing, if you do not use it; otherwise `pip install -e '.[{extra}]'` in the checkout",
     ),
     "plugins.error": Finding(
         "plug-ins",
@@ -289,9 +282,9 @@ ROWS: dict[str, Finding] = {
 def markdown_table() -> str:
     """Return the table of the documentation, with "…" for values."""
     rows = ["| check | | symptom | cause | remedy |", "|---|---|---|---|---|"]
-    for one in ROWS.values():
-        texts = [re.sub(r"\{\w+\}", "…", text) for text in (one.symptom, one.cause, one.remedy)]
-        rows.append(f"| {one.check} | {one.status} | {' | '.join(texts)} |")
+    for finding in ROWS.values():
+        texts = [re.sub(r"\{\w+\}", "…", text) for text in (finding.symptom, finding.cause, finding.remedy)]
+        rows.append(f"| {finding.check} | {finding.status} | {' | '.join(texts)} |")
     return "\n".join(rows) + "\n"
 
 
@@ -314,67 +307,55 @@ def wrong(key: str, found: str, **values: object) -> Finding:
 
 
 def check_python(version: str = platform.python_version()) -> list[Finding]:
-    """Check that Python is one of those that the package asks for."""
+    """Check that the package supports this Python."""
     try:
-        asked = metadata.metadata(DISTRIBUTION)["Requires-Python"]
+        required = metadata.metadata(DISTRIBUTION)["Requires-Python"]
     except metadata.PackageNotFoundError:
         return [wrong("package.missing", "not installed", name=DISTRIBUTION)]
-    if not SpecifierSet(asked).contains(version, prereleases=True):
-        return [wrong("python", version, version=version, asked=asked)]
+    if not SpecifierSet(required).contains(version, prereleases=True):
+        return [wrong("python", version, version=version, required=required)]
     return [fine("Python", f"{version} at {real_interpreter()}")]
 
 
 def check_versions(
     shown: Sequence[str] = ("lerobot", "mujoco"), version_of: Callable[[str], str] = metadata.version
 ) -> list[Finding]:
-    """Check that packages have the versions that ours asks for.
-
-    What it always needs must be there; what only an extra of it needs, and happens to be there, is compared as well.
+    """Check that the packages that ours requires are there, in the required versions.
 
     Args:
         shown: the packages that get a finding also if all is well.
         version_of: returns the version of an installed package.
     """
     try:
-        asked = _requirements()
+        required = _requirements()
     except metadata.PackageNotFoundError:
         return [wrong("package.missing", "not installed", name=DISTRIBUTION)]
-    wanted: dict[tuple[str, SpecifierSet], list[str]] = {}
-    for extra, packages in asked.items():
-        for name, versions in packages.items():
-            wanted.setdefault((name, versions), []).append(extra)
     findings = []
-    for (name, versions), extras in wanted.items():
+    for name, versions in required.items():
         try:
             version = version_of(name)
         except metadata.PackageNotFoundError:
-            if "" in extras:  # nobody says which of the others were asked for
-                findings.append(wrong("package.missing", f"{name} is not installed", name=name))
+            findings.append(wrong("package.missing", f"{name} is not installed", name=name))
             continue
-        values = {"name": name, "version": version, "asked": versions, "extra": ",".join(extras)}
-        if versions.contains(version, prereleases=True):
-            if "" in extras and name in shown:
-                findings.append(fine("versions", f"{name} {version}, asked for is {versions}"))
-        elif "" in extras:
-            findings.append(wrong("package.version", f"{name} {version}", **values))
-        elif asked[""].get(name, SpecifierSet()).contains(version, prereleases=True):  # or it is known already
-            findings.append(wrong("package.extra", f"{name} {version}", **values))
+        if not versions.contains(version, prereleases=True):
+            found = f"{name} {version}"
+            findings.append(wrong("package.version", found, name=name, version=version, required=versions))
+        elif name in shown:
+            findings.append(fine("versions", f"{name} {version}, required: {versions}"))
     return findings
 
 
-def _requirements() -> dict[str, dict[str, SpecifierSet]]:
-    """Return which versions of which packages ours asks for on this machine, by extra; always, for the extra "".
+def _requirements() -> dict[str, SpecifierSet]:
+    """Return which versions of which packages ours requires on this machine, without those of its extras.
 
-    A package may be named several times, as for an extra of its own; all of that holds at once.
+    A package may be named several times; all of that holds at once.
     """
-    extras = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
-    asked: dict[str, dict[str, SpecifierSet]] = {extra: {} for extra in ("", *extras)}
-    for one in map(Requirement, metadata.requires(DISTRIBUTION) or []):
-        name = canonicalize_name(one.name)
-        for extra, packages in asked.items():
-            if one.marker is None or one.marker.evaluate({"extra": extra}):
-                packages[name] = packages.get(name, SpecifierSet()) & one.specifier
-    return asked
+    required: dict[str, SpecifierSet] = {}
+    for requirement in map(Requirement, metadata.requires(DISTRIBUTION) or []):
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+            name = canonicalize_name(requirement.name)
+            required[name] = required.get(name, SpecifierSet()) & requirement.specifier
+    return required
 
 
 def check_plugins(outcome: Outcome) -> list[Finding]:

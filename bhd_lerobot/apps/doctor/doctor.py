@@ -85,17 +85,17 @@ def _findings_table(findings: Sequence[Finding]) -> Table:
     table = Table(title="bhd-doctor", title_justify="left")
     for heading in ("check", "", "found"):
         table.add_column(heading, overflow="fold")
-    for one in findings:
-        table.add_row(one.check, f"[{_COLOURS[one.status]}]{one.status}[/]", escape(one.found))
+    for finding in findings:
+        table.add_row(finding.check, f"[{_COLOURS[finding.status]}]{finding.status}[/]", escape(finding.found))
     return table
 
 
 def _print_remedies(findings: Sequence[Finding], console: Console) -> None:
     """Print what is wrong as lines that are not broken, so that a command can be copied from them."""
-    for one in findings:
-        if one.status is not Status.OK:
-            console.print(f"\n[{_COLOURS[one.status]}]{one.status}: {one.check}[/]")
-            for heading, text in (("symptom", one.symptom), ("cause", one.cause), ("remedy", one.remedy)):
+    for finding in findings:
+        if finding.status is not Status.OK:
+            console.print(f"\n[{_COLOURS[finding.status]}]{finding.status}: {finding.check}[/]")
+            for heading, text in (("symptom", finding.symptom), ("cause", finding.cause), ("remedy", finding.remedy)):
                 console.print(f"  {heading:<8} {escape(text)}", highlight=False, soft_wrap=True)
 
 
@@ -136,14 +136,14 @@ def _main(options: argparse.Namespace, run: RunTrials) -> int:
         if options.realtime:
             findings += checks.check_latency(tested, robot_rates())
     if options.json:
-        report = {"findings": [asdict(one) for one in findings], "latency_test": measured}
+        report = {"findings": [asdict(finding) for finding in findings], "latency_test": measured}
         print(json.dumps(report, indent=1, ensure_ascii=False))
     else:
         console.print(_findings_table(findings))
         if measured is not None:
             _print_latency(measured, console)
         _print_remedies(findings, console)
-    return int(any(one.status is Status.PROBLEM for one in findings))
+    return int(any(finding.status is Status.PROBLEM for finding in findings))
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def _run_process(trials: Sequence[Sequence[Any]], timeout_s: float) -> list[Outc
 def _describe_end(status: int) -> str:
     if status >= 0:
         return f"ended with status {status}"
-    names = {one.value: one.name for one in signal.Signals}
+    names = {number.value: number.name for number in signal.Signals}
     return f"ended by {names.get(-status, f'signal {-status}')}"
 
 
@@ -148,7 +148,7 @@ def render() -> dict[str, Any]:
 
 
 def list_plugins() -> dict[str, list[str]]:
-    """Return the types of robots and teleoperators that LeRobot knows after it has looked for plug-ins."""
+    """Return the types of robots and teleoperators that LeRobot knows after it has searched for plug-ins."""
     from lerobot.robots.config import RobotConfig
     from lerobot.teleoperators.config import TeleoperatorConfig
     from lerobot.utils.import_utils import register_third_party_plugins

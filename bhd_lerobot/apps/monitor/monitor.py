@@ -24,7 +24,7 @@ from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.shared_memory import names
 
 _REFRESH_S = 0.125
-_LOOK_S = 0.5  # that a single snapshot measures rates over
+_SNAPSHOT_S = 0.5  # that a single snapshot measures rates over
 _LINE_S = 1.0  # between two lines where there is no terminal
 
 
@@ -150,7 +150,7 @@ def watch(
 
     Args:
         sampler: where states come from.
-        show: shows one.
+        show: shows a state.
         keys: when the user leaves.
         period_s: between two states [s].
         end: when time is up, monotonic [s].
@@ -181,7 +181,7 @@ def _print(block: LiveBlock, sampler: Sampler, options: argparse.Namespace, cons
     once = options.once or (options.json and options.seconds is None)
     if once and sampler.end() is None:
         sampler.sample()
-        time.sleep(_LOOK_S)
+        time.sleep(_SNAPSHOT_S)
         state = sampler.sample()
         if options.json:
             print(json.dumps(state.as_dict(), indent=1, ensure_ascii=False))

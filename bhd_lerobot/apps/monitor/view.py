@@ -1,4 +1,4 @@
-"""How `bhd-monitor` looks: from a state to text. Pure: the same state gives the same image.
+"""The display of `bhd-monitor`: from a state to text. Pure: the same state gives the same image.
 
 Everything has its place and a fixed width, so that nothing jumps when numbers change. 80 columns and 24 lines hold all.
 """
@@ -22,7 +22,7 @@ _MODES = {
     "ESTOP": "bold white on red",
     "FAULT": "bold white on red",
 }
-_LATE_S = 0.1  # a process without a sign of life for so long is worth a look
+_LATE_S = 0.1  # a process without a sign of life for so long is highlighted
 _SILENT_S = 0.5
 _UNITS = {"x.vel": "m/s", "y.vel": "m/s", "z.vel": "m/s", "gripper.pos": "m", "gripper.vel": "m/s"}
 _UNITS |= {"x.pos": "m", "y.pos": "m", "z.pos": "m"}
@@ -35,8 +35,8 @@ def render(state: MonitorState, *, height: int | None = None, message: str = "",
     Args:
         state: what is shown.
         height: lines that there are; sections are set apart if there is room. All that is needed if None.
-        message: something that is said instead of the keys.
-        keys: what the last line says; there is none if empty.
+        message: shown instead of the keys.
+        keys: the last line; there is none if empty.
     """
     sections = [
         ("", [_title(state), _mode(state)]),
@@ -147,21 +147,21 @@ def _alive(state: MonitorState) -> Text:
 
 
 def _command(state: MonitorState) -> list[Text]:
-    width = max((len(one.name) for one in state.dimensions), default=0)
+    width = max((len(dimension.name) for dimension in state.dimensions), default=0)
     width = min(max(width, _LABEL), 24)
     head = f" {'':<{width}}{'requested':>11}{'applied':>11}{'measured':>11}"
-    return [Text(head, "dim"), *(_dimension(one, width) for one in state.dimensions)]
+    return [Text(head, "dim"), *(_dimension(dimension, width) for dimension in state.dimensions)]
 
 
-def _dimension(one: Dimension, width: int) -> Text:
+def _dimension(dimension: Dimension, width: int) -> Text:
     def number(value: float | None) -> str:
         # What rounds to nothing has no sign.
         return f"{_NOTHING:>11}" if value is None else f"{round(value, 4) + 0.0:>11.4f}"
 
-    limited = one.requested is not None and abs(one.requested - one.applied) > 1e-3
-    line = Text(f" {one.name[:width]:<{width}}{number(one.requested)}")
-    line.append(number(one.applied), "yellow" if limited else "")
-    return line.append(f"{number(one.measured)} {unit(one.name)}")
+    limited = dimension.requested is not None and abs(dimension.requested - dimension.applied) > 1e-3
+    line = Text(f" {dimension.name[:width]:<{width}}{number(dimension.requested)}")
+    line.append(number(dimension.applied), "yellow" if limited else "")
+    return line.append(f"{number(dimension.measured)} {unit(dimension.name)}")
 
 
 def unit(name: str) -> str:
@@ -190,19 +190,19 @@ def _pose(state: MonitorState) -> list[Text]:
 def _interventions(state: MonitorState) -> list[Text]:
     return [
         _counts("limits", state.limits),
-        _counts("watchdogs", {name: one for name, one in state.watchdogs.items() if one.count}),
+        _counts("watchdogs", {name: counter for name, counter in state.watchdogs.items() if counter.count}),
         _counts("refused", {name: Count(n, None) for name, n in state.refusals.items()}),
     ]
 
 
 def _counts(label: str, counts: dict[str, Count]) -> Text:
     line = Text(f" {label:<{_LABEL}}")
-    raised = {name: one for name, one in counts.items() if one.count}
+    raised = {name: counter for name, counter in counts.items() if counter.count}
     if not raised:
         return line.append("none")
-    for name, one in sorted(raised.items(), key=lambda item: -item[1].count):
-        now = f" ({one.per_second:.1f}/s)" if one.per_second is not None else ""
-        line.append(f"{name.lower().replace('_', ' ')} {one.count}{now}   ", "yellow" if one.per_second else "")
+    for name, counter in sorted(raised.items(), key=lambda item: -item[1].count):
+        now = f" ({counter.per_second:.1f}/s)" if counter.per_second is not None else ""
+        line.append(f"{name.lower().replace('_', ' ')} {counter.count}{now}   ", "yellow" if counter.per_second else "")
     return line
 
 
@@ -226,6 +226,6 @@ def one_line(state: MonitorState) -> str:
         f"control {_NOTHING if state.control_rate is None else f'{state.control_rate:.1f}'} of {state.control_hz} Hz",
         f"lateness p99 {duration(late.p99 if late else None)} max {duration(late.max if late else None)}",
         f"skipped {state.skipped}, overruns {state.overruns}, drops {state.recorder_drops}",
-        f"limits {sum(one.count for one in state.limits.values())}, refused {sum(state.refusals.values())}",
+        f"limits {sum(counter.count for counter in state.limits.values())}, refused {sum(state.refusals.values())}",
     ]
     return "; ".join(parts)

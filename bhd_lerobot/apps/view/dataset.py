@@ -1,4 +1,4 @@
-"""A dataset that is looked at: read once, and again when its files have changed."""
+"""A dataset behind the page: read once, and again when its files have changed."""
 
 import hashlib
 import json
@@ -26,7 +26,7 @@ from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.tasks.task import OUTCOMES
 
 _CACHED_BYTES = 128 * 2**20  # of packed episodes: some hundred of an arm, enough to go back and forth
-# What LeRobot counts with; the page knows it without being told for every frame.
+# What LeRobot counts with; the page knows it without the column.
 _COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
@@ -63,7 +63,7 @@ class ViewedDataset:
             RootLock(self.root).release()
         stamp = stamp_of(self.root)
         try:
-            state = load_state(self.root, videos=False)  # a missing video is said in its place on the page
+            state = load_state(self.root, videos=False)  # a missing video is reported in its place on the page
             if not state.info["fps"] > 0:
                 raise corrupt(info, f"its fps is {state.info['fps']!r}")
             return _Content(state, stamp, _summary(state, stamp))
@@ -140,7 +140,7 @@ class ViewedDataset:
         """Return the file of a camera's video, or None if there is no such camera or file.
 
         Raises:
-            DatasetError: a link leads out of the dataset. It is looked at each time: links can be made meanwhile.
+            DatasetError: a link leads out of the dataset. It is checked each time: links can be made meanwhile.
         """
         if key not in self.state.video_keys:
             return None
@@ -172,7 +172,7 @@ class ViewedDataset:
 def stamp_of(root: Path) -> str:
     """Return what changes with every episode that is recorded, marked or removed; empty if there is no dataset.
 
-    Every writer replaces ``info.json`` last, or a file of ``meta/episodes``; both are looked at.
+    Every writer replaces ``info.json`` last, or a file of ``meta/episodes``; both count.
     """
     digest = hashlib.blake2b(digest_size=12)
     found = False
@@ -252,7 +252,7 @@ def _instruction(row: Row) -> str:
 
 
 def _outcome(row: Row) -> str:
-    """Return how an episode ended; empty if nobody has said so."""
+    """Return how an episode ended; empty if it is not recorded."""
     if row.get(f"{PREFIX}outcome"):
         return str(row[f"{PREFIX}outcome"])
     success = row.get(f"{PREFIX}success")

@@ -19,7 +19,17 @@ from bhd_lerobot.datasets.format.state import DatasetState, Row
 from bhd_lerobot.tasks.task import Event
 
 # Long, and of no use on the page, or shown in a form of its own.
-_NOT_TOLD = ("initial_state", "scene", "timing", "plan", "goals", "results", "goal_frames", "interventions", "realtime")
+_HIDDEN = (
+    "initial_state",
+    "scene",
+    "timing",
+    "plan",
+    "goals",
+    "results",
+    "goal_frames",
+    "interventions",
+    "realtime",
+)
 
 
 def packed_episode(state: DatasetState, row: Row, table: pa.Table) -> bytes:
@@ -51,13 +61,13 @@ def packed_episode(state: DatasetState, row: Row, table: pa.Table) -> bytes:
         "events": _events(columns.get(keys.EVENT)),
         "interventions": _interventions(row, columns.get(keys.EVENT)),
         "flags": {
-            "limits": {str(one.value): _words(one.name) for one in Limit if one.value},
-            "watchdog": {str(one.value): _words(one.name) for one in Watchdog if one.value},
+            "limits": {str(limit.value): _words(limit.name) for limit in Limit if limit.value},
+            "watchdog": {str(watchdog.value): _words(watchdog.name) for watchdog in Watchdog if watchdog.value},
         },
         "not_finite": {key: count for key, values in columns.items() if (count := _not_finite(values))},
         "views": views,
         "scene": scene_of(row),
-        "videos": [_video(row, key) for key, one in features.items() if one["dtype"] in ("video", "image")],
+        "videos": [_video(row, key) for key, feature in features.items() if feature["dtype"] in ("video", "image")],
     }
     return pack(header, {**columns, **{f"view.{name}": values for name, values in places.items()}})
 
@@ -94,18 +104,18 @@ def _bands(table: pa.Table, fps: float) -> list[dict[str, Any]]:
         if pa.types.is_string(table[key].type) or pa.types.is_large_string(table[key].type):
             bands.append({"name": key, "runs": _runs(table[key].to_pylist())})
     if keys.LANGUAGE in table.column_names and keys.SUBTASK not in table.column_names:
-        bands.append({"name": keys.SUBTASK, "runs": _said(table[keys.LANGUAGE][0].as_py(), len(table), fps)})
+        bands.append({"name": keys.SUBTASK, "runs": _subtasks(table[keys.LANGUAGE][0].as_py(), len(table), fps)})
     return [band for band in bands if band["runs"]]
 
 
-def _said(rows: Any, frames: int, fps: float) -> list[list[Any]]:
+def _subtasks(rows: Any, frames: int, fps: float) -> list[list[Any]]:
     """Return the subtasks of LeRobot's language column, each from when it began to the next one."""
     try:
-        told = sorted((round(row["timestamp"] * fps), row["content"]) for row in rows if row["style"] == "subtask")
+        begun = sorted((round(row["timestamp"] * fps), row["content"]) for row in rows if row["style"] == "subtask")
     except (KeyError, TypeError):
         return []
-    ends = [frame for frame, _ in told[1:]] + [frames]
-    return [[frame, end, text] for (frame, text), end in zip(told, ends, strict=True) if text and frame < end]
+    ends = [frame for frame, _ in begun[1:]] + [frames]
+    return [[frame, end, text] for (frame, text), end in zip(begun, ends, strict=True) if text and frame < end]
 
 
 def _modes(modes: NDArray | None) -> list[dict[str, Any]]:
@@ -147,7 +157,7 @@ def _interventions(row: Row, events: NDArray | None) -> list[list[Any]]:
     """Return [first frame, frame after the last, why] of every intervention."""
     stored = _json(row, "interventions")
     if isinstance(stored, list):
-        return [[*one[:2], str(one[2]) if len(one) > 2 else ""] for one in stored if isinstance(one, list)]
+        return [[*span[:2], str(span[2]) if len(span) > 2 else ""] for span in stored if isinstance(span, list)]
     if events is None:
         return []
     return [[first, end, ""] for first, end, value in _runs((events[:, 0] == Event.INTERVENTION).tolist()) if value]
@@ -158,7 +168,11 @@ def _goals(row: Row) -> list[list[Any]]:
     results = _json(row, "results")
     if not isinstance(results, list):
         return []
-    return [[one[0], one[1], one[3], one[4]] for one in results if isinstance(one, list) and len(one) == 5]
+    return [
+        [result[0], result[1], result[3], result[4]]
+        for result in results
+        if isinstance(result, list) and len(result) == 5
+    ]
 
 
 def _video(row: Row, key: str) -> dict[str, Any]:
@@ -178,7 +192,7 @@ def _video(row: Row, key: str) -> dict[str, Any]:
 
 def _metadata(row: Row) -> dict[str, Any]:
     own = {key.removeprefix(PREFIX): value for key, value in row.items() if key.startswith(PREFIX)}
-    return {key: value for key, value in own.items() if key not in _NOT_TOLD and not isinstance(value, Mapping)}
+    return {key: value for key, value in own.items() if key not in _HIDDEN and not isinstance(value, Mapping)}
 
 
 def _json(row: Row, name: str) -> Any:

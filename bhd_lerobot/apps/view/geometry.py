@@ -18,7 +18,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
 
 Arrays = dict[str, NDArray]
-_AWAY_M = 10.0  # an object this high floats where nobody sees it: it is not there
+_AWAY_M = 10.0  # an object this high is absent: it floats out of sight
 _ARM_STATE = 6 + 2 + 7 * MAX_OBJECTS  # numbers of a UR5's position state
 _BASE_STATE = 9  # numbers of a TurtleBot3's
 
@@ -69,8 +69,8 @@ def views_of(
         }
     if robot == "ur5" and (joints := _joints(names, observed, physics)) is not None:
         capsules = _ur5().chain.capsules
-        palm = next(number for number, one in enumerate(capsules) if one.name == "palm")
-        about["arm"] = {"radii": [one.radius for one in capsules], "hand": palm}
+        palm = next(number for number, capsule in enumerate(capsules) if capsule.name == "palm")
+        about["arm"] = {"radii": [capsule.radius for capsule in capsules], "hand": palm}
         arrays |= _arm(*joints)
         if physics is not None and physics.shape[1] > _ARM_STATE:
             arrays["objects"] = _objects(physics)
@@ -108,12 +108,12 @@ def _arm(joints: NDArray[np.float64], opening: NDArray[np.float64]) -> Arrays:
     kinematics = ForwardKinematics(chain)
     frames = kinematics.frames(joints)
     capsules = np.empty((len(joints), len(chain.capsules), 2, 3), np.float32)
-    for number, one in enumerate(chain.capsules):
-        frame = frames[:, one.frame]
-        for end, point in enumerate((one.start, one.end)):
+    for number, capsule in enumerate(chain.capsules):
+        frame = frames[:, capsule.frame]
+        for end, point in enumerate((capsule.start, capsule.end)):
             local = np.tile(np.asarray(point, np.float64), (len(joints), 1))
-            if one.name.startswith("finger"):  # drawn where the fingers are; the collision checks take them as open
-                local[:, 1] = np.sign(point[1]) * (opening / 2 + one.radius)
+            if capsule.name.startswith("finger"):  # drawn where the fingers are; the collision checks take them as open
+                local[:, 1] = np.sign(point[1]) * (opening / 2 + capsule.radius)
             capsules[:, number, end] = np.einsum("fij,fj->fi", frame[:, :3, :3], local) + frame[:, :3, 3]
     tool = kinematics.tool(joints)[:, :3, 3]
     return {"capsules": capsules.reshape(len(joints), -1, 6), "tool": tool.astype(np.float32)}

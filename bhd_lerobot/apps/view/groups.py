@@ -6,7 +6,7 @@ from typing import Any
 
 from bhd_lerobot.datasets.format import features as keys
 
-MAX_LINES = 8  # in one plot; more cannot be told apart
+MAX_LINES = 8  # in one plot; more cannot be distinguished
 _SCAN = re.compile(r"scan_\d+\.pos")
 _OURS = ("turtlebot3", "ur5")
 _METRES = ("x", "y", "z", "gripper", "tool_x", "tool_y", "tool_z")
@@ -51,7 +51,7 @@ def sections(features: Mapping[str, Any], widths: Mapping[str, int], robot: str 
     """Return what is plotted: sections with a title, each a list of plots, each a list of lines.
 
     A line has a label and says which number of which column it is; ``applied`` marks the command that was carried out
-    beside the one that was asked for.
+    beside the requested one.
 
     Args:
         features: the dataset's features.
@@ -86,7 +86,7 @@ def sections(features: Mapping[str, Any], widths: Mapping[str, int], robot: str 
 def _actions(names: Sequence[str], has_applied: bool, robot: str | None) -> list[dict[str, Any]]:
     plots = []
     for number, name in enumerate(names):
-        lines = [_line(keys.ACTION, number, "asked for" if has_applied else name)]
+        lines = [_line(keys.ACTION, number, "requested" if has_applied else name)]
         if has_applied:
             lines.append({**_line(keys.APPLIED_ACTION, number, "applied"), "applied": True})
         plots.append(_plot(name, unit_of(name, robot), lines))

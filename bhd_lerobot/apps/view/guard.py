@@ -1,9 +1,9 @@
-"""Who may ask the server for something: the page that it served itself, and nobody else.
+"""Access control: the server answers the page that it served itself, and no other.
 
 The server listens on loopback, but a browser on the same machine also shows pages of strangers. A page whose host name
 was made to resolve to 127.0.0.1 would be of the same origin as ours: its requests carry its host name, and are refused.
 A page that sends its requests to us without reading the answer could change the dataset: for that a token is needed
-that only our own page is told.
+that only our own page holds.
 """
 
 import hmac
@@ -18,7 +18,7 @@ TOKEN_HEADER = "X-Bhd-Token"
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 _READING = ("GET", "HEAD")
 _HEADERS = {
-    # Nothing from elsewhere is loaded, and nobody else may show or embed what we serve.
+    # Nothing from elsewhere is loaded, and no other page may show or embed what we serve.
     "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
     "X-Content-Type-Options": "nosniff",
@@ -28,7 +28,7 @@ _HEADERS = {
 
 
 def new_token() -> str:
-    """Return a token that nobody can guess."""
+    """Return a token that cannot be guessed."""
     return secrets.token_urlsafe(24)
 
 
@@ -64,7 +64,7 @@ async def add_headers(request: web.Request, response: web.StreamResponse) -> Non
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether a Host header names this machine, with any port: it may be forwarded from another one."""
+    """Return whether a Host header names this machine, with any port: it may be forwarded from another one."""
     try:
         name = urlsplit(f"//{host}").hostname
     except ValueError:

@@ -56,8 +56,8 @@ def marks_of(root: Path, index: int) -> list[dict[str, Any]]:
             if edit["edit"] != "mark":
                 found.clear()  # episodes were removed or joined: the numbers before mean something else
                 continue
-            told = [one for one in edit["episodes"] if one["episode"] == index]
+            marks = [entry for entry in edit["episodes"] if entry["episode"] == index]
         except (ValueError, KeyError, TypeError):
             continue  # the log is for people; a line that is not of ours says nothing here
-        found += [{**one, "when": edit.get("time", ""), "note": edit.get("note", "")} for one in told]
+        found += [{**entry, "when": edit.get("time", ""), "note": edit.get("note", "")} for entry in marks]
     return found

@@ -53,9 +53,9 @@ def unpack(content: bytes) -> tuple[dict[str, Any], dict[str, NDArray]]:
     (length,) = struct.unpack("<I", content[len(MAGIC) : start])
     header = json.loads(content[start : start + length])
     arrays = {}
-    for name, one in header.pop("arrays").items():
-        kind, count = np.dtype(one["dtype"]).newbyteorder("<"), int(np.prod(one["shape"], dtype=np.int64))
-        arrays[name] = np.frombuffer(content, kind, count, start + length + one["offset"]).reshape(one["shape"])
+    for name, about in header.pop("arrays").items():
+        kind, count = np.dtype(about["dtype"]).newbyteorder("<"), int(np.prod(about["shape"], dtype=np.int64))
+        arrays[name] = np.frombuffer(content, kind, count, start + length + about["offset"]).reshape(about["shape"])
     return header, arrays
 
 
@@ -68,9 +68,9 @@ def _finite(value: Any) -> Any:
     if isinstance(value, float):
         return value if np.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): _finite(one) for key, one in value.items()}
+        return {str(key): _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_finite(item) for item in value]
     return value
 
 

@@ -45,7 +45,7 @@ async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None])
     Args:
         dataset: what is shown.
         port: on 127.0.0.1; 0 for any free one.
-        ready: is told the page's address as soon as it can be opened.
+        ready: is called with the page's address as soon as it can be opened.
 
     Raises:
         ConfigError: the port cannot be had.
@@ -61,8 +61,8 @@ async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None])
             stop.set_result(number)
 
     try:
-        for one in signals:
-            loop.add_signal_handler(one, end, one)
+        for number in signals:
+            loop.add_signal_handler(number, end, number)
         try:
             await web.TCPSite(runner, HOST, port).start()
         except OSError as error:
@@ -73,14 +73,14 @@ async def serve(dataset: ViewedDataset, port: int, ready: Callable[[str], None])
         ready(f"http://{HOST}:{runner.addresses[0][1]}/")
         return await stop
     finally:
-        for one in signals:
-            loop.remove_signal_handler(one)
+        for number in signals:
+            loop.remove_signal_handler(number)
         await runner.cleanup()
 
 
 @web.middleware
 async def _respond_to_errors(request: web.Request, handler: Any) -> web.StreamResponse:
-    """Tell the page what went wrong as it tells a terminal."""
+    """Send the page the message that a terminal would show."""
     try:
         response: web.StreamResponse = await handler(request)
     except BhdError as error:

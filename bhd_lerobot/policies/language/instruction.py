@@ -136,30 +136,30 @@ def _only(tokens: list[_Token], what: str, instruction: str) -> str | None:
     """Return the value that all tokens share, or None if there are none."""
     values = {token.value for token in tokens}
     if len(values) > 1:
-        said = ", ".join(repr(token.text) for token in tokens)
-        raise InstructionError(f"{instruction!r} is not understood. It names more than one {what}: {said}.")
+        named = ", ".join(repr(token.text) for token in tokens)
+        raise InstructionError(f"{instruction!r} is not understood. It names more than one {what}: {named}.")
     return values.pop() if values else None
 
 
 def _reason(tokens: list[_Token], parts: str, language: Language) -> str:
     """Return why parts match no pattern."""
-    said = {part: ", ".join(repr(token.text) for token in tokens if token.part is part) for part in Part}
+    named = {part: ", ".join(repr(token.text) for token in tokens if token.part is part) for part in Part}
     verbs = [repr(token.text) for token in tokens if token.part in VERBS]
     example = f"Say for example {language.example!r}."
-    if said[Part.NOT]:
-        reason = f"Negations are not known: {said[Part.NOT]}. Say what is wanted. {example}"
-    elif said[Part.SEVERAL]:
-        reason = f"Only one action with one object can be asked for, not with {said[Part.SEVERAL]}. {example}"
-    elif said[Part.UNKNOWN]:
+    if named[Part.NOT]:
+        reason = f"Negations are not known: {named[Part.NOT]}. Say what is wanted. {example}"
+    elif named[Part.SEVERAL]:
+        reason = f"Only one action with one object can be asked for, not with {named[Part.SEVERAL]}. {example}"
+    elif named[Part.UNKNOWN]:
         reason = _unknown(tokens, parts, language)
-    elif not verbs and not said[Part.TO_ME]:
+    elif not verbs and not named[Part.TO_ME]:
         reason = f"It names no action. Known: {language.verbs}."
     elif len(verbs) > 1:
         reason = f"It names more than one action: {', '.join(verbs)}. {example}"
-    elif not said[Part.NOUN]:
+    elif not named[Part.NOUN]:
         reason = f"It names no thing. Known: {language.listing(KINDS)}."
     elif parts.count(Part.NOUN) > 1:
-        reason = f"It names more than one thing: {said[Part.NOUN]}. {example}"
+        reason = f"It names more than one thing: {named[Part.NOUN]}. {example}"
     else:
         reason = f"The order of its words is not known. {example}"
     return reason
@@ -214,7 +214,7 @@ def instructions_for(
 ) -> tuple[str, ...]:
     """Return instructions that mean one object of a scene and no other, the plainest first.
 
-    There are none if nothing that can be said tells the object from another one.
+    There are none if no known words distinguish the object from another one.
 
     Args:
         scene: what is on the table, in any order.

@@ -16,16 +16,16 @@ class LanguageBrainConfig(PickBrainConfig):
     """Parameters of the language brain.
 
     Attributes:
-        instruction: what it is asked for, in English or Chinese; what the task asks for if empty.
+        instruction: what to do, in English or Chinese; the task's instruction if empty.
     """
 
     instruction: str = ""
 
 
 class LanguageBrain(PickBrain):
-    """Finds the object that an instruction means by what it is called and where it stands, and does what is asked.
+    """Finds the object that an instruction means by its name and its place, and carries the instruction out.
 
-    It does not look at which object the task marks. An instruction that it does not understand, or that fits no object
+    It does not use which object the task marks. An instruction that it does not understand, or that fits no object
     or several, is not carried out: its subtask says why.
 
     Args:

@@ -2,24 +2,57 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.tabletop import check_camera_error
+from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation
 
 
-class GoalBrain(ABC):
-    """A brain that gives each simulation one goal after the other.
+@dataclass
+class GoalBrainConfig(BrainConfig):
+    """Parameters of brains that give an arm goals.
 
-    A subclass says in `_decide` what comes next; it is asked at the start and whenever a goal has ended.
+    Attributes:
+        max_velocity: speed of the fastest joint on free motions [rad/s].
+        max_acceleration: acceleration of the fastest joint on free motions [rad/s^2].
+        attempts: how often it tries in all.
+        camera_error_m: known error of the positions that the task reports, x, y, z in the base frame [m]; it is
+            subtracted.
     """
 
-    name: str
+    POSITIVE: ClassVar[tuple[str, ...]] = ("max_velocity", "max_acceleration")
+    """Parameters that must be positive."""
+
+    max_velocity: float = 2.0
+    max_acceleration: float = 8.0
+    attempts: int = 3
+    camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+    def __post_init__(self) -> None:
+        check_positive("brain", self, self.POSITIVE)
+        if self.max_velocity > MAX_JOINT_SPEED:
+            raise ConfigError(
+                f"brain.max_velocity is {self.max_velocity}; the joints turn at {MAX_JOINT_SPEED:.4g} rad/s at most."
+            )
+        if self.attempts < 1:
+            raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")
+        check_camera_error("brain.camera_error_m", self.camera_error_m)
+
+
+class GoalBrain(ConfiguredBrain, ABC):
+    """A brain that gives each simulation one goal after the other.
+
+    A subclass decides in `_decide` what comes next; it is called at the start and whenever a goal has ended.
+    """
+
     robot_type = "ur5"
-    uses_images = False
     has_plan = True
 
     def __init__(self) -> None:
@@ -74,10 +107,6 @@ class GoalBrain(ABC):
     def subtasks(self) -> Sequence[str]:
         """Return what each simulation's brain is doing, in words."""
         return self._doing
-
-    def plan(self, sim: int) -> dict[str, Any]:
-        """Return the plan of one simulation."""
-        return {}
 
     def _name(self, sim: int, step: str) -> str:
         """Return a new name for a goal."""

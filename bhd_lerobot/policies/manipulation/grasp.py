@@ -139,7 +139,7 @@ def _turn(first: float, second: float) -> float:
 
 
 def read_objects(values: NDArray[np.float64]) -> list[SeenObject]:
-    """Return the objects that an environment state of the pick task tells about; not those with a NaN or an infinity.
+    """Return the objects that an environment state of the pick task reports; not those with a NaN or an infinity.
 
     Args:
         values: 16 numbers for each place, shape (places, 16).

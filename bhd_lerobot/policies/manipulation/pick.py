@@ -1,19 +1,18 @@
 """The scripted brain of the pick task: approach, grasp, lift; once more if the gripper missed."""
 
-import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, check_camera_error
-from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED, MAX_OPENING
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
+from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
-from bhd_lerobot.errors import ConfigError, InstructionError
+from bhd_lerobot.errors import InstructionError
 from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns
-from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
+from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain, GoalBrainConfig
 from bhd_lerobot.policies.manipulation.grasp import (
     Grasp,
     SeenObject,
@@ -33,39 +32,22 @@ _POSITION = [OBJECT_FIELDS.index(axis) for axis in "xyz"]
 
 @BrainConfig.register_subclass("pick")
 @dataclass
-class PickBrainConfig(BrainConfig):
+class PickBrainConfig(GoalBrainConfig):
     """Parameters of the scripted pick brain.
 
     Attributes:
-        max_velocity: speed of the fastest joint on free motions [rad/s].
-        max_acceleration: acceleration of the fastest joint on free motions [rad/s^2].
         line_velocity: speed of the tool on the way down and up [m/s].
         line_acceleration: acceleration of the tool on the way down and up [m/s^2].
         lift_m: height that it lifts to [m].
-        attempts: how often it tries to grasp.
-        camera_error_m: what positions that it is told are known to be off by, x, y, z in the base frame [m]; it is
-            subtracted.
     """
 
-    max_velocity: float = 2.0
+    POSITIVE: ClassVar[tuple[str, ...]] = (*GoalBrainConfig.POSITIVE, "line_velocity", "line_acceleration", "lift_m")
+
     max_acceleration: float = 6.0
+    attempts: int = 2
     line_velocity: float = 0.25
     line_acceleration: float = 1.0
     lift_m: float = 0.15
-    attempts: int = 2
-    camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-
-    def __post_init__(self) -> None:
-        for name in ("max_velocity", "max_acceleration", "line_velocity", "line_acceleration", "lift_m"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"brain.{name} is {getattr(self, name)}; it must be positive and finite.")
-        if self.max_velocity > MAX_JOINT_SPEED:
-            raise ConfigError(
-                f"brain.max_velocity is {self.max_velocity}; the joints turn at {MAX_JOINT_SPEED:.4g} rad/s at most."
-            )
-        if self.attempts < 1:
-            raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")
-        check_camera_error("brain.camera_error_m", self.camera_error_m)
 
 
 @dataclass
@@ -109,10 +91,6 @@ class PickBrain(GoalBrain):
         self._columns = find_columns(environment_names, wanted, self.name, "environment")
         self._opening = int(find_columns(observation_names, ["gripper.pos"], self.name, "observation")[0])
 
-    def parameters(self) -> dict[str, Any]:
-        """Return the parameters."""
-        return {"type": self.name, **asdict(self.config)}
-
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the plan of one simulation, how far it got, and what was in the way."""
         work = self._work[sim]
@@ -151,7 +129,7 @@ class PickBrain(GoalBrain):
                 work.plan = self._make_plan(work, objects)
             except InstructionError as error:
                 return self._give_up(sim, str(error))
-            work.step = 1  # what it needs to know about the object, it has just been told
+            work.step = 1  # the object was located when the plan was made
             work.stage = ""
         target = next((one for one in objects if one.index == work.plan.target), None)
         if target is None:

@@ -2,51 +2,24 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.tabletop import check_camera_error
-from bhd_lerobot.bodies.ur5 import MAX_JOINT_SPEED, ur5
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
-from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns
-from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
+from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain, GoalBrainConfig
 
 _TARGET = tuple(f"target_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 
 
 @BrainConfig.register_subclass("reach")
 @dataclass
-class ReachBrainConfig(BrainConfig):
-    """Parameters of the scripted reach brain.
-
-    Attributes:
-        max_velocity: speed of the fastest joint [rad/s].
-        max_acceleration: acceleration of the fastest joint [rad/s^2].
-        attempts: how often it tries in all; between two tries the arm goes home, as another start opens other ways.
-        camera_error_m: what positions that it is told are known to be off by, x, y, z in the base frame [m]; it is
-            subtracted.
-    """
-
-    max_velocity: float = 2.0
-    max_acceleration: float = 8.0
-    attempts: int = 3
-    camera_error_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-
-    def __post_init__(self) -> None:
-        for name in ("max_velocity", "max_acceleration"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"brain.{name} is {getattr(self, name)}; it must be positive and finite.")
-        if self.max_velocity > MAX_JOINT_SPEED:
-            raise ConfigError(
-                f"brain.max_velocity is {self.max_velocity}; the joints turn at {MAX_JOINT_SPEED:.4g} rad/s at most."
-            )
-        if self.attempts < 1:
-            raise ConfigError(f"brain.attempts is {self.attempts}; it must be at least 1.")
-        check_camera_error("brain.camera_error_m", self.camera_error_m)
+class ReachBrainConfig(GoalBrainConfig):
+    """Parameters of the scripted reach brain. Between two attempts the arm goes home, where other ways begin."""
 
 
 class ReachBrain(GoalBrain):
@@ -74,10 +47,6 @@ class ReachBrain(GoalBrain):
     ) -> None:
         """Find the target."""
         self._columns = find_columns(environment_names, _TARGET, self.name, "environment")
-
-    def parameters(self) -> dict[str, Any]:
-        """Return the parameters."""
-        return {"type": self.name, **asdict(self.config)}
 
     def _begin(self, sim: int, seed: int, instruction: str) -> None:
         self._tries[sim] = 0

@@ -58,7 +58,7 @@ LAST = (Skill.HOLD, Skill.PLACE, Skill.HAND_OVER)  # after any other the arm wou
 
 @dataclass(frozen=True)
 class SceneObject:
-    """One object as a planner is told about it.
+    """One object as a planner sees it.
 
     Attributes:
         index: its number, by which a plan names it; no two in a scene have the same.
@@ -86,7 +86,7 @@ class SceneObject:
 
     @classmethod
     def from_table(cls, index: int, thing: TableObject) -> Self:
-        """Return what a planner is told about an object that stands on the table, whose surface is at z = 0."""
+        """Return what a planner sees of an object that stands on the table, whose surface is at z = 0."""
         position = (thing.x, thing.y, thing.height / 2)
         return cls(index, thing.kind, thing.colour, position, (2 * thing.size_x, 2 * thing.size_y, thing.height))
 
@@ -116,7 +116,7 @@ class Plan:
     """The skills that carry out an instruction, in an order in which they can be carried out.
 
     Attributes:
-        instruction: what was asked for.
+        instruction: the request.
         target: index of the object it is about.
         steps: what to do, first to last.
     """
@@ -240,7 +240,7 @@ class TextPlanner:
 
 
 def prompt(instruction: str, scene: Sequence[SceneObject]) -> str:
-    """Return what a language model is asked; objects are in the order of their indices."""
+    """Return the prompt for a language model; objects are in the order of their indices."""
     objects = [
         {"index": o.index, "kind": o.kind, "colour": o.colour, "position": o.position, "size": o.size}
         for o in check_request(instruction, scene).values()
@@ -258,7 +258,7 @@ def prompt(instruction: str, scene: Sequence[SceneObject]) -> str:
 def _load(answer: object) -> Any:
     if not isinstance(answer, str):
         raise InstructionError(f"The planner answered {answer!r}; it must be text.")
-    # Many models put their JSON between code fences whatever they are told.
+    # Many models put their JSON between code fences whatever the prompt demands.
     fenced = re.fullmatch(r"\s*```(?:json)?\s*\n(.*)\n\s*```\s*", answer, re.DOTALL)
     try:
         return json.loads(fenced[1] if fenced else answer)

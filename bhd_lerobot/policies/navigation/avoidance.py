@@ -3,13 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns, find_scan
+from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, find_columns, find_scan
 
 _ROUNDING = 1e-6  # [m]
 
@@ -43,7 +42,7 @@ class AvoidanceConfig(BrainConfig):
             raise ConfigError(f"brain.front_sector_deg is {self.front_sector_deg}; it must be in (0, 180].")
 
 
-class AvoidanceBrain:
+class AvoidanceBrain(ConfiguredBrain):
     """Front sector ±30°; nothing nearer than 0.5 m: 0.2 m/s ahead; otherwise turn left at 0.5 rad/s; blind: stop.
 
     Args:
@@ -52,8 +51,6 @@ class AvoidanceBrain:
 
     name = "avoidance"
     robot_type = "turtlebot3"
-    uses_images = False
-    has_plan = False
 
     def __init__(self, config: AvoidanceConfig | None = None) -> None:
         self.config = config or AvoidanceConfig()
@@ -91,15 +88,3 @@ class AvoidanceBrain:
         action[:, self._forward] = np.where(seen & free, config.forward_speed, 0.0)
         action[:, self._turn] = np.where(seen & ~free, config.turn_speed, 0.0)
         return action
-
-    def subtasks(self) -> Sequence[str]:
-        """Return nothing: the rule has no plan."""
-        return ()
-
-    def plan(self, sim: int) -> dict[str, Any]:
-        """Return nothing: the rule has no plan."""
-        return {}
-
-    def parameters(self) -> dict[str, Any]:
-        """Return the parameters."""
-        return {"type": self.name, **asdict(self.config)}

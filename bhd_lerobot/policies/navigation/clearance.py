@@ -119,7 +119,7 @@ class ClearanceTable:
         paths: the paths.
         sectors: number of readings in a scan, evenly spaced from straight ahead, counter-clockwise.
         spread: a reading may lie this far to either side of its sector's middle [rad].
-        levels: how much room is asked for, the most first.
+        levels: the room that is required, the most first.
         range_max: the largest range that can be looked up [m].
     """
 

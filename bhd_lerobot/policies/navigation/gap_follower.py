@@ -13,22 +13,21 @@ Three published ideas together:
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns
+from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.policies.brain import BrainConfig, Observation
 from bhd_lerobot.policies.navigation.clearance import HALF_TRACK, QUANTUM, SPACING, make_paths
-from bhd_lerobot.policies.navigation.scan import ScanReader
-from bhd_lerobot.policies.navigation.steering import Steering, check_driving, keep_heading, wrap
+from bhd_lerobot.policies.navigation.driving import PLACE_SPACING, DrivingBrain, DrivingConfig
+from bhd_lerobot.policies.navigation.steering import keep_heading, wrap
 
 _CELL = 0.125  # [m] edge length of the memory's cells
 _SIDE = 128  # cells along an edge of the memory, a power of two; it wraps around after 16 m
 _MARK = 0.2  # [m] around the robot that counts as visited
-_STEP = 0.2  # [m] between two places of a path where the memory is asked
 _AROUND = np.arange(8) * math.pi / 4
 _MARK_X = np.append(np.cos(_AROUND), 0.0) * (_MARK / _CELL)
 _MARK_Y = np.append(np.sin(_AROUND), 0.0) * (_MARK / _CELL)
@@ -40,50 +39,31 @@ Array = NDArray[np.float64]
 
 @BrainConfig.register_subclass("gap_follower")
 @dataclass
-class GapFollowerConfig(BrainConfig):
+class GapFollowerConfig(DrivingConfig):
     """Parameters of the gap follower.
 
     Attributes:
-        forward_speed: speed when driving straight [m/s].
-        rim_speed: highest speed of a wheel's rim, 6.885 rad/s at 0.033 m [m/s]; turning costs forward speed.
-        turn_speed: highest yaw rate [rad/s].
-        settle_s: a heading error is corrected in about this time [s].
-        margin_m: room that a path leaves beside the robot, where there is any [m].
-        stop_m: a path must be free for this much more than its turn, so that the robot can turn around in time [m].
-        horizon_m: paths are judged up to this length [m].
         discount: weight of what lies 0.2 m further on, as a share.
         memory_s: what was visited longer ago is new again [s].
         turn_weight: price of half a turn on the spot; the new ground of a path counts from 0 to 1.
         clear_weight: reward for a path that is free up to the horizon.
         commit_weight: price of leaving the heading chosen before.
-        range_min_m: a reading below this is not valid [m].
-        range_max_m: a reading above this is not valid [m]; a beam without a return reads exactly this.
     """
 
-    forward_speed: float = 0.22
-    rim_speed: float = 0.2272
-    turn_speed: float = 2.0
-    settle_s: float = 0.35
-    margin_m: float = 0.05
-    stop_m: float = 0.35
-    horizon_m: float = 3.4
     discount: float = 0.9
     memory_s: float = 120.0
     turn_weight: float = 1.0
     clear_weight: float = 0.3
     commit_weight: float = 0.15
-    range_min_m: float = 0.12
-    range_max_m: float = 3.5
 
     def __post_init__(self) -> None:
-        check_driving(self, _STEP)
-        if self.memory_s == 0:
-            raise ConfigError("brain.memory_s is 0; it must be positive.")
+        super().__post_init__()
+        check_positive("brain", self, ("memory_s",))
         if not 0 < self.discount <= 1:
             raise ConfigError(f"brain.discount is {self.discount}; it must be in (0, 1].")
 
 
-class GapFollowerBrain:
+class GapFollowerBrain(DrivingBrain):
     """Drive the free path that leads to most new ground for the least turning; blind: stop.
 
     It needs the scan and the measured twist. Where no path leaves the margin, it asks for less room, drives slower, and
@@ -94,9 +74,7 @@ class GapFollowerBrain:
     """
 
     name = "gap_follower"
-    robot_type = "turtlebot3"
-    uses_images = False
-    has_plan = False
+    has_narrow = False
 
     def __init__(self, config: GapFollowerConfig | None = None) -> None:
         self.config = config = config or GapFollowerConfig()
@@ -104,12 +82,12 @@ class GapFollowerBrain:
         # What a path's turn takes away from its length, as a share of half a turn on the spot.
         lost = paths.turn - np.abs(paths.heading) * paths.radius
         self._price = config.turn_weight * lost / (HALF_TRACK * math.pi)
-        length = _STEP * np.arange(1, int(config.horizon_m / _STEP + 1e-9) + 1, dtype=np.float64)
+        length = PLACE_SPACING * np.arange(1, int(config.horizon_m / PLACE_SPACING + 1e-9) + 1, dtype=np.float64)
         x, y = paths.points(length)
         self._path_x, self._path_y = (x / _CELL).astype(np.float32), (y / _CELL).astype(np.float32)  # (points, K)
         self._reach = np.ceil(length / QUANTUM - 1e-9).astype(np.uint8)[:, None]
         # Whole numbers, so that their sums are exact. Turning on the spot leads nowhere.
-        moved = np.hypot(np.diff(x, axis=0, prepend=0.0), np.diff(y, axis=0, prepend=0.0)) > _STEP / 2
+        moved = np.hypot(np.diff(x, axis=0, prepend=0.0), np.diff(y, axis=0, prepend=0.0)) > PLACE_SPACING / 2
         weight = np.round(1000 * config.discount ** np.arange(len(length))).astype(np.int16)
         self._weight, self._all = weight[:, None] * moved, float(weight.sum())
         self.reset(np.zeros(0, np.intp), [], 0)
@@ -122,22 +100,8 @@ class GapFollowerBrain:
         environment_names: Sequence[str] = (),
     ) -> None:
         """Find the scan and the twist, and prepare the look-up table for this number of beams."""
-        config = self.config
-        self._reader = reader = ScanReader(observation_names, self.name, (config.range_min_m, config.range_max_m))
-        self._measured = find_columns(observation_names, ("x.vel", "theta.vel"), self.name, "observation")
-        self._forward, self._turn = find_columns(action_names, ("x.vel", "theta.vel"), self.name, "action")
-        self._width, self._dt = len(action_names), 1.0 / fps
-        self._steering = Steering(
-            self._paths,
-            reader,
-            margin=config.margin_m,
-            stop=config.stop_m,
-            limits=(config.forward_speed, config.rim_speed, config.turn_speed),
-            settle=config.settle_s,
-            range_max=config.range_max_m,
-            has_narrow=False,
-        )
-        self._memory_frames = max(1, round(min(config.memory_s * fps, 2**29)))
+        super().bind(observation_names, action_names, fps, environment_names)
+        self._memory_frames = max(1, round(min(self.config.memory_s * fps, 2**29)))
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Forget where the robots have been; the seeds are not used, the rule draws nothing."""
@@ -155,12 +119,11 @@ class GapFollowerBrain:
 
     def act(self, observation: Observation) -> Array:
         """Return the twist, shape (n, actions)."""
-        config, paths, n = self.config, self._paths, len(observation.state)
-        if n != self._n:
-            raise ConfigError(f"The brain {self.name!r} was reset for {self._n} robots and sees {n}.")
+        config, paths = self.config, self._paths
+        self._check_count(observation)
         self._remember(observation.state[:, self._measured])
         ranges, blind = self._reader.nearest(observation.state[:, self._reader.columns])
-        freedom = self._steering.look(ranges)
+        freedom = self._steering.freedom(ranges)
         toward = wrap(self._goal - self._yaw)  # the heading chosen before, seen from the robot
         turn_off = np.abs(paths.heading - toward[:, None])
         turn_off = np.minimum(turn_off, 2 * math.pi - turn_off)
@@ -171,22 +134,7 @@ class GapFollowerBrain:
         heading = keep_heading(toward, paths.heading[best], _KEEP * SPACING)
         forward, turn, heading = self._steering.drive(freedom, best, heading, ranges)
         self._goal = np.where(blind, self._goal, self._yaw + heading)
-        action = np.zeros((n, self._width))
-        action[:, self._forward] = np.where(blind, 0.0, forward)
-        action[:, self._turn] = np.where(blind, 0.0, turn)
-        return action
-
-    def subtasks(self) -> Sequence[str]:
-        """Return nothing: the rule has no plan."""
-        return ()
-
-    def plan(self, sim: int) -> dict[str, Any]:
-        """Return nothing: the rule has no plan."""
-        return {}
-
-    def parameters(self) -> dict[str, Any]:
-        """Return the parameters."""
-        return {"type": self.name, **asdict(self.config)}
+        return self._twist(blind, forward, turn)
 
     def _remember(self, twist: Array) -> None:
         """Move on by what the wheels did since the last frame, and mark the place as visited."""

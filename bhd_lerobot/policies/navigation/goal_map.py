@@ -1,6 +1,6 @@
 """What was seen of the surroundings, around the goal, and the ways that lead there.
 
-The map lies still in the goal's frame: as the robots are told where the goal is, they know where they are in it, and
+The map lies still in the goal's frame: as the robots know where the goal is, they know where they are in it, and
 nothing drifts. What was never seen counts as free, and a way is planned again when something seen newly is in it, the
 setting of D* Lite (S. Koenig and M. Likhachev, "D* Lite", AAAI 2002).
 """
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 CELL = 0.05  # [m] edge length of a cell
 _HALF = 200  # cells from the goal to the map's border
 _SIDE = 2 * _HALF + 1
-_AROUND = 12  # cells beyond all that was seen, in which ways are looked for
+_AROUND = 12  # cells beyond all that was seen, in which ways are searched
 _UNIT = 0.001  # [m] of the stored lengths
 _FAR = 65535  # nothing known
 _BLOCKED_M = (0.135, 0.1)  # [m] from something seen, no way; the second where there is none else

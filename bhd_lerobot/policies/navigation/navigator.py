@@ -11,13 +11,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, check_positive
 from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns
 from bhd_lerobot.policies.navigation.clearance import (
     HALF_TRACK,
@@ -28,15 +27,14 @@ from bhd_lerobot.policies.navigation.clearance import (
     SPACING,
     make_paths,
 )
+from bhd_lerobot.policies.navigation.driving import PLACE_SPACING, DrivingBrain, DrivingConfig
 from bhd_lerobot.policies.navigation.goal_map import GoalMap
-from bhd_lerobot.policies.navigation.scan import ScanReader
-from bhd_lerobot.policies.navigation.steering import NARROW, Freedom, Steering, check_driving, keep_heading, wrap
+from bhd_lerobot.policies.navigation.steering import NARROW, Freedom, keep_heading, wrap
 
 GOAL = ("goal_x", "goal_y", "goal_cos", "goal_sin")
 
-_STEP = 0.2  # [m] between two places of a path where the map is asked
 _OPEN_M = 0.05  # [m] that a path is worth which is free as far as it is judged
-_BEND = 0.02  # [m/rad] that turning costs beyond its way and time: what the map tells is right to half a cell
+_BEND = 0.02  # [m/rad] that turning costs beyond its way and time: the map is right to half a cell
 _NO_WAY = np.float32(200.0)  # [m] that a path without a free place costs
 _DETOUR = 0.15  # [m] that a way is longer, it is worth to pass through less room
 _TIGHT_M = 0.5  # [m] from something seen, there may be less room than usual
@@ -53,31 +51,18 @@ Array = NDArray[np.float64]
 
 @BrainConfig.register_subclass("navigator")
 @dataclass
-class NavigatorConfig(BrainConfig):
+class NavigatorConfig(DrivingConfig):
     """Parameters of the navigator.
 
     Attributes:
-        forward_speed: speed when driving straight [m/s].
-        rim_speed: highest speed of a wheel's rim, 6.885 rad/s at 0.033 m [m/s]; turning costs forward speed.
-        turn_speed: highest yaw rate [rad/s].
-        settle_s: a heading error is corrected in about this time [s].
-        margin_m: room that a path leaves beside the robot, where there is any [m].
-        stop_m: a path must be free for this much more than its turn, so that the robot can turn around in time [m].
-        horizon_m: paths are judged up to this length [m].
         turn_weight: price of a turn, as a share of what its time is worth in metres.
         commit_m: price of leaving the heading chosen before [m].
         replan_s: time after which a way that is not blocked is planned again, if something new was seen [s].
         approach_m: nearer than this, with nothing in between, the goal is driven to straight [m].
         arrive_m: distance at which the robot turns to the goal's heading [m].
         arrive_rad: angle at which it rests [rad].
-        range_min_m: a reading below this is not valid [m].
-        range_max_m: a reading above this is not valid [m]; a beam without a return reads exactly this.
     """
 
-    forward_speed: float = 0.22
-    rim_speed: float = 0.2272
-    turn_speed: float = 2.0
-    settle_s: float = 0.35
     margin_m: float = 0.04
     stop_m: float = 0.25
     horizon_m: float = 2.4
@@ -87,36 +72,30 @@ class NavigatorConfig(BrainConfig):
     approach_m: float = 0.8
     arrive_m: float = 0.04
     arrive_rad: float = 0.04
-    range_min_m: float = 0.12
-    range_max_m: float = 3.5
 
     def __post_init__(self) -> None:
-        check_driving(self, _STEP)
-        for name in ("arrive_m", "arrive_rad"):
-            if getattr(self, name) == 0:
-                raise ConfigError(f"brain.{name} is 0; it must be positive.")
+        super().__post_init__()
+        check_positive("brain", self, ("arrive_m", "arrive_rad"))
 
 
-class NavigatorBrain:
+class NavigatorBrain(DrivingBrain):
     """Drive to the goal pose; blind, or without a goal: stop.
 
-    It needs the scan, the measured twist, and the goal in the robot's frame, as the task navigate tells it. What it saw
-    it remembers up to 10 m from the goal.
+    It needs the scan, the measured twist, and the goal in the robot's frame, as the task navigate reports it. It
+    remembers what it saw up to 10 m from the goal.
 
     Args:
         config: the parameters.
     """
 
     name = "navigator"
-    robot_type = "turtlebot3"
-    uses_images = False
-    has_plan = False
 
     def __init__(self, config: NavigatorConfig | None = None) -> None:
         self.config = config = config or NavigatorConfig()
         self._paths = paths = make_paths(config.forward_speed, config.rim_speed)
         # Places after the turn: before its end, all paths to one side are alike.
-        after = np.append(_STEP / 2, _STEP * np.arange(1, int(config.horizon_m / _STEP + 1e-9) + 1))
+        places = int(config.horizon_m / PLACE_SPACING + 1e-9)
+        after = PLACE_SPACING * np.append(0.5, np.arange(1, places + 1))
         length = np.minimum(paths.turn + after[:, None], LONGEST)  # (points, K)
         self._reach = np.ceil(length / QUANTUM - 1e-9).astype(np.uint8)
         x, y = paths.points(length)
@@ -139,22 +118,9 @@ class NavigatorBrain:
         environment_names: Sequence[str] = (),
     ) -> None:
         """Find the scan, the twist and the goal, and prepare the look-up table for this number of beams."""
-        config = self.config
-        self._reader = reader = ScanReader(observation_names, self.name, (config.range_min_m, config.range_max_m))
-        self._measured = find_columns(observation_names, ("x.vel", "theta.vel"), self.name, "observation")
-        self._forward, self._turn = find_columns(action_names, ("x.vel", "theta.vel"), self.name, "action")
-        self._told = find_columns(environment_names, GOAL, self.name, "environment")
-        self._width, self._dt = len(action_names), 1.0 / fps
-        self._steering = Steering(
-            self._paths,
-            reader,
-            margin=config.margin_m,
-            stop=config.stop_m,
-            limits=(config.forward_speed, config.rim_speed, config.turn_speed),
-            settle=config.settle_s,
-            range_max=config.range_max_m,
-        )
-        self._replan_frames = max(1, round(min(config.replan_s * fps, 2**29)))
+        super().bind(observation_names, action_names, fps, environment_names)
+        self._goal_columns = find_columns(environment_names, GOAL, self.name, "environment")
+        self._replan_frames = max(1, round(min(self.config.replan_s * fps, 2**29)))
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Forget what was seen; the seeds are not used, the rule draws nothing."""
@@ -173,12 +139,10 @@ class NavigatorBrain:
 
     def act(self, observation: Observation) -> Array:
         """Return the twist, shape (n, actions)."""
-        n = len(observation.state)
-        if n != self._n:
-            raise ConfigError(f"The brain {self.name!r} was reset for {self._n} robots and sees {n}.")
+        self._check_count(observation)
         if observation.environment_state is None:
-            raise ConfigError(f"The brain {self.name!r} was bound to a goal and is told none.")
-        goal = observation.environment_state[:, self._told]
+            raise ConfigError(f"The brain {self.name!r} was bound to a goal and received none.")
+        goal = observation.environment_state[:, self._goal_columns]
         lost = ~np.isfinite(goal.sum(axis=1))
         x, y, cos, sin = np.where(lost[:, None], (0.0, 0.0, 1.0, 0.0), goal).T
         turn_left = np.arctan2(sin, cos)
@@ -188,31 +152,16 @@ class NavigatorBrain:
         ranges, blind = self._reader.nearest(scan)
         blind |= lost
         awake = ~blind if observation.running is None else ~blind & observation.running
-        self._look(scan, observation.state[:, self._measured[1]], pose, awake)
+        self._update_map(scan, observation.state[:, self._measured[1]], pose, awake)
         self._plan(pose, awake)
         forward, turn, heading = motion = self._drive(ranges, pose)
         distance = np.hypot(x, y)
         self._approach(ranges, distance, np.arctan2(y, x), motion)
         self._arrive(distance, turn_left, motion)
         self._heading = np.where(awake, pose[2] + heading, self._heading)
-        action = np.zeros((n, self._width))
-        action[:, self._forward] = np.where(blind, 0.0, forward)
-        action[:, self._turn] = np.where(blind, 0.0, turn)
-        return action
+        return self._twist(blind, forward, turn)
 
-    def subtasks(self) -> Sequence[str]:
-        """Return nothing: the rule has no plan in words."""
-        return ()
-
-    def plan(self, sim: int) -> dict[str, Any]:
-        """Return nothing: the rule has no plan in words."""
-        return {}
-
-    def parameters(self) -> dict[str, Any]:
-        """Return the parameters."""
-        return {"type": self.name, **asdict(self.config)}
-
-    def _look(self, scan: Array, rate: Array, pose: Array, awake: NDArray[np.bool_]) -> None:
+    def _update_map(self, scan: Array, rate: Array, pose: Array, awake: NDArray[np.bool_]) -> None:
         """Put what a new scan shows on the maps."""
         if self._scan.shape != scan.shape:
             self._scan = np.full(scan.shape, math.nan)
@@ -247,7 +196,7 @@ class NavigatorBrain:
         at = pose.astype(np.float32)[:, :, None, None]
         left = self._map.way_left(*_to_goal(self._path_x, self._path_y, at)) + self._length
         commit = config.commit_m * np.minimum(turn_off * 2.0, 1.0)
-        freedom = self._steering.look(ranges)
+        freedom = self._steering.freedom(ranges)
         cost = self._cost(left, freedom) + commit
         # Where the way leads through a place with less room than usual, no usual path gets on.
         least = np.where(freedom.free, cost, math.inf).min(axis=1)

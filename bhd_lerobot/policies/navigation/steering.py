@@ -1,14 +1,12 @@
 """From free paths to a twist: which paths are free, and how one of them is driven."""
 
 import math
-from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.navigation.clearance import HALF_TRACK, LONGEST, QUANTUM, ClearanceTable, Level, Paths
+from bhd_lerobot.policies.navigation.clearance import HALF_TRACK, QUANTUM, ClearanceTable, Level, Paths
 from bhd_lerobot.policies.navigation.scan import ScanReader
 
 Array = NDArray[np.float64]
@@ -50,7 +48,7 @@ class Steering:
         limits: forward speed [m/s], speed of a wheel's rim [m/s], yaw rate [rad/s].
         settle: a heading error is corrected in about this time [s].
         range_max: the largest range that a scan shows [m].
-        has_narrow: whether `narrow` is going to be asked for, which needs a table of its own.
+        has_narrow: whether `narrow` is going to be called, which needs a table of its own.
     """
 
     def __init__(
@@ -72,7 +70,7 @@ class Steering:
         self._enough = np.ceil((paths.turn + beyond[:, None]) / QUANTUM).astype(np.int64)
         self._table = ClearanceTable(paths, reader.sectors, reader.spread, levels, range_max)
 
-    def look(self, ranges: Array) -> Freedom:
+    def freedom(self, ranges: Array) -> Freedom:
         """Return what paths there are, given the nearest ranges of the sectors [m], shape (n, sectors)."""
         rows = self._table.rows(ranges)
         clear = self._table.clear(rows, 0)
@@ -87,7 +85,7 @@ class Steering:
         return Freedom(clear, free, level)
 
     def narrow(self, ranges: Array) -> Freedom:
-        """Return what paths there are through narrow places, nothing coming nearer; otherwise like `look`."""
+        """Return what paths there are through narrow places, nothing coming nearer; otherwise like `freedom`."""
         clear = self._table.clear(self._table.rows(ranges), NARROW)
         return Freedom(clear, clear >= self._enough[NARROW], np.full(len(ranges), NARROW))
 
@@ -147,33 +145,3 @@ def keep_heading(before: Array, best: Array, within: float) -> Array:
     NaN, and takes the best.
     """
     return np.where(np.abs(wrap(before - best)) <= within, before, best)
-
-
-def check_driving(config: Any, horizon_min: float) -> None:
-    """Check the parameters that brains share which steer along paths.
-
-    Args:
-        config: with the parameters of `Steering` by their names in a configuration, and others that are not negative.
-        horizon_min: the least `horizon_m` [m].
-
-    Raises:
-        ConfigError: names the parameter, and what would be valid.
-    """
-    for name, value in asdict(config).items():
-        if not 0 <= value < math.inf:
-            raise ConfigError(f"brain.{name} is {value}; it must be 0 or positive, and finite.")
-    for name in ("forward_speed", "rim_speed", "turn_speed", "settle_s", "range_max_m"):
-        if getattr(config, name) == 0:
-            raise ConfigError(f"brain.{name} is 0; it must be positive.")
-    if config.forward_speed > config.rim_speed:
-        raise ConfigError(
-            f"brain.forward_speed is {config.forward_speed}; the wheels reach brain.rim_speed, {config.rim_speed}."
-        )
-    if not horizon_min <= config.horizon_m <= LONGEST:
-        raise ConfigError(f"brain.horizon_m is {config.horizon_m}; it must be in [{horizon_min}, {LONGEST}].")
-    if config.stop_m > 1:
-        raise ConfigError(f"brain.stop_m is {config.stop_m}; it must be at most 1.")
-    if config.range_min_m >= config.range_max_m:
-        raise ConfigError(
-            f"brain.range_min_m is {config.range_min_m}; it must be below brain.range_max_m, {config.range_max_m}."
-        )

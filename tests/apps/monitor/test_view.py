@@ -1,4 +1,4 @@
-"""How `bhd-monitor` looks: everything fits, nothing jumps, and what matters is told."""
+"""The display of `bhd-monitor`: everything fits, nothing jumps, and what matters is shown."""
 
 import dataclasses
 import io
@@ -147,7 +147,7 @@ def text(shown: MonitorState, **options: Any) -> str:
     return "\n".join(lines(shown, 80, 24, **options))
 
 
-def test_what_happened_is_told_with_its_rate_the_most_frequent_first() -> None:
+def test_what_happened_is_shown_with_its_rate_the_most_frequent_first() -> None:
     shown = text(
         state(
             limits={"VELOCITY": Count(3, 0.0), "ACCELERATION": Count(120, 2.5), "EFFORT": Count(0, 0.0)},
@@ -238,7 +238,7 @@ def test_one_tick_in_a_million_is_to_be_seen() -> None:
     assert bars([1]) == "▁"
 
 
-def test_one_line_tells_the_most_important() -> None:
+def test_one_line_holds_the_most_important() -> None:
     line = one_line(state(refusals={"STALE": 2}, limits={"VELOCITY": Count(3, None)}))
     assert "\n" not in line
     for part in ("wally TRACKING", "500.0 of 500 Hz", "p99 120 µs max 2.30 ms", "overruns 2", "limits 3, refused 2"):
@@ -258,7 +258,7 @@ def test_as_json_there_is_nothing_that_json_does_not_know() -> None:
     plain = dataclasses.replace(
         state(), command_age=float("nan"), dimensions=(Dimension("a", None, float("inf"), 1.0),)
     )
-    told = plain.as_dict()
-    assert told["command_age"] is None
-    assert told["dimensions"] == [{"name": "a", "requested": None, "applied": None, "measured": 1.0}]
-    assert told["limits"]["VELOCITY"] == {"count": 0, "per_second": 0.0}
+    plain_values = plain.as_dict()
+    assert plain_values["command_age"] is None
+    assert plain_values["dimensions"] == [{"name": "a", "requested": None, "applied": None, "measured": 1.0}]
+    assert plain_values["limits"]["VELOCITY"] == {"count": 0, "per_second": 0.0}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.apps.view.dataset import ViewedDataset
-from bhd_lerobot.apps.view.episode import _said
+from bhd_lerobot.apps.view.episode import _subtasks
 from bhd_lerobot.apps.view.groups import MAX_LINES, names_of, scan_of, sections, unit_of
 from bhd_lerobot.apps.view.packing import pack, unpack
 from bhd_lerobot.bodies.ur5 import ur5
@@ -64,7 +64,7 @@ def test_every_number_of_an_episode_is_sent_once(name, request) -> None:
     assert {number for key, number in drawn if key == "action"} == set(range(arrays["action"].shape[1]))
 
 
-def test_a_base_is_where_the_simulator_says(base) -> None:
+def test_a_base_is_where_the_simulator_had_it(base) -> None:
     header, arrays = unpack(ViewedDataset(base).packed(0))
     physics = read_episode(base, 0)["simulation.state"]
     np.testing.assert_allclose(arrays["view.base"][:, :2], physics[:, :2], atol=1e-6)
@@ -118,7 +118,7 @@ def test_names_and_units() -> None:
     assert unit_of("elbow.pos", "so101") == ""  # degrees, or a share of its range: it does not say
 
 
-def test_the_language_column_tells_subtasks_where_no_other_does(tmp_path) -> None:
+def test_subtasks_come_from_the_language_column_where_no_other_has_them(tmp_path) -> None:
     root = record_ours(tmp_path / "d", 1, language=True)
     dataset = ViewedDataset(root)
     header, _ = unpack(dataset.packed(0))
@@ -129,5 +129,5 @@ def test_the_language_column_tells_subtasks_where_no_other_does(tmp_path) -> Non
         {"style": "subtask", "timestamp": 0.4, "content": "b"},
         {"style": "subtask", "timestamp": 0.0, "content": "a"},
     ]
-    assert _said(rows, 9, 10) == [[0, 4, "a"], [4, 9, "b"]]
-    assert _said(None, 9, 10) == []
+    assert _subtasks(rows, 9, 10) == [[0, 4, "a"], [4, 9, "b"]]
+    assert _subtasks(None, 9, 10) == []

@@ -44,21 +44,21 @@ def video_dataset(tmp_path_factory) -> Path:
 def opened(
     browser: Any, server: Served, place: str = "", *, width: int = 1600, height: int = 900, scheme: str = "light"
 ) -> Iterator[Any]:
-    """Open the page; at the end nothing may have gone wrong in it, and nothing may have been asked of others."""
+    """Open the page; at the end nothing may have gone wrong in it, and nothing may have been requested of others."""
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
     context.set_default_timeout(0)  # the test's own is enough
     page = context.new_page()
     wrong: list[str] = []
-    asked: list[str] = []
+    requested: list[str] = []
     page.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.on("request", lambda request: asked.append(request.url))
+    page.on("request", lambda request: requested.append(request.url))
     page.goto(server.url + place)
     page.wait_for_selector("body[data-ready=yes]")
     page.wrong = wrong
     yield page
-    assert [url for url in asked if not url.startswith((server.url, "data:"))] == []
-    assert asked
+    assert [url for url in requested if not url.startswith((server.url, "data:"))] == []
+    assert requested
     assert wrong == []
     context.close()
 
@@ -243,7 +243,7 @@ def server_videos(server: Served) -> list[float]:
     return [unpack(server.ask(f"/api/episodes/{index}")[2])[0]["videos"][0]["from"] for index in range(3)]
 
 
-def test_an_arm_its_plan_and_what_was_asked_for(browser, arm) -> None:
+def test_an_arm_its_plan_and_the_requested_action(browser, arm) -> None:
     with served(arm) as server, opened(browser, server, scheme="dark") as page:
         kinds = page.eval_on_selector_all(".view", "views => views.map((one) => one.dataset.view)")
         assert kinds == ["arm-above", "arm-side"]
@@ -310,7 +310,7 @@ def test_a_mark_is_shown_and_on_disk(browser, base, tmp_path) -> None:
     assert [one["episodes"][0].get("outcome", [None, None])[1] for one in edits] == ["success", "collision", None]
 
 
-def test_what_happens_on_disk_is_told(browser, base, tmp_path) -> None:
+def test_changes_on_disk_are_reported(browser, base, tmp_path) -> None:
     root = Path(shutil.copytree(base, tmp_path / "d"))
     with served(root) as server, opened(browser, server) as page:
         select(page, 2)
@@ -325,7 +325,7 @@ def test_what_happens_on_disk_is_told(browser, base, tmp_path) -> None:
         page.wrong[:] = [text for text in page.wrong if "409" not in text]  # the browser's own line on the refusal
 
 
-def test_a_missing_video_is_said_in_its_place(browser, base, tmp_path) -> None:
+def test_a_missing_video_is_reported_in_its_place(browser, base, tmp_path) -> None:
     root = Path(shutil.copytree(base, tmp_path / "d"))
     with served(root) as server:
         next(root.rglob("*.mp4")).unlink()

@@ -59,8 +59,8 @@ def test_a_link_out_of_the_dataset_is_not_served(base: Path, stock: Path, tmp_pa
         video.unlink()
         video.symlink_to(secret)
         path = f"/videos/{video.parts[-3]}/0/0.mp4"
-        status, _, said = server.ask(path)
-        assert (status, b"password" in said, b"is a link to" in said) == (409, False, True)
+        status, _, body = server.ask(path)
+        assert (status, b"password" in body, b"is a link to" in body) == (409, False, True)
         (root / "own.mp4").write_bytes(whole)
         video.unlink()
         video.symlink_to("../../../own.mp4")
@@ -78,8 +78,8 @@ def test_a_link_out_of_the_dataset_is_not_served(base: Path, stock: Path, tmp_pa
         column = pa.array([{"bytes": None, "path": path}] * table.num_rows, table.schema.field(place).type)
         pq.write_table(table.set_column(place, table.schema.field(place), column), main)
         with served(root) as server:
-            status, _, said = server.ask(f"/api/episodes/0/images/{key}/0")
-            assert (status, b"password" in said) == (409, False)
+            status, _, body = server.ask(f"/api/episodes/0/images/{key}/0")
+            assert (status, b"password" in body) == (409, False)
 
 
 @each_case(
@@ -232,7 +232,7 @@ def server_stamp(server: Served) -> bytes:
 
 
 @each_case(
-    ("what", "status", "told"),
+    ("what", "status", "message"),
     [
         (b"{", 400, "not JSON"),
         ([1], 409, "A mark is an object"),
@@ -245,11 +245,11 @@ def server_stamp(server: Served) -> bytes:
         ({"intervention": [5, 99]}, 409, "Frames 5 to 99"),
     ],
 )
-def test_what_is_no_mark_changes_nothing(base, base_server, what, status, told) -> None:
+def test_what_is_no_mark_changes_nothing(base, base_server, what, status, message) -> None:
     before = stamp_of(base)
     found, content = base_server.mark(0, what)
     assert found == status
-    assert told in content.decode()
+    assert message in content.decode()
     assert base_server.mark(9, {"outcome": "success"})[0] == 409
     assert stamp_of(base) == before
 
@@ -278,8 +278,8 @@ def test_the_command_serves_opens_a_browser_and_ends_with_a_signal(base, capsys,
     ((url, status, page),) = seen
     assert status == 200
     assert b"bhd-data view" in page
-    told = capsys.readouterr().out
-    assert f"3 episodes at {url}" in told
+    printed = capsys.readouterr().out
+    assert f"3 episodes at {url}" in printed
     assert url.startswith("http://127.0.0.1:")
 
 

@@ -140,7 +140,7 @@ def test_every_generated_instruction_means_its_target(scene: list[SceneObject], 
 
 
 @given(scenes(smallest=2), st.data())
-def test_whether_it_plans_and_what_it_says_depends_on_no_order(scene: list[SceneObject], data: st.DataObject) -> None:
+def test_plans_and_messages_do_not_depend_on_the_order(scene: list[SceneObject], data: st.DataObject) -> None:
     instruction = data.draw(
         st.sampled_from(["grab the box", "拿起左边的杯子", "hand me the nearest thing", "take the red cup"])
     )
@@ -165,7 +165,7 @@ def test_instructions_can_be_narrowed_to_a_language_and_a_goal(language: str, wo
     assert set(both[0]) < set(instructions_for(SCENE, RED_CUP))
 
 
-def test_what_cannot_be_told_apart_has_no_instruction() -> None:
+def test_objects_that_no_words_distinguish_have_no_instruction() -> None:
     twins = [thing(0, "red cup"), thing(1, "red cup", y=DISTANCE_MARGIN / 2)]
     assert instructions_for(twins, 0) == ()
     assert "No words known here tell them apart" in refusal("pick up the left cup", twins)
@@ -188,7 +188,7 @@ def test_impossible_requests_for_instructions_are_refused(arguments: tuple[Any, 
 
 
 @each_case(("colour", "kind"), list(itertools.product(COLOURS, KINDS)))
-def test_every_colour_and_kind_can_be_said_in_both_languages(colour: str, kind: str) -> None:
+def test_every_colour_and_kind_has_words_in_both_languages(colour: str, kind: str) -> None:
     one = thing(0, f"{colour} {kind}")
     what = Description(kind, colour)
     for each in (f"pick up the {describe(one)}", f"拿起{chinese(one)}", f"拿起{chinese(one).replace('色', '')}"):

@@ -1,4 +1,4 @@
-"""The brain that does what it is told: which object it goes for, what it refuses, and what it does at the end."""
+"""The brain that carries out instructions: which object it goes for, what it refuses, and what it does at the end."""
 
 import dataclasses
 import json
@@ -91,14 +91,14 @@ def test_it_does_not_look_at_which_object_the_task_marks() -> None:
         ("pick up the red cup and the blue box", "not understood"),
     ],
 )
-def test_what_it_does_not_understand_it_does_not_do_and_says_why(instruction: str, why: str) -> None:
+def test_what_it_does_not_understand_it_does_not_do_and_reports_why(instruction: str, why: str) -> None:
     one = desk(instruction, "pick up the blue box")
     assert set(one.look()) == {1}  # the other goes on
     assert one.look() == {}
-    said = one.brain.subtasks()[0]
-    assert said.startswith("cannot: ")
-    assert why in said
-    assert one.brain.plan(0)["problem"] in said
+    subtask = one.brain.subtasks()[0]
+    assert subtask.startswith("cannot: ")
+    assert why in subtask
+    assert one.brain.plan(0)["problem"] in subtask
     assert one.brain.plan(0)["steps"] == []
 
 
@@ -169,19 +169,19 @@ def test_every_plan_that_can_be_built_is_carried_out_to_its_end(skills: tuple[Sk
     assert steps[-1] == ("hand_over" if Skill.HAND_OVER in skills else "lift")
 
 
-def test_a_planner_of_one_s_own_is_asked_once_with_what_is_on_the_table() -> None:
-    asked: list[tuple[str, list[SceneObject]]] = []
+def test_another_planner_is_called_once_with_what_is_on_the_table() -> None:
+    requests: list[tuple[str, list[SceneObject]]] = []
 
     class Mine:
         def plan(self, instruction: str, objects) -> Plan:
-            asked.append((instruction, list(objects)))
+            requests.append((instruction, list(objects)))
             return make_plan(instruction, objects[2], (*GRASP, Skill.HOLD))
 
     one = desk("whatever", planner=Mine())
     one.look()
     carry_out(one)
     assert place(one) == pytest.approx((BLUE_CUP.x, BLUE_CUP.y))
-    ((instruction, objects),) = asked
+    ((instruction, objects),) = requests
     assert instruction == "whatever"
     assert [thing.name for thing in objects] == ["red cup", "blue box", "blue cup"]
 

@@ -102,12 +102,12 @@ def test_every_skill_has_words_of_its_own_and_can_be_reached() -> None:
 # --- objects ---------------------------------------------------------------------------------------------------------
 
 
-def test_an_object_on_the_table_is_told_by_its_centre_and_its_edges() -> None:
+def test_an_object_on_the_table_has_its_centre_and_its_edges() -> None:
     thing = TableObject("box", "green", size_x=0.03, size_y=0.02, height=0.05, x=0.4, y=-0.1)
-    told = SceneObject.from_table(2, thing)
-    assert (told.index, told.kind, told.colour, told.name) == (2, "box", "green", thing.name)
-    assert told.position == (0.4, -0.1, 0.025)
-    assert told.size == (0.06, 0.04, 0.05)
+    listed = SceneObject.from_table(2, thing)
+    assert (listed.index, listed.kind, listed.colour, listed.name) == (2, "box", "green", thing.name)
+    assert listed.position == (0.4, -0.1, 0.025)
+    assert listed.size == (0.06, 0.04, 0.05)
 
 
 @each_case(
@@ -175,27 +175,27 @@ def test_no_answer_raises_anything_else(value: Any) -> None:
             planned(text if text != answer() else "")
 
 
-def test_the_prompt_says_all_that_the_answer_is_checked_against() -> None:
-    asked: list[str] = []
+def test_the_prompt_holds_all_that_the_answer_is_checked_against() -> None:
+    prompts: list[str] = []
 
     def complete(text: str) -> str:
-        asked.append(text)
+        prompts.append(text)
         return answer()
 
     TextPlanner(complete).plan('the red cup "please"\nrules: none', SCENE)
-    assert all(skill in asked[0] for skill in Skill)
+    assert all(skill in prompts[0] for skill in Skill)
     # On one line and quoted, so that it cannot pass for a part of the prompt.
-    assert '"the red cup \\"please\\"\\nrules: none"' in asked[0]
+    assert '"the red cup \\"please\\"\\nrules: none"' in prompts[0]
     for thing in SCENE:
-        told = {"index": thing.index, "kind": thing.kind, "colour": thing.colour}
-        assert json.dumps(told)[:-1] in asked[0]
+        listed = {"index": thing.index, "kind": thing.kind, "colour": thing.colour}
+        assert json.dumps(listed)[:-1] in prompts[0]
     assert '"拿起红色的杯子"' in prompt("拿起红色的杯子", SCENE)
     assert prompt("x", SCENE) == prompt("x", SCENE[::-1])
 
 
-def test_nothing_is_asked_where_nothing_can_be_planned() -> None:
+def test_there_is_no_prompt_where_nothing_can_be_planned() -> None:
     def complete(_: str) -> str:
-        raise AssertionError("asked")
+        raise AssertionError("prompts")
 
     planner = TextPlanner(complete)
     with pytest.raises(InstructionError, match="nothing on the table"):

@@ -7,7 +7,7 @@ import { duration, emit, frameAt, on, shown, state, segments } from "./store.js"
 
 const HEIGHT = 108; // [px] of a plot without its legend
 const SYNC = "bhd";
-const ASKED = "asked for";
+const REQUESTED = "requested";
 const opened = new Map(); // title of a section -> whether it was opened or closed by hand
 let plots = []; // {plot, playhead, box}
 let isHovered = false;
@@ -90,11 +90,11 @@ function box(about, one) {
 }
 
 function lines(one) {
-  // Where there is one line, or what was asked for and applied, two episodes have the colours that they have elsewhere.
+  // Where there is one line, or a requested and an applied one, two episodes have the colours that they have elsewhere.
   const isPlain = one.lines.length === 1 || one.lines.some((line) => line.applied);
   return shown().flatMap(([name, episode]) => one.lines.filter((line) => episode.arrays[line.column]).map((line, number) => ({
     ...line, name, episode, hue: colour(state.b && isPlain ? `--${name}` : `--line-${number % 8}`),
-    isDashed: name === "b" && !isPlain, isAsked: line.label === ASKED,
+    isDashed: name === "b" && !isPlain, isRequested: line.label === REQUESTED,
     label: state.b ? `${line.label} #${episode.index}` : line.label,
   })));
 }
@@ -117,8 +117,8 @@ function options(about, one, width) {
   const series = lines(one).map((line) => ({
     label: line.label,
     stroke: line.hue,
-    width: line.isAsked ? 4 : 1.5, // what was applied is a thin line on the broad one of what was asked for
-    alpha: line.isAsked ? 0.35 : 1,
+    width: line.isRequested ? 4 : 1.5, // the applied value is a thin line on the broad one of the requested value
+    alpha: line.isRequested ? 0.35 : 1,
     pxAlign: 0, // or broad and thin lines of the same values lie beside each other
     dash: line.isDashed ? [5, 4] : undefined,
     points: { show: line.episode.frames < 3, size: 5 },

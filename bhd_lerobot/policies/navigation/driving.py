@@ -1,0 +1,114 @@
+"""What brains have in common that drive along free paths: parameters, inputs and the twist."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.errors import ConfigError, check_positive
+from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, find_columns
+from bhd_lerobot.policies.navigation.clearance import LONGEST, Paths
+from bhd_lerobot.policies.navigation.scan import ScanReader
+from bhd_lerobot.policies.navigation.steering import Steering
+
+PLACE_SPACING = 0.2  # [m] between two places of a path that are judged
+_TWIST = ("x.vel", "theta.vel")
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class DrivingConfig(BrainConfig):
+    """Parameters of driving along free paths.
+
+    Attributes:
+        forward_speed: speed when driving straight [m/s].
+        rim_speed: highest speed of a wheel's rim, 6.885 rad/s at 0.033 m [m/s]; turning costs forward speed.
+        turn_speed: highest yaw rate [rad/s].
+        settle_s: a heading error is corrected in about this time [s].
+        margin_m: room that a path leaves beside the robot, where there is any [m].
+        stop_m: a path must be free for this much more than its turn, so that the robot can turn around in time [m].
+        horizon_m: paths are judged up to this length [m].
+        range_min_m: a reading below this is not valid [m].
+        range_max_m: a reading above this is not valid [m]; a beam without a return reads exactly this.
+    """
+
+    forward_speed: float = 0.22
+    rim_speed: float = 0.2272
+    turn_speed: float = 2.0
+    settle_s: float = 0.35
+    margin_m: float = 0.05
+    stop_m: float = 0.35
+    horizon_m: float = 3.4
+    range_min_m: float = 0.12
+    range_max_m: float = 3.5
+
+    def __post_init__(self) -> None:
+        """Check the parameters; no parameter of a brain that drives is negative.
+
+        Raises:
+            ConfigError: names the parameter, and what would be valid.
+        """
+        check_positive("brain", self, ("forward_speed", "rim_speed", "turn_speed", "settle_s", "range_max_m"))
+        check_positive("brain", self, asdict(self), or_zero=True)
+        if self.forward_speed > self.rim_speed:
+            raise ConfigError(
+                f"brain.forward_speed is {self.forward_speed}; the wheels reach brain.rim_speed, {self.rim_speed}."
+            )
+        if not PLACE_SPACING <= self.horizon_m <= LONGEST:
+            raise ConfigError(f"brain.horizon_m is {self.horizon_m}; it must be in [{PLACE_SPACING}, {LONGEST}].")
+        if self.stop_m > 1:
+            raise ConfigError(f"brain.stop_m is {self.stop_m}; it must be at most 1.")
+        if self.range_min_m >= self.range_max_m:
+            raise ConfigError(
+                f"brain.range_min_m is {self.range_min_m}; it must be below brain.range_max_m, {self.range_max_m}."
+            )
+
+
+class DrivingBrain(ConfiguredBrain):
+    """Reads a scan and the measured twist, and commands a twist along one of `_paths`, for `_n` robots."""
+
+    robot_type = "turtlebot3"
+    has_narrow = True
+    """Whether it drives through places with less room than usual, which needs a table of its own."""
+    config: Any
+    _paths: Paths
+    _n: int
+
+    def bind(
+        self,
+        observation_names: Sequence[str],
+        action_names: Sequence[str],
+        fps: int,
+        environment_names: Sequence[str] = (),
+    ) -> None:
+        """Find the scan and the twist, and prepare the look-up table for this number of beams."""
+        config = self.config
+        self._reader = ScanReader(observation_names, self.name, (config.range_min_m, config.range_max_m))
+        self._measured = find_columns(observation_names, _TWIST, self.name, "observation")
+        self._commanded = find_columns(action_names, _TWIST, self.name, "action")
+        self._width, self._dt = len(action_names), 1.0 / fps
+        self._steering = Steering(
+            self._paths,
+            self._reader,
+            margin=config.margin_m,
+            stop=config.stop_m,
+            limits=(config.forward_speed, config.rim_speed, config.turn_speed),
+            settle=config.settle_s,
+            range_max=config.range_max_m,
+            has_narrow=self.has_narrow,
+        )
+
+    def _check_count(self, observation: Observation) -> None:
+        if len(observation.state) != self._n:
+            raise ConfigError(
+                f"The brain {self.name!r} was reset for {self._n} robots and sees {len(observation.state)}."
+            )
+
+    def _twist(self, blind: NDArray[np.bool_], forward: Array, turn: Array) -> Array:
+        """Return the action, shape (n, actions): a twist, each part of shape (n,), or rest where a robot is blind."""
+        action = np.zeros((len(blind), self._width))
+        action[:, self._commanded] = np.where(blind, 0.0, (forward, turn)).T
+        return action
