@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 
 from lerobot.teleoperators.config import TeleoperatorConfig
 
+import bhd_lerobot.registry  # noqa: F401  registers the brains
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
-from bhd_lerobot.rollout import registry  # noqa: F401  registers the brains
 
 
 @TeleoperatorConfig.register_subclass("bhd_brain")

@@ -16,7 +16,7 @@ type Run = Callable[[argparse.Namespace], int]
 
 
 class Terminal(Console):
-    """Where a command prints. One that is read no longer, as of ``| head -1``, is for the program to mind."""
+    """Where a command prints. The program handles a pipe that is read no longer, as of ``| head -1``."""
 
     def on_broken_pipe(self) -> None:
         """Do not end with status 1, which says something else of some commands.
@@ -37,8 +37,8 @@ def add_command(
         name: what the user types.
         help_text: one line.
         run: what carries it out. Where Ctrl-C does not leave everything as it was, set the default ``stopped``.
-        names_dataset: whether it is told one dataset, as a folder or by name; `root_of` reads it.
-        takes_several: whether it may be told more than one folder; `roots_of` reads them.
+        names_dataset: whether it takes a dataset, as a folder or by name; `root_of` reads it.
+        takes_several: whether it takes several folders; `roots_of` reads them.
 
     Returns:
         Its parser, for its own arguments.
@@ -69,9 +69,9 @@ def roots_of(options: argparse.Namespace) -> list[Path]:
     }
     given = {option: value for option, value in named.items() if value is not None}
     if len(given) != 1:
-        told = " and ".join(f"{option} {value}" for option, value in given.items())
+        named_twice = " and ".join(f"{option} {value}" for option, value in given.items())
         options.command_parser.error(
-            f"name the dataset, in one way: its folder (ROOT or --root), or --repo_id; got {told or 'none'}"
+            f"name the dataset, in one way: its folder (ROOT or --root), or --repo_id; got {named_twice or 'none'}"
         )
     if options.repo_id is not None:
         return [default_root(options.repo_id)]
