@@ -16,7 +16,7 @@ TYPES: dict[str, str] = {"corrected": "dagger"}
 KEYS: dict[str, str] = {}
 """Keys of configurations by their full names, in which `*` stands for anything: old to the new last part.
 
-What is no new name but a sentence, so with a space in it, says what takes the place of a key that is gone.
+A sentence, recognised by the space in it, says what replaces a removed key.
 """
 
 OPTIONS: dict[str, str] = {
@@ -76,10 +76,10 @@ def _in_values(values: Mapping[str, Any], prefix: str) -> Iterator[str]:
 
 
 def _line(old: str, new: str) -> str:
-    return f"{old} is gone: {new}" if " " in new else f"{old} -> {new}"
+    return f"{old} was removed: {new}" if " " in new else f"{old} -> {new}"
 
 
 def _refuse(lines: Sequence[str]) -> None:
     if lines:
         text = "\n  ".join(lines)
-        raise ConfigError(f"These names are those of version 0.1. Write the new ones:\n  {text}")
+        raise ConfigError(f"Names of version 0.1 that have changed since:\n  {text}")

@@ -115,7 +115,7 @@ def _options(
             default = _default(field)
             shown = f"`{_choice_name(kind, type(default))}`" if dataclasses.is_dataclass(default) else "*required*"
             rows.append((f"`{key}.type`", _kinds(kind), shown, meaning))
-            # A choice that holds others of its own kind is told once.
+            # A choice that holds others of its own kind is listed once.
             if choices and not issubclass(config_class, kind):
                 inner += [(f"`{key}.type={name}`", one, f"{key}.") for name, one in _choices(kind).items()]
         elif dataclasses.is_dataclass(kind):
@@ -198,11 +198,11 @@ _VECTORS = {
     f"{keys.OBSERVATION_IMAGES}.front": "the front camera, RGB; only with `robot.camera=true`",
     f"{keys.OBSERVATION_IMAGES}.scene": "the camera beside the table, RGB; only with `robot.camera=true`",
     f"{keys.OBSERVATION_IMAGES}.wrist": "the camera at the gripper, RGB; only with `robot.camera=true`",
-    keys.ENVIRONMENT_STATE: "what the task tells the brain; see below",
+    keys.ENVIRONMENT_STATE: "what the task gives to the brain; see below",
     keys.LANGUAGE: "the plan and the subtasks as LeRobot's language rows, each with the time from which it was valid; "
     "the same in every frame of an episode; only of brains with a plan",
     keys.SUBTASK: "what the brain is doing, in words; only of brains with a plan",
-    keys.ACTION: "what the brain asked for over the coming frame; for goals, where the reference is at its end",
+    keys.ACTION: "the brain's command for the coming frame; for goals, where the reference is at its end",
     keys.APPLIED_ACTION: "what the cerebellum commanded at the end of the frame, after all limits",
     keys.PHYSICS_STATE: "the simulator's generalised positions, then velocities, when the observation was measured",
 }
@@ -230,7 +230,7 @@ def _columns() -> str:
     cameras = {"scene": image, "wrist": image}
     arm = keys.dataset_features(OBSERVED, JOINT_ACTIONS, cameras, physics, pick.ENVIRONMENT, subtask=True)
     environment = (
-        "What a task tells the brain, in `observation.environment_state`.\n\n"
+        "What a task gives to the brain, in `observation.environment_state`.\n\n"
         f"`reach`, {len(reach.ENVIRONMENT)} numbers: {_names(reach.ENVIRONMENT)}: the target pose of the tool in the "
         "base frame, position [m] and unit quaternion.\n\n"
         f"`pick`, {len(pick.ENVIRONMENT)} numbers: for each of five places `object_0` to `object_4` the "

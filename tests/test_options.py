@@ -7,8 +7,6 @@ import re
 from typing import Any
 
 import pytest
-from bhd_lerobot.rollout.registry import make_brain
-from bhd_lerobot.tasks.catalog import make_task
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import RandomConfig
@@ -18,6 +16,7 @@ from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
 from bhd_lerobot.policies.navigation.navigator import NavigatorConfig
+from bhd_lerobot.registry import make_brain, make_task
 from bhd_lerobot.rollout.configuration import decode
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.navigate import NavigateConfig

@@ -99,9 +99,8 @@ def broken_references(document: Path) -> list[str]:
     return broken
 
 
-@each_case("document", DOCUMENTS)
-def test_every_link_and_every_file_exists(document: Path) -> None:
-    assert broken_references(document) == []
+def test_every_link_and_every_file_exists() -> None:
+    assert [(by_name(path), target) for path in DOCUMENTS for target in broken_references(path)] == []
 
 
 @each_case(
@@ -128,7 +127,7 @@ def quoted_commands(path: Path) -> Iterator[str]:
         blocks = "\n".join(re.findall(r"```(?:bash|sh)\n(.*?)```", text, re.DOTALL))
         lines = blocks.replace("\\\n", " ").splitlines()
         lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", without_code(text)) if " " in span]
-    # "…" stands for what was said before.
+    # "…" stands for the options of an earlier command.
     yield from (line for line in lines if re.match(r"bhd-\w+ ", line) and "…" not in line)
 
 
@@ -162,7 +161,7 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def parse_training(arguments: list[str]) -> None:
-    """Parse what `bhd-train` is told; checkpoints of earlier commands need not be there."""
+    """Parse the arguments of `bhd-train`; checkpoints of earlier commands need not be there."""
     if is_rl(arguments):
         parse_rl(arguments)
         return
@@ -173,30 +172,26 @@ def parse_training(arguments: list[str]) -> None:
             raise
 
 
-COMMANDS = [(path, line) for path in [*DOCUMENTS, *CONFIGURATIONS] for line in quoted_commands(path)]
+def test_every_quoted_command_parses(monkeypatch: pytest.MonkeyPatch) -> None:
+    programs, wrong = set(), []
+    for path in [*DOCUMENTS, *CONFIGURATIONS]:
+        for line in quoted_commands(path):
+            programs.add(line.split()[0])
+            try:
+                parse_command(line, monkeypatch)
+            except (Exception, SystemExit) as error:
+                wrong.append(f"{by_name(path)}: {line}: {error}")
+    assert wrong == []
+    assert programs == {"bhd-record", "bhd-replay", "bhd-data", "bhd-monitor", "bhd-train", "bhd-eval"}
 
 
-def test_the_documents_quote_commands() -> None:
-    assert {line.split()[0] for _, line in COMMANDS} == {
-        *("bhd-record", "bhd-replay", "bhd-data", "bhd-monitor", "bhd-train", "bhd-eval")
-    }
-
-
-@each_case(("path", "line"), COMMANDS)
-def test_every_quoted_command_parses(path: Path, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    parse_command(line, monkeypatch)
-
-
-@each_case(
-    "line",
-    [
+def test_a_wrong_command_does_not_parse(monkeypatch: pytest.MonkeyPatch) -> None:
+    for line in (
         *("bhd-record --seed=1", "bhd-replay --mode=sideways", "bhd-data inform x", "bhd-fly x"),
         *("bhd-train --policy.type=none", "bhd-eval --robot.type=ur5"),
-    ],
-)
-def test_a_wrong_command_does_not_parse(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises((Exception, SystemExit)):
-        parse_command(line, monkeypatch)
+    ):
+        with pytest.raises((Exception, SystemExit)):
+            parse_command(line, monkeypatch)
 
 
 # --- messages --------------------------------------------------------------------------------------------------------

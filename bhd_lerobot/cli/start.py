@@ -18,7 +18,7 @@ from bhd_lerobot.command_line import INTERRUPTED, exit_status
 def leaving_on_interrupt() -> Iterator[None]:
     """End the process at Ctrl-C, with a line and status 130; for imports, when there is nothing to be lost yet.
 
-    Where Ctrl-C is ignored, as of a command in the background of a script, or somebody else minds it, nothing is done.
+    Nothing is done where Ctrl-C is ignored, as of a command in the background of a script, or has another handler.
     """
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield

@@ -180,10 +180,10 @@ def free_places(config: RayConfig) -> int:
 
 
 def describe_crowding(config: RayConfig, workers: int) -> str:
-    """Return what a user should know who asked for more workers than there are processors; empty if not.
+    """Return a message if a run wants more workers than there are processors; empty if not.
 
     Args:
-        config: what was asked for.
+        config: of the cluster.
         workers: how many the run will want.
     """
     places = free_places(config)
@@ -207,8 +207,8 @@ def size_of(config: RayConfig) -> str:
 
 def describe_machines() -> str:
     """Return the machines of the cluster in words, for a message."""
-    told = [f"{name} with {r.get('CPU', 0):g} CPUs and {r.get('GPU', 0):g} GPUs" for name, r in _machines().items()]
-    return "; ".join(told[:8] + (["…"] if len(told) > 8 else [])) or "none"
+    machines = [f"{name} with {r.get('CPU', 0):g} CPUs and {r.get('GPU', 0):g} GPUs" for name, r in _machines().items()]
+    return "; ".join(machines[:8] + (["…"] if len(machines) > 8 else [])) or "none"
 
 
 def _machines() -> dict[str, dict[str, float]]:

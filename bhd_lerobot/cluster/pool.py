@@ -36,7 +36,7 @@ class WorkerPool:
 
     Args:
         config: how many workers, and of what size.
-        console: where losses, and what workers print, are told.
+        console: where losses, and what workers print, are printed.
         server: module of the workers' `EpisodeServer`.
     """
 
@@ -47,19 +47,19 @@ class WorkerPool:
         self._lost_early = 0
         self._has_described_crowding = False
         self._failed: tuple[int, BaseException] | None = None  # from this task on there are no results, and why
-        self._told: Counter[str] = Counter()
+        self._printed: Counter[str] = Counter()
         self._facts: dict[str, str] = {}
         self._distributions: tuple[str, ...] = ()
         self.busy_s = 0.0
 
     def run(self, job: Job, fingerprint: str, tasks: Sequence[Task], stop: Callable[[], bool]) -> Iterator[Any]:
-        """Yield the results of tasks, in their order; ends early when told to stop.
+        """Yield the results of tasks, in their order; ends early when `stop` returns true.
 
         Args:
             job: what the tasks are of.
             fingerprint: what this machine computes for it; workers that compute something else are refused.
             tasks: the tasks.
-            stop: asked a few times a second.
+            stop: called a few times a second.
 
         Raises:
             ClusterError: no worker could be started, or they are lost again and again.
@@ -194,7 +194,7 @@ class WorkerPool:
             self._check_facts(worker, answer["facts"])
             self._call(worker, "prepare", worker.actor.prepare.remote(self._job, self._server))
             return
-        self._tell(worker, answer["printed"])
+        self._print(worker, answer["printed"])
         if call.kind == "prepare":
             if "error" in answer:
                 raise error_of(answer, f"A worker on {worker.host} could not get ready.")
@@ -277,10 +277,10 @@ class WorkerPool:
                 "library differs. Use machines of one kind, this one among them."
             )
 
-    def _tell(self, worker: Worker, lines: list[str]) -> None:
+    def _print(self, worker: Worker, lines: list[str]) -> None:
         """Print what a worker printed: each line once, however many workers print it."""
         for line in lines:
-            self._told[line] += 1
-            if self._told[line] == 1 and len(self._told) <= _PRINTED:
-                more = " (no more of this)" if len(self._told) == _PRINTED else ""
+            self._printed[line] += 1
+            if self._printed[line] == 1 and len(self._printed) <= _PRINTED:
+                more = " (no more of this)" if len(self._printed) == _PRINTED else ""
                 self._console.print(f"[dim]{escape(f'[{worker.host}]')}[/dim] {escape(line)}{more}", highlight=False)

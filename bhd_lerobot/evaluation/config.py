@@ -11,7 +11,7 @@ from bhd_lerobot.registry import check_brain, check_robot_and_task
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 
 YARDSTICKS = ("noop", "random")
-"""Brains that are there to be compared with; `fail_below` asks nothing of them."""
+"""Brains that are there to be compared with; `fail_below` does not apply to them."""
 
 
 @dataclass
@@ -36,7 +36,7 @@ class EvalConfig:
         robot: the robot, in simulation; with `robot.clock=realtime` on the wall clock.
         task: what it is to achieve, and where.
         brains: what is compared, by a name of your choice: `--brains.NAME.type=…`. On a command line,
-            `--brains.NAME=null` takes one out that a file names.
+            `--brains.NAME=null` removes one that a file names.
         brain: short for one more brain, named after its type: `--brain.type=…`; `--brain.path=…` alone is a checkpoint.
         only: run only these of the brains.
         n_episodes: number of episodes of each brain.
@@ -51,8 +51,8 @@ class EvalConfig:
         videos: how many failures of each brain get a video, the first ones; of a brain without failures its first
             episode. If nothing, 2 where images can be rendered, and none elsewhere.
         record: where the runs are recorded, if they are.
-        fail_below: end with exit status 1 if the lower end of a brain's 95 % interval of success is below this. Nothing
-            is asked of `noop` and `random`.
+        fail_below: end with exit status 1 if the lower end of a brain's 95 % interval of success is below this. It does
+            not apply to `noop` and `random`.
         output_dir: folder for results and report; a new one in `outputs/eval` if nothing.
     """
 

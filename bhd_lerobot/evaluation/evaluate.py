@@ -3,8 +3,8 @@
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import metadata
@@ -15,7 +15,7 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 from rich.table import Table
 
 from bhd_lerobot.cluster.loop import open_pool
@@ -27,7 +27,7 @@ from bhd_lerobot.evaluation.report import ReportInput, Video, write_report
 from bhd_lerobot.evaluation.results import EvalResults, summarise, write_json, write_table
 from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
 from bhd_lerobot.evaluation.text import number, percent
-from bhd_lerobot.recording.report import ESTOP_STATUS, print_refusals
+from bhd_lerobot.recording.report import ESTOP_STATUS, print_refusals, progress_bars
 from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.simulation import Simulation, describe
 from bhd_lerobot.rollout.configuration import run
@@ -38,7 +38,7 @@ from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 
 
 def print_summary(console: Console, config: EvalConfig, result: "EvalResult") -> None:
-    """Print what was found out, and where it is."""
+    """Print the results, and where they are."""
     results = result.results
     baseline = config.reference
     table = Table(
@@ -81,7 +81,7 @@ FAILED_STATUS = 1  # exit status of an evaluation in which a brain missed `fail_
 
 @dataclass
 class EvalResult:
-    """What an evaluation found out, and where it is.
+    """The results of an evaluation, and where they are.
 
     Attributes:
         output_dir: the folder.
@@ -103,7 +103,7 @@ class EvalResult:
 
     @property
     def exit_status(self) -> int:
-        """The program's exit status: 0 if all was run, and nothing that was asked for was missed."""
+        """The program's exit status: 0 if all episodes were run and no brain missed `fail_below`."""
         if self.estop is not None:
             return ESTOP_STATUS
         if self.stopped_by:
@@ -145,7 +145,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         preview, no_videos = _make_preview(config, console)
         with run_folder(config, "eval") as output_dir:
             facts = _facts(config, simulation, runs)
-        with _progress(console) as progress:
+        with progress_bars(console, "success") as progress:
             bars = [progress.add_task(escape(one.label), total=len(config.indices), success="") for one in runs]
             for one, bar in zip(runs, bars, strict=True):
                 if stop or any(other.loop.emergency_stop for other in runs):
@@ -277,30 +277,13 @@ def _refuse_results(config: EvalConfig) -> None:
         )
 
 
-@contextmanager
-def _progress(console: Console) -> Iterator[Progress]:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[success]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
-        yield progress
-
-
-def _main(config: EvalConfig) -> int:
-    return evaluate(config).exit_status
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bhd-eval`; return the exit status."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     keys = [argument.partition("=")[0] for argument in arguments]
     if "--brain.path" in keys and "--brain.type" not in keys:
         arguments.append("--brain.type=learned")  # nothing else is somewhere on the disk
-    return run(_main, EvalConfig, arguments)
+    return run(lambda config: evaluate(config).exit_status, EvalConfig, arguments)
 
 
 if __name__ == "__main__":

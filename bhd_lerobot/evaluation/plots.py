@@ -1,7 +1,7 @@
 """Charts of an evaluation, as images that a page can hold in itself.
 
-They read in greyscale and for colour-blind people: what tells apart is a label, a shape or a hatch first, and only then
-a colour, from the palette of Okabe and Ito.
+They read in greyscale and for colour-blind people: categories differ by a label, a shape or a hatch first, and only
+then by a colour, from the palette of Okabe and Ito.
 """
 
 import base64
@@ -158,7 +158,7 @@ def trajectory_grid(trajectories: Mapping[str, Mapping[int, Trajectory]]) -> str
 
 
 def notable_episodes(trajectories: Mapping[str, Mapping[int, Trajectory]], shown: int = SHOWN) -> list[int]:
-    """Return the episodes that tell most, in order: those that ended unlike most of a brain's, and the first ones."""
+    """Return the most informative episodes, in order: those that ended unlike most of a brain's, and the first ones."""
     numbers = sorted({number for ran in trajectories.values() for number in ran})
     unusual = dict.fromkeys(numbers, 0)
     for ran in trajectories.values():
@@ -200,8 +200,8 @@ def _draw_rows(axes: Axes, estimates: Mapping[str, Estimate], title: str, refere
 
 def _draw_spread(axes: Axes, row: int, values: np.ndarray, success: Sequence[bool]) -> None:
     """Draw one brain's values: a box, and beside each other a mark for each episode."""
-    kept = np.isfinite(values)
-    values, good = values[kept], np.array(success, bool)[kept]
+    finite = np.isfinite(values)
+    values, good = values[finite], np.array(success, bool)[finite]
     if not len(values):
         return
     box = axes.boxplot(

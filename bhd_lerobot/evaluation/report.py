@@ -86,7 +86,7 @@ def write_report(given: ReportInput, path: Path) -> None:
 
 
 def _sections(given: ReportInput) -> list[tuple[str, str, str]]:
-    """Return title, anchor and content of what is told about episodes; what has nothing to say is empty."""
+    """Return title, anchor and content of each section about episodes; a section without content is empty."""
     return [
         ("Summary", "summary", _summary(given)),
         ("Beside the baseline", "paired", _paired(given)),
@@ -120,7 +120,7 @@ def _lead(given: ReportInput) -> str:
     clock = "on the wall clock" if given.timing["clock"] == "realtime" else "in simulated time"
     count = len(results.brains)
     lead = (
-        f"<p>{count} brain{'s' * (count != 1)} on the same {results.asked} {facts['split'].replace('_', '-')} "
+        f"<p>{count} brain{'s' * (count != 1)} on the same {results.requested} {facts['split'].replace('_', '-')} "
         f"episodes, {clock}: the same scenes, the same sensor noise, the same initial states. "
         f"Robot {escape(facts['robot']['type'])}, {facts['fps']} decisions a second, run seed {facts['seed']}.</p>"
     )

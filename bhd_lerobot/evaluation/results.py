@@ -1,4 +1,4 @@
-"""From the numbers of episodes to what can be said about brains, and to the files that hold it."""
+"""From the numbers of episodes to summaries of brains, and to the files that hold them."""
 
 import json
 import math
@@ -15,7 +15,7 @@ from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.statistics import Discordance, Estimate
 
 MEANS = ("score", "reward", "length_s", "path_m", "jerk_mean", "jerk_max")
-"""Numbers of an episode of which an evaluation tells the mean with its interval."""
+"""Numbers of an episode whose mean and interval an evaluation reports."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,12 @@ class PairedSummary:
 
 @dataclass
 class EvalResults:
-    """Everything an evaluation found out that does not depend on how fast the machine was.
+    """Everything an evaluation measures that does not depend on how fast the machine was.
 
     Attributes:
         config: what decides the numbers: robot, task, brains, episodes and seeds.
         versions: of the programs that made them.
-        asked: how many episodes of each brain were asked for.
+        requested: how many episodes of each brain were requested.
         episodes: all episodes, brain by brain, in their order.
         brains: what each brain achieved.
         paired: the brains beside the baseline.
@@ -87,22 +87,22 @@ class EvalResults:
 
     config: dict[str, Any]
     versions: dict[str, str]
-    asked: int
+    requested: int
     episodes: list[EpisodeMetrics] = field(default_factory=list)
     brains: dict[str, BrainSummary] = field(default_factory=dict)
     paired: dict[str, PairedSummary] = field(default_factory=dict)
 
     @property
     def is_partial(self) -> bool:
-        """Whether a brain ran fewer episodes than were asked for."""
-        return any(one.episodes < self.asked for one in self.brains.values())
+        """Whether a brain ran fewer episodes than were requested."""
+        return any(one.episodes < self.requested for one in self.brains.values())
 
     def plain(self) -> dict[str, Any]:
         """Return everything as plain values; what is not a number is nothing."""
         return {
             "format": "bhd-eval/1",
             "partial": self.is_partial,
-            "episodes_asked": self.asked,
+            "episodes_asked": self.requested,
             "config": self.config,
             "versions": self.versions,
             "confidence": statistics.CONFIDENCE,
@@ -116,19 +116,19 @@ def summarise(
     config: dict[str, Any],
     versions: dict[str, str],
     episodes: Mapping[str, Sequence[EpisodeMetrics]],
-    asked: int,
+    requested: int,
     baseline: str,
 ) -> EvalResults:
-    """Return what can be said after some episodes.
+    """Return the summaries of brains after some episodes.
 
     Args:
         config: what decides the numbers.
         versions: of the programs.
         episodes: of each brain, by its name.
-        asked: how many episodes of each brain were asked for.
+        requested: how many episodes of each brain were requested.
         baseline: the brain that the others are compared with.
     """
-    results = EvalResults(config, versions, asked)
+    results = EvalResults(config, versions, requested)
     for label, ran in episodes.items():
         results.episodes += ran
         results.brains[label] = _brain(label, ran)

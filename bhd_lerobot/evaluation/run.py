@@ -1,8 +1,10 @@
-"""One brain's part of an evaluation: its episodes, and what is kept of them."""
+"""One brain's part of an evaluation: its episodes, and what results and report need of them."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -11,20 +13,24 @@ from numpy.typing import NDArray
 from bhd_lerobot.cluster.loop import ClusterLoop
 from bhd_lerobot.cluster.pool import WorkerPool
 from bhd_lerobot.datasets.format.features import PHYSICS_STATE
+from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
-from bhd_lerobot.evaluation.record import BrainRecorder
 from bhd_lerobot.policies.brain import Brain
+from bhd_lerobot.recording.config import DatasetConfig, RecordConfig
+from bhd_lerobot.recording.record import open_recorder, save_episode
 from bhd_lerobot.registry import make_brain, make_task
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.drivers import TimedBrain
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.plots import Trajectory
+from bhd_lerobot.rollout.provenance import episode_metadata
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import episode_seed
 
-VIDEOS = 2  # failures of each brain of which videos are made, unless said otherwise
+VIDEOS = 2  # failures of each brain of which videos are made, by default
 
 
 @dataclass
@@ -92,25 +98,52 @@ def prepare(config: EvalConfig, label: str, simulation: Simulation, pool: Worker
 
 
 def run_episodes(config: EvalConfig, one: BrainRun, stop: Callable[[], bool], show: Callable[[], None]) -> None:
-    """Run a brain's episodes and keep what is needed of them."""
+    """Run a brain's episodes and store what results and report need of them."""
     simulation, loop = one.loop.simulation, one.loop
     jerk, fps = JerkMeasure.of(simulation.action_names), simulation.rates.fps
     split: Any = config.split
     specs = [EpisodeSpec(index, episode_seed(config.seed, index, split)) for index in config.indices]
-    with BrainRecorder.open(config, one.label, loop) as recorder:
+    with _recorder(config, one.label, loop) as recorder:
         started = time.perf_counter()
-        for episode in loop.run(specs, stop, recorder.begin):
+        for episode in loop.run(specs, stop, recorder.begin_episode if recorder else None):
             track = simulation.track(episode.columns[PHYSICS_STATE])
             metrics = measure(one.label, episode, track, jerk, fps)
-            recorder.save(episode)
+            if recorder:
+                task, brain = loop.task.parameters(), loop.brain.parameters()
+                save_episode(recorder, episode, episode_metadata(episode, split=split, task=task, brain=brain))
             one.episodes.append(metrics)
             one.initial_states.append(episode.initial_state)
-            _keep(config, one, metrics, episode, track)
+            _store(config, one, metrics, episode, track)
             one.wall_s = time.perf_counter() - started
             show()
 
 
-def _keep(
+@contextmanager
+def _recorder(config: EvalConfig, label: str, loop: EpisodeLoop) -> Iterator[DatasetRecorder | None]:
+    """Open the dataset of a brain, written as `bhd-record` writes it and complete at the end; None if none is wanted.
+
+    Raises:
+        DatasetError: there is one already, or it cannot be written.
+    """
+    if config.record.repo_id is None:
+        yield None
+        return
+    repo_id = f"{config.record.repo_id}_{label}"
+    root = Path(config.record.root).expanduser() / label if config.record.root else default_root(repo_id)
+    recording = RecordConfig(
+        robot=config.robot,
+        dataset=DatasetConfig(repo_id, str(root)),
+        brain=config.brains[label],
+        task=config.task,
+        seed=config.seed,
+        split=config.split,
+    )
+    with open_recorder(recording, root, loop.simulation, loop.task, loop.brain) as recorder:
+        yield recorder
+        recorder.finalize()
+
+
+def _store(
     config: EvalConfig, one: BrainRun, metrics: EpisodeMetrics, episode: Episode, track: NDArray[np.float64]
 ) -> None:
     title = f"{metrics.episode}: {metrics.outcome}, {metrics.score:.2f}"
@@ -120,6 +153,6 @@ def _keep(
     failures = sum(not other.success for other in one.episodes)
     wanted = VIDEOS if config.videos is None else config.videos
     if not metrics.success and failures == 1:
-        one.videos.clear()  # the first episode, kept in case that no one fails
+        one.videos.clear()  # the first episode, for the case that none fails
     if (not metrics.success and failures <= wanted) or (len(one.episodes) == 1 and wanted):
         one.videos.append((metrics, episode.scene, episode.columns[PHYSICS_STATE]))

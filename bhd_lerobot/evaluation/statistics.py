@@ -1,6 +1,6 @@
-"""What can be said about brains after a number of episodes: rates, means, paired differences, with intervals. Pure.
+"""Statistics of brains over a number of episodes: rates, means, paired differences, with intervals. Pure.
 
-All intervals are two-sided at the confidence given, 95 % unless said. Resampling draws from a generator with a fixed
+All intervals are two-sided at the confidence given, 95 % by default. Resampling draws from a generator with a fixed
 seed, so that the same numbers give the same interval.
 """
 

@@ -27,7 +27,7 @@ def number(estimate: Estimate, digits: int, *, sign: bool = False) -> str:
 
 
 def sentences(results: EvalResults) -> list[str]:
-    """Return what was found out, a sentence for each brain."""
+    """Return the results, a sentence for each brain."""
     found = []
     for label, one in results.brains.items():
         if not one.episodes:
@@ -46,13 +46,13 @@ def verdict(pair: PairedSummary) -> str:
     rate = _direction(pair.success, "more often", "less often", "")
     score = _direction(pair.score, "a higher score", "a lower score", "")
     times = "" if math.isnan(pair.ratio.value) else f", {pair.ratio.value:.2f} times the mean"
-    said = [
+    clauses = [
         f"it succeeds {rate} ({percent(pair.success, sign=True).split(' (')[0]})"
         if rate
         else "no difference in success is certain",
         f"it has {score}{times}" if score else "none in score" if not rate else "no difference in score is certain",
     ]
-    return " and ".join(said)
+    return " and ".join(clauses)
 
 
 def _direction(estimate: Estimate, above: str, below: str, neither: str) -> str:

@@ -80,7 +80,7 @@ class LiveView:
 
     It is an `Observer` of an `EpisodeLoop`. What goes where, by the names that LeRobot's helpers are given:
 
-    - action: what the brain asked for, by the names of the actions, and beside it what was applied, ``applied.…``;
+    - action: the brain's command, by the names of the actions, and beside it what was applied, ``applied.…``;
     - observation: the robot's floats by their names, but the scan, which is one array ``scan`` [m]; ``pose.…`` of the
       base or the tool at the start of the frame, in the world, from the simulator [m, quaternion wxyz];
       ``environment_state``; the columns ``control.…`` and ``next.reward`` as in the dataset; images;
@@ -303,7 +303,7 @@ def points(scan: NDArray[Any], range_max: float) -> NDArray[np.float64]:
 
 @contextmanager
 def live_view(options: DisplayOptions, simulation: Simulation, console: Console) -> Iterator[LiveView | None]:
-    """Show a run live, if that was asked for; at its end say what was not shown.
+    """Show a run live if `display_data` is set; at its end print how many frames were left out.
 
     Raises:
         ConfigError: the view cannot be started.

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from bhd_lerobot.cluster.loop import ClusterLoop, open_pool
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
@@ -27,7 +26,7 @@ from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.live_view import live_view
-from bhd_lerobot.recording.report import RecordResult, print_refusals, print_summary
+from bhd_lerobot.recording.report import RecordResult, print_refusals, print_summary, progress_bars
 from bhd_lerobot.recording.resume_advice import instead_of_resuming
 from bhd_lerobot.registry import make_brain, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.simulation import Simulation, describe
@@ -44,7 +43,7 @@ from bhd_lerobot.tasks.task import Task, episode_seed, outcomes_of
 
 
 def language_column(plan: dict[str, Any], subtasks: NDArray, fps: int) -> NDArray:
-    """Return LeRobot's column of what is said and stays valid: the plan, and every subtask from when it began.
+    """Return LeRobot's column `language_persistent`: the plan, and every subtask from its first frame on.
 
     Every frame of an episode holds the same rows.
 
@@ -73,7 +72,7 @@ _ATTEMPTS = 3  # that an episode gets to be punctual
 
 
 def record(config: RecordConfig, console: Console | None = None) -> RecordResult:
-    """Record what a configuration asks for.
+    """Record the episodes that a configuration describes.
 
     Args:
         config: what to record.
@@ -152,14 +151,14 @@ def _run(
             "it: nothing is recorded. For more, raise --dataset.num_episodes.",
             soft_wrap=True,
         )
-    with _progress(console) as progress:
+    with progress_bars(console, "success", "speed") as progress:
         bar = progress.add_task("recording", total=len(specs), success="", speed="")
         started = time.perf_counter()
         for episode in _episodes(loop, specs, result, recorder, console):
             metadata = episode_metadata(episode, split=config.split, task=task.parameters(), brain=brain.parameters())
             if config.dataset.language and brain.has_plan:
-                said = language_column(episode.plan, episode.columns[SUBTASK], config.dataset.fps)
-                episode.columns[LANGUAGE] = said
+                rows = language_column(episode.plan, episode.columns[SUBTASK], config.dataset.fps)
+                episode.columns[LANGUAGE] = rows
             save_episode(recorder, episode, metadata)
             result.count(episode, config.dataset.fps)
             result.wall_s = time.perf_counter() - started
@@ -180,7 +179,7 @@ def _run(
 def _episodes(
     loop: EpisodeLoop, specs: list[EpisodeSpec], result: RecordResult, recorder: DatasetRecorder, console: Console
 ) -> Iterator[Episode]:
-    """Run episodes; those that were too unpunctual are run again, if that was asked for.
+    """Run episodes; with `timing.reject`, those that were too unpunctual are run again.
 
     Raises:
         RealtimeError: an episode was too unpunctual every time.
@@ -219,7 +218,7 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
     """Let a signal and, in a terminal, a key press the emergency stop.
 
     Raises:
-        ConfigError: a key was asked for where there is no terminal.
+        ConfigError: `estop_key` is set where there is no terminal.
     """
     is_live = config.robot.clock == "realtime"
     number = estop_signal(config.estop_signal)
@@ -308,34 +307,22 @@ def _make_preview(config: RecordConfig, simulation: Simulation, console: Console
         return None
 
 
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[success]}"),
-        TextColumn("{task.fields[speed]}"),
-        TimeRemainingColumn(),
-        console=console,
-    )
-
-
 def _push(config: RecordConfig, result: RecordResult, console: Console) -> None:
     dataset = config.dataset
     again = push_command(result.root, dataset.repo_id, private=dataset.private, tags=dataset.tags)
     if result.exit_status:
-        said = f"The dataset is not complete, so it was not uploaded. To upload it as it is:\n  {again}"
+        message = f"The dataset is not complete, so it was not uploaded. To upload it as it is:\n  {again}"
     else:
         private = True if dataset.private else None  # of a repository that exists, whatever it is
         left = left_by_interrupt(result.root, again)
         try:
             with prompt_interrupt(left):
                 report = push_dataset(result.root, dataset.repo_id, private=private, tags=dataset.tags)
-                said = format_push_report(report)
+                message = format_push_report(report)
         except KeyboardInterrupt:
             console.print(escape(f"Stopped; {left}"), soft_wrap=True, highlight=False)
             raise
-    console.print(escape(said), soft_wrap=True, highlight=False)
+    console.print(escape(message), soft_wrap=True, highlight=False)
 
 
 def _main(config: RecordConfig, arguments: Sequence[str]) -> int:

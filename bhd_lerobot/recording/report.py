@@ -1,4 +1,4 @@
-"""What a recording run did, counted and told."""
+"""The counts of a recording run, and its summary in the terminal."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from bhd_lerobot.recording.config import RecordConfig
@@ -75,10 +76,21 @@ class RecordResult:
         self.simulated_s += episode.frames / fps
 
 
+def progress_bars(console: Console, *fields: str) -> Progress:
+    """Return bars that also show some fields of their tasks, by name."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        *(TextColumn(f"{{task.fields[{field}]}}") for field in fields),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
 def print_refusals(simulation: Simulation, console: Console) -> None:
-    """Say loudly what the system refused the real-time process, and the remedy."""
-    refused = [grant for grant in simulation.grants or () if not grant["granted"]]
-    for grant in refused:
+    """Print what the system refused the real-time process, and the remedy."""
+    for grant in (grant for grant in simulation.grants or () if not grant["granted"]):
         console.print(
             f"[bold]Real time: {grant['name']} was refused.[/bold] {escape(grant['detail'])} {escape(grant['remedy'])}"
         )

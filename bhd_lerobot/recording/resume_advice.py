@@ -20,8 +20,8 @@ def instead_of_resuming(config: RecordConfig, arguments: Sequence[str]) -> list[
     again.
 
     Args:
-        config: what was asked for.
-        arguments: the command line that asked for it.
+        config: of the run that was refused.
+        arguments: its command line.
 
     Raises:
         DatasetError: the dataset cannot be read.
@@ -38,13 +38,13 @@ def instead_of_resuming(config: RecordConfig, arguments: Sequence[str]) -> list[
     missing = config.dataset.num_episodes - len(episodes)
     more, whole = _free(root, "more"), _free(root, "all")
     record = [
-        *("bhd-record", *_kept(arguments), f"--dataset.root={more}"),
+        *("bhd-record", *_repeated(arguments), f"--dataset.root={more}"),
         *(f"--dataset.num_episodes={missing if missing > 0 else config.dataset.num_episodes}", f"--seed={seed}"),
     ]
     return [shlex.join(record), shlex.join(["bhd-data", "merge", str(root), str(more), "--output", str(whole)])]
 
 
-def _kept(arguments: Sequence[str]) -> Iterator[str]:
+def _repeated(arguments: Sequence[str]) -> Iterator[str]:
     """Yield a command line without the options that are given anew, written ``--key=value`` or ``--key value``."""
     rest = iter(arguments)
     for argument in rest:

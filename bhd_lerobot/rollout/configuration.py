@@ -27,7 +27,7 @@ CONFIG_PATH = "config_path"
 
 
 def parse[T](config_class: type[T], arguments: Sequence[str]) -> T:
-    """Return the configuration that a command line asks for.
+    """Return the configuration that a command line describes.
 
     Args:
         config_class: a dataclass.
@@ -106,7 +106,7 @@ def describe(config_class: type, prefix: str = "", within: tuple[type, ...] = ()
     Args:
         config_class: a dataclass.
         prefix: what stands before the options' names.
-        within: the classes that this one is an option of: a choice that holds one of its own kind is not told again.
+        within: the classes that this one is an option of: a choice that holds one of its own kind is not listed again.
     """
     within = (*within, config_class)
     lines = (
@@ -121,8 +121,8 @@ def describe(config_class: type, prefix: str = "", within: tuple[type, ...] = ()
             if set(within) & set(choices_of(kind).values()):
                 continue
             for choice, subclass in sorted(choices_of(kind).items()):
-                told = describe(subclass, f"{key}.", within).splitlines()
-                lines += [f"    {choice}:", *("  " + line for line in told)]
+                listed = describe(subclass, f"{key}.", within).splitlines()
+                lines += [f"    {choice}:", *("  " + line for line in listed)]
         elif dataclasses.is_dataclass(kind):
             lines.append(describe(typing.cast(type, kind), f"{key}.", within))
         else:
@@ -213,9 +213,9 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
     choices, entries = choices_of(kind), _entries(kind)
     if entries is not None and isinstance(value, dict):
         # Nothing in the place of an entry takes it out: a command line can drop what a file names.
-        kept = {name: one for name, one in value.items() if one is not None}
-        _check_keys(_keyed(kept, entries), kept, f"{key}.")
-        return kept
+        present = {name: entry for name, entry in value.items() if entry is not None}
+        _check_keys(_keyed(present, entries), present, f"{key}.")
+        return present
     if choices and isinstance(value, dict):
         chosen = value.get("type")
         if chosen is None:

@@ -51,7 +51,7 @@ def test_ctrl_c_during_an_import_is_a_line_and_status_130(tmp_path: Path, progra
     assert done.stderr.startswith("Stopped before it began")
 
 
-def test_ctrl_c_afterwards_is_minded_by_the_program_or_else_a_line(tmp_path: Path) -> None:
+def test_ctrl_c_afterwards_is_handled_by_the_program_or_else_a_line(tmp_path: Path) -> None:
     own = f"def main():\n    try:\n        {INTERRUPT.replace(chr(10), chr(10) + '        ')}pass\n"
     done = started(tmp_path, own + "    except KeyboardInterrupt:\n        return 7\n")
     assert (done.returncode, done.stderr) == (7, "")
@@ -70,10 +70,10 @@ def test_where_ctrl_c_is_ignored_it_stays_ignored(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (5, "")
 
 
-def test_threads_that_wait_sleep_unless_somebody_said_otherwise(
+def test_threads_that_wait_sleep_unless_the_environment_sets_another_policy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    program = "import os\nsaid = os.environ['OMP_WAIT_POLICY']\ndef main():\n    print(said)\n    return 0\n"
+    program = "import os\nvalue = os.environ['OMP_WAIT_POLICY']\ndef main():\n    print(value)\n    return 0\n"
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     assert started(tmp_path, program).stdout == "PASSIVE\n"
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
@@ -91,13 +91,31 @@ def test_every_command_begins_this_way(script: str, monkeypatch: pytest.MonkeyPa
     assert SCRIPTS[script] == f"bhd_lerobot.cli.start:{begin.__name__}"
 
 
+def test_every_command_names_the_nearest_option_with_status_2(capsys: pytest.CaptureFixture[str]) -> None:
+    for module, arguments in (
+        ("recording.record", ["--sed=1"]),
+        ("evaluation.evaluate", ["--sed=1"]),
+        ("rollout.replay", ["--mod=state"]),
+        ("cli.train", ["--stepz=1"]),
+        ("cli.data.main", ["check", "--jsonn"]),
+        ("cli.data.main", ["chek"]),
+        ("apps.monitor.monitor", ["--oncee"]),
+        ("apps.doctor.doctor", ["--jsonn"]),
+    ):
+        try:
+            status = importlib.import_module(f"bhd_lerobot.{module}").main(arguments)
+        except SystemExit as end:
+            status = end.code
+        assert (status, "Did you mean" in capsys.readouterr().err) == (2, True), module
+
+
 @pytest.mark.parametrize(
     ("program", "slow"),
     [
         ("import bhd_lerobot.cli.start, bhd_lerobot.cli.data.main", "numpy torch lerobot rich yaml pyarrow mujoco"),
         ("import bhd_lerobot.cli.data.main as d; d._parser()", "torch lerobot pandas mujoco pinocchio matplotlib ray"),
     ],
-    ids=["before Ctrl-C is minded", "for the help"],
+    ids=["before Ctrl-C is handled", "for the help"],
 )
 def test_nothing_slow_is_imported(program: str, slow: str) -> None:
     done = subprocess.run(
@@ -126,7 +144,7 @@ def test_the_handler_before_comes_back() -> None:
 
 
 @pytest.mark.parametrize("command", ["bhd-record", "bhd-replay", "bhd-data"])
-def test_help_that_nobody_reads_to_its_end_ends_without_a_word(command: str) -> None:
+def test_help_that_nobody_reads_to_its_end_ends_without_output(command: str) -> None:
     """As of ``--help | head``; bhd-data has tests of its other output."""
     module, _, function = SCRIPTS[command].partition(":")
     program = f"import sys; sys.argv = [{command!r}, '--help']; import {module} as m; sys.exit(m.{function}())"

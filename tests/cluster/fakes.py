@@ -1,4 +1,4 @@
-"""A server for workers of a cluster that imports nothing of ours: what it does with an episode is said by its seed."""
+"""A server for workers of a cluster that imports nothing of this package; an episode's seed decides what it does."""
 
 import os
 import pickle

@@ -53,7 +53,7 @@ def ray_folder():
     """Return a folder for all that Ray leaves behind; its default one may not exist, or hold what others left."""
     folder = tempfile.mkdtemp(prefix="bhd-ray-", dir="/tmp")  # a socket's path must be short
     with pytest.MonkeyPatch.context() as patch:
-        # `Cluster` writes its address there, whatever folder its machines are told, and needs it to exist.
+        # `Cluster` writes its address there, whatever folder its machines get, and needs it to exist.
         patch.setenv("RAY_TMPDIR", folder)
         Path(folder, "ray").mkdir()
         yield folder
@@ -195,7 +195,7 @@ def test_a_killed_driver_leaves_good_episodes_and_no_processes(ray_folder, tmp_p
         assert any(b"RemoteWorker" in Path(f"/proc/{pid}/cmdline").read_bytes() for pid in family)
         driver.kill()
         driver.wait()
-        # Ray's two agents try for a minute to tell somebody that the rest has gone.
+        # Ray's two agents try for a minute to report that the rest has gone.
         until(lambda: not any(working(pid) for pid in family))
     finally:
         for pid in {driver.pid, *family}:
@@ -410,7 +410,7 @@ def test_how_many_workers_run_at_a_time_is_told_if_more_were_asked_for(cluster):
     assert (got, error) == (list(range(6)), None)
     assert "ray.num_workers is 5, and the cluster has room for 2 of 1 CPU: 2 run at a time." in printed
     assert printed.count("1 CPUs and 0 GPUs") == 2  # the machines that have room, by name
-    # Nobody is told about workers that there is nothing to do for.
+    # No message about workers without a task.
     assert "at a time" not in run_pool(cluster, [fakes.ECHO] * 2, num_workers=5)[1]
     assert "at a time" not in run_pool(cluster, [fakes.ECHO] * 6)[1]
 
@@ -432,9 +432,9 @@ def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(cl
 
 
 def test_the_run_stops_when_it_is_told_to(cluster):
-    asked = threading.Event()
-    threading.Timer(2, asked.set).start()
-    got, _, error = run_pool(cluster, [fakes.SLOW] * 1000, stop=asked.is_set)
+    stopped = threading.Event()
+    threading.Timer(2, stopped.set).start()
+    got, _, error = run_pool(cluster, [fakes.SLOW] * 1000, stop=stopped.is_set)
     assert error is None
     assert got == list(range(len(got)))
     assert len(got) < 1000

@@ -17,7 +17,7 @@ from bhd_lerobot.errors import ClusterError, ConfigError
 from tests.recording.support import run_record
 
 
-def test_a_machine_without_our_package_can_say_so(tmp_path):
+def test_a_machine_without_the_package_reports_it(tmp_path):
     cloudpickle = pytest.importorskip("ray.cloudpickle")
     cloudpickle.register_pickle_by_value(remote)
     try:
@@ -57,13 +57,13 @@ def test_options_that_a_cluster_cannot_honour_are_refused(tmp_path):
     assert not (tmp_path / "data").exists()
 
 
-def test_without_ray_the_command_to_install_it_is_told(tmp_path, monkeypatch):
+def test_without_ray_the_message_names_the_command_that_installs_it(tmp_path, monkeypatch):
     monkeypatch.setattr(config, "importlib", SimpleNamespace(util=SimpleNamespace(find_spec=lambda _: None)))
     with pytest.raises(ConfigError, match=r"pip install -e '\.\[ray\]'"):
         run_record(tmp_path / "data", engine="ray")
 
 
-def test_a_cluster_that_is_not_there_is_told_soon(tmp_path, monkeypatch):
+def test_a_cluster_that_does_not_exist_is_reported_soon(tmp_path, monkeypatch):
     pytest.importorskip("ray")
     monkeypatch.setattr(cluster_module, "_KNOCK_S", 0.3)
     with socket.create_server(("127.0.0.1", 0)) as mute, socket.create_server(("127.0.0.1", 0)) as other:
@@ -76,9 +76,9 @@ def test_a_cluster_that_is_not_there_is_told_soon(tmp_path, monkeypatch):
 
         threading.Thread(target=answer, daemon=True).start()
         with socket.create_server(("127.0.0.1", 0)) as closed:
-            nobody = closed.getsockname()[1]
+            unused = closed.getsockname()[1]
         for address, message in (
-            (f"127.0.0.1:{nobody}", "cannot be reached"),
+            (f"127.0.0.1:{unused}", "cannot be reached"),
             (f"127.0.0.1:{mute.getsockname()[1]}", "does not answer"),
             (f"127.0.0.1:{other.getsockname()[1]}", "is no Ray cluster"),
             ("no-such-host.invalid:6379", "cannot be reached"),
@@ -90,11 +90,11 @@ def test_a_cluster_that_is_not_there_is_told_soon(tmp_path, monkeypatch):
     assert not (tmp_path / "data").exists()
 
 
-def test_workers_that_share_the_processors_of_this_machine_are_told(monkeypatch):
+def test_workers_that_share_the_processors_of_this_machine_are_reported(monkeypatch):
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setattr(cluster_module, "free_places", lambda config: 99)  # Ray was told that there are as many
+    monkeypatch.setattr(cluster_module, "free_places", lambda config: 99)  # as many as Ray was started with
     there = len(os.sched_getaffinity(0))
-    told = cluster_module.describe_crowding(RayConfig(num_workers=there + 3), there + 3)
-    assert told == f"{there + 3} workers of 1 CPU share the {there} processors of this machine."
+    message = cluster_module.describe_crowding(RayConfig(num_workers=there + 3), there + 3)
+    assert message == f"{there + 3} workers of 1 CPU share the {there} processors of this machine."
     assert cluster_module.describe_crowding(RayConfig(num_workers=there), there) == ""
     assert cluster_module.describe_crowding(RayConfig(address="auto"), there + 3) == ""

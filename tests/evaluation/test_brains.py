@@ -55,10 +55,10 @@ def test_a_checkpoint_is_compared_with_rules_and_gives_the_same_bytes_if_that_is
     for name, n_envs in (("one", 1), ("four", 4)):
         run_eval(tmp_path / name, n_envs=n_envs, n_episodes=4, **brain, **FAILING)
     assert (tmp_path / "one" / "results.json").read_bytes() == (tmp_path / "four" / "results.json").read_bytes()
-    said = results(tmp_path / "one")
-    assert set(said["brains"]) == {"old", "new", "net"}
-    assert said["config"]["brains"]["net"]["type"] == "learned"
-    assert said["paired"]["net"]["baseline"] == "old"
+    written = results(tmp_path / "one")
+    assert set(written["brains"]) == {"old", "new", "net"}
+    assert written["config"]["brains"]["net"]["type"] == "learned"
+    assert written["paired"]["net"]["baseline"] == "old"
 
 
 def test_a_checkpoint_for_something_else_is_refused_by_name(checkpoint, tmp_path):

@@ -62,9 +62,9 @@ def whole(tmp_path_factory):
     return folder, result, printed
 
 
-@pytest.mark.parametrize(("n_envs", "threads"), [(1, 1), (4, 2), (16, 2)])
-def test_the_same_bytes_twice_and_for_any_number_of_simulations(whole, tmp_path, n_envs, threads):
-    run_eval(tmp_path, n_episodes=9, n_envs=n_envs, threads=threads, **FAILING)
+def test_the_same_bytes_twice_and_for_any_number_of_simulations(whole, tmp_path):
+    """`test_runs_are_recorded…` compares a third number of simulations."""
+    run_eval(tmp_path, n_episodes=9, n_envs=16, threads=2, **FAILING)
     assert (tmp_path / "results.json").read_bytes() == (whole[0] / "results.json").read_bytes()
     with np.load(whole[0] / "initial_states.npz") as one, np.load(tmp_path / "initial_states.npz") as other:
         assert set(one.files) == {"state_old", "episode_old", "state_new", "episode_new"}
@@ -96,17 +96,17 @@ def test_other_brains_and_episodes_beside_it_change_nothing(whole, tmp_path):
 def test_another_seed_and_split_are_other_episodes(whole, tmp_path):
     seen = {one.seed for one in whole[1].results.episodes}
     for name, overrides in (("a", {"seed": 1}), ("b", {"split": "train"})):
-        result, _ = run_eval(tmp_path / name, only="[old]", **overrides)
+        result, _ = run_eval(tmp_path / name, only="[old]", n_episodes=2, **overrides)
         assert not seen & {one.seed for one in result.results.episodes}
 
 
 def test_counts_and_files_agree(whole):
     folder, _, printed = whole
-    said = results(folder)
+    written = results(folder)
     rows = pq.read_table(folder / "episodes.parquet").to_pylist()
-    assert len(said["episodes"]) == len(rows) == 18
-    assert said["partial"] is False
-    for label, one in said["brains"].items():
+    assert len(written["episodes"]) == len(rows) == 18
+    assert written["partial"] is False
+    for label, one in written["brains"].items():
         mine = [row for row in rows if row["brain"] == label]
         assert one["episodes"] == len(mine) == 9
         assert one["successes"] == sum(row["success"] for row in mine)
@@ -118,11 +118,11 @@ def test_counts_and_files_agree(whole):
         for row in mine:
             assert row["path_m"] == pytest.approx(row["details.path_m"], abs=0.05)  # the task's own count
             assert row["length_s"] == row["frames"] / 10
-    pair = said["paired"]["new"]
+    pair = written["paired"]["new"]
     assert pair["baseline"] == "old"
-    difference = said["brains"]["new"]["means"]["score"]["value"] - said["brains"]["old"]["means"]["score"]["value"]
-    assert pair["score"]["value"] == pytest.approx(difference)
-    assert set(said["brains"]["old"]["outcomes"]) | set(said["brains"]["new"]["outcomes"]) > {"success"}
+    new, old = (written["brains"][label]["means"]["score"]["value"] for label in ("new", "old"))
+    assert pair["score"]["value"] == pytest.approx(new - old)
+    assert set(written["brains"]["old"]["outcomes"]) | set(written["brains"]["new"]["outcomes"]) > {"success"}
     assert "9 held_out episodes" in printed
     timing = json.loads((folder / "timing.json").read_text())
     assert timing["brains"]["old"]["act"]["calls"] >= 9 * 20
@@ -176,8 +176,7 @@ def test_a_brain_that_does_not_fit_fails_before_any_episode_and_is_named(tmp_pat
     assert not (tmp_path / "x").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_keeps_what_is_finished_and_says_that_it_is_partial(whole, tmp_path, monkeypatch, number):
+def test_a_signal_keeps_finished_episodes_and_marks_the_results_as_partial(whole, tmp_path, monkeypatch):
     calls = 0
     act = GapFollowerBrain.act
 
@@ -185,20 +184,20 @@ def test_a_signal_keeps_what_is_finished_and_says_that_it_is_partial(whole, tmp_
         nonlocal calls
         calls += 1
         if calls == 45:  # in the second brain's second episode: 30 frames each
-            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGTERM)
         return act(self, seen)
 
     monkeypatch.setattr(GapFollowerBrain, "act", acting)
     result, printed = run_eval(tmp_path, n_episodes=9, n_envs=1, **FAILING)
-    assert result.exit_status == 128 + number
-    said = results(tmp_path)
-    assert said["partial"] is True
-    assert said["brains"]["old"]["episodes"] == 9
-    finished = said["brains"]["new"]["episodes"]
+    assert result.exit_status == 143
+    written = results(tmp_path)
+    assert written["partial"] is True
+    assert written["brains"]["old"]["episodes"] == 9
+    finished = written["brains"]["new"]["episodes"]
     assert 1 <= finished < 9
     reference = {(one["brain"], one["episode"]): one for one in results(whole[0])["episodes"]}
-    assert all(reference[one["brain"], one["episode"]] == one for one in said["episodes"])
-    assert said["paired"]["new"]["episodes"] == finished
+    assert all(reference[one["brain"], one["episode"]] == one for one in written["episodes"])
+    assert written["paired"]["new"]["episodes"] == finished
     assert "partial" in printed
     assert "Partial:" in (tmp_path / "report.html").read_text()
 
@@ -219,13 +218,7 @@ def test_fail_below_is_about_the_lower_end_of_the_interval(tmp_path):
     assert result.exit_status == 1  # 5 of 5 is not yet 90 %
     assert result.missed == ["old", "new"]
     assert "old missed fail_below" in printed
-    assert run_eval(tmp_path / "b", fail_below=0.5)[0].exit_status == 0
-
-
-def test_main_gives_the_exit_status_and_says_what_is_wrong(tmp_path, capsys):
-    assert main(options(tmp_path / "a", fail_below=0.99, n_episodes=1)) == 1
-    assert main(options(tmp_path / "b", split="tset")) == 2
-    assert "split is 'tset'" in capsys.readouterr().err
+    assert main(options(tmp_path / "b", fail_below=0.5)) == 0
 
 
 def test_a_path_alone_is_a_checkpoint(monkeypatch):

@@ -92,7 +92,7 @@ def test_flags_are_counted_by_kind_in_frames():
     assert {name: count for name, count in metrics.watchdogs.items() if count} == {"command_age": 2, "blocked": 1}
 
 
-def test_latched_stops_are_told():
+def test_latched_stops_are_counted():
     for mode, stops, faults in ((Mode.ESTOP, 1, 0), (Mode.FAULT, 0, 1), (Mode.HOLD, 0, 0)):
         modes = np.array([Mode.TRACKING, mode], np.int64)
         metrics = measured(episode(np.zeros((2, 2)), **{keys.MODE: modes}))

@@ -177,11 +177,11 @@ def test_sentences_claim_a_difference_only_where_the_interval_leaves_out_nothing
     worse = [metrics("old", n, 0.3 + 0.01 * (n % 3), "success" if n % 2 else "collision") for n in range(30)]
     same = [metrics("same", n, 0.31, "success" if n % 2 else "stuck") for n in range(30)]
     results = summarise({}, {}, {"old": worse, "new": better, "same": same}, 30, "old")
-    said = dict(zip(results.brains, sentences(results), strict=True))
-    assert "succeeded in 15 of 30" in said["old"]
-    assert "beside" not in said["old"]
-    assert "it succeeds more often (+50.0 points) and it has a higher score, 2.90 times" in said["new"]
-    assert "no difference in success is certain" in said["same"]
+    text = dict(zip(results.brains, sentences(results), strict=True))
+    assert "succeeded in 15 of 30" in text["old"]
+    assert "beside" not in text["old"]
+    assert "it succeeds more often (+50.0 points) and it has a higher score, 2.90 times" in text["new"]
+    assert "no difference in success is certain" in text["same"]
 
 
 def test_infinity_and_nan_become_null_in_json(tmp_path):

@@ -1,4 +1,4 @@
-"""`--display_data=true`: what the viewers are sent, that nobody waits for them, and what happens without them."""
+"""`--display_data=true`: what the viewers get, that the run does not wait for them, and what happens without them."""
 
 import io
 import socket
@@ -138,7 +138,7 @@ def test_what_is_sent_is_a_copy_and_an_image_is_shown_once(sent: Helpers, robot:
     assert "observation.images.front" not in second
 
 
-def test_a_view_that_is_slow_holds_nobody_up_and_shows_the_newest(sent: Helpers, robot: Simulation) -> None:
+def test_a_slow_view_does_not_delay_the_run_and_shows_the_newest_frames(sent: Helpers, robot: Simulation) -> None:
     sent.gate.clear()
     view = LiveView(display(), robot)
     view(0, columns(robot, 0))
@@ -161,7 +161,7 @@ def test_only_the_first_of_several_robots_is_shown(sent: Helpers, robot: Simulat
     assert "observation.images.front" not in frame["observation"]
 
 
-def test_a_view_that_fails_is_told_at_the_end_and_ends_nothing_else(sent: Helpers, robot: Simulation) -> None:
+def test_a_view_that_fails_is_reported_at_the_end_and_does_not_end_the_run(sent: Helpers, robot: Simulation) -> None:
     console = Console(file=io.StringIO(), width=120)
     sent.error = OSError("viewer gone")
     with live_view(display(), robot, console) as view:
@@ -173,14 +173,14 @@ def test_a_view_that_fails_is_told_at_the_end_and_ends_nothing_else(sent: Helper
     assert sent.ended == ["foxglove"]
 
 
-def test_a_viewer_that_is_not_there_is_found_out_before_the_run(robot: Simulation) -> None:
+def test_a_viewer_that_cannot_be_reached_is_an_error_before_the_run(robot: Simulation) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(ConfigError, match=r"rerun could not be started: .*refused"):
         LiveView(display(display_mode="rerun", display_ip="127.0.0.1", display_port=port), robot)
 
 
-def test_a_viewer_that_goes_away_keeps_nobody_from_ending(tmp_path: Path) -> None:
+def test_a_viewer_that_disappears_does_not_delay_the_end_of_the_run(tmp_path: Path) -> None:
     program = (
         "import socket\n"
         "from bhd_lerobot.recording import live_view\n"
@@ -241,7 +241,7 @@ def test_a_package_that_is_missing_is_named_before_anything_starts(
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None if name == missing else find(name))
     with pytest.raises(ConfigError, match=f"'{package}', which is not installed"):
         parse(RecordConfig, options(tmp_path / "d", display_data="true", display_mode=mode))
-    parse(RecordConfig, options(tmp_path / "d", display_mode=mode))  # nothing is needed for what was not asked for
+    parse(RecordConfig, options(tmp_path / "d", display_mode=mode))  # no package is needed without display_data
 
 
 def test_a_view_that_cannot_start_says_so(monkeypatch: pytest.MonkeyPatch, robot: Simulation) -> None:
@@ -260,7 +260,7 @@ def test_points_lie_ahead_upwards_and_to_the_left_leftwards() -> None:
 
 
 def test_a_recording_shows_the_frames_that_it_records(sent: Helpers, tmp_path: Path) -> None:
-    _, said = run_record(
+    _, printed = run_record(
         tmp_path / "d", display_data="true", display_mode="foxglove", dataset__num_episodes=2, n_envs=2
     )
     recorded = data_columns(tmp_path / "d")
@@ -276,9 +276,9 @@ def test_a_recording_shows_the_frames_that_it_records(sent: Helpers, tmp_path: P
             assert frame["observation"]["x.vel"] == pytest.approx(recorded[keys.OBSERVATION_STATE][i][0])
             assert frame["observation"][keys.MODE] == recorded[keys.MODE][i]
     missing = len(first) - len(sent.frames)
-    assert ("left out" in said) == (missing > 0)
+    assert ("left out" in printed) == (missing > 0)
     if missing:
-        assert f"{len(sent.frames)} frames shown, {missing} left out" in said
+        assert f"{len(sent.frames)} frames shown, {missing} left out" in printed
 
 
 def test_a_recording_is_the_same_with_and_without_a_view(sent: Helpers, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """bhd-record: same seed same bytes, resume after any kill, signals, bad input, what is in the run folder."""
 
 import json
+import os
 import random
 import signal
 import subprocess
@@ -66,20 +67,29 @@ def test_what_is_recorded_is_consistent(tmp_path):
         assert score == pytest.approx(row.metadata["score"], abs=1e-6)
         physics = columns["simulation.state"][rows]
         assert np.hypot(*np.diff(physics[:, :2], axis=0).T).sum() == pytest.approx(row.metadata["path_m"], abs=0.03)
-        # The command applied chases the one asked for, within what the acceleration allows in one frame.
-        applied, asked = columns["control.applied_action"][rows], columns["action"][rows]
+        # The command applied follows the requested one, within what the acceleration allows in one frame.
+        applied, requested = columns["control.applied_action"][rows], columns["action"][rows]
         assert (np.abs(np.diff(applied, axis=0)) <= np.array([0.25, 0.32]) + 1e-6).all()
-        assert np.allclose(applied[asked[:, 0] > 0, 0], 0.2, atol=1e-6)
+        assert np.allclose(applied[requested[:, 0] > 0, 0], 0.2, atol=1e-6)
         seeds = [int(e.metadata["seed"]) for e in dataset_info(root).episodes]
         assert len(set(seeds)) == 4
         assert all(seed % 2 == 0 for seed in seeds)  # training seeds are even
 
 
-def test_stock_lerobot_reads_it(tmp_path):
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Three episodes: the dataset, and what was printed. Nothing may change it."""
+    root = tmp_path_factory.mktemp("record") / "d"
+    result, text = run_record(root)
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    yield root, result, text
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+
+
+def test_stock_lerobot_reads_it(recorded):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    root = tmp_path / "d"
-    run_record(root)
+    root = recorded[0]
     dataset = LeRobotDataset("test/avoid", root=root, video_backend="pyav", delta_timestamps={"action": [0.0, 0.1]})
     columns = data_columns(root)
     assert dataset.num_episodes == 3
@@ -90,13 +100,9 @@ def test_stock_lerobot_reads_it(tmp_path):
     assert set(dataset.meta.stats) >= {"observation.state", "action"}
 
 
-def test_an_existing_root_is_refused_and_left_alone(tmp_path):
-    root = tmp_path / "d"
-    run_record(root)
-    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+def test_an_existing_root_is_refused_and_left_alone(recorded):
     with pytest.raises(DatasetExistsError, match="exists already"):
-        run_record(root)
-    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+        run_record(recorded[0])
 
 
 def test_resume_adds_the_episodes_that_an_undisturbed_run_has(tmp_path):
@@ -107,31 +113,22 @@ def test_resume_adds_the_episodes_that_an_undisturbed_run_has(tmp_path):
     assert data_columns(tmp_path / "parts") == data_columns(tmp_path / "whole")
 
 
-def test_resume_of_a_complete_dataset_adds_nothing(tmp_path):
-    run_record(tmp_path / "d")
-    before = data_columns(tmp_path / "d")
-    result, _ = run_record(tmp_path / "d", resume="true")
+def test_resume_of_a_complete_dataset_adds_nothing(recorded):
+    result, _ = run_record(recorded[0], resume="true")
     assert result.recorded == 0
-    assert data_columns(tmp_path / "d") == before
 
 
-@pytest.mark.parametrize(
-    ("change", "shown"),
-    [
+def test_resume_refuses_another_recording_and_shows_the_difference(recorded):
+    for change, shown in (
         ({"seed": 9}, "seed"),
         ({"robot__beams": 18}, "observation.state"),
         ({"brain__safe_distance_m": 0.4}, "safe_distance_m"),
         ({"task__arena": "turtlebot3_world"}, "arena"),
         ({"dataset__fps": 20}, "fps"),
         ({"split": "held_out"}, "held_out"),
-    ],
-)
-def test_resume_refuses_another_recording_and_shows_the_difference(tmp_path, change, shown):
-    run_record(tmp_path / "d")
-    before = data_columns(tmp_path / "d")
-    with pytest.raises(DatasetMismatchError, match=shown):
-        run_record(tmp_path / "d", resume="true", dataset__num_episodes=5, **change)
-    assert data_columns(tmp_path / "d") == before
+    ):
+        with pytest.raises(DatasetMismatchError, match=shown):
+            run_record(recorded[0], resume="true", dataset__num_episodes=5, **change)
 
 
 def _start(root: Path, **overrides) -> subprocess.Popen:
@@ -166,20 +163,32 @@ def test_killed_and_resumed_is_the_same_as_undisturbed(tmp_path):
     assert dataset_info(root).compact
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_the_run_with_a_finalised_dataset(tmp_path, number):
-    root = tmp_path / "d"
-    process = _start(root, dataset__num_episodes=100_000, n_envs=2)
-    _wait_for_episodes(root, 2, process)
-    process.send_signal(number)
+def test_a_signal_ends_the_run_with_a_finalised_dataset(tmp_path, monkeypatch):
+    process = _start(tmp_path / "program", dataset__num_episodes=100_000, n_envs=2)
+    _wait_for_episodes(tmp_path / "program", 2, process)
+    process.send_signal(signal.SIGTERM)
     _, text = process.communicate()
-    assert process.returncode == 128 + number, text
-    assert number.name in text
-    assert "--resume=true" in text
-    summary = dataset_info(root)
-    assert summary.compact
-    assert len(summary.episodes) >= 2
-    assert len(data_columns(root)["index"]) == summary.frames
+    ended = {"program": (process.returncode, text, signal.SIGTERM)}
+    for number in (signal.SIGINT, signal.SIGHUP):  # in this process
+        save = record_module.DatasetRecorder.save
+
+        def saving(self, *args, save=save, number=number, **kwargs):
+            if self.num_episodes == 1:
+                os.kill(os.getpid(), number)
+            return save(self, *args, **kwargs)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(record_module.DatasetRecorder, "save", saving)
+            result, text = run_record(tmp_path / number.name, dataset__num_episodes=100, n_envs=2)
+        ended[number.name] = (result.exit_status, text, number)
+    for name, (status, text, number) in ended.items():
+        assert status == 128 + number, text
+        assert number.name in text
+        assert "--resume=true" in text
+        summary = dataset_info(tmp_path / name)
+        assert summary.compact
+        assert len(summary.episodes) >= 2
+        assert len(data_columns(tmp_path / name)["index"]) == summary.frames
 
 
 def test_a_failing_save_leaves_the_earlier_episodes_and_names_the_cause(tmp_path, monkeypatch):
@@ -199,12 +208,13 @@ def test_a_failing_save_leaves_the_earlier_episodes_and_names_the_cause(tmp_path
     assert dataset_info(tmp_path / "d").compact
 
 
-def test_the_run_folder_has_the_resolved_configuration_and_a_image(tmp_path):
-    result, text = run_record(tmp_path / "d")
-    saved = tmp_path / "d_run" / "config.yaml"
+def test_the_run_folder_has_the_resolved_configuration_and_an_image(recorded):
+    root, result, text = recorded
+    folder = root.parent / "d_run"
+    saved = folder / "config.yaml"
     again = parse(RecordConfig, [f"--config_path={saved}"])
     assert encode(again) == yaml.safe_load(saved.read_text())
-    assert (tmp_path / "d_run" / "trajectories.png").stat().st_size > 5_000
+    assert (folder / "trajectories.png").stat().st_size > 5_000
     for part in (f"{result.successes} of 3", "mean score", "real time", "trajectories.png"):
         assert part in text
 
@@ -222,7 +232,7 @@ def test_the_video_is_made_where_images_can_be_rendered(tmp_path):
     assert frames[0].to_ndarray(format="rgb24").std() > 5
 
 
-def test_without_opengl_the_recording_goes_on_and_says_so(tmp_path, monkeypatch):
+def test_without_opengl_the_recording_continues_and_reports_it(tmp_path, monkeypatch):
     def no_gl(*args):
         raise RenderingError("No image can be rendered here. Install EGL.")
 
@@ -252,7 +262,7 @@ def test_a_camera_is_recorded_frame_by_frame(tmp_path):
     assert len({image.numpy().tobytes() for image in images}) == 4
 
 
-def test_episodes_come_in_order_and_are_dropped_when_told_to_stop(tmp_path):
+def test_episodes_come_in_order_and_are_dropped_at_a_stop_request(tmp_path):
     config = parse(RecordConfig, options(tmp_path / "d", dataset__num_episodes=4))
     simulation = record_module.make_simulation(config.robot, 3)
     task = record_module.make_task(config.task, 3, 10)

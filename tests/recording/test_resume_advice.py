@@ -30,9 +30,9 @@ def test_the_commands_that_are_told_do_what_was_meant(tmp_path: Path, capsys) ->
     assert "was edited after its recording (delete), so it cannot be continued" in error
     assert len(lines) == 2
     for line, main in zip(lines, (record.main, data.main), strict=True):
-        program, *said = shlex.split(line)
+        program, *arguments = shlex.split(line)
         assert program == {record.main: "bhd-record", data.main: "bhd-data"}[main]
-        assert main(said) == 0
+        assert main(arguments) == 0
     assert seeds(root) == before
     merged = seeds(tmp_path / "my data_all")
     assert merged[:2] == before
@@ -41,9 +41,9 @@ def test_the_commands_that_are_told_do_what_was_meant(tmp_path: Path, capsys) ->
     capsys.readouterr()
     more = {"dataset__num_episodes": 5, "dataset__episode_time_s": 1, "resume": "true"}
     assert record.main(options(tmp_path / "my data_all", **more)) == 2
-    told = capsys.readouterr().err
-    assert "was edited after its recording (merge)" in told
-    assert "--seed=2 " in told.replace("\n", " ")
-    assert "--dataset.num_episodes=2 " in told
+    error = capsys.readouterr().err
+    assert "was edited after its recording (merge)" in error
+    assert "--seed=2 " in error.replace("\n", " ")
+    assert "--dataset.num_episodes=2 " in error
     assert record.main(options(root, **short, resume="true")) == 2
     assert "my data_more2" in capsys.readouterr().err

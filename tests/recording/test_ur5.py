@@ -80,8 +80,8 @@ def test_columns_tell_what_happened(recorded):
         height = state[:, environment.index(f"object_{target}_z")]
         assert height[-1] - height[0] > 0.1
         assert np.allclose(columns["next.reward"][rows].sum(), 1.0, atol=1e-5)
-        said = columns["subtask"][rows].tolist()
-        order = list(dict.fromkeys(said))
+        subtasks = columns["subtask"][rows].tolist()
+        order = list(dict.fromkeys(subtasks))
         assert [text.split()[0] for text in order] == ["move", "close", "lift", "hold"]
         # The action is where the reference stands at the end of the frame: one frame later the arm is there.
         action, seen = columns["action"][rows], columns["observation.state"][rows]
@@ -122,8 +122,8 @@ def test_stock_lerobot_reads_it(recorded):
 
     for index in (0, 7, 60, len(dataset) - 1):
         item = dataset[index]
-        said = active_at(float(item["timestamp"]), persistent=item["language_persistent"], style="subtask")
-        assert said["content"] == item["subtask"] == columns["subtask"][index]
+        row = active_at(float(item["timestamp"]), persistent=item["language_persistent"], style="subtask")
+        assert row["content"] == item["subtask"] == columns["subtask"][index]
         plan = active_at(float(item["timestamp"]), persistent=item["language_persistent"], style="plan")
         assert plan["content"].startswith("1. find the ")
     assert set(dataset.meta.stats) >= {"observation.environment_state", "action"}

@@ -61,13 +61,13 @@ def test_mistakes_are_named(options, message):
 
 
 @pytest.mark.parametrize("left_out", range(4))
-def test_required_options_are_asked_for(left_out):
+def test_missing_required_options_are_named(left_out):
     options = [option for index, option in enumerate(REQUIRED) if index != left_out]
     with pytest.raises(ConfigError, match=REQUIRED[left_out][2:].split("=")[0].removesuffix(".type")):
         parse(RecordConfig, options)
 
 
-def test_errors_of_ours_are_sentences_and_others_keep_their_traceback(capsys):
+def test_errors_of_this_package_are_messages_and_others_keep_their_traceback(capsys):
     def fail(config):
         raise BhdError("a sentence")
 

@@ -16,7 +16,7 @@ type Run = Callable[[argparse.Namespace], int]
 
 
 class Terminal(Console):
-    """Where a command prints. One that is read no longer, as of ``| head -1``, is for the program to mind."""
+    """Where a command prints. The program handles a pipe that is read no longer, as of ``| head -1``."""
 
     def on_broken_pipe(self) -> None:
         """Do not end with status 1, which has another meaning for some commands.
