@@ -18,7 +18,8 @@ from bhd_lerobot.cli.data.episode_list import parse_episodes
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.rosbag.exporter.export import START_S, ExportOptions, export_bags
+from bhd_lerobot.rosbag.exporter.episode import START_S, ExportOptions
+from bhd_lerobot.rosbag.exporter.export import export_bags
 from bhd_lerobot.rosbag.messages.arm import ARM_FRAME, TOOL_FRAME
 from bhd_lerobot.rosbag.messages.base import FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME, BaseNoise
 from bhd_lerobot.rosbag.messages.views import JointFrame, RobotView, StaticFrame
@@ -73,9 +74,7 @@ def _run(options: argparse.Namespace) -> int:
     )
     what = "1 episode" if report.episodes == 1 else f"{report.episodes} episodes"
     bags = "1 bag" if len(report.bags) == 1 else f"{len(report.bags)} bags"
-    print(
-        f"{options.output}: {what}, {report.messages} messages, in {bags}. Look at one: ros2 bag play {report.bags[0]}"
-    )
+    print(f"{options.output}: {what}, {report.messages} messages, in {bags}. Play one: ros2 bag play {report.bags[0]}")
     return 0
 
 

@@ -3,7 +3,6 @@
 import argparse
 import math
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from bhd_lerobot.rosbag.importer.options import ImportOptions
 from bhd_lerobot.rosbag.messages.types import require_rosbags
 from bhd_lerobot.rosbag.storage.find import check_distinct, find_bags
 from bhd_lerobot.rosbag.storage.place import refuse_existing
-from bhd_lerobot.rosbag.storage.read import Bag, Topic
+from bhd_lerobot.rosbag.storage.read import Bag
 from bhd_lerobot.tasks.task import OUTCOMES
 
 ROBOTS = ("turtlebot3",)
@@ -80,12 +79,11 @@ def _run(options: argparse.Namespace) -> int:
     check_distinct(bags)
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()
     refuse_existing(root, "--root")  # before the bags are read, which may take long
-    exported = [options.robot is None and is_exported(bag.topics) for bag in bags]
+    exported = [options.robot is None and is_exported(bag) for bag in bags]
     if all(exported):
         episodes = exported_episodes(bags)
-        report = import_bags(
-            bags, root, options.repo_id, _wanted_of_exported(options, episodes[0][0], bags[0].topics), episodes
-        )
+        wanted = _wanted_of_exported(options, episodes[0][0], bags[0])
+        report = import_bags(bags, root, options.repo_id, wanted, episodes)
     elif any(exported):
         raise ConfigError(
             f"{bags[exported.index(True)].path} was written by bhd-data export, {bags[exported.index(False)].path} was "
@@ -98,10 +96,8 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _wanted_of_exported(
-    options: argparse.Namespace, episode: ExportedEpisode, topics: Mapping[str, Topic]
-) -> ImportOptions:
-    """Return what the options ask for of exported bags.
+def _wanted_of_exported(options: argparse.Namespace, episode: ExportedEpisode, bag: Bag) -> ImportOptions:
+    """Return how exported bags are to be read.
 
     Raises:
         ConfigError: a value that cannot be honoured, or an option for bags of a real robot.
@@ -123,7 +119,7 @@ def _wanted_of_exported(
         observation_names=names_of(episode, keys.OBSERVATION_STATE),
         environment_names=names_of(episode, keys.ENVIRONMENT_STATE),
         action_names=actions,
-        cameras=exported_cameras(episode, topics),
+        cameras=exported_cameras(episode, bag),
         lidar=body.lidar,
         parts=exported_parts(episode),
         max_speed=limits.velocity if limits is not None and limits.names == actions else None,
@@ -168,7 +164,7 @@ def _times(options: argparse.Namespace, fps: int, least: float) -> dict[str, Any
 
 
 def _wanted(options: argparse.Namespace) -> ImportOptions:
-    """Return what the options ask for of a real robot's bags.
+    """Return how a real robot's bags are to be read.
 
     Raises:
         ConfigError: a value that cannot be honoured.

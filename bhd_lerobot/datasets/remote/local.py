@@ -76,7 +76,11 @@ def open_local(root: Path) -> Iterator[LocalDataset]:
         ) from error
     try:
         stamps = _stamps(root)
-        _refuse_subset(root)
+        if is_subset(root):
+            raise DatasetError(
+                f"{root} holds some episodes of a dataset only: it was pulled with --episodes or --outcome. Pull all "
+                "of it first, or make a dataset of its own of these episodes."
+            )
         state = load_state(root)
         _refuse_unfinished(state)
         names, left_out = _files(state, stamps)
@@ -84,14 +88,6 @@ def open_local(root: Path) -> Iterator[LocalDataset]:
         yield LocalDataset(root, state, items, left_out, stamps)
     finally:
         lock.release()
-
-
-def _refuse_subset(root: Path) -> None:
-    if is_subset(root):
-        raise DatasetError(
-            f"{root} holds some episodes of a dataset only: it was pulled with --episodes or --outcome. Pull all of "
-            "it first, or make a dataset of its own of these episodes."
-        )
 
 
 def _refuse_unfinished(state: DatasetState) -> None:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,6 @@ from bhd_lerobot.rosbag.messages.parts import (
     IntegersPart,
     NumbersPart,
     Part,
-    header,
     own_topic,
     stamp_tree,
 )
@@ -35,6 +35,7 @@ from bhd_lerobot.rosbag.storage.write import Stream
 _PLAIN = (arrow.is_string, arrow.is_boolean, arrow.is_integer, arrow.is_floating, arrow.is_list, arrow.is_null)
 _LONGEST_S = 1e8  # three years, longer than any recording
 _PAUSE_NS = 10 * NANO  # between two episodes
+START_S = 1_000_000_000  # [s] since 1970: a dataset does not know on which day it was recorded
 
 STATE_COLUMNS = (
     keys.TIME, keys.AGE, keys.COMMAND_AGE, keys.LATENESS, keys.OVERRUNS, keys.SKIPPED, keys.INFERENCE_TIME, keys.LATE,
@@ -44,6 +45,27 @@ OUTCOME_COLUMNS = (keys.REWARD, keys.SUCCESS, keys.DONE, keys.EVENT)
 EPISODE_TOPIC, STATE_TOPIC, OUTCOME_TOPIC = "/bhd/episode", "/bhd/cerebellum", "/bhd/outcome"
 
 
+@dataclass(frozen=True)
+class ExportOptions:
+    """How bags are written.
+
+    Attributes:
+        storage: ``"mcap"`` or ``"sqlite3"``.
+        episodes: which; all if None.
+        one_bag: all episodes in one bag, instead of a bag for each.
+        bare_twist: commands of a base as Twist, without stamps.
+        compressed_images: images as JPEG.
+        start_s: when the first episode starts [s since 1970].
+    """
+
+    storage: str = "mcap"
+    episodes: Sequence[int] | None = None
+    one_bag: bool = False
+    bare_twist: bool = False
+    compressed_images: bool = False
+    start_s: float = START_S
+
+
 class EpisodeTopics:
     """Makes the topics of a dataset's episodes; the clock goes on from one to the next.
 
@@ -51,29 +73,17 @@ class EpisodeTopics:
         state: the dataset.
         view: what is known of the robot.
         repo_id: name of the dataset.
-        start_s: when the first episode starts [s since 1970].
-        bare_twist: commands of a base without stamps.
-        compressed_images: images as JPEG.
+        options: how bags are written.
 
     Raises:
         UnsupportedDatasetError: the dataset holds something that no message is made for.
     """
 
-    def __init__(
-        self,
-        state: DatasetState,
-        view: views.RobotView,
-        repo_id: str,
-        *,
-        start_s: float,
-        bare_twist: bool = False,
-        compressed_images: bool = False,
-    ) -> None:
-        self._state, self._view, self._repo_id = state, view, repo_id
-        self._bare_twist, self._compressed = bare_twist, compressed_images
+    def __init__(self, state: DatasetState, view: views.RobotView, repo_id: str, options: ExportOptions) -> None:
+        self._state, self._view, self._repo_id, self._options = state, view, repo_id, options
         self._features: dict[str, Any] = {k: v for k, v in state.info["features"].items() if k not in DEFAULT_FEATURES}
         self._robot = str(state.info.get("robot_type") or "")
-        self._next_start = round(start_s * NANO)
+        self._next_start = round(options.start_s * NANO)
         for name, kind in state.metadata_types.items():
             if not any(is_one(kind) for is_one in _PLAIN):
                 raise UnsupportedDatasetError(
@@ -105,7 +115,7 @@ class EpisodeTopics:
             return [NumbersPart(own_topic(key), tuple(map(str, names)))]
         return parts_of(
             key, [str(name) for name in names], self._robot,
-            lidar=self._view.lidar, noise=self._view.noise, bare_twist=self._bare_twist,
+            lidar=self._view.lidar, noise=self._view.noise, bare_twist=self._options.bare_twist,
         )  # fmt: skip
 
     def streams(self, row: Row, columns: Mapping[str, NDArray[Any]]) -> list[Stream]:
@@ -163,7 +173,7 @@ class EpisodeTopics:
         return streams
 
     def _video(self, key: str, row: Row, frames: Frames) -> list[Stream]:
-        camera, compressed = camera_name(key), self._compressed
+        camera, compressed = camera_name(key), self._options.compressed_images
         optical = f"{camera}_optical_frame"
         path = self._state.root / layout.video_file(key, slot_of(row, f"videos/{key}"))
         images = video_frames(path, row[f"videos/{key}/from_timestamp"], row["length"])
@@ -171,9 +181,8 @@ class EpisodeTopics:
 
         def messages() -> Iterator[tuple[int, bytes]]:
             for number, image in enumerate(images):
-                part = slice(number, number + 1)
-                one = Frames(frames.episode, frames.index[part], frames.stamps[part])
-                yield int(frames.stamps[number]), encode_image(one, optical, image, compressed=compressed)
+                message = encode_image(frames.at(number), optical, image, compressed=compressed)
+                yield int(frames.stamps[number]), message
 
         streams = [Stream(topic, COMPRESSED if compressed else IMAGE, messages())]
         if fovy := self._view.fovy.get(camera):
@@ -263,26 +272,15 @@ def scan_stream(part: ScanPart, frames: Frames, values: NDArray[Any], age: NDArr
 
 
 def _states(frames: Frames, observed: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]) -> list[bytes]:
-    fields: dict[str, Any] = {
-        "header": header(frames.stamps),
-        "observed": stamp_tree(observed),
-        "episode_index": frames.episode,
-        "frame_index": frames.index,
-    }
+    fields = {**frames.fields(), "observed": stamp_tree(observed)}
     fields |= {key.removeprefix("control."): columns[key] for key in STATE_COLUMNS if key in columns}
     return encode(types.STATE, fields, len(observed))
 
 
 def _outcomes(frames: Frames, columns: Mapping[str, NDArray[Any]]) -> list[bytes]:
-    n = len(frames.stamps)
-    fields: dict[str, Any] = {
-        "header": header(frames.stamps),
-        "episode_index": frames.episode,
-        "frame_index": frames.index,
-        "subtask": columns.get(keys.SUBTASK, ""),
-    }
+    fields = {**frames.fields(), "subtask": columns.get(keys.SUBTASK, "")}
     fields |= {key.removeprefix("next."): columns[key] for key in OUTCOME_COLUMNS if key in columns}
-    return encode(types.OUTCOME, fields, n)
+    return encode(types.OUTCOME, fields, len(frames.stamps))
 
 
 def _texts(key: str, frames: Frames, values: NDArray[Any]) -> Stream:
@@ -291,13 +289,7 @@ def _texts(key: str, frames: Frames, values: NDArray[Any]) -> Stream:
     for number, value in enumerate(values):
         text = json.dumps(value) if key == LANGUAGE else str(value)
         if text != before:
-            part = slice(number, number + 1)
-            fields = {
-                "header": header(frames.stamps[part]),
-                "episode_index": frames.episode,
-                "frame_index": frames.index[part],
-                "text": text,
-            }
+            fields = {**frames.at(number).fields(), "text": text}
             messages.append((int(frames.stamps[number]), encode(types.TEXT, fields, 1)[0]))
             before = text
     return Stream(own_topic(key), types.TEXT, messages)

@@ -15,33 +15,10 @@ from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, ordere
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import refuse_inside
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.rosbag.exporter.episode import EpisodeTopics
+from bhd_lerobot.rosbag.exporter.episode import EpisodeTopics, ExportOptions
 from bhd_lerobot.rosbag.messages import types, views
 from bhd_lerobot.rosbag.storage.place import complete_or_not
 from bhd_lerobot.rosbag.storage.write import BagWriter
-
-START_S = 1_000_000_000  # [s] since 1970: a dataset does not know on which day it was recorded
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """How bags are written.
-
-    Attributes:
-        storage: ``"mcap"`` or ``"sqlite3"``.
-        episodes: which; all if None.
-        one_bag: all episodes in one bag, instead of a bag for each.
-        bare_twist: commands of a base as Twist, without stamps.
-        compressed_images: images as JPEG.
-        start_s: when the first episode starts [s since 1970].
-    """
-
-    storage: str = "mcap"
-    episodes: Sequence[int] | None = None
-    one_bag: bool = False
-    bare_twist: bool = False
-    compressed_images: bool = False
-    start_s: float = START_S
 
 
 @dataclass
@@ -86,22 +63,13 @@ def _export(
     state: DatasetState, output: Path, view: views.RobotView, repo_id: str, options: ExportOptions
 ) -> ExportReport:
     rows = _chosen(state, options.episodes)
-    topics = EpisodeTopics(
-        state,
-        view,
-        repo_id or state.root.resolve().name,
-        start_s=options.start_s,
-        bare_twist=options.bare_twist,
-        compressed_images=options.compressed_images,
-    )
+    topics = EpisodeTopics(state, view, repo_id or state.root.resolve().name, options)
     report = ExportReport()
     consequence = "The dataset was not touched; no bag was left behind."
     with complete_or_not(output, "--output", "write bags", consequence) as folder:
         if options.one_bag:
             with BagWriter(folder, options.storage, topics.custom) as bag:
-                for row, columns in _episodes(state, rows):
-                    report.messages += bag.write(topics.streams(row, columns))
-                    report.episodes += 1
+                report.messages = sum(bag.write(topics.streams(*episode)) for episode in _episodes(state, rows))
             report.bags.append(output)
         else:
             folder.mkdir()
@@ -109,8 +77,8 @@ def _export(
                 name = f"episode_{row['episode_index']:06d}"
                 with BagWriter(folder / name, options.storage, topics.custom) as bag:
                     report.messages += bag.write(topics.streams(row, columns))
-                report.episodes += 1
                 report.bags.append(output / name)
+        report.episodes = len(rows)
     return report
 
 

@@ -13,7 +13,7 @@ from bhd_lerobot.rosbag.messages import types
 from bhd_lerobot.rosbag.messages.parts import NANO, Part
 from bhd_lerobot.rosbag.messages.serialize import decode
 from bhd_lerobot.rosbag.messages.split import PARTS
-from bhd_lerobot.rosbag.storage.read import Bag, Topic
+from bhd_lerobot.rosbag.storage.read import Bag
 
 _REMEDY = "Export the dataset again, or import a TurtleBot3's bag as a real robot's with --robot=turtlebot3."
 _VECTORS = (keys.OBSERVATION_STATE, keys.ENVIRONMENT_STATE, keys.ACTION)
@@ -48,9 +48,9 @@ class ExportedEpisode:
     parts: Mapping[str, Sequence[Part]]
 
 
-def is_exported(topics: Mapping[str, Topic]) -> bool:
+def is_exported(bag: Bag) -> bool:
     """Return whether a bag holds episodes that `bhd-data export` wrote."""
-    topic = topics.get(EPISODE_TOPIC)
+    topic = bag.topics.get(EPISODE_TOPIC)
     return topic is not None and topic.msgtype == types.EPISODE and topic.count > 0
 
 
@@ -146,11 +146,11 @@ def names_of(episode: ExportedEpisode, key: str) -> tuple[str, ...]:
     return tuple(str(name) for name in (names if known else range(count)))
 
 
-def exported_cameras(episode: ExportedEpisode, topics: Mapping[str, Topic]) -> dict[str, str]:
+def exported_cameras(episode: ExportedEpisode, bag: Bag) -> dict[str, str]:
     """Return the topics of an episode's cameras by name; raw images if a bag has both."""
     return {
         key.removeprefix(f"{keys.OBSERVATION_IMAGES}."): next(
-            (topic for packed in (False, True) if (topic := image_topic(key, compressed=packed)) in topics),
+            (topic for packed in (False, True) if (topic := image_topic(key, compressed=packed)) in bag.topics),
             image_topic(key, compressed=False),
         )
         for key, feature in episode.features.items()

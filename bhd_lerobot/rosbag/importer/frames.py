@@ -117,11 +117,7 @@ def _quaternion(transform: Any) -> Array:
 
 
 def _matrix(quaternion: Array) -> Array:
-    w, x, y, z = quaternion / max(float(np.linalg.norm(quaternion)), 1e-12)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """Return the rotation matrix of a quaternion wxyz; one that was never set, all zeros, is no rotation."""
+    from scipy.spatial.transform import Rotation  # not at the start of every command
+
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix() if quaternion.any() else np.eye(3)

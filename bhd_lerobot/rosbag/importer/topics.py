@@ -1,5 +1,6 @@
 """Which topics of a bag are read for what, and who published them."""
 
+import contextlib
 from collections.abc import Mapping
 
 from bhd_lerobot.errors import DatasetError
@@ -14,36 +15,31 @@ _BASE = (ScanPart.msgtype, OdometryPart.msgtype)
 _NAMED = 6  # joints
 
 
-def other_robot(bag: Bag, topics: Mapping[str, Topic]) -> str | None:
-    """Return, in sentences, that a bag is not of a TurtleBot3 and what can be done; None if it may be.
+def _refuse_arm(bag: Bag) -> None:
+    """Refuse a bag of an arm: it has joints that are no wheels, no scans and no odometry.
 
-    Args:
-        bag: the bag.
-        topics: what it has.
+    Raises:
+        DatasetError: it is of an arm; names its joints.
     """
-    only = "is for bags of a TurtleBot3: it needs scans, odometry and speed commands"
-    if any(topic.msgtype in _BASE and topic.count for topic in topics.values()):
-        return None
-    for topic in topics.values():
+    if any(topic.msgtype in _BASE and topic.count for topic in bag.topics.values()):
+        return
+    for topic in bag.topics.values():
         joints = _joints(bag, topic.name) if topic.msgtype == JOINT_STATE and topic.count else []
-        # A base has the joints of its wheels.
         if joints and not any("wheel" in joint for joint in joints):
             more = ", …" if len(joints) > _NAMED else ""
-            return (
+            raise DatasetError(
                 f"{bag.path} seems to be of an arm: {topic.name} has the joints {', '.join(joints[:_NAMED])}{more}, "
-                f"and there are no scans and no odometry. bhd-data import {only}; for an arm's bags there is none, "
-                "except for those that bhd-data export wrote."
+                "and there are no scans and no odometry. bhd-data import is for bags of a TurtleBot3: it needs scans, "
+                "odometry and speed commands; for an arm's bags there is none, except for those that bhd-data export "
+                "wrote."
             )
-    return None
 
 
 def _joints(bag: Bag, topic: str) -> list[str]:
     """Return the joints of the first message of a topic; none if that cannot be read."""
-    try:
+    with contextlib.suppress(DatasetError):
         for *_, payload in bag.messages((topic,)):
             return list(decode(JOINT_STATE, payload).name)
-    except DatasetError:
-        pass
     return []
 
 
@@ -65,23 +61,16 @@ _MEANING = {
 }
 
 
-def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) -> Topic:
-    """Return a topic that a role is read from.
-
-    Args:
-        bag: the bag.
-        topics: what it has.
-        role: what the topic is wanted for, a key of `TYPES`.
-        name: of the topic.
+def wanted_topic(bag: Bag, role: str, name: str) -> Topic:
+    """Return the topic that a role, a key of `TYPES`, is read from.
 
     Raises:
         DatasetError: the bag is of another robot, or the topic is missing, empty, of another type, of two types, or
             not in ROS 2's serialisation.
     """
-    option, types = (f"--{role}", TYPES[role])
+    option, types, topics = f"--{role}", TYPES[role], bag.topics
     if name not in topics or not topics[name].count:
-        if (other := other_robot(bag, topics)) is not None:
-            raise DatasetError(other)
+        _refuse_arm(bag)
         there = ", ".join(f"{one.name} ({one.msgtype}, {one.count})" for one in topics.values()) or "none"
         fitting = [one.name for one in topics.values() if one.msgtype in types and one.count]
         hint = f" Of the right type: {', '.join(fitting)}." if fitting else ""
@@ -104,13 +93,13 @@ def wanted_topic(bag: Bag, topics: Mapping[str, Topic], role: str, name: str) ->
     return topics[name]
 
 
-def exported_topic(bag: Bag, topics: Mapping[str, Topic], role: str, part: Part) -> Topic:
+def exported_topic(bag: Bag, role: str, part: Part) -> Topic:
     """Return the topic of an exported bag that carries numbers of a feature.
 
     Raises:
         DatasetError: it is missing, empty or of another type.
     """
-    topic = topics.get(part.topic)
+    topic = bag.topics.get(part.topic)
     if topic is None or not topic.count:
         raise DatasetError(
             f"{bag.path} has no message of {part.topic}, which carries {role.removesuffix(part.topic)}, as "
@@ -133,13 +122,8 @@ def static_topics(scan: str) -> set[str]:
     return {"/tf_static", f"{scan.rpartition('/')[0]}/tf_static"}
 
 
-def publisher_notes(topics: Mapping[str, Topic], wanted: Mapping[str, Topic]) -> list[str]:
-    """Return, in sentences, where more than one publisher may have been at work.
-
-    Args:
-        topics: all of a bag.
-        wanted: role -> its topic.
-    """
+def publisher_notes(bag: Bag, wanted: Mapping[str, Topic]) -> list[str]:
+    """Return, in sentences, which wanted topics, by role, may have more than one publisher."""
     notes = []
     for role, topic in wanted.items():
         counts = "newest command counts, as it did for the robot" if role == "cmd" else "newest message counts"
@@ -157,7 +141,7 @@ def publisher_notes(topics: Mapping[str, Topic], wanted: Mapping[str, Topic]) ->
     if "cmd" not in wanted:
         return notes  # an exported bag, whose other topics are known
     read = wanted["cmd"].name
-    others = [one for one in topics.values() if one.msgtype in TYPES["cmd"] and one.count and one.name != read]
+    others = [one for one in bag.topics.values() if one.msgtype in TYPES["cmd"] and one.count and one.name != read]
     if others:
         there = ", ".join(f"{one.name} ({one.count})" for one in others)
         notes.append(

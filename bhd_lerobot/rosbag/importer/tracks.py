@@ -73,12 +73,11 @@ def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> dict[str,
     Raises:
         DatasetError: a topic is missing, empty, of another type or mostly unreadable, or its frame is not known.
     """
-    topics = bag.topics
-    wanted = {role: wanted_topic(bag, topics, role, name) for role, name in options.topics.items()}
-    wanted |= {role: exported_topic(bag, topics, role, part) for role, part in options.parts.items()}
-    cameras = {f"camera/{name}": wanted_topic(bag, topics, "camera", topic) for name, topic in options.cameras.items()}
-    notes += publisher_notes(topics, {**wanted, **cameras})
-    latched = sorted(static_topics(options.topics["scan"]) & topics.keys()) if "scan" in options.topics else []
+    wanted = {role: wanted_topic(bag, role, name) for role, name in options.topics.items()}
+    wanted |= {role: exported_topic(bag, role, part) for role, part in options.parts.items()}
+    cameras = {f"camera/{name}": wanted_topic(bag, "camera", topic) for name, topic in options.cameras.items()}
+    notes += publisher_notes(bag, {**wanted, **cameras})
+    latched = sorted(static_topics(options.topics["scan"]) & bag.topics.keys()) if "scan" in options.topics else []
     names = {topic.name for topic in wanted.values()} | {*latched}
     messages = bag.read(names, {topic.name for topic in cameras.values()})
     static, lost = frames.static_frames([one for name in latched for one in messages[name].data])

@@ -37,6 +37,15 @@ class Frames:
     index: NDArray[np.int64]
     stamps: NDArray[np.int64]
 
+    def at(self, number: int) -> "Frames":
+        """Return one of the frames, by its place among them."""
+        part = slice(number, number + 1)
+        return Frames(self.episode, self.index[part], self.stamps[part])
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields that all messages of ours begin with."""
+        return {"header": header(self.stamps), "episode_index": self.episode, "frame_index": self.index}
+
 
 def stamp_tree(stamps: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
     """Return `builtin_interfaces/msg/Time` of times [ns]."""
@@ -107,14 +116,7 @@ class NumbersPart(Part):
 
     @override
     def encode(self, frames: Frames, values: Array) -> list[bytes]:
-        fields = {
-            "header": header(frames.stamps),
-            "episode_index": frames.episode,
-            "frame_index": frames.index,
-            "names": list(self.names),
-            "values": values,
-        }
-        return encode(self.msgtype, fields, len(values))
+        return encode(self.msgtype, {**frames.fields(), "names": list(self.names), "values": values}, len(values))
 
     @override
     def decode(self, messages: Sequence[Any]) -> Array:

@@ -148,19 +148,17 @@ def wheel_states(
     view: RobotView, frames: Frames, features: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]
 ) -> list[bytes]:
     """Return messages for ``/joint_states`` of a base's wheels; none where the physics was not recorded."""
-    state = columns.get(keys.PHYSICS_STATE)
-    names = list(features.get(keys.PHYSICS_STATE, {}).get("names") or ())
-    pairs = list(view.wheels.values())
-    if state is None or not pairs or not {name for pair in pairs for name in pair} <= set(names):
+    physics = _columns_of(features.get(keys.PHYSICS_STATE, {}).get("names"), columns.get(keys.PHYSICS_STATE))
+    if not view.wheels or not {name for pair in view.wheels.values() for name in pair} <= physics.keys():
         return []
-    angles, speeds = ([names.index(pair[side]) for pair in pairs] for side in (0, 1))
+    angles, speeds = (np.stack([physics[pair[side]] for pair in view.wheels.values()], axis=1) for side in (0, 1))
     fields = {
         "header": header(frames.stamps),
         "name": list(view.wheels),
-        "position": state[:, angles],
-        "velocity": state[:, speeds],
+        "position": angles,
+        "velocity": speeds,
     }
-    return encode(JOINT_STATE, fields, len(state))
+    return encode(JOINT_STATE, fields, len(angles))
 
 
 def camera_info(frames: Frames, frame_id: str, size: tuple[int, int], fovy: float) -> list[bytes]:

@@ -13,7 +13,8 @@ import pytest
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import DatasetExistsError
-from bhd_lerobot.rosbag.exporter.export import ExportOptions, export_bags
+from bhd_lerobot.rosbag.exporter.episode import ExportOptions
+from bhd_lerobot.rosbag.exporter.export import export_bags
 from bhd_lerobot.rosbag.messages.views import RobotView
 from bhd_lerobot.rosbag.storage.place import complete_or_not
 from tests.datasets import support
