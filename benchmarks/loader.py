@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks._turns import spread, write
-from bhd_lerobot.datasets.loader.loader import BatchLoader, TableDataset
+from bhd_lerobot.datasets.loader.loader import LoaderConfig, make_loader
 
 BATCH, CHUNK, WORKERS = 64, 50, (0, 2)
 NAMES = ("ours", *(f"LeRobot, {n} workers" for n in WORKERS))
@@ -76,8 +76,8 @@ class Ours:
     """The loader of this package."""
 
     def __init__(self, root: Path, fps: int) -> None:
-        self.dataset = TableDataset("bhd/bench", root, delta_timestamps=chunk(fps), return_uint8=True)
-        self.loader = BatchLoader(self.dataset, BATCH)
+        config = LoaderConfig(batch_size=BATCH, delta_timestamps=chunk(fps))
+        self.dataset, self.loader, _, _ = make_loader("bhd/bench", config, root=root)
 
     def batches(self) -> Iterator[dict[str, Any]]:
         """Return batches for ever."""

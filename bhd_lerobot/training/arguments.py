@@ -68,7 +68,7 @@ def parse_train(arguments: Sequence[str]) -> Request:
 
 
 def _resumed(path: Path, output_dir: Any) -> Path:
-    """Return the checkpoint to go on with; who names the run's folder in another way is told how to name it."""
+    """Return the checkpoint to go on with; the message names the run's folder where `output_dir` was given instead."""
     try:
         return resumed_checkpoint(path)
     except ConfigError as error:
@@ -101,7 +101,7 @@ def _read_checkpoint(checkpoint: Path) -> dict[str, Any]:
     values = configuration.read_file(folder / TRAIN_CONFIG_NAME)
     own = folder / OWN_CONFIG_NAME  # a checkpoint of lerobot-train has none
     values |= configuration.read_file(own) if own.is_file() else {}
-    # Where it is not said, LeRobot's rule was the only one.
+    # Where it is missing, LeRobot's rule was the only one.
     values["selection"] = {"hold_out": "instruction", **(values.get("selection") or {})}
     return values
 

@@ -11,7 +11,8 @@ import draccus
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 
-from bhd_lerobot.datasets.loader.selection import HOLD_OUTS, EpisodeFilter
+from bhd_lerobot.datasets.loader.config import LoaderConfig
+from bhd_lerobot.datasets.loader.selection import EpisodeFilter
 from bhd_lerobot.errors import ConfigError, quoted, unknown_name
 
 OWN_CONFIG_NAME = "bhd_train.json"
@@ -47,12 +48,6 @@ class SelectionConfig:
             ConfigError: names the value and the valid ones.
         """
         _ = self.filter
-        if not 0 <= self.intervention_weight < float("inf"):
-            raise ConfigError(
-                f"selection.intervention_weight is {self.intervention_weight}; it must be 0 or more, and finite."
-            )
-        if self.hold_out not in HOLD_OUTS:
-            raise ConfigError(unknown_name("selection.hold_out", self.hold_out, HOLD_OUTS))
 
     @property
     def filter(self) -> EpisodeFilter:
@@ -70,7 +65,7 @@ class BhdTrainConfig(TrainPipelineConfig):
     """Train a policy on a LeRobotDataset, with a loop that resumes to the same bits.
 
     All fields of LeRobot's `TrainPipelineConfig` mean what they mean for `lerobot-train`. One default differs:
-    `policy.push_to_hub` is true only if it was said.
+    `policy.push_to_hub` is true only if it was set.
 
     Attributes:
         selection: which frames are learned from.
@@ -94,7 +89,7 @@ class BhdTrainConfig(TrainPipelineConfig):
     threads: int | None = None
 
     def _resolve_pretrained_from_cli(self) -> None:
-        """Do nothing: `train_arguments.parse_train` has done it, and from its own arguments."""
+        """Do nothing: `arguments.parse_train` has done it, and from its own arguments."""
 
     def validate(self) -> None:
         """Check the configuration and fill in what follows from it: LeRobot's rules, and ours.
@@ -104,11 +99,7 @@ class BhdTrainConfig(TrainPipelineConfig):
         """
         for name, value, least in (
             ("steps", self.steps, 1),
-            ("batch_size", self.batch_size, 1),
             ("threads", 1 if self.threads is None else self.threads, 1),
-            ("num_workers", self.num_workers, 0),
-            ("seed", 0 if self.seed is None else self.seed, 0),
-            ("max_eval_samples", self.max_eval_samples, 0),
             ("log_freq", self.log_freq, 0),
             ("save_freq", self.save_freq, 0),
             ("eval_steps", self.eval_steps, 0),
@@ -118,10 +109,7 @@ class BhdTrainConfig(TrainPipelineConfig):
         ):
             if value < least:
                 raise ConfigError(f"{name} is {value}; it must be at least {least}.")
-        if not 0 < self.tolerance_s < float("inf"):
-            raise ConfigError(f"tolerance_s is {self.tolerance_s}; it must be more than 0, and finite [s].")
-        if not self.budget_gib > 0:
-            raise ConfigError(f"budget_gib is {self.budget_gib}; it must be more than 0.")
+        self.loader_config()
         if self.fine_tune_statistics not in STATISTICS:
             raise ConfigError(unknown_name("fine_tune_statistics", self.fine_tune_statistics, STATISTICS))
         if self.policy is None:
@@ -147,6 +135,31 @@ class BhdTrainConfig(TrainPipelineConfig):
             raise ConfigError(f"The configuration cannot be used: {error}") from error
         if self.use_policy_training_preset and not self.resume:
             self._refuse_unused(*given)
+
+    def loader_config(self, **fields: Any) -> LoaderConfig:
+        """Return how the dataset is loaded.
+
+        Args:
+            fields: of `LoaderConfig`, those that the policy and the machine decide.
+
+        Raises:
+            ConfigError: a value out of range.
+        """
+        return LoaderConfig(
+            batch_size=self.batch_size,
+            seed=0 if self.seed is None else self.seed,
+            episodes=self.dataset.episodes,
+            intervention_weight=self.selection.intervention_weight,
+            eval_split=self.dataset.eval_split,
+            hold_out=self.selection.hold_out,
+            max_eval_samples=self.max_eval_samples,
+            use_imagenet_stats=self.dataset.use_imagenet_stats,
+            tolerance_s=self.tolerance_s,
+            video_backend=self.dataset.video_backend,
+            budget_gib=self.budget_gib,
+            num_workers=self.num_workers,
+            **fields,
+        )
 
     @property
     def _is_evaluated(self) -> bool:

@@ -94,7 +94,7 @@ def open_data(
     device: torch.device,
     rank: int = 0,
     world_size: int = 1,
-    say: Callable[[str], None] = lambda message: None,
+    report: Callable[[str], None] = lambda message: None,
 ) -> TrainingData:
     """Load the dataset.
 
@@ -105,7 +105,7 @@ def open_data(
         device: where batches are needed.
         rank: this process among `world_size`.
         world_size: processes that train together.
-        say: gets what the user should know: that LeRobot's own loader is used, and why.
+        report: gets the reason why LeRobot's own loader is used, if it is.
 
     Raises:
         BhdError: no episode is left, a value is not finite, or the dataset cannot be read.
@@ -113,36 +113,16 @@ def open_data(
     dataset = config.dataset
     keep = kept_features(meta, policy, config.rename_map)
     deltas = {key: times for key, times in (resolve_delta_timestamps(policy, meta) or {}).items() if key in keep}
-    loaders = make_loader(
-        dataset.repo_id,
-        batch_size=config.batch_size,
-        seed=0 if config.seed is None else config.seed,
-        root=meta.root,
-        revision=dataset.revision,
-        episodes=dataset.episodes,
-        intervention_weight=config.selection.intervention_weight,
-        eval_split=dataset.eval_split,
-        hold_out=config.selection.hold_out,
-        max_eval_samples=config.max_eval_samples,
+    loading = config.loader_config(
         delta_timestamps=deltas or None,
         drop_n_last_frames=getattr(policy, "drop_n_last_frames", 0),
         image_transforms=ImageTransforms(dataset.image_transforms) if dataset.image_transforms.enable else None,
-        use_imagenet_stats=dataset.use_imagenet_stats,
-        tolerance_s=config.tolerance_s,
-        video_backend=dataset.video_backend,
         keep=keep,
-        budget_gib=config.budget_gib,
-        num_workers=config.num_workers,
         device=device,
-        pin=device.type == "cuda",
         rank=rank,
         world_size=world_size,
-        say=say,
     )
-    stock = getattr(loaders.train, "_loader", None)
-    if stock is not None:
-        # Else each new iterator draws from the common generator, and a resumed run, which makes one more, goes astray.
-        stock.generator = torch.Generator().manual_seed(0)
+    loaders = make_loader(dataset.repo_id, loading, root=meta.root, revision=dataset.revision, report=report)
     check(loaders.dataset, keep)
     if loaders.held_out is not None:
         check(loaders.held_out.dataset, keep)

@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from bhd_lerobot.datasets.storage.disk import Disk
 
@@ -129,54 +129,59 @@ def _parts(rows: Sequence[Row]) -> list[str]:
     return keys if len(keys) > 1 else []
 
 
-class TrainingProgress:
-    """A bar in a terminal, a line for each logged step elsewhere."""
+class RunProgress:
+    """A bar in a terminal; elsewhere, one line for each row of metrics.
 
-    def __init__(self, console: Console, steps: int, done: int) -> None:
-        """Prepare it.
+    Args:
+        console: where it is printed.
+        description: what stands before the bar.
+        total: value of `completed` at the end of the run.
+        completed: its value at the start.
+    """
 
-        Args:
-            console: where it is shown.
-            steps: steps of the whole run.
-            done: steps that were done before.
-        """
-        self._console, self._steps, self._done = console, steps, done
+    def __init__(self, console: Console, description: str, total: float, completed: int = 0) -> None:
+        self._console = console
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[loss]}"),
-            TextColumn("{task.fields[speed]}"),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[numbers]}"),
             TimeRemainingColumn(),
             console=console,
             transient=True,
             disable=not console.is_terminal,
         )
+        self._task = self._bar.add_task(description, total=total, completed=completed, numbers="")
 
-    def __enter__(self) -> "TrainingProgress":
+    def __enter__(self) -> "RunProgress":
         self._bar.start()
-        self._task = self._bar.add_task("training", total=self._steps, completed=self._done, loss="", speed="")
         return self
 
     def __exit__(self, *error: object) -> None:
         self._bar.stop()
 
-    def advance(self, step: int) -> None:
-        """Show how far it is."""
-        self._bar.update(self._task, completed=step)
+    def advance(self, completed: float) -> None:
+        """Move the bar."""
+        self._bar.update(self._task, completed=completed)
 
-    def log(self, row: Mapping[str, Any]) -> None:
-        """Show what was logged."""
-        parts = [f"{label} {row[key]:.4g}" for key, label in _SHOWN if row.get(key) is not None]
-        speed = (
-            f"{row['steps_per_s']:.3g} steps/s  {row['samples_per_s']:.4g} samples/s" if "steps_per_s" in row else ""
-        )
+    def log(self, prefix: str, numbers: str) -> None:
+        """Print a row: its numbers beside the bar, or with a prefix on a line of its own."""
         if self._console.is_terminal:
-            self._bar.update(self._task, completed=row["step"], loss="  ".join(parts), speed=speed)
-        else:
-            self._console.print(
-                f"step {row['step']}/{self._steps}  " + "  ".join([*parts, *([speed] if speed else [])])
-            )
+            self._bar.update(self._task, numbers=numbers)
+        elif prefix:
+            self._console.print(f"{prefix}  {numbers}")
 
 
-_SHOWN = (("loss", "loss"), ("held_out_loss", "held-out"), ("success", "success %"))
+def format_numbers(row: Mapping[str, Any], labels: Sequence[tuple[str, str]]) -> str:
+    """Return the numbers of a row that have a label, as pairs of key and label, to 4 digits."""
+    return "  ".join(f"{label} {row[key]:.4g}" for key, label in labels if row.get(key) is not None)
+
+
+SHOWN = (
+    ("loss", "loss"),
+    ("held_out_loss", "held-out"),
+    ("success", "success %"),
+    ("steps_per_s", "steps/s"),
+    ("samples_per_s", "samples/s"),
+)
+"""Keys of a row of metrics that are printed, and their labels."""

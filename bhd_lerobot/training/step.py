@@ -14,12 +14,12 @@ Batch = dict[str, Any]
 
 @dataclass(frozen=True)
 class StepResult:
-    """What a step measured; tensors on the device, so that nobody waits for them.
+    """What a step measured; tensors on the device, so that a step does not wait for them.
 
     Attributes:
         loss: before the step, shape ().
         grad_norm: before clipping, shape ().
-        outputs: what the policy said besides: numbers, or tensors of one number.
+        outputs: what else the policy returned: numbers, or tensors of one number.
     """
 
     loss: Tensor

@@ -1,4 +1,4 @@
-"""What `bhd-train` says before and after."""
+"""What `bhd-train` prints before and after a run."""
 
 import json
 import shlex
@@ -28,7 +28,7 @@ _EXAMPLE_TASKS = {"turtlebot3": "avoid", "ur5": "pick"}
 
 
 def print_start(console: Console, config: BhdTrainConfig, policy: Any, data: TrainingData, step: int) -> None:
-    """Say what is about to be trained on what."""
+    """Print which policy is trained on which data."""
     learnable = sum(one.numel() for one in policy.parameters() if one.requires_grad)
     total = sum(one.numel() for one in policy.parameters())
     frozen = f", {total - learnable:,} more are fixed" if total > learnable else ""
@@ -48,7 +48,7 @@ def print_start(console: Console, config: BhdTrainConfig, policy: Any, data: Tra
 
 
 def print_summary(console: Console, config: BhdTrainConfig, result: "TrainResult") -> None:
-    """Say how it ended, where everything is, and how to go on."""
+    """Print how the run ended, where its files are, and the next command."""
     losses = [row["loss"] for row in result.rows if row.get("loss") is not None]
     held_out = [row["held_out_loss"] for row in result.rows if row.get("held_out_loss") is not None]
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
@@ -82,7 +82,7 @@ def _course(losses: Sequence[float]) -> str:
 
 
 def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
-    """Return what to say about evaluating a checkpoint: a line, and a command on held-out episodes of its task.
+    """Return a line and a command that evaluate a checkpoint on held-out episodes of its task.
 
     The command names the options of robot and task that are not at their defaults: with others the observations or
     actions do not fit. A dataset that another program recorded does not say its task; then it is one of the robot's.
@@ -95,15 +95,15 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
         return ["Let it drive the robot for a minute with:", f"  {rollout}"]
     if task not in TaskConfig.get_known_choices():
         task = _EXAMPLE_TASKS[contract.robot_type]
-        said = f"The dataset does not say its task. Evaluate it in simulation at {task!r}, for example, with:"
+        text = f"The dataset does not say its task. Evaluate it in simulation at {task!r}, for example, with:"
     else:
-        said = "Evaluate it with:"
+        text = "Evaluate it with:"
     options = _options("robot", contract.robot or {}, describe(kinds[contract.robot_type]()))
-    asked = _options("task", contract.task or {}, asdict(TaskConfig.get_choice_class(task)()))
+    chosen = _options("task", contract.task or {}, asdict(TaskConfig.get_choice_class(task)()))
     command = (
-        f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task}{asked} --brain.path={quoted(path)}"
+        f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task}{chosen} --brain.path={quoted(path)}"
     )
-    return [said, f"  {command}"]
+    return [text, f"  {command}"]
 
 
 def _options(name: str, values: Mapping[str, Any], usual: Mapping[str, Any]) -> str:

@@ -22,7 +22,7 @@ from bhd_lerobot.training.checkpoint import TrainingParts, resume_command
 from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.data import TrainingData, open_data, open_metadata, select_episodes
 from bhd_lerobot.training.env import EnvEvaluation
-from bhd_lerobot.training.log import Row, TrainingProgress
+from bhd_lerobot.training.log import SHOWN, Row, RunProgress, format_numbers
 from bhd_lerobot.training.loop import Hooks, LoopOptions, TrainingLoop
 from bhd_lerobot.training.output import RunOutput
 from bhd_lerobot.training.setup import (
@@ -100,7 +100,7 @@ def train(request: Request, console: Console | None = None) -> TrainResult:
         device=accelerator.device,
         rank=accelerator.process_index,
         world_size=accelerator.num_processes,
-        say=lambda message: console.print(escape(message), soft_wrap=True, highlight=False),
+        report=lambda message: console.print(escape(message), soft_wrap=True, highlight=False),
     )
     contract = PolicyContract.from_dataset(meta, trainer="bhd-train")
     parts = TrainingParts(policy, optimizer, scheduler, preprocessor, postprocessor, contract)
@@ -189,11 +189,11 @@ def _follow(
 ) -> None:
     """Run the loop, show and write what comes of it, and keep the result up to date, also when it fails."""
     started = time.perf_counter()
-    with TrainingProgress(console, config.steps, loop.step) as progress, stop_on_signals() as stop:
+    with RunProgress(console, "training", config.steps, loop.step) as progress, stop_on_signals() as stop:
 
         def log(row: Row) -> None:
             output.log(row)
-            progress.log(row)
+            progress.log(f"step {row['step']}/{config.steps}", format_numbers(row, SHOWN))
 
         def save(at: int, loop_state: dict[str, Any]) -> None:
             output.save(at, loop_state)

@@ -42,10 +42,10 @@ def refused(arguments: list[str], error: type[BhdError], match: str) -> None:
 
 def test_an_error_is_one_sentence_and_status_2(data: Path, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     assert main(options(data / "nowhere", tmp_path / "run")) == 2
-    said = capfd.readouterr().err
-    assert "error: " in said
-    assert "nowhere" in said
-    assert "Traceback" not in said
+    printed = capfd.readouterr().err
+    assert "error: " in printed
+    assert "nowhere" in printed
+    assert "Traceback" not in printed
 
 
 def test_a_missing_dataset_names_where_it_was_looked_for(tmp_path: Path) -> None:
@@ -68,20 +68,15 @@ def test_a_dataset_without_statistics(tmp_path: Path) -> None:
     refused(options(root, tmp_path / "run"), DatasetError, "no statistics.*bhd-data repair")
 
 
-def test_no_episode_after_filtering_says_what_there_is(data: Path, tmp_path: Path) -> None:
-    arguments = options(data, tmp_path / "run", selection__outcome="dropped")
-    refused(arguments, DatasetError, r"dropped.*4 success")
-    arguments = options(data, tmp_path / "run", selection__outcome="sucess")
-    refused(arguments, ConfigError, r"sucess.*Did you mean 'success'")
-
-
-def test_everything_held_out(data: Path, tmp_path: Path) -> None:
-    arguments = options(data, tmp_path / "run", dataset__episodes="[0]", dataset__eval_split=0.5)
-    refused(arguments, DatasetError, "no episode to train on")
-
-
-def test_an_episode_that_does_not_exist(data: Path, tmp_path: Path) -> None:
-    refused(options(data, tmp_path / "run", dataset__episodes="[0, 17]"), DatasetError, "no episode 17.*0 to 5")
+def test_a_selection_that_leaves_nothing_to_learn_from(data: Path, tmp_path: Path) -> None:
+    for change, error, match in (
+        ({"selection__outcome": "dropped"}, DatasetError, r"dropped.*4 success"),
+        ({"selection__outcome": "sucess"}, ConfigError, r"sucess.*Did you mean 'success'"),
+        ({"dataset__episodes": "[0]", "dataset__eval_split": 0.5}, DatasetError, "no episode to train on"),
+        ({"dataset__episodes": "[0, 17]"}, DatasetError, "no episode 17.*0 to 5"),
+    ):
+        arguments: dict[str, Any] = change
+        refused(options(data, tmp_path / "run", **arguments), error, match)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -190,12 +185,15 @@ def test_a_checkpoint_that_is_not_there(data: Path, tmp_path: Path) -> None:
         parse_train(["--resume=true"])
 
 
-def test_a_damaged_checkpoint_is_not_resumed(data: Path, tmp_path: Path) -> None:
-    run_train(options(data, tmp_path / "run", MLP, steps=5))
-    state = tmp_path / "run" / "checkpoints" / "last" / "training_state" / "optimizer_state.safetensors"
-    state.write_bytes(b"torn")
+def test_a_checkpoint_with_a_damaged_state_or_another_dataset_is_not_resumed(trained: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(trained, tmp_path / "run", symlinks=True)
+    again = ["--resume=true", f"--config_path={run}", "--steps=12"]
+    other = make_dataset(tmp_path / "other", episodes=3)
+    with pytest.raises(BhdError, match=r"120 frames.*60.*--fine_tune"):
+        run_train([*again, f"--dataset.root={other}"])
+    (run / "checkpoints" / "last" / "training_state" / "optimizer_state.safetensors").write_bytes(b"torn")
     with pytest.raises(ConfigError, match="cannot be resumed from"):
-        run_train(["--resume=true", f"--config_path={tmp_path / 'run'}", "--steps=9"])
+        run_train(again)
 
 
 def test_weights_that_are_damaged_are_named(data: Path, trained: Path, tmp_path: Path) -> None:
@@ -238,20 +236,12 @@ def test_metrics_that_cannot_be_written_leave_the_checkpoint(
     assert (result.step, [row["step"] for row in curve(tmp_path / "run")]) == (20, [5, 10, 15, 20])
 
 
-def test_a_dataset_that_grew_since_is_not_resumed_on(tmp_path: Path) -> None:
-    root = make_dataset(tmp_path / "set", episodes=2)
-    run_train(options(root, tmp_path / "run", MLP, steps=5))
-    bigger = make_dataset(tmp_path / "bigger", episodes=3)
-    with pytest.raises(BhdError, match=r"40 frames.*60.*--fine_tune"):
-        run_train(["--resume=true", f"--config_path={tmp_path / 'run'}", "--steps=9", f"--dataset.root={bigger}"])
-
-
 def test_what_is_held_out_stays_so_when_a_run_is_resumed(tmp_path: Path) -> None:
     root = make_dataset(tmp_path / "set", episodes=5, instructions=5)
     run = tmp_path / "run"
     held_out = {"dataset__episodes": "[0, 1, 2, 3]", "dataset__eval_split": 0.3, "eval_steps": 5}
-    _, said = run_train(options(root, run, MLP, steps=5, **held_out))
-    assert "2 episodes, 2 held out" in said
+    _, printed = run_train(options(root, run, MLP, steps=5, **held_out))
+    assert "2 episodes, 2 held out" in printed
     again = ["--resume=true", f"--config_path={run}", "--steps=9"]
     with pytest.raises(BhdError, match=r"2 episodes \(0, 3\) held out, and now it would be 2 episodes \(0, 4\)"):
         run_train([*again, "--dataset.episodes=[0, 1, 2, 4]"])
@@ -312,7 +302,7 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
         ({"fine_tune_parameters": "[]"}, r"fine_tune_parameters is \[\]; it matches no parameter .* and \d+ more"),
         ({"selection.min_score": 2}, "min_score is 2"),
         ({"selection.intervention_weight": -1}, "intervention_weight is -1"),
-        ({"selection.hold_out": "task"}, "Unknown selection.hold_out 'task'. Valid: episode, instruction"),
+        ({"selection.hold_out": "task"}, "Unknown hold_out 'task'. Valid: episode, instruction"),
         ({"dataset.streaming": "true"}, "dataset.streaming is not for bhd-train"),
         ({"peft.r": 4}, "peft"),
         ({"policy.push_to_hub": "true"}, "--policy.repo_id"),

@@ -16,20 +16,12 @@ def test_rows_come_back_with_all_their_bits(tmp_path: Path) -> None:
     assert read_metrics(file.path, 20) == ROWS[:2]
 
 
-def test_a_torn_line_is_left_out(tmp_path: Path) -> None:
-    file = MetricsFile(tmp_path / "metrics.jsonl", ROWS)
-    with file.path.open("a") as stream:
-        stream.write('{"step": 40, "lo')
-    assert read_metrics(file.path) == ROWS
-
-
-def test_what_is_not_finite_is_null(tmp_path: Path) -> None:
-    file = MetricsFile(tmp_path / "metrics.jsonl", [{"step": 1, "grad_norm": float("inf")}])
-    assert read_metrics(file.path) == [{"step": 1, "grad_norm": None}]
-
-
-def test_there_are_no_metrics_before_the_first(tmp_path: Path) -> None:
+def test_an_incomplete_file_and_values_that_are_not_finite(tmp_path: Path) -> None:
     assert read_metrics(tmp_path / "metrics.jsonl") == []
+    file = MetricsFile(tmp_path / "metrics.jsonl", [*ROWS, {"step": 40, "grad_norm": float("inf")}])
+    with file.path.open("a") as stream:
+        stream.write('{"step": 50, "lo')
+    assert read_metrics(file.path) == [*ROWS, {"step": 40, "grad_norm": None}]
 
 
 def drawn(rows: list[dict], path: Path, monkeypatch) -> Figure:

@@ -1,7 +1,6 @@
-"""Batches for training, in an order that can be taken up again."""
+"""Batches for training, in an order that can be resumed: from memory, or by PyTorch's `DataLoader`."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -9,63 +8,24 @@ from torch import Tensor
 
 from bhd_lerobot.datasets.loader.gather import Batch
 from bhd_lerobot.datasets.loader.order import BatchOrder
-from bhd_lerobot.datasets.loader.table_dataset import TableDataset
-from bhd_lerobot.errors import ConfigError
-
-
-@dataclass(frozen=True)
-class Placing:
-    """Where batches are put.
-
-    Attributes:
-        device: None leaves them where they are.
-        pin: go through page-locked memory, from which a GPU copies while the program goes on; without a GPU, nothing.
-    """
-
-    device: torch.device | str | None = None
-    pin: bool = False
-
-    def __call__(self, batch: Batch) -> Batch:
-        """Return the batch there."""
-        pin = self.pin and torch.cuda.is_available()
-        if self.device is None and not pin:
-            return batch
-        placed: Batch = {}
-        for key, value in batch.items():
-            if isinstance(value, Tensor):
-                source = value.pin_memory() if pin else value
-                placed[key] = source if self.device is None else source.to(self.device, non_blocking=pin)
-            else:
-                placed[key] = value
-        return placed
 
 
 class Loader:
-    """What a training loop needs: batches, epoch by epoch, in an order that can be taken up again.
+    """What a training loop needs: batches, epoch by epoch, in an order that can be resumed.
 
     Iterating gives one epoch; iterating again gives the next. `cycle` never ends. The order is that of stock
     `lerobot-train` for the same seed. `state_dict` may be taken after any batch.
 
     Attributes:
         dataset: where the samples come from.
-        batch_size: samples in a batch of this rank.
         order: which samples, when.
-        place: puts a batch where it is needed.
+        device: where batches are put; None leaves them in memory.
     """
 
-    def __init__(self, dataset: Any, order: BatchOrder, placing: Placing) -> None:
-        """Keep the parts."""
-        self.dataset, self.order, self.batch_size, self.place = dataset, order, order.batch_size, placing
-
-    @property
-    def dataset_meta(self) -> Any:
-        """LeRobot's metadata of the dataset."""
-        return self.dataset.meta
-
-    @property
-    def stats(self) -> Any:
-        """Statistics of the whole dataset, for normalisation."""
-        return self.dataset.meta.stats
+    def __init__(self, dataset: Any, order: BatchOrder, device: torch.device | str | None = None) -> None:
+        """Prepare the first epoch."""
+        self.dataset, self.order = dataset, order
+        self.device = None if device is None else torch.device(device)
 
     def __len__(self) -> int:
         """Return the number of batches in an epoch."""
@@ -73,7 +33,7 @@ class Loader:
 
     def __iter__(self) -> Iterator[Batch]:
         """Return the batches of the next epoch, or of the rest of the one that `load_state_dict` set."""
-        return self.order.follow(self._fetch)
+        return self.order.follow(lambda batches: map(self._place, self._fetch(batches)))
 
     def cycle(self) -> Iterator[Batch]:
         """Return batches for ever, epoch after epoch."""
@@ -99,107 +59,60 @@ class Loader:
     def _fetch(self, batches: Iterator[Tensor]) -> Iterator[Batch]:
         raise NotImplementedError
 
+    def _place(self, batch: Batch) -> Batch:
+        if self.device is None:
+            return batch
+        # From page-locked memory a GPU copies while the program goes on.
+        pin = self.device.type == "cuda"
+        return {
+            key: (value.pin_memory() if pin else value).to(self.device, non_blocking=pin)
+            if isinstance(value, Tensor)
+            else value
+            for key, value in batch.items()
+        }
+
 
 class BatchLoader(Loader):
     """Batches of a `TableDataset`, gathered from memory."""
 
+    def _fetch(self, batches: Iterator[Tensor]) -> Iterator[Batch]:
+        return map(self.dataset.batch, batches)
+
+
+class LeRobotLoader(Loader):
+    """Batches of a `LeRobotDataset`, by PyTorch's `DataLoader`, in the same order as from memory."""
+
     def __init__(
-        self,
-        dataset: TableDataset,
-        batch_size: int,
-        seed: int = 0,
-        shuffle: bool = True,
-        *,
-        drop_last: bool = False,
-        weights: Tensor | None = None,
-        device: torch.device | str | None = None,
-        rank: int = 0,
-        world_size: int = 1,
-        pin: bool = False,
-        drop_n_last_frames: int = 0,
-        samples: Tensor | None = None,
+        self, dataset: Any, order: BatchOrder, device: torch.device | str | None = None, num_workers: int = 0
     ) -> None:
-        """Prepare the order.
+        """Start `num_workers` processes that decode, on the first batch."""
+        super().__init__(dataset, order, device)
+        from lerobot.utils.collate import lerobot_collate_fn
 
-        Args:
-            dataset: where the samples come from.
-            batch_size: samples in a batch of this rank.
-            seed: decides the order, with the number of the epoch.
-            shuffle: False serves the samples in the order of the dataset, and ignores weights.
-            drop_last: leave an incomplete batch out.
-            weights: relative frequency of each sample, shape (N,); None takes those of the dataset.
-            device: where batches are put; None leaves them where they are.
-            rank: this process among `world_size`.
-            world_size: processes that train together.
-            pin: page-locked memory, from which a GPU copies while the program goes on.
-            drop_n_last_frames: frames at the end of each episode that no sample starts from; some policies ask for it.
-            samples: indices of the samples to serve, shape (M,); None means all.
-
-        Raises:
-            ConfigError: a value out of range, or nothing left to draw.
-        """
-        if samples is None:
-            samples = first_frames(dataset, drop_n_last_frames)
-        weights = dataset.weights if weights is None else weights
-        order = BatchOrder(
-            samples,
-            batch_size,
-            seed,
-            shuffle=shuffle,
-            drop_last=drop_last,
-            weights=weights[samples] if weights is not None and shuffle else None,
-            rank=rank,
-            world_size=world_size,
+        self._epoch = _Epoch()
+        self._loader = torch.utils.data.DataLoader(
+            dataset,
+            batch_sampler=self._epoch,
+            num_workers=num_workers,
+            collate_fn=lerobot_collate_fn if dataset.meta.has_language_columns else None,
+            persistent_workers=num_workers > 0,
+            # Without it, each new iterator draws from the common generator, and a resumed run makes one more of them.
+            generator=torch.Generator().manual_seed(0),
         )
-        super().__init__(dataset, order, Placing(device, pin))
-
-    @classmethod
-    def of(cls, dataset: TableDataset, order: BatchOrder, placing: Placing) -> "BatchLoader":
-        """Return batches of a dataset in an order that was made before."""
-        loader = cls.__new__(cls)
-        Loader.__init__(loader, dataset, order, placing)
-        return loader
 
     def _fetch(self, batches: Iterator[Tensor]) -> Iterator[Batch]:
-        for indices in batches:
-            yield self.place(self.dataset.batch(indices))
+        self._epoch.batches = [indices.tolist() for indices in batches]
+        return iter(self._loader)
 
 
-def first_frames(dataset: TableDataset, drop_n_last_frames: int = 0) -> Tensor:
-    """Return `ordered_samples` of a dataset in memory."""
-    return ordered_samples(dataset.table.columns["index"][dataset.rows], dataset.meta, drop_n_last_frames)
+class _Epoch:
+    """The batches of the current epoch, for a `DataLoader` whose workers outlive it."""
 
+    def __init__(self) -> None:
+        self.batches: list[list[int]] = []
 
-def ordered_samples(index: Tensor, meta: Any, drop_n_last_frames: int = 0) -> Tensor:
-    """Return the samples that a batch may contain, in the order of the episodes, shape (M,), int64.
+    def __iter__(self) -> Iterator[list[int]]:
+        return iter(self.batches)
 
-    Args:
-        index: number of each sample's frame in the whole dataset, shape (N,).
-        meta: the dataset.
-        drop_n_last_frames: frames at the end of each episode that no sample starts from.
-
-    Raises:
-        ConfigError: nothing is left, or the number is negative.
-    """
-    if drop_n_last_frames < 0:
-        raise ConfigError(f"drop_n_last_frames must not be negative; got {drop_n_last_frames}.")
-    ends = torch.as_tensor(meta.episodes["dataset_to_index"], dtype=torch.int64)
-    end = ends[torch.searchsorted(ends, index, right=True)]
-    samples = (index + drop_n_last_frames < end).nonzero()[:, 0]
-    if not len(samples):
-        raise ConfigError(f"drop_n_last_frames={drop_n_last_frames} leaves no frame: all episodes are shorter.")
-    return samples[torch.argsort(index[samples], stable=True)]
-
-
-def per_task_samples(task_index: Tensor, limit: int) -> Tensor:
-    """Return at most about `limit` samples, the first ones of every task, as LeRobot chooses them for `eval_steps`.
-
-    Args:
-        task_index: task of every sample, shape (N,).
-        limit: samples in all; 0 means no limit.
-    """
-    if limit <= 0:
-        return torch.arange(len(task_index))
-    tasks: Sequence[int] = torch.unique(task_index).tolist()
-    each = max(1, limit // len(tasks))
-    return torch.cat([(task_index == task).nonzero()[:each, 0] for task in tasks])
+    def __len__(self) -> int:
+        return len(self.batches)

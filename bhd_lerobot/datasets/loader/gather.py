@@ -82,9 +82,9 @@ class Gatherer:
         if self._windows:
             first, last = self._first.take(rows)[:, None], self._last.take(rows)[:, None]
             for name, delta in self._windows.items():
-                asked = rows[:, None] + delta
-                windows[name] = np.minimum(np.maximum(asked, first), last)
-                pads[name] = windows[name] != asked
+                wanted = rows[:, None] + delta
+                windows[name] = np.minimum(np.maximum(wanted, first), last)
+                pads[name] = windows[name] != wanted
         return windows, pads
 
 

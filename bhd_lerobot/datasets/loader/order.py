@@ -37,11 +37,11 @@ class BatchOrder:
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
-        """Check the arguments.
+        """Check that there is something to draw.
 
         Args:
             samples: indices to draw from, shape (M,), int64.
-            batch_size: samples in a batch of one rank.
+            batch_size: samples in a batch of one rank, at least 1.
             seed: decides the order, with the number of the epoch.
             shuffle: False serves the samples as given.
             drop_last: leave an incomplete batch out.
@@ -50,14 +50,8 @@ class BatchOrder:
             world_size: processes that train together.
 
         Raises:
-            ConfigError: a value out of range.
+            ConfigError: no sample or no batch is left, or weights that cannot be used.
         """
-        if batch_size < 1:
-            raise ConfigError(f"batch_size must be at least 1; got {batch_size}.")
-        if seed < 0:
-            raise ConfigError(f"The seed of the order of samples must not be negative; got {seed}.")
-        if not 0 <= rank < world_size:
-            raise ConfigError(f"rank must be from 0 to world_size - 1 = {world_size - 1}; got {rank}.")
         self.batch_size, self.seed, self.shuffle, self.drop_last = batch_size, seed, shuffle, drop_last
         self.rank, self.world_size = rank, world_size
         self._cumulated: Tensor | None = None

@@ -118,16 +118,16 @@ class EpisodeFilter:
         return wanted
 
     def _nothing_left(self, meta: "LeRobotDatasetMetadata | StoredEpisodes", candidates: Sequence[int]) -> str:
-        asked = [f"outcome {' or '.join(self.outcomes)}"] if self.outcomes else []
-        asked += [f"a score of at least {self.min_score:g}"] if self.min_score is not None else []
-        asked += ["not too many late frames"] if self.exclude_late else []
+        criteria = [f"outcome {' or '.join(self.outcomes)}"] if self.outcomes else []
+        criteria += [f"a score of at least {self.min_score:g}"] if self.min_score is not None else []
+        criteria += ["not too many late frames"] if self.exclude_late else []
         found = ""
         if f"{PREFIX}outcome" in meta.episodes.column_names:
             outcomes = meta.episodes[f"{PREFIX}outcome"]
             counts = Counter(str(outcomes[episode]) for episode in candidates)
             found = f": {', '.join(f'{count} {name}' for name, count in counts.most_common())}"
         return (
-            f"No episode of {meta.root} is left after filtering: {' and '.join(asked)} was asked for, and it has "
+            f"No episode of {meta.root} is left after filtering: {' and '.join(criteria)} was asked for, and it has "
             f"{len(candidates)} episodes{found}. Ask for less, or record more."
         )
 
@@ -135,7 +135,7 @@ class EpisodeFilter:
 def split_episodes(
     meta: "LeRobotDatasetMetadata", episodes: Sequence[int] | None, eval_split: float, hold_out: str = "episode"
 ) -> tuple[list[int], list[int]]:
-    """Return the episodes to train on and those that are held out; the same ones whenever it is asked.
+    """Return the episodes to train on and those that are held out; always the same for the same dataset.
 
     Of each instruction the last episodes are held out. How many is counted over all episodes, the instructions one
     after the other: ceil(n * eval_split) in all. Where most instructions occur once, that is one episode in so many.
@@ -149,13 +149,8 @@ def split_episodes(
             holds out at least one episode of every one.
 
     Raises:
-        ConfigError: a share that is not in [0, 1), or an unknown rule.
         DatasetError: nothing is left to train on.
     """
-    if not 0 <= eval_split < 1:
-        raise ConfigError(f"eval_split is {eval_split}; it must be from 0 to below 1.")
-    if hold_out not in HOLD_OUTS:
-        raise ConfigError(unknown_name("hold_out", hold_out, HOLD_OUTS))
     candidates = checked_episodes(meta, None) if episodes is None else [int(episode) for episode in episodes]
     if eval_split == 0:
         return candidates, []
@@ -206,11 +201,8 @@ def intervention_weights(
         Shape (N,), float32, in the order of the samples; None if all are drawn equally often.
 
     Raises:
-        ConfigError: a weight that is negative or not finite.
         DatasetError: the dataset does not say where somebody intervened.
     """
-    if not 0 <= weight < math.inf:
-        raise ConfigError(f"The weight of interventions must be 0 or more, and finite; got {weight}.")
     if weight == 1:
         return None
     if EVENT not in meta.features:

@@ -28,7 +28,6 @@ class TableDataset:
         repo_id, root, revision, meta, delta_timestamps, image_transforms, tolerance_s: as in `LeRobotDataset`.
         episodes: selected episodes, None for all.
         table: the columns.
-        weights: relative frequency of each sample in training, shape (N,), or None; `BatchLoader` reads it.
     """
 
     def __init__(
@@ -75,7 +74,6 @@ class TableDataset:
         self.root, self.revision = self.meta.root, self.meta.revision
         self.image_transforms, self.return_uint8 = image_transforms, return_uint8
         self.episodes = None if episodes is None else list(episodes)
-        self.weights: Tensor | None = None
         wanted = checked_episodes(self.meta, episodes)
         cameras = self._served_cameras(keep)
         deltas = delta_indices(self.meta, delta_timestamps, tolerance_s, keep)
@@ -157,10 +155,6 @@ class TableDataset:
         part.episodes = [int(episode) for episode in episodes]
         chosen = torch.tensor(part.episodes)
         part._rows = torch.isin(self.table.columns["episode_index"], chosen).nonzero()[:, 0]
-        if self.weights is not None:
-            whole = torch.zeros(len(self.table), dtype=self.weights.dtype)
-            whole[self.rows] = self.weights
-            part.weights = whole[part._rows]
         return part
 
     def __len__(self) -> int:
@@ -181,8 +175,8 @@ class TableDataset:
         sample = {key: values[0] for key, values in batch.items()}
         if not self.table.nested:
             return sample
-        said = {key: column[row].as_py() for key, column in self.table.nested.items()}
-        own = {key: said[key] if key in said else sample[key] for key in self.table.keys}
+        sample |= {key: column[row].as_py() for key, column in self.table.nested.items()}
+        own = {key: sample[key] for key in self.table.keys}
         videos = {key: sample[key] for key in self._frames.keys if key not in own}
         return {**videos, **own, **{key: value for key, value in sample.items() if key not in own}}
 

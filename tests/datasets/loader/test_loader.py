@@ -11,7 +11,7 @@ from torchvision.transforms import v2
 
 from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.datasets.loader import frame_cache
-from bhd_lerobot.datasets.loader.loader import BatchLoader, FrameTable, TableDataset, make_loader
+from bhd_lerobot.datasets.loader.loader import FrameTable, LoaderConfig, TableDataset, make_loader
 from bhd_lerobot.errors import DatasetError
 from tests.cases import each_case
 from tests.datasets.loader import support
@@ -103,7 +103,7 @@ def test_random_transforms_draw_as_in_lerobot(video_dataset: Path) -> None:
     assert not torch.equal(ours.batch(torch.tensor([5, 1, 9]))[FRONT], wanted[FRONT])
 
 
-def test_other_decoders_are_asked_through_lerobot(video_dataset: Path) -> None:
+def test_other_decoders_run_through_lerobot(video_dataset: Path) -> None:
     ours = TableDataset("t/t", video_dataset, video_backend="video_reader", return_uint8=True)
     cache = frame_cache.FrameCache(ours.table, [FRONT], 1e-4)
     slow = frame_cache.FrameCache.__new__(frame_cache.FrameCache)
@@ -118,13 +118,12 @@ def test_a_language_column_is_in_samples_and_left_out_of_batches_as_in_lerobot(t
     ours = assert_equal_datasets(root, delta_timestamps={"action": CHUNK})
     assert ours[0]["language_persistent"][0]["content"] == "pick it up"
     assert "language_persistent" not in ours.batch(torch.tensor([0]))
-    loader = make_loader("t/t", root=root, batch_size=4, budget_gib=1e-9, say=lambda _: None).train
+    loader = make_loader("t/t", LoaderConfig(batch_size=4, budget_gib=1e-9), root=root, report=lambda _: None).train
     assert "language_persistent" not in next(iter(loader))
 
 
 def test_a_subset_shares_memory_and_is_what_lerobot_selects(video_dataset: Path) -> None:
     whole = TableDataset("t/t", video_dataset, delta_timestamps={"action": CHUNK}, return_uint8=True)
-    whole.weights = torch.arange(len(whole)).float()
     part = whole.subset([3, 1])
     theirs = support.stock(video_dataset, episodes=[3, 1], delta_timestamps={"action": CHUNK}, return_uint8=True)
     assert part.table is whole.table
@@ -132,8 +131,6 @@ def test_a_subset_shares_memory_and_is_what_lerobot_selects(video_dataset: Path)
     indices = list(range(len(theirs)))
     assert len(part) == len(theirs)
     support.assert_same(part.batch(torch.tensor(indices)), support.collated(theirs, indices))
-    assert part.weights is not None
-    assert part.weights.tolist() == part.batch(torch.tensor(indices))["index"].tolist()
     assert part.subset([1]).num_frames == support.length(1)
     with pytest.raises(DatasetError, match="Episode 0 is not among the 2"):
         part.subset([0])
@@ -151,7 +148,7 @@ def test_batches_do_not_share_memory_with_the_dataset_or_each_other(video_datase
     support.assert_same(dataset.batch(torch.arange(3)), wanted)
 
 
-def test_only_what_is_kept_is_read_and_decoded(video_dataset: Path) -> None:
+def test_keep_limits_what_is_read_and_decoded(video_dataset: Path) -> None:
     keep = ["action", WRIST]
     dataset = TableDataset("t/t", video_dataset, keep=keep, delta_timestamps={"action": CHUNK})
     theirs = support.stock(video_dataset, delta_timestamps={"action": CHUNK})
@@ -163,7 +160,7 @@ def test_only_what_is_kept_is_read_and_decoded(video_dataset: Path) -> None:
     assert dataset.nbytes < TableDataset("t/t", video_dataset).nbytes
 
 
-def test_it_serves_pytorchs_data_loader_and_slices(plain: Path) -> None:
+def test_pytorch_data_loader_and_slices(plain: Path) -> None:
     ours, theirs = both(plain, delta_timestamps={"action": CHUNK})
     for mine, other in zip(DataLoader(ours, 7), DataLoader(theirs, 7), strict=True):
         support.assert_same(mine, other)
@@ -187,7 +184,7 @@ def test_the_table_by_episode(plain: Path) -> None:
 def test_the_batches_of_a_training_are_those_of_lerobot_train(plain: Path) -> None:
     from lerobot.datasets.sampler import EpisodeAwareSampler
 
-    ours, theirs = both(plain, episodes=[0, 2, 3], delta_timestamps={"action": CHUNK})
+    theirs = support.stock(plain, episodes=[0, 2, 3], delta_timestamps={"action": CHUNK})
     sampler = EpisodeAwareSampler(
         theirs.meta.episodes["dataset_from_index"],
         theirs.meta.episodes["dataset_to_index"],
@@ -197,7 +194,15 @@ def test_the_batches_of_a_training_are_those_of_lerobot_train(plain: Path) -> No
         seed=11,
         absolute_to_relative_idx=theirs.absolute_to_relative_idx,
     )
-    loader = BatchLoader(ours, 4, 11, drop_n_last_frames=2)
+    config = LoaderConfig(
+        batch_size=4,
+        seed=11,
+        episodes=[0, 2, 3],
+        delta_timestamps={"action": CHUNK},
+        drop_n_last_frames=2,
+        return_uint8=False,
+    )
+    loader = make_loader("t/t", config, root=plain).train
     reference = DataLoader(theirs, 4, sampler=sampler)
     for _ in range(2):
         assert len(loader) == len(reference)
@@ -206,10 +211,9 @@ def test_the_batches_of_a_training_are_those_of_lerobot_train(plain: Path) -> No
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_the_fallback_serves_the_same_batches_and_says_so_once(video_dataset: Path, workers: int) -> None:
-    said: list[str] = []
+def test_the_fallback_serves_the_same_batches_and_reports_it_once(video_dataset: Path, workers: int) -> None:
+    messages: list[str] = []
     options: dict[str, Any] = {
-        "root": video_dataset,
         "batch_size": 6,
         "seed": 5,
         "eval_split": 0.5,
@@ -217,12 +221,12 @@ def test_the_fallback_serves_the_same_batches_and_says_so_once(video_dataset: Pa
         "delta_timestamps": {"action": CHUNK},
         "drop_n_last_frames": 1,
         "intervention_weight": 0.0,
-        "say": said.append,
     }
-    memory = make_loader("t/t", **options)
-    assert (said, memory.message) == ([], "")
-    stock = make_loader("t/t", budget_gib=1e-4, num_workers=workers, **options)
-    assert said == [stock.message]
+    memory = make_loader("t/t", LoaderConfig(**options), root=video_dataset, report=messages.append)
+    assert (messages, memory.message) == ([], "")
+    small = LoaderConfig(**options, budget_gib=1e-4, num_workers=workers)
+    stock = make_loader("t/t", small, root=video_dataset, report=messages.append)
+    assert messages == [stock.message]
     assert "more than the budget of 0.0001 GiB" in stock.message
     assert "LeRobot's own loader" in stock.message
     assert type(stock.dataset).__name__ == "LeRobotDataset"
@@ -240,9 +244,10 @@ def test_the_fallback_serves_the_same_batches_and_says_so_once(video_dataset: Pa
     assert np.allclose(memory.dataset.meta.stats[FRONT]["mean"].squeeze(), [0.485, 0.456, 0.406])
 
 
-def test_a_resumed_fallback_goes_on_at_the_same_sample(video_dataset: Path) -> None:
+def test_resumed_fallback_continues_at_the_same_sample(video_dataset: Path) -> None:
     def make() -> Any:
-        return make_loader("t/t", root=video_dataset, batch_size=3, seed=5, budget_gib=1e-4, say=lambda _: None).train
+        config = LoaderConfig(batch_size=3, seed=5, budget_gib=1e-4)
+        return make_loader("t/t", config, root=video_dataset, report=lambda _: None).train
 
     loader = make()
     stream = loader.cycle()

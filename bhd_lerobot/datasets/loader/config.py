@@ -1,0 +1,103 @@
+"""What a training reads of a dataset, and in which form: the configuration of `make_loader`."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from bhd_lerobot.datasets.loader.selection import HOLD_OUTS, EpisodeFilter
+from bhd_lerobot.errors import ConfigError, unknown_name
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoaderConfig:
+    """Which samples a training reads, in which order and form, and where batches are put.
+
+    Attributes:
+        batch_size: samples in a batch of this rank.
+        seed: decides the order, with the number of the epoch; for the same seed it is that of `lerobot-train`.
+        episodes: indices of the episodes to choose from; None means all.
+        selection: which of these episodes; None means all.
+        intervention_weight: how often frames with an intervention are drawn, compared with others; 0 drops them.
+            Held-out samples are not weighted.
+        eval_split: share of the episodes that is held out, from 0 to below 1.
+        hold_out: what `eval_split` is a share of: `episode` or `instruction`; see `split_episodes`.
+        max_eval_samples: at most about this many held-out samples, the first of each task; 0 means all.
+        delta_timestamps: key -> times relative to the sample [s], multiples of 1 / fps.
+        drop_n_last_frames: frames at the end of each episode that no training sample starts from.
+        image_transforms: applied to training images only.
+        use_imagenet_stats: normalise images with the statistics of ImageNet.
+        return_uint8: serve videos as uint8, which `lerobot-train` divides by 255 afterwards, instead of float32.
+        tolerance_s: by how much a video frame may miss its time [s].
+        video_backend: LeRobot's decoder whose pixels are served.
+        keep: features to serve besides the index columns; None serves all. LeRobot's dataset always serves all.
+        budget_gib: memory that columns and decoded images may take [GiB].
+        num_workers: processes of PyTorch's `DataLoader`, where LeRobot's dataset is used.
+        drop_last: leave an incomplete batch out of the training's epochs.
+        device: where batches are put, through page-locked memory if it is a GPU; None leaves them in memory.
+        rank: this process among `world_size`.
+        world_size: processes that train together.
+
+    Raises:
+        ConfigError: an unknown field, or a value out of range; the message names the valid ones.
+    """
+
+    batch_size: int
+    seed: int = 0
+    episodes: Sequence[int] | None = None
+    selection: EpisodeFilter | None = None
+    intervention_weight: float = 1.0
+    eval_split: float = 0.0
+    hold_out: str = "episode"
+    max_eval_samples: int = 0
+    delta_timestamps: Mapping[str, Sequence[float]] | None = None
+    drop_n_last_frames: int = 0
+    image_transforms: Callable[[Tensor], Tensor] | None = None
+    use_imagenet_stats: bool = True
+    return_uint8: bool = True
+    tolerance_s: float = 1e-4
+    video_backend: str | None = "pyav"
+    keep: Collection[str] | None = None
+    budget_gib: float = 4.0
+    num_workers: int = 0
+    drop_last: bool = False
+    device: torch.device | str | None = None
+    rank: int = 0
+    world_size: int = 1
+
+    def __new__(cls, **fields: Any) -> Self:
+        """Refuse a field that does not exist."""
+        names = [one.name for one in dataclasses.fields(cls)]
+        for name in fields:
+            if name not in names:
+                raise ConfigError(unknown_name("field of LoaderConfig", name, names))
+        return super().__new__(cls)
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        for name, least in (
+            ("batch_size", 1),
+            ("seed", 0),
+            ("max_eval_samples", 0),
+            ("drop_n_last_frames", 0),
+            ("num_workers", 0),
+            ("world_size", 1),
+        ):
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
+        if not 0 <= self.rank < self.world_size:
+            raise ConfigError(f"rank is {self.rank}; it must be from 0 to world_size - 1 = {self.world_size - 1}.")
+        if not 0 <= self.intervention_weight < math.inf:
+            raise ConfigError(f"intervention_weight is {self.intervention_weight}; it must be 0 or more, and finite.")
+        if not 0 <= self.eval_split < 1:
+            raise ConfigError(f"eval_split is {self.eval_split}; it must be from 0 to below 1.")
+        if self.hold_out not in HOLD_OUTS:
+            raise ConfigError(unknown_name("hold_out", self.hold_out, HOLD_OUTS))
+        if not 0 < self.tolerance_s < math.inf:
+            raise ConfigError(f"tolerance_s is {self.tolerance_s}; it must be more than 0, and finite [s].")
+        if not self.budget_gib > 0:
+            raise ConfigError(f"budget_gib is {self.budget_gib}; it must be more than 0 [GiB].")
