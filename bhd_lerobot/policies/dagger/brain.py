@@ -71,7 +71,7 @@ class DaggerConfig(BrainConfig):
 class DaggerBrain:
     """Drives with a learner, and with an expert where the learner needs help.
 
-    The learner is asked in every frame of its turns, and between them if it gets another; a rule that gives setpoints
+    The learner acts in every frame of its turns, and between them if it gets another; a rule that gives setpoints
     sees every frame, so that it knows where the robot has been. An expert that gives goals starts afresh whenever it
     takes over.
 
@@ -181,8 +181,8 @@ class DaggerBrain:
 
     def subtasks(self) -> Sequence[str]:
         """Return what the expert is doing, in words, where it drives."""
-        said = self._goals.subtasks() if self._goals else self.expert.subtasks()
-        return [text if taken else LEARNER_DRIVES for text, taken in zip(said, self._shown, strict=True)]
+        texts = self._goals.subtasks() if self._goals else self.expert.subtasks()
+        return [text if taken else LEARNER_DRIVES for text, taken in zip(texts, self._shown, strict=True)]
 
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the expert's plan for one simulation."""
@@ -201,12 +201,12 @@ class DaggerBrain:
     # --- turns -------------------------------------------------------------------------------------------------------
 
     def _ask_learner(self, observation: Observation, running: NDArray[np.bool_]) -> Array:
-        """Return what the learner wants, shape (n, actions); zeros where nobody needs to know any more."""
-        asked = running if self._hold is not None else running & ~self._driving
-        if not asked.any():
+        """Return what the learner wants, shape (n, actions); zeros where it has no further turn."""
+        needed = running if self._hold is not None else running & ~self._driving
+        if not needed.any():
             return np.zeros((len(running), self._width))
-        wanted = _setpoints(self.learner.act(replace(observation, running=asked)), self.learner.name, "learner")
-        return np.where(asked[:, None], wanted, 0.0)
+        wanted = _setpoints(self.learner.act(replace(observation, running=needed)), self.learner.name, "learner")
+        return np.where(needed[:, None], wanted, 0.0)
 
     def _decide(
         self, observation: Observation, wanted: Array, advised: Array | None, running: NDArray[np.bool_]
@@ -216,7 +216,7 @@ class DaggerBrain:
         self._driven += self._driving
         danger: NDArray[np.bool_] = np.zeros(n, np.bool_)
         if self._collision is not None:
-            danger = self._collision.look(observation, wanted, advised)
+            danger = self._collision.check(observation, wanted, advised)
         if self._hold is not None:
             # One who is about to collide would be taken over from again at once.
             over = self._driving & running & (self._driven >= self._hold) & ~danger
@@ -225,7 +225,7 @@ class DaggerBrain:
                 for watch in self._watches:
                     watch.restart(np.flatnonzero(over), n)
         for watch in self._watches:
-            mask = danger if watch is self._collision else watch.look(observation, wanted, advised)
+            mask = danger if watch is self._collision else watch.check(observation, wanted, advised)
             for sim in np.flatnonzero(mask & running & ~self._driving).tolist():
                 self._driving[sim], self._driven[sim], self._causes[sim] = True, 0, watch.cause
                 if self._goals is not None:

@@ -24,12 +24,12 @@ _HELD_LIFT, _HELD_APART = 0.006, 0.05  # [m] an object this far up and this near
 _ODD = np.array([1.5, 0.9, 0.9, 1.2, 0.9, 3.2])  # [rad] joints farther than this from home
 _UPRIGHT = np.array([-np.pi / 2, 0.0])  # [rad] shoulder lift and elbow of an arm that is stretched upwards
 _IDLE_S = 2.5  # [s] after which an expert that has nothing to do any more begins again
-_FAST = 0.3  # [rad/s] an arm that is faster comes to rest first: from there it can be said where it is
+_FAST = 0.3  # [rad/s] an arm that is faster comes to rest first: then its position is known
 _STOPS = 5  # how often that is tried
 _HOMES = 3  # how often it is brought home, in one intervention, because it finds no way
 
 STOP, OPEN, UP, RAISE, UPRIGHT, HOME = "stop", "open", "up", "raise", "upright", "home"
-_SAID = {
+_DESCRIPTIONS = {
     STOP: "come to rest",
     OPEN: "open the gripper",
     UP: "raise the arm",
@@ -51,7 +51,7 @@ class _Turn:
         is_first: whether that is the first since it began.
         is_new: whether the turn has just begun, or begins again.
         is_holding: whether it holds what the task is about, and waits for that to be enough.
-        stops: how often it was told to come to rest.
+        stops: how often it had to come to rest.
         homes: how often it was brought home.
         idle: frames in which it had nothing to do.
         count: number of the last goal of ours.
@@ -135,7 +135,7 @@ class GoalExpert:
 
     def subtasks(self) -> Sequence[str]:
         """Return what is being done, in words."""
-        return [turn.doing or said for turn, said in zip(self._turns, self.brain.subtasks(), strict=True)]
+        return [turn.doing or text for turn, text in zip(self._turns, self.brain.subtasks(), strict=True)]
 
     def act(self, seen: Observation, driving: NDArray[np.bool_]) -> dict[int, list[BrainCommand]]:
         """Return the new goals, by simulation.
@@ -146,7 +146,7 @@ class GoalExpert:
         """
         commands: dict[int, list[BrainCommand]] = {}
         results: dict[int, list[CommandResult]] = {}
-        asked = driving.copy()
+        active = driving.copy()
         for sim in np.flatnonzero(driving).tolist():
             turn = self._turns[sim]
             own, ended = self._results(turn, seen.results.get(sim, ()))
@@ -164,7 +164,7 @@ class GoalExpert:
                 ended = []
             if turn.pending is not None:
                 if own is None:
-                    asked[sim] = False
+                    active[sim] = False
                     continue
                 turn.pending = None
                 turn.is_holding = own.success and own.task_id.endswith(RAISE)
@@ -172,24 +172,24 @@ class GoalExpert:
                     turn.own = [UPRIGHT, HOME]
             if turn.own:
                 commands[sim] = [self._own_goal(sim, turn.own.pop(0), seen)]
-                asked[sim] = False
+                active[sim] = False
                 continue
             if turn.is_holding:
-                asked[sim] = False
+                active[sim] = False
                 self._idle(turn)
                 continue
             turn.doing = ""
             if ended:
                 results[sim] = ended
-        if asked.any():
-            self._ask(replace(seen, running=asked, results=results), commands)
+        if active.any():
+            self._ask(replace(seen, running=active, results=results), commands)
         return commands
 
     def _ask(self, seen: Observation, commands: dict[int, list[BrainCommand]]) -> None:
         """Add the expert's own goals."""
         given = self.brain.act(seen).commands
         if seen.running is None:
-            raise AssertionError("It was said who is asked.")
+            raise AssertionError("GoalExpert always sets `running`.")
         for sim in np.flatnonzero(seen.running).tolist():
             turn = self._turns[sim]
             ended = {one.task_id for one in seen.results.get(sim, ())}
@@ -258,7 +258,7 @@ class GoalExpert:
     def _own_goal(self, sim: int, step: str, seen: Observation) -> BrainCommand:
         turn = self._turns[sim]
         turn.count += 1
-        turn.pending, turn.doing = f"{turn.number}-{turn.homes}-{turn.count}-{step}", _SAID[step]
+        turn.pending, turn.doing = f"{turn.number}-{turn.homes}-{turn.count}-{step}", _DESCRIPTIONS[step]
         if step == STOP:
             opening = float(np.clip(seen.state[sim, self._opening], 0.0, MAX_OPENING))
             return BrainCommand(turn.pending, gripper=opening)

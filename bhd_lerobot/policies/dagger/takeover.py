@@ -30,7 +30,7 @@ _DOF = len(_ARM.limits.names) - 1
 
 
 class Watch(Protocol):
-    """Looks at what a learner does in each frame of its turns."""
+    """Checks what a learner does in each frame of its turns."""
 
     cause: str
     """What it finds, in words."""
@@ -38,7 +38,7 @@ class Watch(Protocol):
     def restart(self, ids: NDArray[np.intp], n: int) -> None:
         """Begin the learner's turn in some of n simulations."""
 
-    def look(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Return where the learner needs help, shape (n,).
 
         To be called once a frame; where the learner does not drive, the answer means nothing.
@@ -50,7 +50,20 @@ class Watch(Protocol):
         """
 
 
-class PatienceWatch:
+class _FrameCounter:
+    """Counts frames of the learner's turn in every simulation."""
+
+    def __init__(self) -> None:
+        self._frames = np.zeros(0, np.int64)
+
+    def restart(self, ids: NDArray[np.intp], n: int) -> None:
+        """Begin the learner's turn."""
+        if len(self._frames) != n:
+            self._frames = np.zeros(n, np.int64)
+        self._frames[ids] = 0
+
+
+class PatienceWatch(_FrameCounter):
     """The learner has had its time.
 
     Args:
@@ -60,16 +73,10 @@ class PatienceWatch:
     cause = "time is up"
 
     def __init__(self, frames: int) -> None:
+        super().__init__()
         self._most = frames
-        self._frames = np.zeros(0, np.int64)
 
-    def restart(self, ids: NDArray[np.intp], n: int) -> None:
-        """Begin the learner's turn."""
-        if len(self._frames) != n:
-            self._frames = np.zeros(n, np.int64)
-        self._frames[ids] = 0
-
-    def look(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Count the frames."""
         self._frames += 1
         return np.asarray(self._frames > self._most)
@@ -105,7 +112,7 @@ class StallWatch:
             self._past = np.zeros((n, self._window, 2 if self._is_base else _DOF))
         self._frames[ids] = 0
 
-    def look(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Compare where the robot was within the window."""
         values = seen.state[:, self._columns]
         if self._is_base:
@@ -121,7 +128,7 @@ class StallWatch:
         return np.asarray((self._frames >= self._window) & still)
 
 
-class DisagreementWatch:
+class DisagreementWatch(_FrameCounter):
     """The learner wants something else than the expert would do.
 
     Args:
@@ -137,16 +144,10 @@ class DisagreementWatch:
 
     def __init__(self, share: float, frames: int, names: Sequence[str]) -> None:
         self._share, self._most = share, frames
+        super().__init__()
         self._range = _ranges(names)
-        self._frames = np.zeros(0, np.int64)
 
-    def restart(self, ids: NDArray[np.intp], n: int) -> None:
-        """Begin the learner's turn."""
-        if len(self._frames) != n:
-            self._frames = np.zeros(n, np.int64)
-        self._frames[ids] = 0
-
-    def look(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Count the frames of disagreement."""
         if advised is None:
             raise AssertionError("It is not used with an expert that gives goals.")
@@ -175,7 +176,7 @@ class BaseCollisionWatch:
     def restart(self, ids: NDArray[np.intp], n: int) -> None:
         """It remembers nothing."""
 
-    def look(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Compare the robot's outline on its way with what the scan shows."""
         ranges = seen.state[:, self._scan]
         is_hit = (ranges > 0) & (ranges < _NO_RETURN)
@@ -223,14 +224,14 @@ class ArmCollisionWatch:
     def restart(self, ids: NDArray[np.intp], n: int) -> None:
         """It remembers nothing."""
 
-    def look(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
+    def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Compare the postures on the way to rest with the table and with each other."""
         position, velocity = seen.state[:, self._position], seen.state[:, self._velocity]
         after = velocity
         if self._actions is not None:
-            asked = np.clip((wanted[:, self._actions] - position) * self._fps, -self._speed, self._speed)
+            speed = np.clip((wanted[:, self._actions] - position) * self._fps, -self._speed, self._speed)
             change = self._change / self._fps
-            after = np.clip(asked, velocity - change, velocity + change)
+            after = np.clip(speed, velocity - change, velocity + change)
         frame = (velocity + after) / 2 / self._fps
         way = _STOP_SHARE * (after * self._delay + after * np.abs(after) / (2 * self._change))
         share = (np.arange(1, _STOP_POSTURES + 1) / _STOP_POSTURES)[:, None, None]

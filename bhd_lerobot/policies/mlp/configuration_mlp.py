@@ -216,8 +216,8 @@ class MlpConfig(PreTrainedConfig):
             raise ConfigError(f"policy.min_std is {self.min_std}; it must be 0 or positive, and finite.")
         if not 0 < self.huber_delta < math.inf:
             raise ConfigError(f"policy.huber_delta is {self.huber_delta}; it must be positive.")
-        for name, asked in (("loss=nll", self.loss == "nll"), ("sample", self.sample)):
-            if asked and not self.gaussian:
+        for name, is_set in (("loss=nll", self.loss == "nll"), ("sample", self.sample)):
+            if is_set and not self.gaussian:
                 raise ConfigError(f"policy.{name} needs a distribution; set --policy.gaussian=true.")
         self.scan.check()
 

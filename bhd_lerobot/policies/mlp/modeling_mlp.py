@@ -2,8 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -16,7 +15,7 @@ from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder, other_columns, transformed
 from bhd_lerobot.policies.mlp.yaw_mlp import OBS_YAW, harmonics
 
-_ACTIVATIONS: dict[str, type[nn.Module]] = {
+ACTIVATION_LAYERS: dict[str, type[nn.Module]] = {
     "relu": nn.ReLU,
     "tanh": nn.Tanh,
     "gelu": nn.GELU,
@@ -28,21 +27,17 @@ _PADDING = "action_is_pad"
 _HINTS = {
     OBS_SCAN: " Run the policy's own preprocessor first.",
     OBS_YAW: " Run the policy's own preprocessor first.",
-    OBS_ENV_STATE: " A task tells it; a robot's own sensors, and so lerobot-rollout, do not. Run this policy in "
+    OBS_ENV_STATE: " It comes from a task; a robot's own sensors, and so lerobot-rollout, lack it. Run this policy in "
     "bhd-eval or lerobot-eval, or train one on the sensors alone: "
     "--policy.input_features='{observation.state: {type: STATE, shape: [WIDTH]}}'.",
 }
-
-type Layer = tuple[Tensor, Tensor]
-"""Weight, shape (outputs, inputs), and bias, shape (outputs,), of a linear layer."""
 
 
 class MlpPolicy(PreTrainedPolicy):
     """The policy type ``bhd_mlp``.
 
     `features` turns a preprocessed batch into one vector a row, and `net`, a `torch.nn.Sequential` of linear layers and
-    activations, turns that into the chunk. `layers` and `from_layers` copy the linear layers out and in, so that a
-    network of the same shape that was trained elsewhere runs here.
+    activations, turns that into the chunk.
 
     Args:
         config: its shape and its features.
@@ -68,7 +63,7 @@ class MlpPolicy(PreTrainedPolicy):
         columns = other_columns(state_size, scan.start or 0, scan.beams if scan.is_used else 0, config.ignored_columns)
         # Not part of the checkpoint: the configuration says it.
         self.register_buffer("_columns", torch.tensor(columns, dtype=torch.long), persistent=False)
-        activation = _ACTIVATIONS[config.activation]
+        activation = ACTIVATION_LAYERS[config.activation]
         self.scan_encoder = ScanEncoder(scan, steps, activation) if scan.is_used and scan.channels else None
         self._beams = 0 if not scan.is_used else self.scan_encoder.size if self.scan_encoder else steps * scan.beams
         yaws = 2 * config.yaw_harmonics * config.quaternions
@@ -79,44 +74,6 @@ class MlpPolicy(PreTrainedPolicy):
             shape = (config.chunk_size, self._action_size)
             self.log_std = nn.Parameter(torch.full(shape, float(config.initial_log_std)))
         self.reset()
-
-    @classmethod
-    def from_layers(cls, config: MlpConfig, layers: Sequence[Layer], log_std: Tensor | None = None) -> Self:
-        """Return a policy with weights from elsewhere.
-
-        Args:
-            config: of the same shape, without `scan.channels`.
-            layers: the linear layers, first to last; they are copied.
-            log_std: logarithm of the standard deviations, shape (chunk_size, actions) or (actions,), with `gaussian`.
-
-        Raises:
-            ConfigError: the shapes are not those of the configuration.
-        """
-        policy = cls(config)
-        own = [module for module in policy.net if isinstance(module, nn.Linear)]
-        wanted = [tuple(module.weight.shape) for module in own]
-        given = [tuple(weight.shape) for weight, _ in layers]
-        if given != wanted:
-            raise ConfigError(
-                f"The layers have the shapes {given} (outputs, inputs); this configuration needs {wanted}. "
-                "Check hidden_dims, chunk_size and the features."
-            )
-        if (log_std is not None) != config.gaussian:
-            raise ConfigError(f"policy.gaussian is {config.gaussian}; give log_std if it is true, and only then.")
-        with torch.no_grad():
-            for module, (weight, bias) in zip(own, layers, strict=True):
-                module.weight.copy_(weight)
-                module.bias.copy_(bias)
-            if policy.log_std is not None and log_std is not None:
-                policy.log_std.copy_(log_std.expand_as(policy.log_std))
-        policy.to(config.device)
-        policy.eval()
-        return policy
-
-    def layers(self) -> list[Layer]:
-        """Return copies of the linear layers' weights and biases, first to last."""
-        linear = [module for module in self.net if isinstance(module, nn.Linear)]
-        return [(one.weight.detach().clone(), one.bias.detach().clone()) for one in linear]
 
     def get_optim_params(self) -> list[dict[str, Any]]:
         """Return the parameters in two groups: weights, and biases and scales, which do not decay."""
@@ -191,12 +148,12 @@ class MlpPolicy(PreTrainedPolicy):
         padding = batch.get(_PADDING)
         valid = torch.ones_like(loss[..., :1]) if padding is None else (~padding).unsqueeze(-1).to(loss.dtype)
         loss = loss * valid
-        told = {"l1_loss": float(((mean.detach() - target).abs() * valid).sum() / (valid.sum() * target.shape[-1]))}
+        outputs = {"l1_loss": float(((mean.detach() - target).abs() * valid).sum() / (valid.sum() * target.shape[-1]))}
         if self.log_std is not None:
-            told["std"] = float(self._std().detach().mean())
+            outputs["std"] = float(self._std().detach().mean())
         if reduction == "none":
-            return loss.sum((1, 2)) / (valid.sum((1, 2)) * target.shape[-1]).clamp_min(1), told
-        return loss.sum() / (valid.sum() * target.shape[-1]).clamp_min(1), told
+            return loss.sum((1, 2)) / (valid.sum((1, 2)) * target.shape[-1]).clamp_min(1), outputs
+        return loss.sum() / (valid.sum() * target.shape[-1]).clamp_min(1), outputs
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], noise: Tensor | None = None, **_: Any) -> Tensor:
@@ -278,7 +235,7 @@ def _perceptron(config: MlpConfig, inputs: int, outputs: int) -> list[nn.Module]
     for width in config.hidden_dims:
         modules.append(nn.Linear(inputs, width))
         modules += [nn.LayerNorm(width)] * config.layer_norm
-        modules.append(_ACTIVATIONS[config.activation]())
+        modules.append(ACTIVATION_LAYERS[config.activation]())
         modules += [nn.Dropout(config.dropout)] * (config.dropout > 0)
         inputs = width
     return [*modules, nn.Linear(inputs, outputs)]

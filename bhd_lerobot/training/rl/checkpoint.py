@@ -29,7 +29,7 @@ def save(output_dir: Path, parts: RlParts, learner: Any, run: dict[str, Any]) ->
     Args:
         output_dir: the run's folder.
         parts: the policy, whose weights are the learner's, and what belongs to it.
-        learner: the `AnchoredPPO`.
+        learner: the `WarmedUpPPO`.
         run: state of the run, JSON values.
 
     Raises:

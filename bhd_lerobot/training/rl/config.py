@@ -38,9 +38,7 @@ _LEAST = {
     "validation.n_episodes": 1,
     "validation.n_envs": 1,
     "validation.seed": 0,
-    "anchor.batch_size": 1,
     "critic_warmup": 0,
-    "start_action": 0,
     "seed": 0,
     "policy.critic_dims": 1,
 }
@@ -55,7 +53,7 @@ _RANGES = (
     (
         "0 or positive, and finite",
         lambda number: 0 <= number < math.inf,
-        ("ppo.ent_coef", "ppo.vf_coef", "reward.per_m", "reward.per_rad", "anchor.coef"),
+        ("ppo.ent_coef", "ppo.vf_coef", "reward.per_m", "reward.per_rad"),
     ),
     ("a finite number", math.isfinite, ("ppo.log_std_init", "reward.frame")),
 )
@@ -200,21 +198,6 @@ class ValidationConfig:
 
 
 @dataclass
-class AnchorConfig:
-    """What keeps the actor near the checkpoint that it started from.
-
-    Attributes:
-        coef: weight of the KL divergence from the checkpoint's policy; 0 turns it off.
-        batch_size: samples of a gradient step.
-        decay: whether the weight falls to 0 over the training.
-    """
-
-    coef: float = 0.0
-    batch_size: int = 4096
-    decay: bool = True
-
-
-@dataclass
 class RlConfig:
     """Learn by trial and error: PPO of stable-baselines3 on many simulations side by side, into a `bhd_mlp`.
 
@@ -227,12 +210,9 @@ class RlConfig:
         ppo: the algorithm.
         reward: what the learner gets.
         validation: how it is judged on the way.
-        anchor: what keeps it near `start_from`.
         steps: environment steps, all environments together.
         max_minutes: end after this time [min], validation included; nothing: after `steps` only.
-        start_from: a checkpoint of a `bhd_mlp`, whose weights become the actor.
-        start_action: which action of the checkpoint's chunk becomes the actor's, from 0. A later one asks at once for
-            what the checkpoint would ask for some frames later, and so hurries.
+        start_from: a checkpoint of a `bhd_mlp`, whose weights become the actor; of a chunk, the first action counts.
         see_ignored: let the actor see what the checkpoint ignores (`policy.ignore`); it begins as if it did not. A
             clone must not see its own speed, because it would repeat it; who learns from what comes of it may.
         critic_warmup: environment steps in which only the critic learns.
@@ -250,11 +230,9 @@ class RlConfig:
     ppo: PpoConfig = field(default_factory=PpoConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
-    anchor: AnchorConfig = field(default_factory=AnchorConfig)
     steps: int = 1_000_000
     max_minutes: float | None = None
     start_from: str | None = None
-    start_action: int = 0
     see_ignored: bool = False
     critic_warmup: int = 0
     output_dir: str | None = None
@@ -279,9 +257,8 @@ class RlConfig:
                 "learned from. Set another --validation.seed."
             )
         if self.start_from is None:
-            for name, asked in (("anchor.coef", self.anchor.coef), ("critic_warmup", self.critic_warmup)):
-                if asked:
-                    raise ConfigError(f"{name} is {asked}; it needs --start_from, a checkpoint to stay near.")
+            if self.critic_warmup:
+                raise ConfigError(f"critic_warmup is {self.critic_warmup}; it needs --start_from, a checkpoint.")
             if self.see_ignored:
                 raise ConfigError("see_ignored is true; it needs --start_from, a checkpoint that ignores something.")
         if self.policy.scan.channels and self.policy.scan.transform == "none":

@@ -3,7 +3,6 @@
 The actor's modules are those of a `bhd_mlp`, so that exporting it is exact.
 """
 
-import copy
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -18,8 +17,8 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor, nn
 
-from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
-from bhd_lerobot.training.rl.config import AnchorConfig, RlConfig
+from bhd_lerobot.policies.mlp.modeling_mlp import ACTIVATION_LAYERS, MlpPolicy
+from bhd_lerobot.training.rl.config import RlConfig
 from bhd_lerobot.training.rl.environment import RlVecEnv
 from bhd_lerobot.training.rl.log import Row
 from bhd_lerobot.training.rl.parts import RlParts
@@ -32,18 +31,8 @@ _LOGGED = {
     "train/policy_gradient_loss": "policy_loss",
     "train/std": "std",
     "train/learning_rate": "lr",
-    "train/anchor_kl": "anchor_kl",
 }
 _NEVER = 2**62  # updates between two outputs of stable-baselines3's own log
-
-
-_ACTIVATIONS: dict[str, type[nn.Module]] = {
-    "relu": nn.ReLU,
-    "tanh": nn.Tanh,
-    "gelu": nn.GELU,
-    "silu": nn.SiLU,
-    "elu": nn.ELU,
-}
 
 
 class ActorHead(nn.Module):
@@ -85,7 +74,7 @@ class Networks(nn.Module):
         layers: list[nn.Module] = []
         width = size
         for dim in critic_dims:
-            layers += [nn.Linear(width, dim), _ACTIVATIONS[policy.config.activation]()]
+            layers += [nn.Linear(width, dim), ACTIVATION_LAYERS[policy.config.activation]()]
             width = dim
         self.value_net = nn.Sequential(*layers)
         self.latent_dim_vf = width
@@ -163,32 +152,21 @@ class MlpActorCritic(ActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), **kwargs)
 
 
-class AnchoredPPO(PPO):
-    """Stable-baselines3's PPO; its actor can be frozen at first, and be kept near the one that it started as.
-
-    The anchor is a pass of gradient steps over the samples of an update, after PPO's own: it lowers the divergence
-    KL(first, policy) times the weight.
+class WarmedUpPPO(PPO):
+    """PPO of stable-baselines3, whose actor can be frozen at first.
 
     Args:
         args: see `stable_baselines3.PPO`.
         critic_warmup: environment steps in which the actor is frozen.
-        anchor: the anchor's weight.
-        done: how much of the run is done after an environment step, from 0 to 1.
+        done: share of the run that is done after an environment step, from 0 to 1.
         kwargs: see `stable_baselines3.PPO`.
     """
 
     policy: MlpActorCritic
 
-    def __init__(
-        self, *args: Any, critic_warmup: int, anchor: AnchorConfig, done: Callable[[int], float], **kwargs: Any
-    ) -> None:
+    def __init__(self, *args: Any, critic_warmup: int, done: Callable[[int], float], **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._warmup, self._anchor, self._done = critic_warmup, anchor, done
-        self._first: tuple[nn.Module, nn.Module, Tensor] | None = None
-        if anchor.coef:
-            self._first = copy.deepcopy(
-                (self.policy.mlp_extractor.policy_net, self.policy.action_net, self.policy.log_std.detach())
-            )
+        self._warmup, self._done = critic_warmup, done
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         # Stable-baselines3 counts steps; here the time may be up first.
@@ -200,29 +178,9 @@ class AnchoredPPO(PPO):
         for one in self.policy.actor_parameters():
             one.requires_grad_(not frozen)
         super().train()
-        if self._first is not None and not frozen:
-            self._pull(self._anchor.coef * (self._current_progress_remaining if self._anchor.decay else 1.0))
-
-    def _pull(self, coef: float) -> None:
-        assert self._first is not None
-        hidden, output, log_std = self._first
-        total, count = 0.0, 0
-        for samples in self.rollout_buffer.get(self._anchor.batch_size):
-            features: Any = samples.observations
-            with torch.no_grad():
-                target = torch.distributions.Normal(output(hidden(features)), log_std.exp())
-            mean = self.policy.action_net(self.policy.mlp_extractor.forward_actor(features))
-            distribution = torch.distributions.Normal(mean, self.policy.log_std.exp())
-            divergence = torch.distributions.kl_divergence(target, distribution).sum(1).mean()
-            self.policy.optimizer.zero_grad()
-            (coef * divergence).backward()
-            nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
-            self.policy.optimizer.step()
-            total, count = total + float(divergence.detach()), count + 1
-        self.logger.record("train/anchor_kl", total / max(count, 1))
 
 
-def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv, done: Callable[[int], float]) -> AnchoredPPO:
+def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv, done: Callable[[int], float]) -> WarmedUpPPO:
     """Return PPO on an actor.
 
     Args:
@@ -237,7 +195,7 @@ def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv, done: Callable
     if log_std is None:
         own = parts.actor.log_std
         log_std = 0.0 if own is None or parts.fresh else float(own.detach().mean())
-    learner = AnchoredPPO(
+    learner = WarmedUpPPO(
         MlpActorCritic,
         env,
         learning_rate=lr if schedule == "constant" else lambda remaining: lr * remaining,
@@ -251,14 +209,13 @@ def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv, done: Callable
             "log_std_init": log_std,
         },
         critic_warmup=config.critic_warmup,
-        anchor=config.anchor,
         done=done,
     )
     learner.set_logger(Logger(None, []))
     return learner
 
 
-def learn(learner: AnchoredPPO, steps: int, updated: Callable[[Any, Row], None], is_over: Callable[[], bool]) -> None:
+def learn(learner: WarmedUpPPO, steps: int, updated: Callable[[Any, Row], None], is_over: Callable[[], bool]) -> None:
     """Learn until a number of environment steps is done, or until it is over.
 
     Args:

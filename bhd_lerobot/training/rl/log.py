@@ -5,14 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 PLOT_NAME = "learning_curve.png"
 Row = dict[str, Any]
 
 _CURVES = (("return", "return of the task"), ("success", "success"), ("score", "score"))
-_SHOWN = (
+SHOWN = (
     ("return", "return"),
     ("success", "success"),
     ("score", "score"),
@@ -60,36 +58,3 @@ def draw_curve(rows: Sequence[Row], path: Path, heading: str, rule: tuple[str, M
 def _points(rows: Sequence[Row], time: str, key: str) -> tuple[list[float], list[float]] | None:
     points = [(row[time], row[key]) for row in rows if row.get(key) is not None]
     return ([x for x, _ in points], [y for _, y in points]) if points else None
-
-
-class RlProgress:
-    """A bar in a terminal, a line for each logged update elsewhere."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.percentage:.0f}%"),
-            TextColumn("{task.fields[numbers]}"),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-
-    def __enter__(self) -> "RlProgress":
-        self._bar.start()
-        self._task = self._bar.add_task("learning", total=1.0, numbers="")
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._bar.stop()
-
-    def show(self, row: Row, done: float) -> None:
-        """Show a row, and how much of the run is done, from 0 to 1."""
-        numbers = "  ".join(f"{label} {row[key]:.4g}" for key, label in _SHOWN if row.get(key) is not None)
-        if self._console.is_terminal:
-            self._bar.update(self._task, completed=done, numbers=numbers)
-        elif "val_score" in row:
-            self._console.print(f"step {row['step']:,}  {row['minutes']:.1f} min  {numbers}")

@@ -77,7 +77,7 @@ def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] 
         versions=versions(),
     )
     if config.start_from is not None:
-        return _from_checkpoint(config.start_from, contract, config.start_action, see_ignored=config.see_ignored)
+        return _from_checkpoint(config.start_from, contract, see_ignored=config.see_ignored)
     if config.resume:
         # With the normalisation that the run began with.
         return _from_checkpoint(str(config.output_dir), contract)
@@ -96,7 +96,7 @@ def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] 
     return RlParts(MlpPolicy(mlp), _front(mlp), before, after, contract, fresh=True)
 
 
-def _from_checkpoint(path: str, contract: PolicyContract, action: int = 0, *, see_ignored: bool = False) -> RlParts:
+def _from_checkpoint(path: str, contract: PolicyContract, *, see_ignored: bool = False) -> RlParts:
     folder = find_checkpoint(path)
     loaded = load_policy(folder)
     who = f"The policy {path!r}"
@@ -120,18 +120,15 @@ def _from_checkpoint(path: str, contract: PolicyContract, action: int = 0, *, se
         raise ConfigError(f"{who} has dropout {loaded.config.dropout}; PPO needs a policy without it.")
     if loaded.config.scan.channels and loaded.config.scan.transform == "none":
         raise ConfigError(f"{who} has policy.scan.channels without a transform; train it with inverse or log ranges.")
-    chunk = loaded.config.chunk_size
-    if action >= chunk:
-        raise ConfigError(f"start_action is {action}; {who[0].lower()}{who[1:]} predicts {chunk}: 0 to {chunk - 1}.")
     if see_ignored and not loaded.config.ignored_columns:
         raise ConfigError(f"see_ignored is true, and {who[0].lower()}{who[1:]} ignores nothing. Leave it out.")
-    actor = single_action(seeing_all(loaded.policy) if see_ignored else loaded.policy, action)
+    actor = single_action(seeing_all(loaded.policy) if see_ignored else loaded.policy)
     known = dataclasses.replace(contract, dataset=trained.dataset)
     return RlParts(actor, _front(actor.config), loaded.before, loaded.after, known, fresh=False)
 
 
-def single_action(policy: MlpPolicy, action: int = 0) -> MlpPolicy:
-    """Return a Gaussian policy that predicts one action of another's chunk, with the same weights."""
+def single_action(policy: MlpPolicy) -> MlpPolicy:
+    """Return a Gaussian policy that predicts the first action of another's chunk, with the same weights."""
     old = policy.config
     values: dict[str, Any] = {
         "chunk_size": 1,
@@ -145,13 +142,12 @@ def single_action(policy: MlpPolicy, action: int = 0) -> MlpPolicy:
     config.scan = copy.deepcopy(old.scan)
     actor = MlpPolicy(config)
     size = int(config.action_feature.shape[0])
-    rows = slice(action * size, (action + 1) * size)
     state = dict(policy.state_dict())
     last = f"net.{len(policy.net) - 1}"
     for name in ("weight", "bias"):
-        state[f"{last}.{name}"] = state[f"{last}.{name}"][rows].clone()
+        state[f"{last}.{name}"] = state[f"{last}.{name}"][:size].clone()
     if "log_std" in state:
-        state["log_std"] = state["log_std"][action : action + 1].clone()
+        state["log_std"] = state["log_std"][:1].clone()
     else:
         state["log_std"] = torch.zeros(1, size)
     actor.load_state_dict(state)

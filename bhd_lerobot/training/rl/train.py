@@ -22,10 +22,10 @@ from bhd_lerobot.errors import BhdError, ConfigError, install_extra, quoted
 from bhd_lerobot.rollout import configuration
 from bhd_lerobot.rollout.signals import StopRequest, stop_on_signals
 from bhd_lerobot.training.checkpoint import clean, point
-from bhd_lerobot.training.log import METRICS_NAME, MetricsFile, read_metrics
+from bhd_lerobot.training.log import METRICS_NAME, MetricsFile, RunProgress, format_numbers, read_metrics
 from bhd_lerobot.training.rl import checkpoint as checkpoints
 from bhd_lerobot.training.rl.config import CONFIG_NAME, RlConfig, parse_rl
-from bhd_lerobot.training.rl.log import PLOT_NAME, RlProgress, Row, draw_curve
+from bhd_lerobot.training.rl.log import PLOT_NAME, SHOWN, Row, draw_curve
 from bhd_lerobot.training.rl.parts import make_parts
 from bhd_lerobot.training.rl.validation import Level, Validation, level
 
@@ -203,7 +203,7 @@ class _Run:
         self._metrics = MetricsFile(metrics, rows)
         result.rows = self._metrics.rows
         self._point_to_best()
-        with RlProgress(self._console) as self._progress:
+        with RunProgress(self._console, "learning", 1.0) as self._progress:
             if not config.resume:
                 self._judge(learner, {"step": 0, "minutes": self._minutes()})
             try:
@@ -246,8 +246,8 @@ class _Run:
         """Save, and find out how good the policy is."""
         self._judged = self._result.step
         policy = self._save(learner) / PRETRAINED_MODEL_DIR
-        found = self._validation.checkpoint(policy, self._stop.__bool__)
-        self._log(row if found is None or self._stop else {**row, **found.row()})
+        level_now = self._validation.checkpoint(policy, self._stop.__bool__)
+        self._log(row if level_now is None or self._stop else {**row, **level_now.row()})
         self._point_to_best()
 
     def _save(self, learner: Any) -> Path:
@@ -272,7 +272,9 @@ class _Run:
 
     def _log(self, row: Row) -> None:
         self._metrics.append(row)
-        self._progress.show(row, self._done(self._result.step))
+        self._progress.advance(self._done(self._result.step))
+        prefix = f"step {row['step']:,}  {row['minutes']:.1f} min" if "val_score" in row else ""
+        self._progress.log(prefix, format_numbers(row, SHOWN))
 
     def _draw(self) -> None:
         config, result = self._config, self._result

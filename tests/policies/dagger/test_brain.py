@@ -28,7 +28,6 @@ from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
 from bhd_lerobot.registry import make_brain, robot_of_brain
 from bhd_lerobot.tasks.pick import ENVIRONMENT
-from tests.cases import each_case
 from tests.policies.arm_desk import BOX, CUP, Desk, scene
 
 BASE = ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36)))
@@ -39,7 +38,7 @@ HOME = np.array(ur5().home)
 
 
 class Fake:
-    """Always wants the same, and remembers what it was shown."""
+    """Always wants the same, and remembers what it received."""
 
     robot_type, uses_images, has_plan = "any", False, False
 
@@ -88,7 +87,7 @@ def made(n: int = 1, **values: Any) -> tuple[DaggerBrain, Fake, Fake]:
 # --- turns -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_expert_drives_to_the_end_and_the_learner_is_not_asked_any_more() -> None:
+def test_the_expert_drives_to_the_end_and_the_learner_does_not_act_any_more() -> None:
     brain, learner, expert = made(patience_s=0.5)
     actions, taken = [], []
     for _ in range(9):
@@ -97,7 +96,7 @@ def test_the_expert_drives_to_the_end_and_the_learner_is_not_asked_any_more() ->
     assert taken == [False] * 5 + [True] * 4
     assert actions == [0.1] * 5 + [0.2] * 4
     assert brain.causes() == ("time is up",)
-    assert len(learner.seen) == 6  # the sixth time it was asked in vain
+    assert len(learner.seen) == 6  # the action of the sixth is not used
     assert len(expert.seen) == 9  # what it has to remember, it has seen
 
 
@@ -141,11 +140,11 @@ def test_a_simulation_that_is_not_running_is_not_flagged() -> None:
 # --- what is refused -------------------------------------------------------------------------------------------------
 
 
-@each_case("name", ["collision_s", "stall_s", "disagreement", "disagreement_s", "patience_s", "hold_s"])
-@each_case("value", [0, -1.0, math.inf, math.nan])
-def test_times_and_shares_are_positive(name: str, value: float) -> None:
-    with pytest.raises(ConfigError, match=rf"brain\.{name} is .*must be positive"):
-        config(**{name: value})
+def test_times_and_shares_are_positive() -> None:
+    for name in ("collision_s", "stall_s", "disagreement", "disagreement_s", "patience_s", "hold_s"):
+        for value in (0, -1.0, math.inf, math.nan):
+            with pytest.raises(ConfigError, match=rf"brain\.{name} is .*must be positive"):
+                config(**{name: value})
 
 
 def test_what_does_not_fit_together_is_refused() -> None:
@@ -193,8 +192,8 @@ def test_a_base_that_drives_at_a_wall_is_about_to_collide_and_one_that_stands_or
     seen = base()
     seen.state[0, 2] = 0.15  # straight ahead, 0.08 m before the robot's front
     for speed, turn, expected in [(0.22, 0.0, True), (0.0, 0.0, False), (-0.1, 0.0, False), (0.05, 0.0, False)]:
-        assert watch.look(seen, np.array([[speed, turn]]), None).tolist() == [expected], (speed, turn)
-    assert not watch.look(base(), np.array([[0.22, 0.0]]), None).any()
+        assert watch.check(seen, np.array([[speed, turn]]), None).tolist() == [expected], (speed, turn)
+    assert not watch.check(base(), np.array([[0.22, 0.0]]), None).any()
 
 
 def test_an_arm_that_falls_to_the_table_is_about_to_collide_and_one_that_rises_is_not() -> None:
@@ -202,30 +201,30 @@ def test_an_arm_that_falls_to_the_table_is_about_to_collide_and_one_that_rises_i
     down = np.zeros(7)
     down[1] = 1.0  # the shoulder leans forward
     low = HOME + np.array([0, 0.40, 0, 0, 0, 0, 0])
-    assert not watch.look(arm(HOME), HOME[None], None).any()
+    assert not watch.check(arm(HOME), HOME[None], None).any()
     # The same posture: what counts is where it can come to rest.
     fast, slow = 2.5 * down, 0.02 * down
-    assert watch.look(arm(low, fast), low[None] + 0.1 * down, None).all()
-    assert not watch.look(arm(low, slow), low[None] + 0.0008 * down, None).any()
-    assert not watch.look(arm(low, -fast), low[None] - 0.1 * down, None).any()
+    assert watch.check(arm(low, fast), low[None] + 0.1 * down, None).all()
+    assert not watch.check(arm(low, slow), low[None] + 0.0008 * down, None).any()
+    assert not watch.check(arm(low, -fast), low[None] - 0.1 * down, None).any()
 
 
 @pytest.mark.parametrize(("speed", "stalls"), [(0.0, True), (0.005, True), (0.2, False)])
 def test_a_base_that_gets_nowhere_stalls(speed: float, stalls: bool) -> None:
     watch = StallWatch(20, BASE, 10)
     watch.restart(np.arange(1), 1)
-    looks = [bool(watch.look(base(speed=speed), np.zeros((1, 2)), None)[0]) for _ in range(30)]
+    looks = [bool(watch.check(base(speed=speed), np.zeros((1, 2)), None)[0]) for _ in range(30)]
     assert not any(looks[:20])
     assert looks[20] == stalls
     watch.restart(np.arange(1), 1)
-    assert not watch.look(base(speed=speed), np.zeros((1, 2)), None)[0]
+    assert not watch.check(base(speed=speed), np.zeros((1, 2)), None)[0]
 
 
 def test_an_arm_that_turns_one_joint_does_not_stall() -> None:
     watch = StallWatch(10, ARM, 25)
     for turning, stalls in [(0.02, False), (0.0, True)]:
         watch.restart(np.arange(1), 1)
-        looks = [watch.look(arm(HOME + turning * k), HOME[None], None)[0] for k in range(12)]
+        looks = [watch.check(arm(HOME + turning * k), HOME[None], None)[0] for k in range(12)]
         assert bool(looks[-1]) == stalls
 
 
@@ -235,7 +234,7 @@ def test_disagreement_counts_only_if_it_lasts() -> None:
     wide = 2 * 2.84 * 0.3  # rad/s, 0.3 of the range of the yaw rate
     looks = []
     for turn in (wide, wide, 0.0, wide, wide, wide, wide):
-        looks.append(bool(watch.look(base(), np.zeros((1, 2)), np.array([[0.0, turn]]))[0]))
+        looks.append(bool(watch.check(base(), np.zeros((1, 2)), np.array([[0.0, turn]]))[0]))
     assert looks == [False, False, False, False, False, True, True]
 
 

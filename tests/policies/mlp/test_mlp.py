@@ -248,7 +248,7 @@ def test_cameras_are_left_alone() -> None:
         ({"n_obs_steps": 3, "obs_stride": 4, "chunk_size": 1}, [-8, -4, 0], [0]),
     ],
 )
-def test_which_frames_it_asks_the_dataset_for(options: Any, observations: Any, actions: Any) -> None:
+def test_which_frames_it_needs(options: Any, observations: Any, actions: Any) -> None:
     made = config(**options)
     assert made.observation_delta_indices == observations
     assert made.action_delta_indices == actions
@@ -266,7 +266,7 @@ def test_the_loss_is_what_its_name_says_and_leaves_padding_out(loss: str) -> Non
     given["action_is_pad"][3, 3] = True
     with torch.no_grad():
         error = policy.predict_action_chunk(given) - given[ACTION]
-        value, told = policy(given)
+        value, outputs = policy(given)
         each, _ = policy(given, reduction="none")
     wanted = {
         "l1": error.abs(),
@@ -276,7 +276,7 @@ def test_the_loss_is_what_its_name_says_and_leaves_padding_out(loss: str) -> Non
     }[loss]
     keep = ~given["action_is_pad"]
     assert float(value) == pytest.approx(float(wanted[keep].mean()), rel=1e-5)
-    assert told["l1_loss"] == pytest.approx(float(error[keep].abs().mean()), rel=1e-5)
+    assert outputs["l1_loss"] == pytest.approx(float(error[keep].abs().mean()), rel=1e-5)
     rows = torch.stack([wanted[i][keep[i]].mean() for i in range(5)])
     assert torch.allclose(each, rows, rtol=1e-5)
     given[ACTION][~keep] = 1e6
@@ -301,7 +301,7 @@ def test_it_learns_a_function_and_how_much_it_scatters() -> None:
         policy.train()
         state = torch.randn(128, 10, generator=torch.Generator().manual_seed(step))
         action = state[:, :2].sin() + noise * torch.randn(128, 2, generator=torch.Generator().manual_seed(1000 + step))
-        loss, told = policy({OBS_STATE: state, ACTION: action.unsqueeze(1)})
+        loss, outputs = policy({OBS_STATE: state, ACTION: action.unsqueeze(1)})
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -310,7 +310,7 @@ def test_it_learns_a_function_and_how_much_it_scatters() -> None:
     assert float(error.abs().mean()) < 0.15
     assert policy.log_std is not None
     assert policy.log_std.detach().exp()[0] == pytest.approx(noise.numpy(), abs=0.2)
-    assert told["std"] == pytest.approx(float(policy.log_std.detach().exp().mean()), abs=0.05)
+    assert outputs["std"] == pytest.approx(float(policy.log_std.detach().exp().mean()), abs=0.05)
 
 
 def test_biases_and_deviations_do_not_decay() -> None:
@@ -329,24 +329,24 @@ def test_biases_and_deviations_do_not_decay() -> None:
 def test_frame_by_frame_it_acts_as_on_the_rows_of_a_dataset(options: Any) -> None:
     made = config(**options)
     policy = MlpPolicy(made)
-    states, told = torch.randn(9, 2, 10), torch.randn(9, 2, 3)
-    rows_seen = [{OBS_STATE: state, OBS_ENV_STATE: one} for state, one in zip(states, told, strict=True)]
+    states, tasks = torch.randn(9, 2, 10), torch.randn(9, 2, 3)
+    rows_seen = [{OBS_STATE: state, OBS_ENV_STATE: one} for state, one in zip(states, tasks, strict=True)]
     chosen = torch.stack([policy.select_action(row) for row in rows_seen])
     for frame in range(9):
-        looked = frame - frame % made.n_action_steps
-        rows = [max(0, looked + delta) for delta in made.observation_delta_indices or [0]]
-        given = {OBS_STATE: states[rows].transpose(0, 1), OBS_ENV_STATE: told[rows].transpose(0, 1)}
-        assert torch.allclose(chosen[frame], policy.predict_action_chunk(given)[:, frame - looked], atol=1e-6)
+        start = frame - frame % made.n_action_steps
+        rows = [max(0, start + delta) for delta in made.observation_delta_indices or [0]]
+        given = {OBS_STATE: states[rows].transpose(0, 1), OBS_ENV_STATE: tasks[rows].transpose(0, 1)}
+        assert torch.allclose(chosen[frame], policy.predict_action_chunk(given)[:, frame - start], atol=1e-6)
 
 
 def test_reset_forgets_the_history_and_the_plan() -> None:
     made = config(n_obs_steps=2, n_action_steps=4)
     policy, one, two = MlpPolicy(made), torch.randn(1, 10), torch.randn(1, 10)
-    told = torch.zeros(1, 3)
-    first = policy.select_action({OBS_STATE: one, OBS_ENV_STATE: told})
-    policy.select_action({OBS_STATE: two, OBS_ENV_STATE: told})
+    task = torch.zeros(1, 3)
+    first = policy.select_action({OBS_STATE: one, OBS_ENV_STATE: task})
+    policy.select_action({OBS_STATE: two, OBS_ENV_STATE: task})
     policy.reset()
-    assert torch.equal(first, policy.select_action({OBS_STATE: one, OBS_ENV_STATE: told}))
+    assert torch.equal(first, policy.select_action({OBS_STATE: one, OBS_ENV_STATE: task}))
 
 
 def test_samples_scatter_as_the_deviation_says() -> None:
@@ -365,44 +365,8 @@ def test_samples_scatter_as_the_deviation_says() -> None:
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_layers_go_out_and_in_exactly(activation: str) -> None:
-    made = config(hidden_dims=[16, 8], activation=activation, gaussian=True)
-    policy, given = MlpPolicy(made), batch(made)
-    log_std = torch.tensor([-1.0, -2.0])
-    other = config(hidden_dims=[16, 8], activation=activation, gaussian=True)
-    again = MlpPolicy.from_layers(other, policy.layers(), log_std)
-    assert torch.equal(policy.predict_action_chunk(given), again.predict_action_chunk(given))
-    assert again.log_std is not None
-    assert torch.equal(again.log_std.detach(), log_std.expand(4, 2))
-
-
-def test_an_actor_of_stable_baselines_runs_here_unchanged() -> None:
-    gymnasium = pytest.importorskip("gymnasium")
-    policies = pytest.importorskip("stable_baselines3.common.policies")
-    box = gymnasium.spaces.Box(-np.inf, np.inf, (10,), np.float32)
-    hand = gymnasium.spaces.Box(-np.ones(2, np.float32), np.ones(2, np.float32))
-    torch.manual_seed(0)
-    actor = policies.ActorCriticPolicy(box, hand, lambda _: 1e-3, net_arch=[32, 16], activation_fn=nn.Tanh)
-    linear = [m for m in actor.mlp_extractor.policy_net if isinstance(m, nn.Linear)] + [actor.action_net]
-    made = config(0, hidden_dims=[32, 16], activation="tanh", chunk_size=1, gaussian=True, feature_clip=None)
-    policy = MlpPolicy.from_layers(made, [(m.weight, m.bias) for m in linear], actor.log_std)
-    seen = torch.randn(20, 10)
-    with torch.no_grad():
-        wanted = actor.get_distribution(seen).distribution
-    assert torch.equal(policy.predict_action_chunk({OBS_STATE: seen})[:, 0], wanted.mean)
-    assert torch.equal(policy._std()[0], wanted.stddev[0])
-
-
-def test_layers_of_another_shape_are_refused() -> None:
-    policy = MlpPolicy(config(hidden_dims=[16]))
-    with pytest.raises(ConfigError, match=r"\(16, 13\).*needs \[\(8, 13\), \(8, 8\)\]"):
-        MlpPolicy.from_layers(config(hidden_dims=[8]), policy.layers())
-    with pytest.raises(ConfigError, match="give log_std"):
-        MlpPolicy.from_layers(config(gaussian=True), policy.layers())
-
-
-def test_it_is_saved_and_loaded_as_a_lerobot_policy(tmp_path: Path) -> None:
-    made = config(scan=ScanConfig(transform="log", channels=[3]), gaussian=True, n_obs_steps=2)
+def test_it_is_saved_and_loaded_as_a_lerobot_policy(tmp_path: Path, activation: str) -> None:
+    made = config(scan=ScanConfig(transform="log", channels=[3]), gaussian=True, n_obs_steps=2, activation=activation)
     policy, given = MlpPolicy(made), batch(made)
     policy.save_pretrained(tmp_path)
     loaded = PreTrainedConfig.from_pretrained(tmp_path)

@@ -15,7 +15,7 @@ from bhd_lerobot.policies.mlp.yaw_mlp import OBS_YAW
 from bhd_lerobot.training.rl.config import parse_rl
 from bhd_lerobot.training.rl.parts import seeing_all
 
-WIDTH, BEAMS, TOLD = 14, 8, 9  # two numbers, the beams, four more numbers; what the task tells
+WIDTH, BEAMS, TASK = 14, 8, 9  # two numbers, the beams, four more numbers; the environment state
 IGNORED = [0, 11, 13]
 CASES = {
     "beams as numbers": {},
@@ -37,7 +37,7 @@ def policy(**values: object) -> MlpPolicy:
     config = MlpConfig(device="cpu", push_to_hub=False, ignore=["?"], ignored_columns=IGNORED, **options)  # type: ignore[arg-type]
     config.input_features = {
         "observation.state": PolicyFeature(FeatureType.STATE, (WIDTH,)),
-        "observation.environment_state": PolicyFeature(FeatureType.ENV, (TOLD,)),
+        "observation.environment_state": PolicyFeature(FeatureType.ENV, (TASK,)),
     }
     config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
     return MlpPolicy(config)
@@ -48,7 +48,7 @@ def batch(one: MlpPolicy, seed: int = 0) -> dict[str, Tensor]:
     steps = one.config.n_obs_steps
     rows = {
         "observation.state": torch.randn(5, steps, WIDTH, generator=draw),
-        "observation.environment_state": torch.randn(5, steps, TOLD, generator=draw),
+        "observation.environment_state": torch.randn(5, steps, TASK, generator=draw),
     }
     if one.config.scan.is_used:
         rows[OBS_SCAN] = torch.rand(5, steps, BEAMS, generator=draw) + 0.2

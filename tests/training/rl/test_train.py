@@ -228,33 +228,13 @@ def test_a_checkpoint_that_is_exported_without_training_does_the_same(finished: 
     np.testing.assert_array_equal(actions(tmp_path, states), actions(finished.checkpoint, states))
 
 
-def test_while_the_critic_warms_up_the_actor_stays_and_the_anchor_keeps_it_near(
-    finished: RlResult, tmp_path: Path
-) -> None:
-    assert finished.checkpoint is not None
-    start = finished.checkpoint
-    frozen = run(tmp_path / "frozen", start_from=start, critic_warmup=96)
+def test_the_actor_is_frozen_while_the_critic_warms_up(finished: RlResult, tmp_path: Path) -> None:
+    frozen = run(tmp_path / "frozen", start_from=finished.checkpoint, critic_warmup=96)
     assert frozen.checkpoint is not None
     assert weights(frozen.checkpoint) == weights(frozen.output_dir / "checkpoints" / "000000000")
 
-    def moved(name: str, coef: float) -> float:
-        result = run(
-            tmp_path / name,
-            start_from=start,
-            ppo__lr=0.01,
-            anchor__coef=coef,
-            anchor__batch_size=4,
-            anchor__decay=False,
-        )
-        states = np.random.default_rng(0).uniform(0.1, 3.0, (3, 4, 38)).astype(np.float32)
-        return float(np.abs(actions(result.output_dir, states) - actions(start, states)).mean())
 
-    free = moved("free", 0.0)
-    assert free > 1e-3
-    assert moved("kept", 100.0) < free
-
-
-def test_ctrl_c_saves_and_tells_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_ctrl_c_saves_and_prints_the_resume_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     step = RlVecEnv.step_wait
     count = []
 
@@ -299,7 +279,7 @@ WRONG: list[tuple[dict[str, object], str]] = [
     ({"ppo.target_kl": -1}, "ppo.target_kl is -1"),
     ({"reward.frame": ".nan"}, "reward.frame is nan"),
     ({"reward.events": "{collision: .inf}"}, "reward.events.collision is inf"),
-    ({"anchor.coef": ".nan"}, "anchor.coef is nan"),
+    ({"anchor.coef": 1}, "Unknown option 'anchor"),
     ({"policy.critic_dims": [0]}, "policy.critic_dims is 0"),
     ({"policy.activation": "gelul"}, "Did you mean 'gelu'"),
     ({"policy.n_obs_steps": 0}, "policy.n_obs_steps is 0"),
@@ -367,7 +347,7 @@ def test_the_shipped_configurations_are_valid(name: str) -> None:
     assert config.max_minutes <= 20
 
 
-def test_bhd_train_hands_over_what_names_an_algorithm(tmp_path: Path, capsys) -> None:
+def test_bhd_train_with_an_algorithm_runs_reinforcement_learning(tmp_path: Path, capsys) -> None:
     from bhd_lerobot.cli.train import main as bhd_train
 
     assert bhd_train(options(tmp_path / "run", steps=0)) == 2
@@ -376,20 +356,14 @@ def test_bhd_train_hands_over_what_names_an_algorithm(tmp_path: Path, capsys) ->
     assert (tmp_path / "run/checkpoints/last/pretrained_model/config.json").is_file()
 
 
-def test_a_later_action_of_the_checkpoints_chunk_may_become_the_actors(tmp_path: Path) -> None:
+def test_the_first_action_of_the_checkpoints_chunk_becomes_the_actors() -> None:
     policy = MlpPolicy(mlp(chunk_size=4))
-    first, third = single_action(policy), single_action(policy, 2)
+    actor = single_action(policy)
     batch = {"observation.state": torch.linspace(-1, 1, 10).reshape(2, 5)}
     chunk = policy.predict_action_chunk(batch)
-    for actor, index in ((first, 0), (third, 2)):
-        torch.testing.assert_close(actor.predict_action_chunk(batch)[:, 0], chunk[:, index], rtol=0, atol=1e-6)
-        assert actor.config.chunk_size == 1
-        assert actor.log_std is not None
-
-
-def test_an_action_beyond_the_chunk_is_refused(finished: RlResult, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"start_action is 3; the policy .* predicts 1: 0 to 0"):
-        run(tmp_path / "run", start_from=finished.checkpoint, start_action=3)
+    torch.testing.assert_close(actor.predict_action_chunk(batch)[:, 0], chunk[:, 0], rtol=0, atol=1e-6)
+    assert actor.config.chunk_size == 1
+    assert actor.log_std is not None
 
 
 def mlp(**values: object) -> MlpConfig:
@@ -409,7 +383,7 @@ def test_a_run_that_fails_before_it_began_leaves_nothing(tmp_path: Path, capsys)
             run(folder)
 
 
-def test_weights_that_are_no_numbers_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_that_are_not_finite_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(learner, steps, updated, is_over) -> None:
         for one in learner.policy.parameters():
             one.data.fill_(float("nan"))
