@@ -17,8 +17,7 @@ import av  # noqa: F401
 import pandas as pd  # noqa: F401
 import pyarrow.dataset  # noqa: F401
 
-from bhd_lerobot.datasets.edit import edits, mark
-from bhd_lerobot.datasets.recovery import repair
+from bhd_lerobot.datasets.edit import edits
 from bhd_lerobot.datasets.storage import disk
 from tests.datasets import support
 
@@ -32,16 +31,8 @@ def edit(job: dict[str, Any]) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
     disk._before_step = before_step
-    roots = [Path(root) for root in job["roots"]]
-    if job["edit"] == "delete":
-        edits.delete(roots[0], job["episodes"])
-    elif job["edit"] == "merge":
-        edits.merge(roots[1:], roots[0])
-    elif job["edit"] == "mark":
-        mark.mark(roots[0], job["episodes"], outcome=job["outcome"])
-    else:
-        assert job["edit"] == "repair"
-        repair.repair(roots[0])
+    assert job["edit"] == "delete"
+    edits.delete(Path(job["roots"][0]), job["episodes"])
 
 
 def run(job: dict[str, Any]) -> None:

@@ -303,7 +303,7 @@ def _fill(
     """Write a new dataset into a folder."""
     identities = [pick.source.identity for pick in picks]
     identity = None
-    if identities and all(one is not None for one in identities):
+    if identities and all(identity is not None for identity in identities):
         # Another program's dataset among them: then the whole was not recorded by this one.
         video = (identities[0] or {}).get("video", {})
         identity = {"format": FORMAT, "recording": {**recording, "edited": dict(edit)}, "video": video}
@@ -325,7 +325,9 @@ def _edited(state: DatasetState, edit: Mapping[str, Any]) -> dict[str, Any] | No
 def _common(recordings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return what all recordings share."""
     return {
-        name: value for name, value in recordings[0].items() if all(one.get(name) == value for one in recordings[1:])
+        name: value
+        for name, value in recordings[0].items()
+        if all(recording.get(name) == value for recording in recordings[1:])
     }
 
 

@@ -42,7 +42,7 @@ def lost_cameras(root: Path, info: Mapping[str, Any]) -> list[str]:
     """Return the cameras of which there is no video and no image."""
     if any(root.glob("tmp*")):  # videos that are being made, which do not say whose they are
         return []
-    keys = [key for key, one in info["features"].items() if one["dtype"] == "video"]
+    keys = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
     return [key for key in keys if not (root / "videos" / key).is_dir() and not (root / "images" / key).is_dir()]
 
 
@@ -91,7 +91,7 @@ def _difference(info: Mapping[str, Any], sizes: Mapping[str, int | None], comple
     """
     features = {**DEFAULT_FEATURES, **info["features"]}
     unlisted = ("video",) if complete else _NO_STATISTICS
-    wanted = {key for key, one in features.items() if one["dtype"] not in unlisted}
+    wanted = {key for key, feature in features.items() if feature["dtype"] not in unlisted}
     if not sizes:
         return ""
     lacks, more = sorted(sizes.keys() - features.keys()), sorted(wanted - sizes.keys())

@@ -43,20 +43,20 @@ def fix(root: Path | str, findings: Sequence[Finding]) -> list[str]:
         DatasetWriteError: the disk refuses; the dataset is as it was.
     """
     root = Path(root)
-    wanted = [one for one in findings if is_fixable(one)]
+    wanted = [finding for finding in findings if is_fixable(finding)]
     remove_abandoned(real(root))
     if has_unfinished_episodes(root):
         return []  # an interrupted recording, which is for `repair`
-    if not wanted or any(one.severity is Severity.ERROR and not is_fixable(one) for one in findings):
+    if not wanted or any(finding.severity is Severity.ERROR and not is_fixable(finding) for finding in findings):
         return []
     disk = Disk()
     lock = RootLock(root)
     done: list[str] = []
     try:
         with write_errors("repair the dataset", root, "It is as it was."):
-            if any(one.check == "counts" for one in wanted):
+            if any(finding.check == "counts" for finding in wanted):
                 done.append(_count_frames(root, disk))
-            if any(one.check == "stats" for one in wanted):
+            if any(finding.check == "stats" for finding in wanted):
                 done.append(compute_stats(load_state(root), disk, lock))
             disk.remove_tree(root / layout.STAGING)
     finally:

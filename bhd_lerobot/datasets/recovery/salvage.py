@@ -76,13 +76,13 @@ class RepairReport:
         lines += [f"  completed: {item}" for item in self.completed]
         lines += [f"  dropped: {item}" for item in self.dropped]
         lines += [f"  lost: {item}" for item in self.lost or ("nothing",) * (self.aside is not None)]
-        lines += [f"  note: {one}" for one in self.findings if one.severity is Severity.NOTE]
+        lines += [f"  note: {finding}" for finding in self.findings if finding.severity is Severity.NOTE]
         lines += [f"  the damaged files are in {self.aside}"] if self.aside is not None else []
         return "\n".join(lines if self else [*lines, "  nothing to do"])
 
 
 def _losses(findings: Iterable[Finding]) -> tuple[str, ...]:
-    return tuple(str(one) for one in findings if one.severity is Severity.ERROR)
+    return tuple(str(finding) for finding in findings if finding.severity is Severity.ERROR)
 
 
 def salvage(root: Path, disk: Disk, lock: RootLock, wrong: str, *, is_ours: bool = False) -> RepairReport:
@@ -172,7 +172,7 @@ def _nothing_left(root: Path, info: dict[str, Any], wrong: str, findings: Findin
     if cameras := lost_cameras(root, info):
         what = f"it describes {few(cameras)}, of which there is no video and no image. If it is another recording's: "
         findings.error("video", layout.INFO, what + repair_with_info(root))
-    reasons = "".join(f"\n  {one}" for one in findings)
+    reasons = "".join(f"\n  {finding}" for finding in findings)
     return DatasetCorruptError(
         f"{wrong}. No whole episode of {root} can be recovered; nothing was changed. Restore this file from a copy (or "
         f"from the Hub).{reasons}"

@@ -479,14 +479,14 @@ def uninterrupted() -> Iterator[None]:
     def wait(number: int, frame: FrameType | None) -> None:
         waiting.append(number)
 
-    for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(one) is not None:  # None: installed by C code, which cannot be restored
-            former[one] = signal.signal(one, wait)
+    for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(signum) is not None:  # None: installed by C code, which cannot be restored
+            former[signum] = signal.signal(signum, wait)
     try:
         yield
     finally:
-        for one, handler in former.items():
-            signal.signal(one, handler)
+        for signum, handler in former.items():
+            signal.signal(signum, handler)
     for number in waiting[:1]:  # an error ends the command anyway, with a better message
         signal.raise_signal(number)
 

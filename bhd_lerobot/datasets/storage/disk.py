@@ -97,20 +97,20 @@ class Disk:
         self.write(part, content)
         self.move(part, path)
 
-    def swap(self, one: Path, other: Path) -> None:
-        """Exchange the names of two folders, in one step.
+    def swap(self, first: Path, second: Path) -> None:
+        """Swap two folders atomically.
 
         Raises:
             OSError: this kernel or file system cannot do that, among others.
         """
-        _before_step("swap", other)
+        _before_step("swap", second)
         function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
         if function is None:
-            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS), str(other))
-        if function(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) != 0:
+            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS), str(second))
+        if function(_AT_FDCWD, os.fsencode(first), _AT_FDCWD, os.fsencode(second), _RENAME_EXCHANGE) != 0:
             number = ctypes.get_errno()
-            raise OSError(number, os.strerror(number), str(one), None, str(other))
-        for folder in {one.parent, other.parent}:
+            raise OSError(number, os.strerror(number), str(first), None, str(second))
+        for folder in {first.parent, second.parent}:
             self._flush_folder(folder)
 
     def link(self, source: Path, target: Path) -> None:

@@ -70,7 +70,7 @@ def _draw_all_series(report: TimingReport, panels: dict[str, Axes]) -> None:
     for key, axes in panels.items():
         label, limit = _SERIES[key]
         _draw_series(axes, columns[key], late, label=label, limit=tolerated.get(limit))
-    ends = np.cumsum([len(one.columns[keys.TIME]) for one in report.episodes])
+    ends = np.cumsum([len(episode.columns[keys.TIME]) for episode in report.episodes])
     if len(ends) <= _FEW:  # every other episode is shaded; narrower stripes are no help
         for start, end in zip(ends[:-1:2], ends[1::2], strict=False):
             for axes in panels.values():

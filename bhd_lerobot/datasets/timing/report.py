@@ -74,7 +74,7 @@ class TimingReport:
     @property
     def simulated(self) -> bool:
         """Whether no episode was recorded on the wall clock."""
-        return all(one.summary.clock == "lockstep" for one in self.episodes)
+        return all(episode.summary.clock == "lockstep" for episode in self.episodes)
 
     @cached_property
     def total(self) -> EpisodeTiming:
@@ -83,15 +83,15 @@ class TimingReport:
         Counts are sums, maxima maxima. The quantiles of ticks are those of the worst episode, an upper bound of what
         they are over all; the rate error is the largest one. Ages, intervals and inference times are exact.
         """
-        parts = [one.summary for one in self.episodes]
+        parts = [episode.summary for episode in self.episodes]
 
         def summed(name: str) -> Any:
-            return sum(getattr(one, name) for one in parts)
+            return sum(getattr(part, name) for part in parts)
 
         def worst(name: str) -> Any:
-            return max(getattr(one, name) for one in parts)
+            return max(getattr(part, name) for part in parts)
 
-        columns = {key: np.concatenate([one.columns[key] for one in self.episodes]) for key in _COLUMNS}
+        columns = {key: np.concatenate([episode.columns[key] for episode in self.episodes]) for key in _COLUMNS}
         inference = quantiles(columns[keys.INFERENCE_TIME])
         summary = replace(
             parts[0],
@@ -102,20 +102,20 @@ class TimingReport:
             inference_p99=inference["p99"],
             inference_max=inference["max"],
             elapsed=summed("elapsed"),
-            rate_error=max((one.rate_error for one in parts), key=abs),
+            rate_error=max((part.rate_error for part in parts), key=abs),
             clock="lockstep" if self.simulated else "realtime",
-            tolerated=parts[0].tolerated if all(one.tolerated == parts[0].tolerated for one in parts) else {},
+            tolerated=parts[0].tolerated if all(part.tolerated == parts[0].tolerated for part in parts) else {},
         )
-        return EpisodeTiming("all", summary, columns, np.concatenate([one.intervals for one in self.episodes]))
+        return EpisodeTiming("all", summary, columns, np.concatenate([episode.intervals for episode in self.episodes]))
 
     @property
     def grants(self) -> list[tuple[str, tuple[dict[str, Any], ...]]]:
         """What was requested from the operating system and granted, with the episodes of each."""
         found: dict[str, list[EpisodeTiming]] = {}
-        for one in self.episodes:
-            if one.grants:
-                found.setdefault(json.dumps(one.grants, sort_keys=True), []).append(one)
-        return [(_ranges([int(one.name) for one in group]), group[0].grants) for group in found.values()]
+        for episode in self.episodes:
+            if episode.grants:
+                found.setdefault(json.dumps(episode.grants, sort_keys=True), []).append(episode)
+        return [(_ranges([int(episode.name) for episode in group]), group[0].grants) for group in found.values()]
 
     def values(self) -> dict[str, Any]:
         """Return everything but the columns as plain values, times in seconds."""
@@ -124,7 +124,7 @@ class TimingReport:
             "fps": self.fps,
             "clock": self.total.summary.clock,
             "all": self.total.values(),
-            "episodes": [{"index": int(one.name), **one.values()} for one in self.episodes],
+            "episodes": [{"index": int(episode.name), **episode.values()} for episode in self.episodes],
         }
 
 
@@ -155,7 +155,7 @@ def _grants_of(episode: EpisodeSummary) -> tuple[dict[str, Any], ...]:
     if not episode.metadata.get("realtime"):
         return ()
     grants = _stored(episode, "realtime")
-    if not isinstance(grants, list) or not all(isinstance(one, dict) and one.keys() >= _GRANT for one in grants):
+    if not isinstance(grants, list) or not all(isinstance(grant, dict) and grant.keys() >= _GRANT for grant in grants):
         raise DatasetError(f"bhd/realtime of episode {episode.index} is no list of grants: {grants!r:.200}.")
     return tuple(grants)
 

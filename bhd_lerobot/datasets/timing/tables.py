@@ -25,8 +25,8 @@ def print_timing(report: TimingReport, console: Console) -> None:
 
 def _overview(report: TimingReport) -> Table:
     total, summary = report.total, report.total.summary
-    one = len(report.episodes) == 1
-    what = f"episode {report.episodes[0].name}" if one else f"all {len(report.episodes)} episodes"
+    is_single = len(report.episodes) == 1
+    what = f"episode {report.episodes[0].name}" if is_single else f"all {len(report.episodes)} episodes"
     table = Table(title=f"{report.root}, {what}", title_justify="left", show_header=False)
     limits = summary.tolerated
 
@@ -41,7 +41,7 @@ def _overview(report: TimingReport) -> Table:
         table.add_row("control ticks", f"{summary.ticks}")
     else:
         table.add_row("clock", "realtime: wall clock")
-        worst = "" if one else ", in the worst episode"
+        worst = "" if is_single else ", in the worst episode"
         table.add_row("control ticks", f"{summary.ticks} run, {summary.skipped} skipped, {summary.overruns} overran")
         table.add_row("rate error", f"{ticks(summary.rate_error)} ticks in {summary.elapsed:.1f} s{worst}")
         table.add_row("tick lateness", f"{_three(summary, 'lateness', ', ')} ms{worst}{tolerated('lateness')}")
@@ -125,10 +125,10 @@ def _grants(of: str, grants: Sequence[dict[str, Any]]) -> Table:
     table = Table(title=f"What the control loop was granted, {of}", title_justify="left")
     for heading in ("what", "wanted", "granted", "detail, remedy"):
         table.add_column(heading)
-    for one in grants:
-        granted = one.get("granted", "")
-        cells = [one.get("name", ""), one.get("wanted", ""), "yes" if granted is True else granted or "no"]
-        cells.append("; ".join(str(one[key]) for key in ("detail", "remedy") if one.get(key)))
+    for grant in grants:
+        granted = grant.get("granted", "")
+        cells = [grant.get("name", ""), grant.get("wanted", ""), "yes" if granted is True else granted or "no"]
+        cells.append("; ".join(str(grant[key]) for key in ("detail", "remedy") if grant.get(key)))
         table.add_row(*(escape(str(cell)) for cell in cells))
     return table
 

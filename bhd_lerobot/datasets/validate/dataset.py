@@ -52,11 +52,11 @@ class DatasetCheck:
     @property
     def worst(self) -> Severity:
         """The worst finding's severity."""
-        return max((one.severity for one in self.findings), default=Severity.NOTE)
+        return max((finding.severity for finding in self.findings), default=Severity.NOTE)
 
     def count(self, severity: Severity) -> int:
         """Return how many findings are of a severity."""
-        return sum(one.severity == severity for one in self.findings)
+        return sum(finding.severity == severity for finding in self.findings)
 
 
 def check_dataset(

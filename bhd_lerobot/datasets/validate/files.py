@@ -72,7 +72,7 @@ class Files:
     @property
     def cameras(self) -> list[str]:
         """Features that are videos."""
-        return [key for key, one in self.features.items() if one.get("dtype") == "video"]
+        return [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
 
     def slots(self, kind: str) -> dict[layout.Slot, NDArray[np.int64]]:
         """Return the files of one kind, `data` or `videos/KEY`, each with the positions of its episodes."""
@@ -167,7 +167,7 @@ def _read_episodes(files: Files, findings: Findings) -> None:
         except UNREADABLE as error:
             findings.error("files", name, f"it cannot be read: {one_line(error)}", _COPY)
             continue
-        wanted = [*_LIGHT, *(f"videos/{key}/{one}" for key in files.cameras for one in _SLOT)]
+        wanted = [*_LIGHT, *(f"videos/{key}/{part}" for key in files.cameras for part in _SLOT)]
         missing = [column for column in wanted if column not in part or None in part[column]]
         if missing:
             findings.error("schema", name, f"it lacks {few(missing)}, or some of them", _COPY)
@@ -285,7 +285,7 @@ def _read_stats(files: Files, findings: Findings) -> None:
             continue
         stored = stats.get(key)
         known = files.stats[key] = _vectors(stored if isinstance(stored, dict) else {})
-        lacking = [one for one in _STATISTICS if one not in known]
+        lacking = [statistic for statistic in _STATISTICS if statistic not in known]
         report = findings.warning if key in UNREAD else findings.error
         if lacking:
             report("stats", f"{name}: {key}", f"it has no {few(lacking)}", remedy)

@@ -51,7 +51,7 @@ class Findings:
 
     def __iter__(self) -> Iterator[Finding]:
         """Iterate over the findings, the worst first, otherwise in the order in which they were added."""
-        return iter(sorted(self.items, key=lambda one: -one.severity))
+        return iter(sorted(self.items, key=lambda finding: -finding.severity))
 
     def error(self, check: str, where: str, what: str, remedy: str = "") -> None:
         """Add an error."""

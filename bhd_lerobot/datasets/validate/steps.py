@@ -98,7 +98,7 @@ def _add(
     episodes: Sequence[int],
 ) -> None:
     inside = np.searchsorted(starts, rows + 1, side="right") - 1
-    numbers = [episodes[one] for one in inside.tolist()]
+    numbers = [episodes[place] for place in inside.tolist()]
     known = kind.setdefault(what, _Steps(numbers[0], int(rows[0] + 1 - starts[inside[0]])))
     known.count += len(rows)
     known.episodes.update(numbers)

@@ -87,7 +87,9 @@ class ValueCheck:
 
     def _read(self, name: str) -> pa.Table | None:
         stored = [
-            key for key, one in self._files.features.items() if one.get("dtype") not in ("video", "image", "language")
+            key
+            for key, feature in self._files.features.items()
+            if feature.get("dtype") not in ("video", "image", "language")
         ]
         try:
             file = pq.ParquetFile(self._files.root / name, page_checksum_verification=True)
@@ -220,7 +222,7 @@ class ValueCheck:
 
     def _judge_columns(self) -> None:
         for key, places in self._broken.items():
-            count = sum(one for one, _ in places)
+            count = sum(frames for frames, _ in places)
             what = f"{count} frames hold numbers that are not finite; the first in {places[0][1]}"
             if key.startswith(("observation", "action")):
                 self._findings.error("finite", key, what, _LEAVE)
