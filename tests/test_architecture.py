@@ -41,7 +41,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "envs": ("tasks", "bodies", "sim", "robots.*"),
     "policies": _TASKS,
     "policies.mlp": ("control.geometry",),
-    "policies.learned": ("__version__", "policies", "policies.mlp"),
+    "policies.learned": ("__version__", "control", "policies", "policies.mlp"),
     "policies.navigation": ("bodies", "policies"),
     "policies.manipulation": (*_TASKS, "policies"),
     "policies.language": (*_TASKS, "policies", "policies.manipulation"),

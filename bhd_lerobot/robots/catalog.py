@@ -29,7 +29,7 @@ def make_simulation(config: Any, n: int = 1, threads: int | None = None) -> Simu
 
 
 def make_robot(config: Any, n: int = 1, threads: int | None = None) -> Simulation:
-    """Return n robots on the clock that the configuration asks for.
+    """Return n robots on the clock of the configuration.
 
     Raises:
         ConfigError: more than one on the wall clock.
