@@ -45,7 +45,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "rollout.configuration"),
     "policies": _TASKS,
     "policies.mlp": ("control.geometry",),
-    "policies.learned": ("__version__", "datasets.storage", "policies", "policies.mlp"),
+    "policies.learned": ("__version__", "control", "datasets.storage", "policies", "policies.mlp"),
     "policies.navigation": ("bodies", "policies"),
     "policies.manipulation": (*_TASKS, "policies"),
     "policies.language": (*_TASKS, "policies", "policies.manipulation"),

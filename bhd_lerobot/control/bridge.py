@@ -1,5 +1,6 @@
 """The bridge between brain and cerebellum, in lockstep with a simulated clock."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 import numpy as np
@@ -13,7 +14,31 @@ from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError
 
 
-class LockstepBridge:
+class ModeRequests(ABC):
+    """The changes of mode that a bridge can request."""
+
+    @abstractmethod
+    def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Request a change of mode of some simulations, of all if None; return what became of it."""
+
+    def configure(self, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Leave UNCONFIGURED: odometry starts here."""
+        return self.request(Request.CONFIGURE, ids)
+
+    def activate(self, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Leave INACTIVE: setpoints are accepted from now on."""
+        return self.request(Request.ACTIVATE, ids)
+
+    def deactivate(self, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Ramp to rest and refuse setpoints."""
+        return self.request(Request.DEACTIVATE, ids)
+
+    def reset(self, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Clear an emergency stop, a fault or a deactivation; motion needs `activate` afterwards."""
+        return self.request(Request.RESET, ids)
+
+
+class LockstepBridge(ModeRequests):
     """Runs the cerebellum on simulated time: a command is sent, then exactly one frame of ticks goes by.
 
     Nothing waits and nothing is late: the same commands give the same states, bit for bit.
@@ -142,21 +167,9 @@ class LockstepBridge:
         """Whether the emergency-stop word of any simulation is set, be it latched already or not."""
         return bool(np.any(self.cerebellum.estop_word))
 
-    def configure(self, ids: NDArray[np.intp] | None = None) -> SendResult:
-        """Leave UNCONFIGURED: odometry starts here."""
-        return self.cerebellum.request(Request.CONFIGURE, ids)
-
-    def activate(self, ids: NDArray[np.intp] | None = None) -> SendResult:
-        """Leave INACTIVE: setpoints are accepted from now on."""
-        return self.cerebellum.request(Request.ACTIVATE, ids)
-
-    def deactivate(self, ids: NDArray[np.intp] | None = None) -> SendResult:
-        """Ramp to rest and refuse setpoints."""
-        return self.cerebellum.request(Request.DEACTIVATE, ids)
-
-    def reset(self, ids: NDArray[np.intp] | None = None) -> SendResult:
-        """Clear an emergency stop, a fault or a deactivation; motion needs `activate` afterwards."""
-        return self.cerebellum.request(Request.RESET, ids)
+    def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Request a change of mode; it happens before the next tick or is refused with a reason."""
+        return self.cerebellum.request(request, ids)
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Start a new episode in simulations whose plant was put to a new initial state: configured and active."""

@@ -1,14 +1,12 @@
 """The cerebellum: turns commands into safe actuator commands, one tick at a time. It owns the modes."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.controller import Controller
-from bhd_lerobot.control.fifo import CommandFifo, StateRing
+from bhd_lerobot.control.fifo import CommandFifo
 from bhd_lerobot.control.messages import (
     NANOSECONDS,
     CerebellumState,
@@ -46,7 +44,6 @@ class Cerebellum:
         control_hz: ticks a second [Hz].
         controller: what turns commands into actuator commands.
         fifo: where commands come from; a new one if None.
-        ring: where every tick's state is published, of dtype `state_dtype(n)`; nowhere if None.
         estop_word: n 64-bit integers that any process may set to something else than 0; new memory if None.
 
     Attributes:
@@ -63,7 +60,6 @@ class Cerebellum:
         controller: Controller,
         *,
         fifo: CommandFifo | None = None,
-        ring: StateRing | None = None,
         estop_word: NDArray[np.int64] | None = None,
     ) -> None:
         self.body, self.plant, self.control_hz = body, plant, control_hz
@@ -73,7 +69,6 @@ class Cerebellum:
         self.command = self.controller.command
         self.fifo = CommandFifo(n, width) if fifo is None else fifo
         self.estop_word = np.zeros(n, np.int64) if estop_word is None else estop_word
-        self._ring = ring
         self.mode = np.full(n, Mode.UNCONFIGURED, np.int8)
         self.refusals = np.zeros((len(Reason), n), np.int64)
         self.reading = PlantReading(n, self.controller.joints)
@@ -117,12 +112,10 @@ class Cerebellum:
         self.plant.write(self.controller.actuators)
         self._last_position[:] = self.reading.position
         self.ticks += 1
-        if self._ring is not None:
-            self._publish(now_ns)
 
     def _supervise(self, now_ns: int) -> None:
-        """Emergency stop, plant faults and watchdogs: changes of mode that nobody asked for."""
-        # Every tick asks a few such questions: counting is several times cheaper than `any`.
+        """Emergency stop, plant faults and watchdogs: changes of mode that were not requested."""
+        # This runs several times a tick: counting is several times cheaper than `any`.
         if np.count_nonzero(self.estop_word):
             hit = (self.estop_word != 0) & (self.mode != Mode.ESTOP)
             if hit.any():
@@ -380,8 +373,8 @@ class Cerebellum:
         )
 
     @staticmethod
-    def state_dtype(n: int, joints: int = 2, width: int = 2, odometry: int = 3) -> np.dtype:
-        """Return the dtype of the states that go to the ring: the fields of `CerebellumState`."""
+    def state_dtype(n: int, joints: int, width: int, odometry: int) -> np.dtype:
+        """Return the dtype of published states: the fields of `CerebellumState`."""
         per_joint, per_command = (np.float64, (n, joints)), (np.float64, (n, width))
         return np.dtype(
             [
@@ -398,15 +391,6 @@ class Cerebellum:
             ],
             align=True,
         )
-
-    def _publish(self, now_ns: int) -> None:
-        state = self.state(now_ns)
-        odometry = state.odometry.shape[1]
-        record = np.zeros((), self.state_dtype(self.n, self.controller.joints, self.width, odometry))
-        for name in record.dtype.names or ():
-            record[name] = getattr(state, name)
-        ring: Any = self._ring
-        ring.publish(record)
 
     # --- modes -------------------------------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ class Controller(ABC):
     """Turns commands into actuator commands that respect every limit, for n robots.
 
     The cerebellum says where to head for and when to stop, and calls `run` once a tick. The arrays are the controller's
-    own, live, and nobody else's to write.
+    own and live; others only read them.
 
     Attributes:
         width: number of values in a command.
@@ -75,7 +75,7 @@ class Controller(ABC):
 
     @abstractmethod
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return what the servos are asked for [N m; N for a gripper], shape (n, joints)."""
+        """Return the commanded efforts of the servos [N m; N for a gripper], shape (n, joints)."""
 
     @property
     def following(self) -> NDArray[np.bool_]:
@@ -110,7 +110,7 @@ class Controller(ABC):
         return ResultCode.UNKNOWN_ID
 
     def take_results(self, sim: int) -> list[CommandResult]:
-        """Return the results of one robot that nobody has taken yet."""
+        """Return the results of one robot that were not taken yet."""
         return []
 
     def feedback(self, sim: int) -> Feedback | None:

@@ -18,7 +18,7 @@ SIGNALS = ("SIGUSR1", "SIGUSR2", "SIGQUIT")
 """Signals that may stand for an emergency stop: those that mean nothing else to a run."""
 KEYS = b" e"
 """Keys of the terminal that press: space and e."""
-POLL_S = 0.01  # [s] between two questions to a callable, unless another time is asked for
+POLL_S = 0.01  # [s] between two calls of a callable, by default
 _ROUND_S = 0.05  # [s] between two rounds of the thread: how often what stays pressed is pressed again
 _SILENCE_S = 1.0  # [s] a callable that has not answered for so long hangs
 
@@ -95,7 +95,7 @@ class EstopInputs:
         self._press_word = press
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._handlers: dict[int, Callable[[bytes], None]] = {}  # what is to be done with the bytes of each descriptor
+        self._handlers: dict[int, Callable[[bytes], None]] = {}  # what handles the bytes of each descriptor
         self._broken: list[str] = []  # inputs that can press no more, and therefore stay pressed
         self._silence: dict[str, int] = {}  # rounds of the thread that a callable may still be silent for
         self._signals: dict[signal.Signals, Any] = {}
@@ -112,10 +112,10 @@ class EstopInputs:
 
         Args:
             source: a file descriptor or an object with one: any byte presses, and so does its end or an error, a wire
-                that is cut. Or a callable, asked again and again: it presses when it returns something true, raises, or
+                that is cut. Or a callable, called once a period: it presses when it returns something true, raises, or
                 does not return for a second. Neither is closed here.
             name: what it is called in `causes`.
-            period_s: time between two questions to a callable [s].
+            period_s: time between two calls of a callable [s].
 
         Raises:
             ConfigError: it is neither, the descriptor is not open, or the period is not positive.
@@ -128,7 +128,7 @@ class EstopInputs:
         name = name if name not in self._silence else f"{name} ({len(self._silence)})"
         rounds = math.ceil((_SILENCE_S + period_s) / _ROUND_S)
         self._silence[name] = rounds
-        self._run_thread(f"bhd-estop {name}", self._ask, source, name, period_s, rounds)
+        self._run_thread(f"bhd-estop {name}", self._poll_callable, source, name, period_s, rounds)
         self._start()
 
     def add_key(self, descriptor: int | None = None) -> bool:
@@ -160,7 +160,7 @@ class EstopInputs:
             )
         if number in self._signals:
             return
-        # A handler runs when the main thread comes back to Python; the pipe tells the thread at once.
+        # A handler runs when the main thread comes back to Python; the pipe wakes the thread at once.
         if self._pipe is None:
             self._open_pipe()
         self._signals[number] = signal.signal(number, self._handle)
@@ -170,7 +170,7 @@ class EstopInputs:
         os.set_blocking(reader, False)
         os.set_blocking(writer, False)
         former = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-        if former != -1:  # somebody else's, an event loop's for example: the handler alone has to do
+        if former != -1:  # another library's, an event loop's for example: only the handler is used
             signal.set_wakeup_fd(former, warn_on_full_buffer=False)
             os.close(reader)
             os.close(writer)
@@ -190,27 +190,27 @@ class EstopInputs:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self._press(f"signal {signal.Signals(number).name}")
 
-    def _on_signals(self, said: bytes) -> None:
-        for number in said:
+    def _on_signals(self, received: bytes) -> None:
+        for number in received:
             if number in self._signals:
                 self._press(f"signal {signal.Signals(number).name}")
 
-    def _on_terminal_keys(self, said: bytes) -> None:
-        if any(key in said for key in KEYS):
+    def _on_terminal_keys(self, keys: bytes) -> None:
+        if any(key in keys for key in KEYS):
             self._press("key")
-        self._on_other_keys(bytes(key for key in said if key not in KEYS))
-        if not said and self._terminal is not None:  # it is gone; that is a SIGHUP, which ends a run
+        self._on_other_keys(bytes(key for key in keys if key not in KEYS))
+        if not keys and self._terminal is not None:  # it is gone; that is a SIGHUP, which ends a run
             self._poll.unregister(self._terminal.descriptor)
 
-    def _on_button(self, descriptor: int, name: str, said: bytes) -> None:
-        if said:
+    def _on_button(self, descriptor: int, name: str, received: bytes) -> None:
+        if received:
             self._press(name)
         else:
             self._poll.unregister(descriptor)
             self._broken.append(f"{name} is closed or broken")
 
-    def _ask(self, source: Callable[[], Any], name: str, period_s: float, rounds: int) -> None:
-        """Ask a callable; the work of its thread."""
+    def _poll_callable(self, source: Callable[[], Any], name: str, period_s: float, rounds: int) -> None:
+        """Call a callable again and again; the work of its thread."""
         while not self._stop.wait(period_s):
             try:
                 if source():
@@ -225,7 +225,7 @@ class EstopInputs:
         self._start()
 
     def _start(self) -> None:
-        """Start the thread, or tell it that there is more to wait for."""
+        """Start the thread, or wake it: there is one more input."""
         if "bhd-estop" not in [thread.name for thread in self._threads]:
             self._run_thread("bhd-estop", self._work)
         os.write(self._wake, b"\0")
@@ -255,12 +255,12 @@ class EstopInputs:
             self._stop.wait(_ROUND_S)  # to read now would stop the whole process: the keys are another's
             return
         try:
-            said = os.read(descriptor, 4096)
+            received = os.read(descriptor, 4096)
         except BlockingIOError:
             return
         except OSError:
-            said = b""
-        self._handlers[descriptor](said)
+            received = b""
+        self._handlers[descriptor](received)
 
     def _count_silence(self) -> None:
         for name in list(self._silence):
@@ -291,11 +291,9 @@ class EstopInputs:
                 os.close(descriptor)
 
     def __enter__(self) -> Self:
-        """Return itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close."""
         self.close()

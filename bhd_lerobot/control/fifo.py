@@ -40,7 +40,7 @@ class CommandFifo:
         entries = np.frombuffer(buffer, self._dtype(n, width), capacity, offset=16)
         self._sequence, self._due = entries["sequence"], entries["due_ns"]
         self._mask, self._values = entries["mask"], entries["values"]
-        # What the reader found out about the entries up to a head.
+        # The next entry, as of a head.
         self._seen_head = -1
         self._next: int | None = None
         self._next_due: int | None = None
@@ -90,7 +90,7 @@ class CommandFifo:
     def next_due(self) -> int | None:
         """Return when the next entry is due [ns], or None if nothing waits."""
         if int(self._head[0]) != self._seen_head:
-            self._look()
+            self._update()
         return self._next_due
 
     def pop(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> tuple[int, int] | None:
@@ -113,7 +113,7 @@ class CommandFifo:
             self._tail[0] = self._seen_head
             self._next, self._next_due = None, None
         else:
-            self._look()
+            self._update()
         return result
 
     def drop(self, ids: NDArray[np.intp]) -> NDArray[np.int64]:
@@ -123,7 +123,7 @@ class CommandFifo:
             slot = entry % self.capacity
             dropped += self._mask[slot, ids]
             self._mask[slot, ids] = False
-        self._look()
+        self._update()
         return dropped
 
     def drop_older(self, sequence: int, mask: NDArray[np.bool_]) -> None:
@@ -139,10 +139,10 @@ class CommandFifo:
         older = slots[self._sequence[slots] < sequence]
         if len(older):
             self._mask[np.ix_(older, np.flatnonzero(mask))] = False
-            self._look()
+            self._update()
 
-    def _look(self) -> None:
-        """Find the next entry, and give up the oldest entries that nobody waits for any more."""
+    def _update(self) -> None:
+        """Find the next entry, and release the oldest entries that are for no simulation any more."""
         tail, head = int(self._tail[0]), int(self._head[0])
         self._seen_head = head
         self._next, self._next_due = None, None
@@ -155,7 +155,7 @@ class CommandFifo:
             else:
                 self._tail[0] = head
             return
-        # All at once: a chunk of actions is a hundred entries, and this is asked within a tick.
+        # All at once: a chunk of actions is a hundred entries, and this runs within a tick.
         slots = np.arange(tail, head) % self.capacity
         waiting = np.flatnonzero(self._mask[slots].any(axis=1))
         if not len(waiting):
@@ -255,7 +255,7 @@ class RingReader:
         while (published := len(self._ring)) > self._next:
             number = self._next
             self._next += 1
-            # The writer may be about to overwrite the oldest: it is not worth a look.
+            # The writer may be about to overwrite the oldest, so it is skipped.
             oldest = published - self._ring.capacity + 1
             if number < oldest:
                 self.drops += oldest - number

@@ -1,4 +1,4 @@
-"""What brain, bridge and cerebellum say to each other.
+"""Messages between brain, bridge and cerebellum.
 
 Times are whole nanoseconds, so that a grid of ticks is exact and an age does not depend on how long a process has been
 running. Arrays carry the simulation axis first; a robot is n = 1.
@@ -94,7 +94,7 @@ class Limit(IntFlag):
     ACCELERATION = 4
     """Slowed to the acceleration limit."""
     EFFORT = 8
-    """The servo is asked for more than its largest effort: a wheel's command is clipped, an arm's servo saturates."""
+    """The commanded effort is above the servo's largest: a wheel's command is clipped, an arm's servo saturates."""
     POSITION = 16
     """Clipped to the range of the joint."""
 
@@ -168,7 +168,7 @@ class CerebellumState:
         stamp_ns: time of the tick [ns].
         joint_positions: joint or wheel angles [rad], a gripper's opening [m], shape (n, joints).
         joint_velocities: their speeds [rad/s, m/s], shape (n, joints).
-        joint_efforts: effort that the servos are asked for [N m, N], shape (n, joints).
+        joint_efforts: commanded effort of the servos [N m, N], shape (n, joints).
         command: the command applied, after all limits, shape (n, width).
         measured: where the robot really is in the space of the commands, shape (n, width).
         odometry: x [m], y [m] and yaw [rad] since the last reset, from the encoders, shape (n, 3); shape (n, 0) for a

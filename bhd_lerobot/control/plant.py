@@ -20,7 +20,7 @@ class PlantReading:
     """
 
     def __init__(self, n: int, joints: int) -> None:
-        # One block, so that a single sum tells whether every number in it is finite.
+        # One block, so that a single sum checks that every number in it is finite.
         self.values = np.zeros((2, n, joints))
         self.position: NDArray[np.float64] = self.values[0]
         self.velocity: NDArray[np.float64] = self.values[1]

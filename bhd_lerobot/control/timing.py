@@ -1,7 +1,7 @@
 """How punctual a loop is: histograms that cost no memory, overruns, quantiles. Pure: no clock in here.
 
 The numbers lie in one flat array of 64-bit integers, which may be shared memory: one process counts its ticks there and
-others read, without a lock. Every number is written in one piece; a reader that looks in the middle of a tick sees some
+others read, without a lock. Every number is written in one piece; a reader in the middle of a tick sees some
 numbers with it and some without it, never a broken one.
 """
 
@@ -22,13 +22,13 @@ Clock = Literal["lockstep", "realtime"]
 _EDGES_NS: list[int] = np.round(1_000 * 10 ** (np.arange(141) / 20)).astype(int).tolist()
 _BINS = len(_EDGES_NS) + 1
 
-# Where what stands in the array. Of the cells before _LATEST, two statistics are merged by adding them.
+# Layout of the array.
 _TICKS, _OVERRUNS, _SKIPPED, _INTERVALS, _ELAPSED = range(5)
 _LATENESS = 5
 _DURATION = _LATENESS + _BINS
 _LATEST = _DURATION + _BINS
 _LONGEST, _LAST_START, _PERIOD, _FORMAT, _CELLS = range(_LATEST + 1, _LATEST + 6)
-_FORMAT_1 = 0x7469_6D69_6E67_0001  # the last cell: whoever made this array meant this layout
+_FORMAT_1 = 0x7469_6D69_6E67_0001  # the last cell: version of this layout
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class TimingSummary:
         Raises:
             TypeError: a value without which there is no summary is missing.
         """
-        return cls(**{one.name: values[one.name] for one in fields(cls) if one.name in values})
+        return cls(**{own.name: values[own.name] for own in fields(cls) if own.name in values})
 
 
 class TimingStatistics:
@@ -182,40 +182,11 @@ class TimingStatistics:
         cells[_INTERVALS] += ticks
         cells[_ELAPSED] += ticks * self.period_ns
 
-    def merge(self, other: Self) -> None:
-        """Add the ticks of another loop, or of another segment of this one; the time between is not counted.
-
-        Raises:
-            ConfigError: it has another period.
-        """
-        if other.period_ns != self.period_ns:
-            raise ConfigError(f"The loops have different periods: {self.period_ns} ns and {other.period_ns} ns.")
-        mine, theirs = self._array(), other._array()
-        mine[:_LATEST] += theirs[:_LATEST]
-        mine[_LATEST : _LONGEST + 1] = np.maximum(mine[_LATEST : _LONGEST + 1], theirs[_LATEST : _LONGEST + 1])
-
     def copy(self) -> "TimingStatistics":
         """Return a copy in memory of its own."""
         copied = TimingStatistics(self.period_ns)
         copied._cells[:] = self._cells
         return copied
-
-    def since(self, earlier: "TimingStatistics") -> "TimingStatistics":
-        """Return what came after an earlier copy of these statistics.
-
-        Counts and quantiles are exact. A maximum that is not a new one is unknown; the upper edge of its bin takes its
-        place, at most 12 % too high.
-        """
-        result = self.copy()
-        new, old = result._array(), earlier._array()
-        new[:_LATEST] -= old[:_LATEST]
-        for maximum, start in ((_LATEST, _LATENESS), (_LONGEST, _DURATION)):
-            used = np.flatnonzero(new[start : start + _BINS])
-            if len(used) == 0:
-                new[maximum] = 0
-            elif new[maximum] == old[maximum] and used[-1] < len(_EDGES_NS):
-                new[maximum] = min(_EDGES_NS[used[-1]], int(new[maximum]))
-        return result
 
     @property
     def ticks(self) -> int:

@@ -39,11 +39,6 @@ class TimingTolerance:
     reject: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
         for name in ("max_lateness_s", "max_age_s", "max_jitter_s"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:

@@ -138,7 +138,7 @@ class LiveBlock:
 
     @classmethod
     def watch(cls, name: str) -> Self:
-        """Open the block of a running robot to look at it; nothing in it can be written but by `set_estop`.
+        """Open the block of a running robot to read it; nothing in it can be written but by `set_estop`.
 
         Raises:
             RealtimeError: there is none.

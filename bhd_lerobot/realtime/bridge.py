@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Rates
+from bhd_lerobot.control.bridge import ModeRequests
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.messages import (
     NANOSECONDS,
@@ -24,7 +25,7 @@ from bhd_lerobot.realtime.block import LiveBlock, Word
 from bhd_lerobot.realtime.requests import RequestClient
 
 
-class LiveBridge:
+class LiveBridge(ModeRequests):
     """Sends commands to a cerebellum that ticks in another process, and reads what it publishes.
 
     Sending never waits. What the cerebellum finds out later (a command that became stale, a mode that changed) it
@@ -33,7 +34,7 @@ class LiveBridge:
     Args:
         block: what both processes share.
         rates: the rates.
-        client: asks for modes and goals.
+        client: sends requests for modes and goals.
         wait: waits for about a tick, and raises if there is nothing to wait for any more.
         clock: monotonic time [ns].
     """
@@ -185,23 +186,12 @@ class LiveBridge:
         """Whether the emergency-stop word is set, be it latched already or not."""
         return bool(self._block.words[Word.ESTOP])
 
-    def configure(self, ids: NDArray[np.intp] | None = None) -> SendResult:
-        """Leave UNCONFIGURED: odometry starts here."""
-        return self._ask(Request.CONFIGURE)
+    def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
+        """Request a change of mode, and wait until it is published.
 
-    def activate(self, ids: NDArray[np.intp] | None = None) -> SendResult:
-        """Leave INACTIVE: setpoints are accepted from now on."""
-        return self._ask(Request.ACTIVATE)
-
-    def deactivate(self, ids: NDArray[np.intp] | None = None) -> SendResult:
-        """Ramp to rest and refuse setpoints."""
-        return self._ask(Request.DEACTIVATE)
-
-    def reset(self, ids: NDArray[np.intp] | None = None) -> SendResult:
-        """Clear an emergency stop, a fault or a deactivation; motion needs `activate` afterwards."""
-        return self._ask(Request.RESET)
-
-    def _ask(self, request: Request) -> SendResult:
+        Raises:
+            RealtimeError: the cerebellum does not answer.
+        """
         reason = self._client.request(request)
         # What was published before the request was carried out would still refuse what comes next.
         tick = int(self.latest["tick"])

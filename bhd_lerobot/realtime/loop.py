@@ -40,7 +40,7 @@ class LoopLimits:
 Advance = Callable[[int], None]
 """Lets the plant go on by a number of ticks."""
 Serve = Callable[[int], None]
-"""Answers what the bridge asks for, at a time of the cerebellum [ns]."""
+"""Answers requests of the bridge, at a time of the cerebellum [ns]."""
 Publish = Callable[[Slot, int, int, TickGrid], None]
 """Publishes the state: the tick, when it started and when its predecessor ended (both monotonic) [ns], the grid."""
 Count = Callable[[int, int, int, int], None]

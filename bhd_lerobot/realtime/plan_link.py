@@ -44,7 +44,7 @@ def _header_dtype(dof: int) -> np.dtype:
     )
     return np.dtype(
         [
-            # Odd while the request is being written: who sees it change while reading reads again.
+            # Odd while the request is being written: a reader that sees it change reads again.
             ("guard", np.int64),
             ("request", request),
             ("dropped", np.int64),  # the last request that no answer is wanted to
@@ -114,7 +114,7 @@ class PlanLink:
         self._request: Any = memory.header["request"][0]
         self._answer: Any = memory.header[0]
         self._guard, self._dropped, self._answered = memory.guard, memory.dropped, memory.answered
-        if self._guard.item() % 2:  # whoever had the memory before was killed while writing
+        if self._guard.item() % 2:  # the process that had the memory before was killed while writing
             self._guard[0] += 1
         self._number = int(self._request["number"])
         self._out = False  # whether an answer is wanted
@@ -132,7 +132,7 @@ class PlanLink:
             ConfigError: for another arm than the first.
         """
         if sim:
-            raise ConfigError(f"A plan for arm {sim} was asked for; another process plans for one arm only, number 0.")
+            raise ConfigError(f"A plan for arm {sim} was requested; another process plans for one arm only, number 0.")
         self._number += 1
         request = self._request
         self._guard[0] += 1
@@ -179,11 +179,11 @@ class PlanServer:
         self._memory = memory = _Memory(buffer, planner.dof, planner.hz, duration_s)
         self._header: Any = memory.header[0]
         self._guard, self._dropped, self._answered = memory.guard, memory.dropped, memory.answered
-        # A request that somebody else has not answered is served; one that was answered is not served again.
+        # A request that another server has not answered is served; one that was answered is not served again.
         self._served, self._seen_guard = self._answered.item(), -1
 
     def serve(self, stop: Callable[[], bool], sleep: Callable[[], None]) -> None:
-        """Serve until told to stop; sleep when nothing is asked for, a millisecond or so at a time."""
+        """Serve until `stop` returns true; sleep when there is no request, a millisecond or so at a time."""
         while not stop():
             if not self.serve_once():
                 sleep()

@@ -18,7 +18,7 @@ from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.realtime.block import LiveBlock
 
-_COMMANDS = 8  # that are kept; only the newest counts
+_COMMANDS = 8  # capacity of the ring; only the newest counts
 
 
 class PlantPhase(IntEnum):
@@ -42,7 +42,7 @@ class PlantShape:
         velocities: generalised velocities of the physics.
         features: floats in an observation.
         touches: kinds of touches.
-        kept: states that can still be read.
+        capacity: states that can still be read.
     """
 
     joints: int
@@ -50,7 +50,7 @@ class PlantShape:
     velocities: int
     features: int
     touches: int
-    kept: int
+    capacity: int
 
     @property
     def command_dtype(self) -> np.dtype:
@@ -89,7 +89,7 @@ class PlantShape:
         """Return what sections a block needs, and their sizes [bytes]."""
         return {
             "plant_commands": StateRing.nbytes(self.command_dtype, _COMMANDS),
-            "plant_states": StateRing.nbytes(self.state_dtype, self.kept),
+            "plant_states": StateRing.nbytes(self.state_dtype, self.capacity),
         }
 
     def as_dict(self) -> dict[str, int]:
@@ -114,7 +114,7 @@ class PlantLink:
     def __init__(self, shape: PlantShape, commands: Any = None, states: Any = None) -> None:
         self.shape = shape
         self.commands = StateRing(shape.command_dtype, _COMMANDS, commands)
-        self.states = StateRing(shape.state_dtype, shape.kept, states)
+        self.states = StateRing(shape.state_dtype, shape.capacity, states)
 
     @classmethod
     def of(cls, block: LiveBlock) -> Self | None:
@@ -158,12 +158,12 @@ class RemotePlant:
         return self.state is None or bool(self.state["stops"] > self._record["acknowledged"])
 
     def acknowledge(self) -> None:
-        """Let the plant be driven again, after the stops that the state taken last tells of."""
+        """Let the plant be driven again, after the stops that the state taken last reports."""
         if self.state is not None:
             self._record["acknowledged"] = self.state["stops"]
 
     def read(self, out: PlantReading) -> None:
-        """Write the newest joint readings into `out`; a stop that nobody acknowledged is a fault."""
+        """Write the newest joint readings into `out`; a stop that was not acknowledged is a fault."""
         state = self.refresh()
         if state is not None:
             out.position[:], out.velocity[:] = state["position"], state["velocity"]

@@ -1,4 +1,4 @@
-"""What a process asks of the kernel and of Python, so that it wakes up on time: asked for, reported, given back.
+"""Real-time privileges of a process, so that it wakes up on time: requested, reported, given back.
 
 Nothing here is needed for a simulation in lockstep. Each request may be refused; a refusal is reported with its remedy.
 """
@@ -9,7 +9,7 @@ import os
 import resource
 import struct
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -93,7 +93,6 @@ class SystemCalls:
         return next((int(line.split()[1], 16) for line in status.splitlines() if line.startswith("CapEff:")), 0)
 
     def _call(self, name: str, *arguments: int) -> int:
-        """Call a function of the C library, every argument an unsigned long."""
         result = int(getattr(self._libc, name)(*map(ctypes.c_ulong, arguments)))
         if result < 0:
             number = ctypes.get_errno()
@@ -133,7 +132,7 @@ def real_interpreter() -> str:
 
 @dataclass(frozen=True)
 class RealtimeSettings:
-    """What a real-time process asks for.
+    """The privileges that a real-time process requests.
 
     Attributes:
         priority: priority under SCHED_FIFO, 1 to 99, larger is more urgent. The kernel's own interrupt threads have 50.
@@ -168,13 +167,13 @@ class RealtimeSettings:
 
 @dataclass(frozen=True)
 class Grant:
-    """What became of one request.
+    """The result of one request.
 
     Attributes:
         name: "affinity", "collector", "memory lock", "cpu latency", "timer slack" or "scheduler".
-        wanted: what was asked for.
+        wanted: the request.
         granted: whether it is in force.
-        detail: what is in force now.
+        detail: the present state.
         remedy: how to have it granted; empty where it was.
     """
 
@@ -189,17 +188,8 @@ class Grant:
         return asdict(self)
 
 
-def describe_refusals(grants: Iterable[Grant]) -> str:
-    """Return a text that says what was refused and how to have it granted, one line each; empty if nothing was."""
-    return "\n".join(
-        f"real time: {grant.name} refused ({grant.wanted}). {grant.detail} Remedy: {grant.remedy}."
-        for grant in grants
-        if not grant.granted
-    )
-
-
 class Privileges:
-    """Acquires what `RealtimeSettings` asks for, and gives it back.
+    """Acquires the privileges of `RealtimeSettings`, and gives them back.
 
     Everything concerns the thread that calls `acquire` or its whole process, and `release` must be called from the
     same thread. Threads and processes started later run under SCHED_OTHER (reset on fork).
@@ -215,19 +205,19 @@ class Privileges:
         """What became of each request of `acquire`."""
 
     def acquire(self, settings: RealtimeSettings) -> list[Grant]:
-        """Ask for everything, each independently of the others.
+        """Request everything, each independently of the others.
 
-        What takes long comes before the priority is raised, so that it holds up nobody else.
+        What takes long comes before the priority is raised, so that it delays no other process.
 
         Args:
-            settings: what to ask for.
+            settings: what to request.
 
         Returns:
             One grant for each request, the scheduler's last.
 
         Raises:
-            RealtimeError: SCHED_FIFO was refused and the settings require it, in which case nothing is kept; or
-                this was called before without `release`.
+            RealtimeError: SCHED_FIFO was refused and the settings require it, and everything is given back; or this
+                was called before without `release`.
         """
         if self.grants:
             raise RealtimeError("The privileges are held already; call release() first.")
@@ -365,7 +355,7 @@ def _rights(settings: RealtimeSettings) -> str:
 
 
 def _why(error: OSError) -> str:
-    return f"The kernel said: {error.strerror or error}."
+    return f"The kernel refused: {error.strerror or error}."
 
 
 def _policy(policy: int) -> str:

@@ -1,4 +1,4 @@
-"""Requests of a caller to a cerebellum in another process, and what it hears back: replies and results.
+"""Requests of a caller to a cerebellum in another process, and the replies and results that come back.
 
 Each request has a number, and is answered by one reply with the same number. Results come when goals end.
 """
@@ -33,7 +33,7 @@ TIMEOUT_S = 1.0  # [s] a cerebellum that does not answer for so long is not runn
 
 
 class RequestKind(IntEnum):
-    """What is asked for."""
+    """Kinds of requests."""
 
     MODE = 0
     """A change of mode; the reply is a `Reason`."""
@@ -41,12 +41,10 @@ class RequestKind(IntEnum):
     """To take a goal; the reply is that it was accepted, or the refusal."""
     CANCEL = 2
     """To cancel a goal; the reply is a `ResultCode`."""
-    RESTART = 3
-    """To forget everything: the plant was put somewhere else. Results that were not taken are lost."""
 
 
 class EventKind(IntEnum):
-    """What the cerebellum says."""
+    """Kinds of events from the cerebellum."""
 
     REPLY = 0
     RESULT = 1
@@ -84,7 +82,7 @@ class RequestServer:
     """The cerebellum's side. One robot: simulation 0.
 
     Args:
-        cerebellum: who is asked.
+        cerebellum: what carries requests out.
         requests: where requests come from, of dtype `request_dtype(dof)`.
         events: where replies and results go to, of dtype `EVENT_DTYPE`.
 
@@ -96,7 +94,6 @@ class RequestServer:
         self.expired = 0
         self._cerebellum, self._requests, self._events = cerebellum, requests, events
         self._unposted: deque[CommandResult] = deque()  # results that there was no room for
-        self._all = np.arange(1)
 
     def serve(self, now_ns: int) -> None:
         """Carry out the next request, and post its reply and the results that have come; to be called once a tick.
@@ -117,7 +114,7 @@ class RequestServer:
     def _answer(self, request: Any, now_ns: int) -> None:
         cerebellum, kind = self._cerebellum, RequestKind(int(request["kind"]))
         if now_ns > int(request["expires_ns"]):
-            # Nobody waits for it any more, and nobody expects what it asks for to happen now.
+            # The caller does not wait for it any more, and does not expect it to happen now.
             self.expired += 1
             return
         event = np.zeros(1, EVENT_DTYPE)[0]
@@ -128,15 +125,11 @@ class RequestServer:
             refusal = cerebellum.submit(0, decode_goal(request["goal"]))
             if refusal is not None:
                 event["refused"], event["code"], event["result"] = True, refusal.code, encode_result(refusal)
-        elif kind == RequestKind.CANCEL:
-            event["code"] = cerebellum.cancel(0, decode_name(request["goal"]))
         else:
-            cerebellum.restart(self._all)
-            self._unposted.clear()
+            event["code"] = cerebellum.cancel(0, decode_name(request["goal"]))
         self._events.post(event)
 
     def _post(self) -> None:
-        """Post the results that there is room for."""
         while self._unposted and not self._events.full:
             event = np.zeros(1, EVENT_DTYPE)[0]
             event["tick"], event["kind"] = self._cerebellum.ticks, EventKind.RESULT
@@ -155,7 +148,7 @@ class RequestClient:
         events: where replies and results come from, of dtype `EVENT_DTYPE`.
         wait: waits for a moment, about a tick.
         timeout_s: how long a reply may take [s].
-        clock_ns: the time on the clock that the cerebellum's side is told, too [ns].
+        clock_ns: the time on the clock that the cerebellum's side uses, too [ns].
     """
 
     def __init__(
@@ -169,7 +162,7 @@ class RequestClient:
         self._requests, self._events, self._wait, self._clock_ns = requests, events, wait, clock_ns
         self._timeout_ns = round(timeout_s * NANOSECONDS)
         self._dof = int(requests.dtype["goal"]["joint_target"].shape[0])
-        self._number = clock_ns()  # a reply to somebody who used the mailboxes before is not taken for one's own
+        self._number = clock_ns()  # a reply to an earlier user of the mailboxes is not taken for an own one
         self._reply: Any = None
         self._live: set[str] = set()  # goals that were accepted and whose result has not come yet
         self._results: list[CommandResult] = []
@@ -214,14 +207,6 @@ class RequestClient:
             return ResultCode.UNKNOWN_ID  # no goal can have this name
         return ResultCode(int(self._ask(RequestKind.CANCEL, goal=encode_name(task_id, self._dof))["code"]))
 
-    def restart(self) -> None:
-        """Make the cerebellum forget everything about a robot that was put somewhere else; it is unconfigured again.
-
-        Raises:
-            RealtimeError: the cerebellum does not answer.
-        """
-        self._ask(RequestKind.RESTART)
-
     def take_results(self) -> list[CommandResult]:
         """Return the results that were not taken yet, in the order in which the goals ended."""
         self._take_events()
@@ -229,7 +214,6 @@ class RequestClient:
         return results
 
     def _ask(self, kind: RequestKind, mode: Request = Request.CONFIGURE, goal: Any = None, name: str = "") -> Any:
-        """Send a request and return its reply."""
         self._number += 1
         self._reply = None
         end_ns = self._clock_ns() + self._timeout_ns
@@ -261,6 +245,3 @@ class RequestClient:
                 self._reply = event
                 if kind == RequestKind.GOAL and not event["refused"]:
                     self._live.add(name)
-                elif kind == RequestKind.RESTART:
-                    self._live.clear()
-                    self._results.clear()

@@ -12,7 +12,7 @@ from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
 from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestServer, request_dtype
 
 _REQUESTS, _EVENTS = 16, 64
-_REST_S = 0.002  # between two looks of the planner for a request
+_REST_S = 0.002  # between two checks of the planner for a request
 
 
 def _dof(cerebellum: Cerebellum) -> int:
@@ -50,8 +50,8 @@ class BrainSide:
     """The brain's process.
 
     Attributes:
-        client: asks for modes and goals.
-        serve: plans goals until it is told to stop, for a thread; None for a robot that takes no goals.
+        client: sends requests for modes and goals.
+        serve: plans goals until its argument returns true, for a thread; None for a robot that takes no goals.
 
     Args:
         block: the block.

@@ -1,10 +1,10 @@
 """A named block of memory that several processes share and that does not outlive them.
 
 It is a file in the memory file system. Every process that uses it holds a shared lock on it, which the kernel releases
-however the process ends: a block that nobody holds is rubbish, and `sweep` removes it. Nothing else is needed to clean
-up after SIGKILL, and no process number is ever trusted.
+however the process ends: a block that no process holds is garbage, and `sweep` removes it. Nothing else is needed to
+clean up after SIGKILL, and no process number is ever trusted.
 
-The folder is everybody's. A file's name has a part that nobody can guess, so that nobody can be in its way; only this
+Every user can write to the folder. A file's name has a random part, so that no other file can take it; only this
 user can open it; and what is not a plain file of this user is neither read nor removed, whatever it is called.
 """
 
@@ -32,7 +32,7 @@ _FILE = re.compile(rf"{PREFIX}(?P<name>[\w.-]{{1,100}})\.[0-9a-f]{{16}}")
 _TRIES = 8  # to make a block of a name that another process is seen to hold
 _MAGIC = b"bhd-blk1"
 _ALIGNMENT = 64  # a cache line: no two sections share one
-_ASKING_S = 0.002  # it takes much less to find out whether somebody holds a block
+_CHECK_S = 0.002  # it takes much less to find out whether a process holds a block
 _HEADER = 4096  # bytes for the description; it grows in pages
 # Aligned 64-bit stores become visible to other processes in program order on x86 alone; on other processors the
 # counters that guard an entry could be seen before the entry.
@@ -60,7 +60,7 @@ class SharedBlock:
 
     Attributes:
         name: its name, unique among the blocks of this user.
-        about: what its maker says about it.
+        about: the description that its maker gave.
 
     Use `create` or `attach`, and `close` when done.
     """
@@ -131,9 +131,9 @@ class SharedBlock:
 
     @classmethod
     def watch(cls, name: str) -> Self:
-        """Open a block of another process to look at it: its memory cannot be written, and it does not count as held.
+        """Open a block of another process to read it: its memory cannot be written, and it does not count as held.
 
-        So nobody who watches keeps a name taken, and the block's end does not wait for him.
+        So a watching process keeps no name taken, and the block's end does not wait for it.
 
         Raises:
             RealtimeError: there is none; the message lists those that there are.
@@ -146,7 +146,7 @@ class SharedBlock:
             valid = False
         if not valid or _is_free(descriptor):
             os.close(descriptor)
-            raise _nobody(name, "it is no block of this version" if not valid else "nobody holds it any more")
+            raise _not_found(name, "it is no block of this version" if not valid else "no process holds it any more")
         return cls._opened(path, descriptor, memory)
 
     @property
@@ -186,13 +186,13 @@ class SharedBlock:
                 raise RealtimeError(f"Shared memory cannot be made in {FOLDER}: {error.strerror}.") from error
             fcntl.flock(descriptor, fcntl.LOCK_SH)
             others = any(not free and other != path and _name(other) == name for other, free in _blocks())
-            # A sweep between the two calls may have taken it for rubbish.
+            # A sweep between the two calls may have removed it.
             if path.exists() and not others:
                 return path, descriptor
             path.unlink(missing_ok=True)
             os.close(descriptor)
-            # Perhaps somebody was just asking whether anybody holds the other, or makes one of this name, too.
-            time.sleep(random.uniform(1, 3) * _ASKING_S)
+            # Another process may just be checking whether the other block is held, or making one of this name, too.
+            time.sleep(random.uniform(1, 3) * _CHECK_S)
         raise RealtimeError(f"A robot called {name!r} is running already.")
 
     def section(self, name: str) -> memoryview:
@@ -220,8 +220,8 @@ class SharedBlock:
             self._memory.close()
         sweep()
         if self._path.exists():
-            # Either others hold it, or somebody was just asking whether anybody does.
-            time.sleep(_ASKING_S)
+            # Either others hold it, or another process is just checking whether it is held.
+            time.sleep(_CHECK_S)
             sweep()
 
 
@@ -236,7 +236,7 @@ def _find(name: str) -> tuple[Path, int]:
     for _, _, path in sorted(found):
         if (descriptor := _open(path)) is not None:
             return path, descriptor
-    raise _nobody(name, "no process of yours has made such a block")
+    raise _not_found(name, "no process of yours has made such a block")
 
 
 def _open(path: Path) -> int | None:
@@ -253,7 +253,6 @@ def _open(path: Path) -> int | None:
 
 
 def _is_made(path: Path) -> bool:
-    """Return whether a block is complete."""
     descriptor = _open(path)
     if descriptor is None:
         return False
@@ -269,12 +268,12 @@ def _name(path: Path) -> str:
     return found["name"] if found else path.name.removeprefix(PREFIX)
 
 
-def _nobody(name: str, why: str) -> RealtimeError:
+def _not_found(name: str, why: str) -> RealtimeError:
     return RealtimeError(f"No running robot is called {name!r} ({why}). Running: {', '.join(names()) or 'none'}.")
 
 
 def _is_free(descriptor: int) -> bool:
-    """Return whether nobody holds a block; the descriptor itself must not."""
+    """Return whether no process holds a block; the descriptor itself must not."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -305,7 +304,7 @@ def sweep() -> list[str]:
 
 
 def _blocks(*, remove: bool = False) -> Iterator[tuple[Path, bool]]:
-    """Yield the file of each block of this user, and whether nobody holds it."""
+    """Yield the file of each block of this user, and whether no process holds it."""
     for path in sorted(FOLDER.glob(f"{PREFIX}*")) if FOLDER.is_dir() else []:
         # Other programs have files with such names, too; version 0.1's have no part that cannot be guessed.
         if not _FILE.fullmatch(path.name) and not _is_made(path):

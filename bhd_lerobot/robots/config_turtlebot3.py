@@ -56,11 +56,6 @@ class TurtleBot3Config(RobotConfig):
     command_timeout_s: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
         super().__post_init__()
         if self.clock not in CLOCKS:
             raise ConfigError(unknown_name("clock", self.clock, CLOCKS))

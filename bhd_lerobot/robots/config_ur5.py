@@ -57,11 +57,6 @@ class UR5Config(RobotConfig):
     stale_after_s: float = 0.1
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
         super().__post_init__()
         for name, valid in (
             ("clock", CLOCKS),

@@ -34,8 +34,8 @@ def check_robot(
     """Check a robot against LeRobot's contract.
 
     What a real robot goes through: it is connected twice by `connect()`, which starts a calibration if it is not
-    calibrated, and asked to connect while it is connected. In between it gets one and the same action `frames` + 2
-    times, without a pause, and is asked for observations. Then it is disconnected; an arm that switches its motors off
+    calibrated, and connected once more while it is connected. In between it gets one and the same action `frames` + 2
+    times, without a pause, and is observed. Then it is disconnected; an arm that switches its motors off
     then falls, so support it. A robot that takes actions without a connection gets this action then, too. Nothing else
     is sent, and nothing that the robot handed out is written to.
 
@@ -45,14 +45,14 @@ def check_robot(
             it is: the positions that it observes when it is connected, and speeds of zero.
         frames: how many observations and actions are tried.
         adversarial: also write into what the robot handed out, and send it NaN and infinities, which it must refuse
-            with an exception or replace. For simulations: a real robot that fails this moves to where nobody meant.
+            with an exception or replace. For simulations: a real robot that fails this moves somewhere unintended.
 
     Returns:
         Findings that are no breach, since robots of LeRobot have them as well.
 
     Raises:
         ConformanceError: names the breach. The robot was disconnected; if that failed, a note of the error says so.
-        ConfigError: the action is not finite, or there is none and the robot does not observe all that it is told.
+        ConfigError: the action is not finite, or there is none and the robot does not observe all that it is commanded.
     """
     robot = make_robot()
     observation_features = dict(robot.observation_features)
@@ -84,10 +84,10 @@ def check_robot(
     findings += _check_second_disconnect(robot)
     _check_features_stay(robot, observation_features, action_features, "after disconnect()")
     fresh = make_robot()
-    for one in (robot, fresh):
-        _check_not_connected(one)
-        send = functools.partial(one.send_action, dict(chosen))
-        with _disconnected_after_error(one):
+    for unconnected in (robot, fresh):
+        _check_not_connected(unconnected)
+        send = functools.partial(unconnected.send_action, dict(chosen))
+        with _disconnected_after_error(unconnected):
             _expect(DeviceNotConnectedError, send, "send_action() without a connection")
     with _disconnected_after_error(fresh):
         _check_context_manager(fresh)
@@ -198,9 +198,9 @@ def _check_action(robot: Robot, features: dict[str, Any], action: dict[str, floa
 
 
 def _check_not_shared(robot: Robot, action: dict[str, float]) -> list[str]:
-    """Check by looking alone that what is handed out is the caller's; return findings."""
+    """Check without writing that returned values belong to the caller; return findings."""
     first = robot.get_observation()
-    kept = {name: np.copy(value) for name, value in first.items()}
+    before = {name: np.copy(value) for name, value in first.items()}
     # A robot may return the very dict that it was given, as some of LeRobot's do, so it gets two.
     applied = [robot.send_action(dict(action)) for _ in range(2)]
     second = robot.get_observation()
@@ -208,7 +208,8 @@ def _check_not_shared(robot: Robot, action: dict[str, float]) -> list[str]:
     _require(applied[0] is not applied[1], "send_action() returns the same dict every time: the robot's own state.")
     for name, value in first.items():
         _require(
-            np.array_equal(value, kept[name]), f"Observation {name!r} changed after it was returned: it is not a copy."
+            np.array_equal(value, before[name]),
+            f"Observation {name!r} changed after it was returned: it is not a copy.",
         )
     shared = [name for name, value in first.items() if np.ndim(value) and np.shares_memory(value, second[name])]
     if not shared:
@@ -221,7 +222,7 @@ def _check_not_shared(robot: Robot, action: dict[str, float]) -> list[str]:
 def _check_writes(robot: Robot, action: dict[str, float]) -> None:
     """Check that what a caller writes into what it got comes back from nowhere."""
     first = robot.get_observation()
-    kept = {name: np.copy(value) for name, value in first.items()}
+    before = {name: np.copy(value) for name, value in first.items()}
     for name, value in first.items():
         if isinstance(value, np.ndarray) and value.flags.writeable:
             value[...] = 0
@@ -229,7 +230,7 @@ def _check_writes(robot: Robot, action: dict[str, float]) -> None:
             first[name] = 0.0
     for name, value in robot.get_observation().items():
         # On a real robot readings are noisy, so what may not happen is that they become what the caller wrote.
-        written_over = not np.array_equal(kept[name], 0 * kept[name]) and np.array_equal(value, 0 * kept[name])
+        written_over = not np.array_equal(before[name], 0 * before[name]) and np.array_equal(value, 0 * before[name])
         _require(not written_over, f"Observation {name!r} shares memory with the robot: a caller's write came back.")
     applied = robot.send_action(dict(action))
     for name in list(applied):

@@ -19,8 +19,8 @@ from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
 from bhd_lerobot.robots.host.realtime import LiveSimulation, make_live
 from bhd_lerobot.robots.host.simulation import Simulation
 
-# Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator; one that
-# thinks for itself finds its robot here. Weak, so that a forgotten robot is freed.
+# Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator: a brain
+# finds its robot here. Weak, so that a forgotten robot is freed.
 _connected: "weakref.WeakSet[SimulatedRobot]" = weakref.WeakSet()
 
 
@@ -37,7 +37,7 @@ class SimulatedRobot(Robot):
     `send_action` returns at the end of the frame, with what the cerebellum commanded by then.
 
     With ``clock = "realtime"`` the robot runs on the wall clock, in processes of its own: `send_action` returns at
-    once, and a robot that hears nothing for too long decelerates and holds.
+    once, and a robot that gets no command for too long decelerates and holds.
     """
 
     config: Any
@@ -54,7 +54,6 @@ class SimulatedRobot(Robot):
         self.cameras: dict[str, Any] = dict.fromkeys(self.camera_shapes)
 
     def __str__(self) -> str:
-        """Return the robot's name, and its id if it has one."""
         return self.name if self.id is None else f"{self.name} {self.id!r}"
 
     @abstractmethod
@@ -201,27 +200,19 @@ class SimulatedRobot(Robot):
         """
         simulation = self.simulation
         values = self.action_array(action)
+        refusals: Mapping[int, str]
         if isinstance(simulation, LiveSimulation):
-            return self._send_live(simulation, values)
-        report = simulation.step(values)
-        self._results += report.results.get(0, ())
-        reason = Reason(int(report.sent.reasons[0]))
+            receipt = simulation.send(values)
+            sent, refusals, mode = receipt.sent, receipt.refusals, simulation.modes
+            applied = simulation.to_action(simulation.live_bridge.latest["command"])
+        else:
+            report = simulation.step(values)
+            sent, refusals, mode, applied = report.sent, report.refusals, report.mode, report.applied
+            self._results += report.results.get(0, ())
+        reason = Reason(int(sent.reasons[0]))
         if reason != Reason.ACCEPTED:
-            mode = Mode(int(report.mode[0])).name
-            why = report.refusals.get(0, reason.explanation)
-            raise CommandRefusedError(f"The {self.name} refused the action: {why} (mode {mode}).")
-        return dict(zip(self.action_names, report.applied[0].tolist(), strict=True))
-
-    def _send_live(self, simulation: LiveSimulation, values: NDArray[np.float64]) -> dict[str, float]:
-        """Send an action and return at once, with what is commanded now."""
-        receipt = simulation.send(values)
-        reason = Reason(int(receipt.sent.reasons[0]))
-        if reason != Reason.ACCEPTED:
-            mode = Mode(int(simulation.modes[0])).name
-            raise CommandRefusedError(
-                f"The {self.name} refused the action: {receipt.refusals.get(0, reason.explanation)} (mode {mode})."
-            )
-        applied = simulation.to_action(simulation.live_bridge.latest["command"])
+            words = refusals.get(0, reason.explanation)
+            raise CommandRefusedError(f"The {self.name} refused the action: {words} (mode {Mode(int(mode[0])).name}).")
         return dict(zip(self.action_names, applied[0].tolist(), strict=True))
 
     def action_array(self, action: Mapping[str, Any]) -> NDArray[np.float64]:
@@ -257,16 +248,16 @@ class SimulatedRobot(Robot):
 
     @property
     def environment(self) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """What the robot's scene tells a brain beyond the robot's own sensors: names, and values of shape (k,)."""
+        """Environment state of the robot's scene, beyond its own sensors: names, and values of shape (k,)."""
         return (), np.zeros(0)
 
     @property
     def instruction(self) -> str:
-        """What a person would ask for in the robot's scene; empty if nothing."""
+        """The instruction of the robot's scene; empty if it has none."""
         return ""
 
     def take_results(self) -> list[CommandResult]:
-        """Return the results of goals, sent by `simulation.bridge`, that nobody has taken yet, in their order.
+        """Return the results of goals, sent by `simulation.bridge`, that were not taken yet, in their order.
 
         Raises:
             DeviceNotConnectedError: the robot is not connected.
@@ -287,10 +278,10 @@ class SimulatedRobot(Robot):
 
         Args:
             source: a file descriptor or an object with one: any byte presses, and so does its end or an error, a wire
-                that is cut. Or a callable, asked again and again: it presses when it returns something true, raises, or
+                that is cut. Or a callable, called once a period: it presses when it returns something true, raises, or
                 does not return for a second.
             name: what it is called.
-            period_s: time between two questions to a callable [s].
+            period_s: time between two calls of a callable [s].
 
         Raises:
             ConfigError: it is neither, the descriptor is not open, or the period is not positive.

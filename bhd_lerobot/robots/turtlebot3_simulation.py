@@ -105,7 +105,7 @@ class TurtleBot3Simulation(Simulation):
 
     def _step(self) -> None:
         for _ in range(self.rates.steps_per_tick):
-            # One by one: a touch may last a single step, and the sensor tells of the last one only.
+            # Step by step: a touch may last a single step, and the sensor reports only the last step.
             self.world.step(1, self._active)
             np.logical_or(self._touched, self._touch, out=self._touched)
 

@@ -53,7 +53,7 @@ class UR5(SimulatedRobot):
 
     @property
     def environment(self) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """What the scene tells a brain: target and objects, names and values of shape (k,)."""
+        """Environment state of the scene: target and objects, names and values of shape (k,)."""
         if self._task is None:
             return (), np.zeros(0)
         return self._task.environment_names, self._task.environment_state(self.simulation.truth())[0]

@@ -1,4 +1,4 @@
-"""Who drives in each frame: the brain or one who took over, by setpoints or by goals; and how long the brain thinks."""
+"""Who drives in each frame: the brain or an intervening expert, by setpoints or goals; and inference times."""
 
 import time
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Intervention:
-    """Frames in which somebody else drove.
+    """Frames of one intervention.
 
     Attributes:
         first: the first frame.
@@ -33,12 +33,12 @@ class DriverLog:
     """Who drives n simulations, from one decision of a brain to the next.
 
     Attributes:
-        intervenes: whether the brain is one in which somebody takes over.
+        intervenes: whether an expert can take over in the brain.
         is_mixed: whether it gives setpoints in some frames and goals in others.
         gives_goals: whether it gives goals at all.
 
     Args:
-        brain: the brain; an `Intervening` if somebody takes over in it.
+        brain: the brain; an `Intervening` if an expert takes over in it.
         n: number of simulations.
         frames: longest episode, in frames.
     """
@@ -61,7 +61,7 @@ class DriverLog:
             self._causes[sim] = {}
 
     def decided(self, decision: Any) -> None:
-        """Take note of what the brain wants: what `act` returned."""
+        """Note the command that the brain returned."""
         n = len(self._fresh)
         self.is_mixed = isinstance(decision, Mixed)
         self.gives_goals = self.is_mixed or isinstance(decision, Goals)
@@ -83,11 +83,11 @@ class DriverLog:
         Args:
             running: the simulations that are in an episode.
             length: frames of each episode before this one, shape (n,).
-            is_missed: whether the frame went by, on the wall clock, while the brain was thinking: what it had decided
-                before was still in force.
+            is_missed: whether the frame went by, on the wall clock, during inference: the decision before was
+                still in force.
 
         Returns:
-            Which simulations somebody had taken over, and which followed goals, each of shape (n,).
+            In which simulations an intervention was on, and which followed goals, each of shape (n,).
         """
         taken, by_goals = self._before if is_missed else self._now
         rows = length[running]
@@ -100,7 +100,7 @@ class DriverLog:
         return taken, by_goals
 
     def interventions(self, sim: int, length: int) -> list[Intervention] | None:
-        """Return the interventions of an episode that has ended; None if there is nobody to intervene."""
+        """Return the interventions of an episode that has ended; None if the brain has no interventions."""
         if not self.intervenes:
             return None
         causes = self._causes[sim]
@@ -115,7 +115,7 @@ class DriverLog:
 
 
 def flagged(event: NDArray[np.int64], taken: Mask) -> NDArray[np.int64]:
-    """Return the events of a frame with the interventions among them: what ends an episode says more, and stays."""
+    """Return the events of a frame with the interventions among them: what ends an episode takes precedence."""
     return np.where(taken & (event == Event.NOTHING), int(Event.INTERVENTION), event)
 
 
@@ -137,11 +137,10 @@ class TimedBrain:
         self.times: list[float] = []
 
     def __getattr__(self, name: str) -> Any:
-        """Return what the brain has."""
         return getattr(self._brain, name)
 
     def act(self, observation: Observation) -> Any:
-        """Return what the brain wants, and remember how long it took."""
+        """Return the command of the brain, and note how long it took."""
         started = time.perf_counter()
         try:
             return self._brain.act(observation)

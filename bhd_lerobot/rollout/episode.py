@@ -1,4 +1,4 @@
-"""The only observe-think-act-record loop: n episodes side by side, each as if it were alone."""
+"""The observe-act-record loop: n episodes side by side, each as if it were alone."""
 
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -29,11 +29,11 @@ _BRAIN_STREAM = 2
 class EpisodeLoop:
     """Runs episodes on n simulations. A simulation that is done with one takes the next.
 
-    What the brain sees and what it asks for are rounded to single precision first, because that is what is recorded: a
+    Observations and setpoints are rounded to single precision first, because that is what is recorded: a
     recorded action, applied again, is exactly the action that was applied.
 
     Attributes:
-        observer: is shown every frame of every simulation, and every image; None if nobody looks.
+        observer: receives every frame of every simulation, and every image; None if there is none.
 
     Args:
         simulation: the robots.
@@ -43,7 +43,7 @@ class EpisodeLoop:
 
     Attributes:
         emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
-        marks: takes what a person says about the running episodes.
+        marks: takes the marks of a person for the running episodes.
     """
 
     observer: Observer | None = None
@@ -81,7 +81,7 @@ class EpisodeLoop:
 
         Args:
             specs: the episodes.
-            stop: asked between frames; when it says yes, the episodes that run are dropped and the loop ends.
+            stop: called between frames; when it returns true, the running episodes are dropped and the loop ends.
             open_images: called at the start of every episode of a robot with cameras; returns where its images go.
         """
         self._open_images = open_images
@@ -161,8 +161,8 @@ class EpisodeLoop:
         if task.environment_names:
             # What is true at the end of a frame is so at the beginning of the next, unless an episode began in between.
             truth = simulation.truth() if self._truth is None else self._truth
-            told = task.environment_state(truth).astype(np.float32)
-            environment, values[keys.ENVIRONMENT_STATE] = told.astype(np.float64), told
+            values[keys.ENVIRONMENT_STATE] = task.environment_state(truth).astype(np.float32)
+            environment = values[keys.ENVIRONMENT_STATE].astype(np.float64)
         seen = Observation(
             simulation.observation_names,
             state.astype(np.float64),
@@ -173,8 +173,8 @@ class EpisodeLoop:
         )
         started = time.perf_counter()
         command = in_single_precision(brain.act(seen))
-        # On the lockstep clock time stands still while the brain thinks.
-        thought = np.full(simulation.n, time.perf_counter() - started if simulation.is_live else 0.0)
+        # On the lockstep clock time stands still during inference.
+        inference_time = np.full(simulation.n, time.perf_counter() - started if simulation.is_live else 0.0)
         physics = simulation.physics_state
         report = simulation.step(command)
         match command:
@@ -195,14 +195,14 @@ class EpisodeLoop:
             keys.ACTION: action.astype(np.float32),
             keys.TIME: frame.time_ns / NANOSECONDS,
             keys.AGE: frame.age_ns / NANOSECONDS,
-            keys.INFERENCE_TIME: thought,
+            keys.INFERENCE_TIME: inference_time,
             keys.PHYSICS_STATE: physics,
         }
         finished: list[tuple[int, Event]] = []
-        for one in (*report.missed, report):
-            if one.live is not None:
-                values |= self._live_values(one, is_first=one is (report.missed or [report])[0])
-            finished = self._end_frame(one, values, is_missed=one is not report)
+        for frame_report in (*report.missed, report):
+            if frame_report.live is not None:
+                values |= self._live_values(frame_report, is_first=frame_report is (report.missed or [report])[0])
+            finished = self._end_frame(frame_report, values, is_missed=frame_report is not report)
             if finished:
                 break  # what a robot did after its episode's end is not part of it
         return finished
@@ -240,7 +240,7 @@ class EpisodeLoop:
     def _live_values(self, report: FrameReport, *, is_first: bool) -> dict[str, NDArray]:
         """Return what was measured of a frame on the wall clock.
 
-        The first is the one that the brain saw the beginning of; later ones went by while it was still thinking.
+        The first is the one that the brain saw the beginning of; later ones went by during inference.
         """
         live = report.live
         self._last_frame = live.number

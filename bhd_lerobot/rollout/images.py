@@ -35,7 +35,7 @@ class EpisodeImages:
     def order_all(self, observer: Observer | None, *, wanted: bool) -> dict[str, Image]:
         """Order the images of the running simulations; return them if they are wanted.
 
-        A brain that does not look at images does not wait for them: they are made while the frame goes on.
+        A brain that does not use images does not wait for them: they are made while the frame goes on.
 
         Args:
             observer: is shown them, too.

@@ -1,4 +1,4 @@
-"""What a person says while an episode is recorded: it succeeded, it failed, somebody intervenes."""
+"""Marks of a person while an episode is recorded: success, failure, intervention."""
 
 import threading
 from collections.abc import Sequence
@@ -12,15 +12,15 @@ from bhd_lerobot.tasks.task import OUTCOMES, Event
 Mask = NDArray[np.bool_]
 
 KEYS = "s success, f failure, i intervention begins or ends"
-"""What each key of the terminal says."""
+"""What each key of the terminal means."""
 
-_HARD = (Event.ESTOP, Event.FAULT)  # what the robot did is true, whatever a person says in the same frame
+_HARD = (Event.ESTOP, Event.FAULT)  # they take precedence over a person's mark in the same frame
 
 
 class Marks:
     """Takes marks from any thread and hands them to the recording loop, frame by frame.
 
-    An outcome ends the episode with the frame in which it is said. A frame in which somebody intervenes carries the
+    An outcome ends the episode with the frame in which it is set. A frame of an intervention carries the
     event ``intervention``; what moves the robot meanwhile is not decided here.
 
     Args:
@@ -35,7 +35,7 @@ class Marks:
         self._driving: set[int] = set()
 
     def outcome(self, name: str, simulation: int = 0) -> None:
-        """Say that the running episode ends now, and how.
+        """Mark that the running episode ends now, and how.
 
         Args:
             name: one of `outcomes`, for example ``success``, ``failure`` or ``collision``.
@@ -50,10 +50,10 @@ class Marks:
             self._outcomes[self._checked(simulation)] = Event[name.upper()]
 
     def intervention(self, is_on: bool | None = None, simulation: int = 0) -> None:
-        """Say that somebody intervenes from now on, or no longer.
+        """Mark that an intervention begins now, or ends.
 
         Args:
-            is_on: whether somebody does; the contrary of what was so if None.
+            is_on: whether it begins; toggled if None.
             simulation: in whose episode.
 
         Raises:
@@ -76,14 +76,14 @@ class Marks:
                 self.intervention()
 
     def begin(self, simulations: NDArray[np.intp]) -> None:
-        """Forget what was said about episodes before."""
+        """Forget the marks of episodes before."""
         with self._lock:
             for simulation in simulations.tolist():
                 self._outcomes.pop(simulation, None)
                 self._driving.discard(simulation)
 
     def frame(self, event: NDArray[np.int64], running: Mask) -> tuple[NDArray[np.int64], Mask]:
-        """Return the events of a frame with what was said, and where somebody intervenes.
+        """Return the events of a frame with the marks applied, and where interventions are on.
 
         Args:
             event: what happened, shape (n,).
@@ -97,12 +97,12 @@ class Marks:
             if not self._outcomes and not self._driving:
                 return event, driven
             driven[list(self._driving)] = True
-            said = event.copy()
-            for simulation in [one for one in self._outcomes if running[one]]:
+            marked = event.copy()
+            for simulation in [sim for sim in self._outcomes if running[sim]]:
                 outcome = self._outcomes.pop(simulation)
-                if said[simulation] not in _HARD:
-                    said[simulation] = outcome
-        return said, driven & running
+                if marked[simulation] not in _HARD:
+                    marked[simulation] = outcome
+        return marked, driven & running
 
     def _checked(self, simulation: int) -> int:
         if not 0 <= simulation < self._n:

@@ -16,7 +16,7 @@ from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.bodies.tabletop import COLOURS, TableScene
 
 PANELS = 100  # panels on one page
-SHOWN = 200  # episodes of a run that are drawn: a panel takes 0.1 s, and nobody looks at thousands
+SHOWN = 200  # episodes of a run that are drawn: a panel takes 0.1 s
 
 _FREE, _WALL, _GOOD, _BAD = "#f4f1ea", "#8a8478", "#1b7f4d", "#c0392b"
 
@@ -29,7 +29,7 @@ class Trajectory:
         title: what stands above the panel.
         scene: the obstacles, or the objects on the table.
         xy: positions in the world frame [m], shape (frames, 2).
-        success: whether the episode was one.
+        success: whether the episode succeeded.
     """
 
     title: str
@@ -47,19 +47,19 @@ class TrajectoryAlbum:
 
     def __init__(self) -> None:
         self.added = 0
-        self._kept: dict[bool, list[tuple[int, Trajectory]]] = {True: [], False: []}
+        self._drawn: dict[bool, list[tuple[int, Trajectory]]] = {True: [], False: []}
 
     def add(self, trajectory: Trajectory) -> None:
-        """Add the next episode; of failures, and of successes, the first `SHOWN` are kept."""
-        kept = self._kept[trajectory.success]
-        if len(kept) < SHOWN:
-            kept.append((self.added, trajectory))
+        """Add the next episode; of failures, and of successes, the first `SHOWN` are drawn."""
+        drawn = self._drawn[trajectory.success]
+        if len(drawn) < SHOWN:
+            drawn.append((self.added, trajectory))
         self.added += 1
 
     @property
     def shown(self) -> list[Trajectory]:
         """At most `SHOWN` episodes in the order of the run: failures before all, then the first successes."""
-        failures, successes = self._kept[False], self._kept[True]
+        failures, successes = self._drawn[False], self._drawn[True]
         chosen = [*failures, *successes[: SHOWN - len(failures)]]
         return [trajectory for _, trajectory in sorted(chosen, key=lambda one: one[0])]
 
@@ -127,19 +127,19 @@ def draw_table(axes: Axes, scene: TableScene) -> None:
     """Draw the objects before an arm from above, to scale, the base of the arm at the left."""
     axes.set_facecolor(_FREE)
     axes.add_patch(Circle((0.0, 0.0), 0.075, color=_WALL, linewidth=0))
-    for number, one in enumerate(scene.objects):
-        edge: dict[str, Any] = {"facecolor": COLOURS[one.colour], "edgecolor": "black"}
+    for number, item in enumerate(scene.objects):
+        edge: dict[str, Any] = {"facecolor": COLOURS[item.colour], "edgecolor": "black"}
         edge["linewidth"] = 0.3
         if number == scene.target_object:  # a ring beside it, which an object of any colour leaves visible
-            ring = math.hypot(one.size_x, one.size_y) + 0.02
-            axes.add_patch(Circle((one.x, one.y), ring, fill=False, edgecolor="black", linestyle="--", linewidth=1.0))
-        if one.kind == "cup":
-            axes.add_patch(Circle((one.x, one.y), one.size_x, **edge))
+            ring = math.hypot(item.size_x, item.size_y) + 0.02
+            axes.add_patch(Circle((item.x, item.y), ring, fill=False, edgecolor="black", linestyle="--", linewidth=1.0))
+        if item.kind == "cup":
+            axes.add_patch(Circle((item.x, item.y), item.size_x, **edge))
         else:
-            corner = (one.x - one.size_x, one.y - one.size_y)
-            angle = math.degrees(one.yaw)
+            corner = (item.x - item.size_x, item.y - item.size_y)
+            angle = math.degrees(item.yaw)
             axes.add_patch(
-                Rectangle(corner, 2 * one.size_x, 2 * one.size_y, angle=angle, rotation_point="center", **edge)
+                Rectangle(corner, 2 * item.size_x, 2 * item.size_y, angle=angle, rotation_point="center", **edge)
             )
     if scene.target_pose is not None:
         axes.plot(*scene.target_pose[:2], marker="+", color="black", markersize=8, markeredgewidth=1.5)
@@ -179,7 +179,7 @@ def draw_arena(axes: Axes, arena: Arena) -> None:
     if arena.goal is not None:
         x, y, yaw = arena.goal
         axes.plot(x, y, marker="+", color="black", markersize=8, markeredgewidth=1.5)
-        tip = (x + 0.35 * math.cos(yaw), y + 0.35 * math.sin(yaw))  # the heading asked for
+        tip = (x + 0.35 * math.cos(yaw), y + 0.35 * math.sin(yaw))  # the requested heading
         axes.annotate("", xy=tip, xytext=(x, y), arrowprops={"arrowstyle": "->", "color": "black", "linewidth": 1.2})
     _frame_axes(axes, (x_min - 0.12, x_max + 0.12, y_min - 0.12, y_max + 0.12))
 

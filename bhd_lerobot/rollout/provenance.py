@@ -58,7 +58,7 @@ def _goals(episode: Episode) -> dict[str, Any]:
     if episode.commands is not None:
         columns["goals"] = _json([[frame, asdict(command)] for frame, command in episode.commands])
         columns["results"] = _json(
-            [[frame, one.task_id, one.success, one.code.name.lower(), one.message] for frame, one in episode.results]
+            [[frame, end.task_id, end.success, end.code.name.lower(), end.message] for frame, end in episode.results]
         )
     if episode.goal_frames is not None:
         columns["goal_frames"] = _json(episode.goal_frames)
@@ -66,12 +66,12 @@ def _goals(episode: Episode) -> dict[str, Any]:
 
 
 def _interventions(episode: Episode) -> dict[str, Any]:
-    """Return when somebody else than the brain drove, if there was anybody to do so."""
+    """Return the interventions of an episode, if the brain has any."""
     if episode.interventions is None:
         return {}
     return {
-        "intervened_frames": sum(one.end - one.first for one in episode.interventions),
-        "interventions": _json([[one.first, one.end, one.cause] for one in episode.interventions]),
+        "intervened_frames": sum(span.end - span.first for span in episode.interventions),
+        "interventions": _json([[span.first, span.end, span.cause] for span in episode.interventions]),
     }
 
 
@@ -116,7 +116,7 @@ def command_from_json(fields: dict[str, Any]) -> BrainCommand:
 
 
 def _tuples(fields: dict[str, Any]) -> dict[str, Any]:
-    """JSON knows lists only."""
+    """Turn the lists of JSON into tuples."""
     return {key: tuple(value) if isinstance(value, list) else value for key, value in fields.items()}
 
 

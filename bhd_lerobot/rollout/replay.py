@@ -1,4 +1,4 @@
-"""`bhd-replay`: run a recorded episode again, and say how far it came out differently.
+"""`bhd-replay`: run a recorded episode again, and report how far it diverges.
 
 Open loop: the recorded actions, from the recorded initial state, through a new cerebellum and new physics. State-exact:
 the robot is put into each recorded physics state, and its sensors are read again.
@@ -64,11 +64,6 @@ class ReplayConfig:
     tolerance_m: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
         if self.mode not in MODES:
             raise ConfigError(unknown_name("mode", self.mode, MODES))
         if self.tolerance_m is not None and not self.tolerance_m >= 0:
@@ -201,7 +196,7 @@ class Replay:
     ) -> Divergence:
         recorded = self.columns[keys.PHYSICS_STATE]
         names = self.simulation.observation_names
-        kept = np.array([name not in skipped for name in names])
+        compared = np.array([name not in skipped for name in names])
         # A scan that fell between two frames is not in any recorded state.
         fresh = self.columns[keys.AGE] == 0 if mode == "state" else np.ones(len(recorded), bool)
         scan = np.array([name.startswith("scan_") for name in names])
@@ -213,7 +208,7 @@ class Replay:
             position_m=np.sqrt(((now[:, :3] - then[:, :3]) ** 2).sum(axis=1)),
             angle_rad=_angle(now[:, 3:], then[:, 3:]),
             state=np.abs(states - recorded).max(axis=1),
-            observation=difference[:, kept].max(axis=1),
+            observation=difference[:, compared].max(axis=1),
             recorded_xy=then[:, :2],
             replayed_xy=now[:, :2],
             not_compared=skipped,
@@ -295,7 +290,7 @@ def _robot_config(recorded: dict[str, Any]) -> Any:
         kind = RobotConfig.get_choice_class(recorded["type"])
     except KeyError:
         raise DatasetError(f"The dataset was recorded by an unknown robot, {recorded.get('type')!r}.") from None
-    known = {one.name for one in fields(kind)}
+    known = {field.name for field in fields(kind)}
     # Replayed in simulated time, whatever clock it was recorded on.
     parameters = {key: value for key, value in recorded.items() if key in known and key != "realtime"}
     return kind(**{**parameters, "camera": False, "clock": "lockstep"})

@@ -1,4 +1,4 @@
-"""An episode: what is asked for, and what came of it."""
+"""An episode: its specification and its result."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -30,9 +30,9 @@ class Episode:
     """An episode that was run.
 
     Attributes:
-        spec: what was asked for.
+        spec: its number and seed.
         scene: where it was: an `Arena` or a `TableScene`.
-        instruction: what was asked for: what the brain was told to do, or what the task asks for.
+        instruction: the instruction that the brain followed, or that of the task.
         initial_state: the simulator's complete state at its start, shape (nstate,).
         columns: the dataset's columns by key, each of shape (frames, ...), images left out.
         outcome: how it ended.
@@ -42,7 +42,7 @@ class Episode:
         results: how goals ended, each with the frame in which it did.
         plan: the brain's plan, as plain values, if it has one.
         realtime: what the real-time process was granted and refused; None on the lockstep clock.
-        interventions: when somebody else than the brain drove, in order; None if there was nobody to take over.
+        interventions: when an expert or a person drove, in order; None if none could take over.
         goal_frames: in which frames goals were followed, as first frames and those after the last; None if always, or
             never.
     """

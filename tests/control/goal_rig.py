@@ -114,7 +114,7 @@ class Rig:
         raise AssertionError("still busy")
 
     def check(self) -> None:
-        """Assert that the reference has kept all limits so far."""
+        """Assert that the reference was within all limits so far."""
         if self._stopped:
             assert broken_limit(np.array(self._rows), np.array(self._stopped)) == ""
 

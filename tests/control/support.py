@@ -22,7 +22,7 @@ BODY = turtlebot3_burger()
 
 
 class PerfectPlant:
-    """Wheels that turn as they are told, and that a test can break."""
+    """Wheels that turn as commanded, and that a test can break."""
 
     def __init__(self, n: int = 1) -> None:
         self.n = n

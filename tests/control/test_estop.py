@@ -18,7 +18,6 @@ import pytest
 from bhd_lerobot.control.estop import SIGNALS, EstopInputs, estop_signal
 from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.errors import ConfigError
-from tests.cases import each_case
 from tests.control.support import Rig
 from tests.waiting import until
 
@@ -56,7 +55,7 @@ def wire() -> Iterator[tuple[int, int]]:
             os.close(end)
 
 
-def on_key(inputs: EstopInputs, cause: str) -> None:
+def wait_for_cause(inputs: EstopInputs, cause: str) -> None:
     """Wait until a cause is among those that pressed."""
     until(lambda: cause in inputs.causes)
 
@@ -90,7 +89,7 @@ def test_an_error_on_a_descriptor_presses(button, inputs):
     assert inputs.causes == ["relay is closed or broken"]
 
 
-def test_a_callable_presses_for_as_long_as_it_says_so(button, inputs):
+def test_a_callable_presses_as_long_as_it_returns_true(button, inputs):
     state = {"pressed": False}
     inputs.add(lambda: state["pressed"], "relay", period_s=0.001)
     asked = threading.Event()
@@ -109,7 +108,7 @@ def test_a_callable_that_raises_presses(button, inputs):
         raise OSError("the bus is gone")
 
     inputs.add(broken, "relay", period_s=0.001)
-    on_key(inputs, "relay failed: OSError: the bus is gone")
+    wait_for_cause(inputs, "relay failed: OSError: the bus is gone")
     assert button.is_pressed()
 
 
@@ -119,8 +118,8 @@ def test_a_callable_that_hangs_presses_and_holds_up_no_other_input(button, wire)
         inputs.add(lambda: let_go.wait(30), "relay", period_s=0.001)
         inputs.add(wire[0], "button")
         os.write(wire[1], b"x")
-        on_key(inputs, "button")
-        on_key(inputs, "relay does not answer")
+        wait_for_cause(inputs, "button")
+        wait_for_cause(inputs, "relay does not answer")
         assert inputs.causes == ["button", "relay does not answer"]
         let_go.set()
 
@@ -167,7 +166,7 @@ def test_a_signal_presses_though_the_main_thread_does_not_come_back_to_python(bu
     assert pressed == [True]
 
 
-def test_somebody_elses_wake_up_descriptor_is_left_alone(button):
+def test_a_wake_up_descriptor_of_another_library_is_left_alone(button):
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer)
@@ -199,8 +198,8 @@ def test_a_signal_outside_of_the_main_thread_is_refused(inputs):
     assert "'worker'" in errors[0]
 
 
-@each_case("name", ["SIGINT", "SIGKILL", "SIGTERM", "", "9", "SIGFOO"])
-def test_a_signal_that_means_something_else_is_refused(name):
+@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL", "SIGTERM", "", "9", "SIGFOO"])
+def test_a_reserved_signal_is_refused(name):
     with pytest.raises(ConfigError, match="Valid: SIGUSR1"):
         estop_signal(name)
 
@@ -220,7 +219,7 @@ def test_signals_by_name():
         (bool, float("nan"), "period_s is nan"),
     ],
 )
-def test_what_is_no_input_is_refused(inputs, source, period, message):
+def test_invalid_estop_inputs_are_refused(inputs, source, period, message):
     with pytest.raises(ConfigError, match=message):
         inputs.add(source, period_s=period)
 
@@ -256,7 +255,7 @@ def test_after_close_nothing_presses_and_no_thread_is_left(button, wire):
     assert threading.active_count() == before
     os.write(wire[1], b"x")
     assert not button.word.is_set()
-    assert os.read(wire[0], 1) == b"x"  # it was left for whoever reads it next
+    assert os.read(wire[0], 1) == b"x"  # it is left for the next reader
 
 
 def test_without_a_terminal_there_is_no_key(inputs, wire):

@@ -1,13 +1,10 @@
-import numpy as np
-
-from bhd_lerobot.control.messages import Limit, Mode, Reason, SendResult, Watchdog
-from tests.cases import each_case
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
 
 
-@each_case("reason", list(Reason))
-def test_every_reason_has_an_explanation_of_its_own(reason: Reason) -> None:
-    assert len(reason.explanation) > 5
-    assert [other for other in Reason if other.explanation == reason.explanation] == [reason]
+def test_every_reason_has_an_explanation_of_its_own() -> None:
+    explanations = {reason.explanation for reason in Reason}
+    assert len(explanations) == len(Reason)
+    assert min(map(len, explanations)) > 5
 
 
 def test_a_latch_is_explained_with_the_way_out_of_it() -> None:
@@ -16,7 +13,7 @@ def test_a_latch_is_explained_with_the_way_out_of_it() -> None:
         assert "activate()" in reason.explanation
 
 
-def test_numbers_that_are_recorded_stay_what_they_are() -> None:
+def test_recorded_enum_values_are_stable() -> None:
     """Datasets hold these numbers: a change breaks what was recorded before."""
     assert [mode.name for mode in Mode] == [
         "UNCONFIGURED", "INACTIVE", "HOLD", "TRACKING", "STOPPING", "SAFE_OFF", "ESTOP", "FAULT",
@@ -28,8 +25,3 @@ def test_numbers_that_are_recorded_stay_what_they_are() -> None:
     assert {flag.name: int(flag) for flag in Watchdog} == {
         "COMMAND_AGE": 1, "BLOCKED": 2, "BRAIN": 4, "RECORDER": 8, "PLANT": 16, "MISSES": 32,
     }  # fmt: skip
-
-
-def test_a_result_tells_who_took_the_command() -> None:
-    result = SendResult(np.array([Reason.ACCEPTED, Reason.ESTOP], np.int8))
-    assert result.accepted.tolist() == [True, False]

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.errors import ConfigError
-from tests.cases import each_case
 
 PERIOD = 5_000_000
 BIN = 10 ** (1 / 20)  # 20 bins a decade
@@ -24,14 +23,14 @@ def collect(lateness: np.ndarray, duration: np.ndarray | int = 100) -> TimingSta
     return statistics
 
 
-@each_case("seed", range(6))
-@each_case("scale", [3e3, 5e4, 2e6])
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("scale", [3e3, 5e4, 2e6])
 def test_quantiles_are_at_most_one_bin_too_high_and_never_too_low(seed: int, scale: float) -> None:
     lateness = np.random.default_rng(seed).lognormal(np.log(scale), 1.0, 997).astype(np.int64)
     summary = collect(lateness).summary()
     for share, measured in ((0.50, summary.lateness_p50), (0.99, summary.lateness_p99)):
         exact = np.quantile(lateness, share, method="inverted_cdf") / 1e9
-        # Below a microsecond, the first bin, the statistics do not tell times apart.
+        # Below a microsecond, the first bin, the statistics do not resolve times.
         assert exact <= measured * (1 + 1e-12)
         assert measured <= max(exact * BIN * 1.001, 1e-6)
     assert summary.lateness_max == lateness.max() / 1e9
@@ -129,47 +128,6 @@ def test_quantiles_of_durations_are_at_most_one_bin_too_high_and_never_too_low(d
     assert summary.duration_p99 <= summary.duration_max == max(durations) / 1e9
 
 
-# --- together and apart ----------------------------------------------------------------------------------------------
-
-
-@given(TICKS, TICKS)
-def test_merging_is_counting_both(first: list[tuple[int, int, int]], second: list[tuple[int, int, int]]) -> None:
-    a, b = on_grid(first), on_grid(second, first=3 * 10**15)
-    merged, swapped = a.copy(), b.copy()
-    merged.merge(b)
-    swapped.merge(a)
-    assert merged.summary() == swapped.summary()
-    for total, *parts in zip(merged.histograms[1:], a.histograms[1:], b.histograms[1:], strict=True):
-        assert np.array_equal(total, parts[0] + parts[1])
-    for name in ("ticks", "skipped", "overruns"):
-        assert getattr(merged.summary(), name) == getattr(a.summary(), name) + getattr(b.summary(), name)
-    for name in ("lateness_max", "duration_max"):
-        assert getattr(merged.summary(), name) == max(getattr(a.summary(), name), getattr(b.summary(), name))
-    # The time between the two is no part of either: two loops on their grid are on it together.
-    assert merged.summary().rate_error == pytest.approx(a.summary().rate_error + b.summary().rate_error, abs=1e-6)
-
-
-def test_loops_of_different_periods_are_not_merged() -> None:
-    with pytest.raises(ConfigError, match="different periods"):
-        TimingStatistics(PERIOD).merge(TimingStatistics(2 * PERIOD))
-
-
-@given(TICKS, TICKS)
-def test_what_came_since_is_what_was_added(first: list[tuple[int, int, int]], then: list[tuple[int, int, int]]) -> None:
-    statistics = on_grid(first)
-    before = statistics.copy()
-    later = on_grid(then, first=10**15 + PERIOD * 10**6)
-    for late, long, skipped in then:
-        statistics.add(2 * 10**15, 2 * 10**15 + late, 2 * 10**15 + late + long, skipped)
-    since, wanted = statistics.since(before).summary(), later.summary()
-    assert (since.ticks, since.skipped, since.overruns) == (wanted.ticks, wanted.skipped, wanted.overruns)
-    for name in ("lateness", "duration"):
-        exact, found = getattr(wanted, f"{name}_max"), getattr(since, f"{name}_max")
-        assert exact <= found * (1 + 1e-12)
-        assert found <= max(exact * BIN * 1.001, 1e-6)
-    assert before.summary() == on_grid(first).summary()
-
-
 # --- shared memory ---------------------------------------------------------------------------------------------------
 
 
@@ -183,15 +141,15 @@ def test_a_reader_sees_what_is_counted_and_changes_nothing() -> None:
         assert reader.period_ns == PERIOD
         assert reader.summary() == writer.summary()
         assert bytes(memory.buf) == content
-        kept = reader.copy()
+        before = reader.copy()
         writer.add(PERIOD, PERIOD, PERIOD + 5)
-        assert (reader.ticks, kept.ticks) == (2, 1)
+        assert (reader.ticks, before.ticks) == (2, 1)
         writer.reset()
         assert reader.summary() == TimingStatistics(PERIOD).summary()
         writer.release()
         reader.release()
     finally:
-        memory.close()  # raises if somebody still holds the buffer
+        memory.close()  # raises if the buffer is still held
         memory.unlink()
 
 
@@ -230,7 +188,7 @@ def test_a_summary_survives_json() -> None:
     assert summary.inference_max == summary.inference_p99 == pytest.approx(0.2)
 
 
-def test_a_summary_of_before_and_one_of_later_can_be_read() -> None:
+def test_summaries_of_other_versions_can_be_read() -> None:
     old = {"ticks": 200, "overruns": 0, "lateness_p50": 0.0, "lateness_p99": 0.0, "lateness_max": 0.0}
     old["duration_max"] = 0.0
     summary = TimingSummary.from_fields(old)

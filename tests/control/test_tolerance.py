@@ -49,7 +49,7 @@ def test_exactly_the_frame_beyond_a_default_is_late(column: str, limit: float) -
     assert np.flatnonzero(late).tolist() == [4]
 
 
-def test_what_was_not_measured_is_late() -> None:
+def test_a_frame_with_nan_timing_is_late() -> None:
     late = late_frames(changed("age", 4, float("nan")), TimingTolerance(), RATES)
     assert np.flatnonzero(late).tolist() == [4]
 
@@ -140,7 +140,7 @@ def test_an_episode_is_bad_above_the_share_and_not_at_it(share: float, frames: i
         assert f"allows {allowed}" in message
 
 
-def test_the_verdict_says_what_was_exceeded_by_how_much_and_what_to_do() -> None:
+def test_the_verdict_names_excess_and_remedy() -> None:
     message = verdict(summary(9, 100, lateness_max=0.0123, age_max=0.002, skipped=14), TimingTolerance())
     assert message is not None
     assert "late by 12.30 ms (tolerated 1.00 ms)" in message

@@ -22,7 +22,7 @@ from tests.control.support import BODY, PerfectPlant
 HZ, FPS = 200, 10
 TICK = 1_000_000_000 // HZ
 F = HZ // FPS
-STATE = Cerebellum.state_dtype(1)
+STATE = Cerebellum.state_dtype(1, 2, 2, 3)
 
 
 class Rig:
@@ -140,7 +140,7 @@ def test_modes_are_asked_for_and_setpoints_move_the_robot(rig: Rig) -> None:
     assert Phase(int(rig.block.words[Word.PHASE])) == Phase.STANDING
 
 
-def test_what_cannot_be_accepted_is_refused_at_once_and_with_the_reason(rig: Rig) -> None:
+def test_invalid_setpoints_are_refused_at_once_with_the_reason(rig: Rig) -> None:
     bridge = rig.bridge
 
     def reason(values: np.ndarray, due: int | None = None) -> Reason:

@@ -39,7 +39,7 @@ def test_a_boundary_is_the_state_that_a_frame_ends_with() -> None:
     assert rig.boundaries() == [(0, -1), (1, F - 1), (2, 2 * F - 1), (3, 3 * F - 1)]
 
 
-def test_the_latest_start_of_a_frame_is_kept_with_its_end() -> None:
+def test_the_lateness_of_a_frame_is_in_its_boundary() -> None:
     rig = Rig()
     for tick in range(-1, 2 * F):
         rig.tick(tick, lateness={2: 70, 3: 40, F: 5}.get(tick, 1))
@@ -81,7 +81,7 @@ def test_every_boundary_is_recorded_or_its_absence_is_explained(
         assert dict(found) == firsts
 
 
-def test_a_new_stretch_starts_at_frame_0_and_counts_its_own_drops() -> None:
+def test_a_new_segment_starts_at_frame_0_and_counts_its_own_drops() -> None:
     rig = Rig(ring=8)
     for tick in range(-1, 30):
         rig.tick(tick)

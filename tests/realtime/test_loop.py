@@ -37,12 +37,12 @@ class VirtualLoop:
         self.rig.cerebellum.estop_word = self.words[Word.ESTOP : Word.ESTOP + 1]
         self.delays, self.work, self.alive = delays, work, set(alive)
         self.script: dict[int, Callable[[], object]] = {}
-        self.until = 0  # executed ticks after which the loop is told to pause
+        self.until = 0  # executed ticks after which the loop is to pause
         self.slots: list[Slot] = []
         self.starts: list[int] = []
         self.counted: list[tuple[int, int, int, int]] = []
         self.served: list[int] = []
-        self.given: list[tuple[int, int]] = []  # what the cerebellum was told: its time, and periods that passed
+        self.given: list[tuple[int, int]] = []  # arguments of `tick`: the time, and periods that passed
         self.advanced = 0
         self.modes: list[int] = []
         self.speeds: list[float] = []
@@ -145,19 +145,7 @@ def test_the_grid_is_absolute_and_every_period_is_accounted_for(delays, work, ca
     assert words[Word.CEREBELLUM_ALIVE] == loop.counted[-1][2]
 
 
-def test_a_punctual_loop_skips_and_loses_nothing():
-    loop = VirtualLoop()
-    loop.run(1000)
-    assert [loop.words[word] for word in (Word.EXECUTED, Word.SKIPPED, Word.OVERRUNS, Word.CATCH_UP_LOST)] == [
-        1000,
-        0,
-        0,
-        0,
-    ]
-    assert loop.served == [k * TICK_NS for k in range(1000)]
-
-
-def test_what_is_beyond_the_catch_up_is_lost_and_counted():
+def test_ticks_beyond_the_catch_up_are_lost_and_counted():
     loop = VirtualLoop(LoopLimits(most_misses=10, most_catch_up=3), work=(0, 8 * TICK_NS + 1))
     loop.run(4)
     assert [slot.skipped for slot in loop.slots] == [0, 0, 7, 0]
@@ -232,7 +220,7 @@ def test_a_sign_of_life_after_the_silence_and_a_new_setpoint_move_it_again():
     assert loop.modes[-1] == Mode.TRACKING
 
 
-def test_what_does_not_watch_is_not_watched():
+def test_absent_processes_are_not_watched():
     """A word that was never written belongs to a process that there is not."""
     loop = VirtualLoop(LoopLimits(brain_timeout_s=0.01, recorder_timeout_s=0.01, plant_timeout_s=0.01))
     loop.drive(0, 100)
@@ -270,7 +258,7 @@ def test_the_stop_word_takes_effect_at_the_next_executed_tick(tick, delays):
     assert loop.speeds[tick] < loop.speeds[tick - 1] or loop.speeds[tick] == 0.0
     assert np.all(np.diff(loop.speeds[tick - 1 :]) <= 0)
     assert loop.speeds[-1] == 0.0
-    assert loop.words[Word.ESTOP] == 1  # nobody but a reset clears it
+    assert loop.words[Word.ESTOP] == 1  # only a reset clears it
 
 
 def test_reset_and_activation_lead_out_of_an_emergency_stop_between_late_ticks():
@@ -297,7 +285,7 @@ def test_reset_and_activation_lead_out_of_an_emergency_stop_between_late_ticks()
     assert loop.words[Word.ESTOP] == 0
 
 
-def test_a_pause_ends_the_stretch_and_the_next_one_starts_at_tick_0():
+def test_a_pause_ends_the_segment_and_the_next_starts_at_tick_0():
     loop = VirtualLoop(delays=(3 * TICK_NS,))
     seen: list[int] = []
     loop.script[0] = lambda: seen.append(int(loop.words[Word.PHASE]))

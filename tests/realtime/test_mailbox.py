@@ -58,16 +58,6 @@ def test_the_block_of_memory_has_the_stated_size() -> None:
         Mailbox(RECORD, 3, bytearray(size - 1))
 
 
-def test_two_objects_on_one_block_are_one_mailbox() -> None:
-    block = bytearray(Mailbox.nbytes(RECORD, CAPACITY))
-    writer, reader = Mailbox(RECORD, CAPACITY, block), Mailbox(RECORD, CAPACITY, block)
-    for number in range(20):
-        assert reader.take() is None
-        assert writer.post(record(number))
-        assert len(reader) == 1
-        assert number_of(reader.take()) == number
-
-
 def test_between_two_processes_nothing_is_lost_reordered_or_torn(tmp_path: Path) -> None:
     count, path = 3000, tmp_path / "block"
     mailbox = Mailbox(RECORD, CAPACITY, shared_block(path, Mailbox.nbytes(RECORD, CAPACITY)))

@@ -200,7 +200,7 @@ def test_a_half_written_request_is_not_read() -> None:
     guard = np.frombuffer(block, np.int64, 1)
     guard += 1
     assert not server.serve_once()
-    # Whoever was killed while writing is followed by somebody who can write again.
+    # After a writer that was killed while writing, the next one can write again.
     again = PlanLink(block, 6, 100, duration_s=DURATION_S)
     assert guard[0] % 2 == 0
     again.request(0, ramp(4), STATE, None, 0)
@@ -227,7 +227,7 @@ def test_a_request_that_changes_while_it_is_read_is_read_again() -> None:
     assert answer(link).trajectory.ticks == 5
 
 
-def test_a_planner_that_is_started_anew_answers_what_was_not_answered_and_nothing_else() -> None:
+def test_a_restarted_planner_answers_only_open_requests() -> None:
     link, server, planner, block = linked()
     link.request(0, ramp(3), STATE, None, 0)
     assert server.serve_once()
@@ -237,7 +237,7 @@ def test_a_planner_that_is_started_anew_answers_what_was_not_answered_and_nothin
     assert answer(link).trajectory.ticks == 5
 
 
-def test_it_serves_until_it_is_told_to_stop() -> None:
+def test_serve_runs_until_stop_returns_true() -> None:
     link, server, planner, _ = linked()
     sleeps = []
 
@@ -254,7 +254,7 @@ def test_another_process_plans(tmp_path: Path) -> None:
     block = shared_block(path, PlanLink.nbytes(6, 100, DURATION_S))
     link = PlanLink(block, 6, 100, duration_s=DURATION_S)
     process = start("serve_plans", path, count)
-    kept: tuple[np.ndarray, np.ndarray] | None = None
+    playing_rows: tuple[np.ndarray, np.ndarray] | None = None
     for number in range(1, count + 1):
         link.request(0, ramp(1 + number % 500, float(number)), STATE, 0.01 * number, 0)
         while (plan := link.poll(0)) is None:
@@ -264,10 +264,10 @@ def test_another_process_plans(tmp_path: Path) -> None:
         steps = number * np.arange(1, 2 + number % 500)
         assert np.array_equal(plan.rows[:, 1, 2], STATE.velocity[2] + steps)
         assert plan.target.tolist() == [0.01 * number] * 7
-        assert kept is None or np.array_equal(*kept)
+        assert playing_rows is None or np.array_equal(*playing_rows)
         if number % 3:
             link.begin(0)
-            kept = plan.rows, plan.rows.copy()
+            playing_rows = plan.rows, plan.rows.copy()
     assert process.wait() == 0
 
 
@@ -275,7 +275,7 @@ def test_another_process_plans(tmp_path: Path) -> None:
 
 
 class Scribbler(PlanServer):
-    """A planner's side that takes its time, and leaves rubbish where it may write while the arm goes on."""
+    """A planner's side that takes its time, and leaves garbage where it may write while the arm goes on."""
 
     def __init__(self, world: "World", latencies: list[int]) -> None:
         super().__init__(world.block, PLANNER, duration_s=world.duration_s)

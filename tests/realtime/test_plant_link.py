@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, PlantShape, RemotePlant
 
-SHAPE = PlantShape(joints=2, positions=9, velocities=8, features=300, touches=1, kept=4)
+SHAPE = PlantShape(joints=2, positions=9, velocities=8, features=300, touches=1, capacity=4)
 MS = 1_000_000
 TIMEOUT = 20 * MS
 
@@ -36,8 +36,8 @@ class Rig:
         self.now += round(after_ms * MS)
         return self.guard.check(self.now)
 
-    def tell(self) -> PlantReading:
-        """Publish what the guard knows, and return the cerebellum's reading of it."""
+    def publish_state(self) -> PlantReading:
+        """Publish the state of the guard, and return the cerebellum's reading of it."""
         state = np.zeros((), SHAPE.state_dtype)
         state["stops"], state["position"], state["velocity"] = self.guard.stops, (1.0, 2.0), (3.0, 4.0)
         self.link.states.publish(state)
@@ -86,9 +86,9 @@ def test_a_stop_is_latched_until_a_fresh_command_acknowledges_it() -> None:
     for _ in range(5):
         rig.send()
         assert rig.check(1) == PlantPhase.STOPPED
-    assert rig.tell().fault.tolist() == [True]
+    assert rig.publish_state().fault.tolist() == [True]
     rig.remote.acknowledge()
-    assert rig.tell().fault.tolist() == [False]
+    assert rig.publish_state().fault.tolist() == [False]
     assert rig.check(1) == PlantPhase.STOPPED  # the commands so far acknowledge nothing
     rig.send()
     assert rig.check(1) == PlantPhase.DRIVEN
@@ -98,7 +98,7 @@ def test_a_stop_is_latched_until_a_fresh_command_acknowledges_it() -> None:
 def test_an_old_command_acknowledges_nothing() -> None:
     rig = Rig()
     rig.stop()
-    rig.tell()
+    rig.publish_state()
     rig.remote.acknowledge()
     rig.send()
     assert rig.check(21) == PlantPhase.STOPPED
@@ -106,14 +106,14 @@ def test_an_old_command_acknowledges_nothing() -> None:
 
 def test_an_acknowledgement_is_for_the_stops_that_were_seen() -> None:
     rig = Rig()
-    rig.tell()
+    rig.publish_state()
     rig.remote.acknowledge()  # of none
     rig.stop()
     rig.send()
     assert rig.check(1) == PlantPhase.STOPPED
 
 
-def test_commands_of_an_earlier_stretch_do_not_drive() -> None:
+def test_commands_of_an_earlier_segment_do_not_drive() -> None:
     rig = Rig()
     rig.send()
     rig.guard.begin()
@@ -165,13 +165,13 @@ def test_a_pause_is_no_absence() -> None:
     assert rig.check() == PlantPhase.DRIVEN
 
 
-def test_the_cerebellum_reads_the_newest_state_and_a_plant_that_tells_nothing_is_a_fault() -> None:
+def test_the_newest_plant_state_is_read_and_a_silent_plant_is_a_fault() -> None:
     rig = Rig()
     reading = PlantReading(1, 2)
     rig.remote.read(reading)
     assert reading.fault.tolist() == [True]
     rig.remote.acknowledge()  # of nothing: refused without an error
-    reading = rig.tell()
+    reading = rig.publish_state()
     assert (reading.position.tolist(), reading.velocity.tolist()) == ([[1.0, 2.0]], [[3.0, 4.0]])
     assert reading.fault.tolist() == [False]
 
@@ -181,7 +181,7 @@ def test_reading_and_writing_never_wait_for_the_other_side() -> None:
     rig = Rig()
     for number in range(80):
         rig.send(float(number))
-        rig.tell()
+        rig.publish_state()
     assert rig.check() == PlantPhase.DRIVEN
     assert rig.guard.actuators.tolist() == [[79.0, 79.0]]
     assert rig.guard.number == 80

@@ -139,7 +139,7 @@ def test_goals_and_their_results() -> None:
         (BrainCommand("a"), ResultCode.BAD_TARGET, "no target"),
     ],
 )
-def test_a_refusal_is_also_the_goals_one_result(command: BrainCommand, code: ResultCode, words: str) -> None:
+def test_a_refusal_is_the_only_result_of_its_goal(command: BrainCommand, code: ResultCode, words: str) -> None:
     pair = Pair()
     refusal = pair.client.submit(command)
     assert refusal is not None
@@ -151,7 +151,7 @@ def test_a_refusal_is_also_the_goals_one_result(command: BrainCommand, code: Res
 
 
 @pytest.mark.parametrize("again", [goal("a"), BrainCommand("a", joint_target=(1.0,))], ids=["fits", "does not fit"])
-def test_a_goal_that_has_the_name_of_a_live_one_leaves_that_one_its_result(again: BrainCommand) -> None:
+def test_a_duplicate_name_leaves_the_live_goal_its_result(again: BrainCommand) -> None:
     pair = Pair()
     pair.client.submit(goal("a"))
     assert pair.client.submit(again) is not None
@@ -175,26 +175,6 @@ def test_cancel() -> None:
     assert pair.results() == [("a", ResultCode.CANCELLED)]
 
 
-def test_a_restart_forgets_results_and_names() -> None:
-    pair = Pair(events=2)
-    for name in "abcd":  # more than there is room for
-        pair.client.submit(goal(name, 99.0))
-    pair.client.submit(goal("live", 2.0))
-    for number in range(6):
-        pair.cerebellum.submit(0, goal(str(number), 99.0))
-    pair.tick(50)
-    pair.client.restart()
-    assert pair.results() == []
-    pair.tick(5)
-    assert pair.results() == []
-    assert pair.mode == Mode.UNCONFIGURED
-    pair.client.request(Request.CONFIGURE)
-    pair.client.request(Request.ACTIVATE)
-    assert pair.client.submit(goal("a")) is None
-    pair.rest()
-    assert pair.results() == [("a", ResultCode.SUCCEEDED)]
-
-
 def test_an_emergency_stop_ends_goals_and_refuses_others() -> None:
     pair = Pair()
     pair.client.submit(goal("a", 2.0))
@@ -207,7 +187,7 @@ def test_an_emergency_stop_ends_goals_and_refuses_others() -> None:
     assert Counter(pair.results()) == Counter([("a", ResultCode.ESTOP), ("b", ResultCode.ESTOP)])
 
 
-def test_a_robot_that_takes_no_goals_says_so() -> None:
+def test_a_robot_without_goals_refuses_them_with_a_reason() -> None:
     rig = support.Rig()
     requests, events = Mailbox(request_dtype(0)), Mailbox(EVENT_DTYPE)
     server = RequestServer(rig.cerebellum, requests, events)
@@ -232,7 +212,6 @@ def test_a_cerebellum_that_does_not_answer_is_named_and_does_nothing_later(kind:
         RequestKind.MODE: lambda: pair.client.request(Request.DEACTIVATE),
         RequestKind.GOAL: lambda: pair.client.submit(goal("a")),
         RequestKind.CANCEL: lambda: pair.client.cancel("live"),
-        RequestKind.RESTART: pair.client.restart,
     }
     began = pair.now_ns
     with pytest.raises(RealtimeError, match=f"has not answered a {kind.name} request within 0.1 s"):
@@ -273,7 +252,7 @@ def test_a_reply_that_comes_too_late_is_not_taken_for_another_ones() -> None:
     assert pair.results() == [("a", ResultCode.SUCCEEDED)]
 
 
-def test_who_comes_later_is_not_answered_with_what_is_left() -> None:
+def test_a_new_client_ignores_replies_to_an_earlier_one() -> None:
     pair = Pair()
     pair.client.submit(goal("a", 2.0))
     pair.requests.post(pair_request(pair, 1))
@@ -291,7 +270,7 @@ def pair_request(pair: Pair, number: int) -> Any:
 # --- laws ------------------------------------------------------------------------------------------------------------
 
 
-def test_results_that_nobody_takes_are_kept() -> None:
+def test_results_wait_until_they_are_taken() -> None:
     pair = Pair(events=1)
     due = []
     for number in range(30):

@@ -1,4 +1,4 @@
-"""Blocks of shared memory: found by name, and gone when nobody holds them any more, however their holders ended."""
+"""Blocks of shared memory: found by name, and removed after their last holder, however their holders ended."""
 
 import os
 import shutil
@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -51,7 +50,7 @@ def kill(process: subprocess.Popen[str]) -> None:
     process.communicate()
 
 
-def test_sections_are_separate_zeroed_and_seen_by_whoever_attaches(name: str) -> None:
+def test_sections_are_separate_zeroed_and_shared(name: str) -> None:
     block = SharedBlock.create(name, {"a": 10, "b": 100}, {"robot": "ur5", "names": ["é"]})
     other = SharedBlock.attach(name)
     assert other.about == {"robot": "ur5", "names": ["é"]}
@@ -71,7 +70,7 @@ def test_sections_are_separate_zeroed_and_seen_by_whoever_attaches(name: str) ->
     assert not files(name)
 
 
-def test_a_name_is_taken_as_long_as_anybody_holds_it(name: str) -> None:
+def test_a_held_name_is_taken(name: str) -> None:
     process = hold(name, f"create({name!r}, {{'a': 8}}, {{}})")
     try:
         with pytest.raises(RealtimeError, match="running already"):
@@ -81,7 +80,7 @@ def test_a_name_is_taken_as_long_as_anybody_holds_it(name: str) -> None:
     SharedBlock.create(name, {"a": 8}, {}).close()
 
 
-def test_a_kill_of_the_maker_leaves_it_to_the_others_and_a_kill_of_all_leaves_rubbish_that_is_swept(name: str) -> None:
+def test_a_block_survives_its_maker_and_is_swept_after_its_last_holder(name: str) -> None:
     maker = hold(name, f"create({name!r}, {{'a': 8}}, {{}})")
     other = hold(name, f"attach({name!r})")
     kill(maker)
@@ -95,7 +94,7 @@ def test_a_kill_of_the_maker_leaves_it_to_the_others_and_a_kill_of_all_leaves_ru
     assert not files(name)
 
 
-def test_attaching_to_what_does_not_run_names_what_does(name: str) -> None:
+def test_attaching_to_an_unknown_robot_lists_the_running_ones(name: str) -> None:
     block = SharedBlock.create(name, {"a": 8}, {})
     with pytest.raises(RealtimeError, match=f"'nobody'.*Running: .*{name}"):
         SharedBlock.attach("nobody")
@@ -103,12 +102,12 @@ def test_attaching_to_what_does_not_run_names_what_does(name: str) -> None:
 
 
 @pytest.mark.parametrize("bad", ["", "a/b", "../x", "a b", "x" * 200])
-def test_names_that_are_no_names_are_refused(bad: str) -> None:
+def test_invalid_names_are_refused(bad: str) -> None:
     with pytest.raises(ConfigError, match="cannot be called"):
         SharedBlock.create(bad, {"a": 8}, {})
 
 
-def test_no_room_is_said_before_anything_is_used(name: str) -> None:
+def test_missing_shared_memory_is_reported_at_creation(name: str) -> None:
     with pytest.raises(RealtimeError, match="No room"):
         SharedBlock.create(name, {"a": 1 << 50}, {})
     assert name not in names()
@@ -126,7 +125,7 @@ def test_a_file_that_is_no_block_is_refused(name: str) -> None:
 
 
 def plant(path: Path, kind: str, content: bytes) -> bool:
-    """Put a file of somebody else's into the folder; return whether this user can do that."""
+    """Put a file of another program into the folder; return whether this user can do that."""
     if kind == "folder":
         path.mkdir()
     elif kind == "pipe":
@@ -147,8 +146,8 @@ def plant(path: Path, kind: str, content: bytes) -> bool:
     return True
 
 
-def test_files_of_others_are_neither_in_the_way_nor_read_nor_removed(name: str) -> None:
-    """The folder is everybody's; a block is known by its owner, its kind and its mode, and not by its name."""
+def test_files_of_others_are_neither_read_nor_removed(name: str) -> None:
+    """The folder is shared by all users; a block is known by its owner, its kind and its mode, and not by its name."""
     real = SharedBlock.create(name, {"a": 8}, {"robot": "real"})
     content = files(name)[0].read_bytes()
     for kind in ("folder", "pipe", "link", "socket", "open to all", "of another user"):
@@ -174,7 +173,7 @@ def test_files_of_others_are_neither_in_the_way_nor_read_nor_removed(name: str) 
     real.close()
 
 
-def test_a_block_is_for_its_user_alone_and_its_file_cannot_be_foreseen(name: str) -> None:
+def test_a_block_is_private_and_its_file_name_is_random(name: str) -> None:
     found = set()
     for _ in range(3):
         block = SharedBlock.create(name, {"a": 8}, {})
@@ -185,7 +184,7 @@ def test_a_block_is_for_its_user_alone_and_its_file_cannot_be_foreseen(name: str
     assert len(found) == 3
 
 
-def test_what_a_killed_run_left_is_removed_at_the_next_start_and_what_lives_is_kept(name: str) -> None:
+def test_blocks_of_killed_runs_are_removed_and_live_blocks_stay(name: str) -> None:
     old = shared_memory.FOLDER / f"{shared_memory.PREFIX}{name}-old"  # as version 0.1 called it
     other = shared_memory.FOLDER / f"{shared_memory.PREFIX}{name}-notes"  # another program's
     dead, living = (hold(f"{name}-{what}", f"create({f'{name}-{what}'!r}, {{'a': 8}}, {{}})") for what in "dl")
@@ -210,7 +209,7 @@ def test_what_a_killed_run_left_is_removed_at_the_next_start_and_what_lives_is_k
         other.unlink(missing_ok=True)
 
 
-def test_of_several_that_start_at_once_no_two_have_the_name(name: str) -> None:
+def test_of_several_simultaneous_creators_at_most_one_gets_the_name(name: str) -> None:
     code = (
         "import sys\nfrom bhd_lerobot.realtime.shared_memory import SharedBlock\nfrom bhd_lerobot.errors import "
         "RealtimeError\nsys.stdin.read(1)\ntry:\n    block = SharedBlock.create(sys.argv[1], {'a': 8}, {})\n"
@@ -222,10 +221,10 @@ def test_of_several_that_start_at_once_no_two_have_the_name(name: str) -> None:
         assert process.stdin is not None
         process.stdin.write("x")
         process.stdin.flush()
-    said = [process.stdout.readline() if process.stdout else "" for process in started]
-    assert said.count("made\n") <= 1
-    assert len(files(name)) == said.count("made\n")
-    assert all("running already" in line or line == "made\n" for line in said), said
+    replies = [process.stdout.readline() if process.stdout else "" for process in started]
+    assert replies.count("made\n") <= 1
+    assert len(files(name)) == replies.count("made\n")
+    assert all("running already" in line or line == "made\n" for line in replies), replies
     for process in started:
         process.communicate()
 
@@ -234,8 +233,3 @@ def test_of_several_that_start_at_once_no_two_have_the_name(name: str) -> None:
 def test_other_platforms_are_refused_with_the_way_out(machine: str, system: str) -> None:
     with pytest.raises(RealtimeError, match="lockstep"):
         check_platform(machine, system)
-
-
-def test_this_platform_is_one_that_was_checked() -> None:
-    check_platform("x86_64", "Linux")
-    assert time.monotonic_ns() > 0

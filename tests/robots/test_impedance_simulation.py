@@ -128,7 +128,7 @@ def test_an_emergency_stop_in_motion_ends_where_it_was_pressed() -> None:
     assert rig.bridge.reset().accepted.all()
 
 
-def test_commands_that_no_longer_come_end_the_push_and_hold_what_was_commanded() -> None:
+def test_without_commands_the_push_ends_and_the_arm_holds() -> None:
     rig = pushing()
     commanded = rig.controller.command.copy()
     rig.wait(0.5)
@@ -203,7 +203,7 @@ def test_a_free_response_loses_energy_in_every_tick(damping: tuple[float, ...] |
     assert energies[-1] < 1e-3 * energies[0]
 
 
-def test_a_far_target_in_one_command_moves_nothing_in_a_jump() -> None:
+def test_a_far_target_causes_no_jump() -> None:
     rig = Rig()
     rig.target[:, :3] += (0.05, -0.3, -0.05)
     rig.target[:, 3:7] = (0.0, 0.0, 1.0, 0.0)  # the tool points down

@@ -57,7 +57,7 @@ def test_each_command_arrives_exactly_so_many_ticks_late_and_the_first_holds_unt
         assert line.arrived(sim) == [float(max(0, tick - late)) for tick in range(80)]
 
 
-def test_nothing_of_the_episode_before_arrives_in_the_next() -> None:
+def test_delayed_commands_do_not_cross_episodes() -> None:
     line = Line([5, 3])
     line.write(40)
     line.late.set_latency(np.array([0]), [7])
@@ -97,7 +97,7 @@ def test_readings_are_not_late() -> None:
 
 
 @pytest.mark.parametrize("ticks", [-1, MAX_LATENCY + 1, 10**9])
-def test_what_it_cannot_delay_by_is_refused_and_changes_nothing(ticks: int) -> None:
+def test_invalid_latencies_are_refused(ticks: int) -> None:
     line = Line([3, 3])
     with pytest.raises(ConfigError, match=f"latency_ticks is {ticks}; it must be between 0 and {MAX_LATENCY}"):
         line.late.set_latency(np.array([0, 1]), [1, ticks])

@@ -1,15 +1,13 @@
 """The UR5 as LeRobot sees it: features, bad actions, stops, goals beside setpoints, tool space, noise, options."""
 
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
-from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError, RenderingError
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
@@ -40,8 +38,7 @@ def stay(robot) -> dict[str, float]:
     )
 
 
-@pytest.mark.parametrize("space", ["joint", "tool"])
-@pytest.mark.parametrize("scene", ["empty", "pick"])
+@pytest.mark.parametrize(("space", "scene"), [("joint", "empty"), ("tool", "pick")])
 def test_it_keeps_the_contract_of_a_lerobot_robot(tmp_path, space, scene):
     with make(tmp_path, action_space=space) as robot:
         action = stay(robot)
@@ -58,19 +55,16 @@ def test_features_are_the_joints_and_the_gripper(robot):
     assert names[7:] == [name.replace(".pos", ".vel") for name in names[:7]]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_bad_actions_are_refused_and_nothing_happens(robot):
+    before, now = robot.simulation.physics_state, robot.simulation.bridge.now_ns
+    for change, message in (
         ({"elbow.pos": None}, "not a number"),
         ({"elbow.pos": math.nan}, "'elbow.pos' is nan"),
         ({"gripper.pos": math.inf}, "'gripper.pos' is inf"),
         ({"elbo.pos": 1.0}, "Did you mean 'elbow.pos'"),
-    ],
-)
-def test_a_bad_action_is_refused_and_nothing_happens(robot, change, message):
-    before, now = robot.simulation.physics_state, robot.simulation.bridge.now_ns
-    with pytest.raises(ActionError, match=message):
-        robot.send_action({**stay(robot), **change})
+    ):
+        with pytest.raises(ActionError, match=message):
+            robot.send_action({**stay(robot), **change})
     assert np.array_equal(robot.simulation.physics_state, before)
     assert robot.simulation.bridge.now_ns == now
 
@@ -180,19 +174,6 @@ def test_a_goal_tracks_then_holds_and_a_setpoint_takes_over(robot):
     assert (moved[:6] < math.pi * 0.04).all()
 
 
-def test_tool_actions_are_solved_by_the_bridge(tmp_path):
-    with make(tmp_path, action_space="tool") as robot:
-        action = stay(robot)
-        assert list(action) == list(robot.action_features)
-        action["tool_x.pos"] += 0.05
-        action["tool_z.pos"] -= 0.05
-        for _ in range(25):
-            applied = robot.send_action(action)
-        assert applied == pytest.approx(action, abs=1e-5)
-        tool = robot.simulation.truth().tool_pose[0]
-        assert tool[:3] == pytest.approx([action[f"tool_{axis}.pos"] for axis in "xyz"], abs=5e-4)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -207,19 +188,6 @@ def test_a_tool_pose_that_cannot_be_taken_is_refused_with_the_reason(tmp_path, c
         with pytest.raises(CommandRefusedError, match=message):
             robot.send_action({**stay(robot), **change})
         assert np.array_equal(robot.simulation.cerebellum.command, before)
-
-
-def test_one_refused_arm_does_not_hinder_the_others():
-    simulation = UR5Simulation(UR5Config(action_space="tool"), 3)
-    scene = TableScene("empty", (), simulation.body.home)
-    simulation.reset(np.arange(3), [scene] * 3, [0, 1, 2])
-    action = simulation.to_action(simulation.cerebellum.command)
-    action[1, 0] = 5.0
-    action[:, 2] += 0.001
-    report = simulation.step(action)
-    assert report.sent.reasons.tolist() == [Reason.ACCEPTED, Reason.NO_POSTURE, Reason.ACCEPTED]
-    assert list(report.refusals) == [1]
-    assert np.array_equal(report.applied[0], report.applied[2])
 
 
 def test_noise_and_latency_belong_to_the_episode(tmp_path):
@@ -270,16 +238,6 @@ def test_scenes_bring_their_objects_and_their_instruction(tmp_path):
     with make(tmp_path) as robot:
         assert robot.environment[0] == ()
         assert robot.instruction == ""
-
-
-def test_lerobot_finds_it_through_its_plugin_mechanism():
-    code = (
-        "from lerobot.utils.import_utils import register_third_party_plugins as r; r();"
-        "from lerobot.robots import RobotConfig, make_robot_from_config as m;"
-        "print(type(m(RobotConfig.get_choice_class('ur5')())).__name__)"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.split() == ["UR5"]
 
 
 def test_camera_images_where_there_is_opengl(tmp_path):
@@ -353,34 +311,33 @@ def test_an_arm_that_presses_on_the_table_stops_and_lets_go(robot):
     assert simulation.bridge.state().joint_positions[0] == pytest.approx(start[0], abs=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("goal", "code"),
-    [
-        ({"max_velocity": 1e-7}, ResultCode.PLANNING_FAILED),
-        ({"max_velocity": 1e-5}, ResultCode.PLANNING_FAILED),
-        ({"max_velocity": 1e-3}, ResultCode.PLANNING_FAILED),
-        ({"max_acceleration": 1e-6}, ResultCode.PLANNING_FAILED),
-        ({"max_velocity": 1e-4, "motion": "line"}, ResultCode.PLANNING_FAILED),
-        ({"timeout_s": 1e17}, ResultCode.BAD_TIMEOUT),
-        ({"preempt": "no"}, ResultCode.BAD_TARGET),
-        ({"target_pose": (0.3, 0.2, 0.4)}, ResultCode.BAD_TARGET),
-        ({"target_pose": np.eye(4)}, ResultCode.BAD_TARGET),
-    ],
-)
-def test_a_goal_that_makes_no_sense_ends_with_a_code_and_harms_nothing(robot, goal, code):
+def test_invalid_goals_end_with_a_code(robot):
     bridge = robot.simulation.bridge
-    refusal = bridge.submit(BrainCommand(**{"task_id": "a", "target_pose": Pose((0.4, 0.1, 0.3), DOWN), **goal}))
-    bridge.advance_frame()
-    results = bridge.take_results()
-    assert [one.code for one in results] == [code]
-    assert refusal in (None, results[0])
-    assert bridge.submit(BrainCommand("b", gripper=0.05)) is None
-    for _ in range(20):
+    for number, (goal, code) in enumerate(
+        (
+            ({"max_velocity": 1e-7}, ResultCode.PLANNING_FAILED),
+            ({"max_velocity": 1e-3}, ResultCode.PLANNING_FAILED),
+            ({"max_acceleration": 1e-6}, ResultCode.PLANNING_FAILED),
+            ({"max_velocity": 1e-4, "motion": "line"}, ResultCode.PLANNING_FAILED),
+            ({"timeout_s": 1e17}, ResultCode.BAD_TIMEOUT),
+            ({"preempt": "no"}, ResultCode.BAD_TARGET),
+            ({"target_pose": (0.3, 0.2, 0.4)}, ResultCode.BAD_TARGET),
+            ({"target_pose": np.eye(4)}, ResultCode.BAD_TARGET),
+        )
+    ):
+        fields = {"task_id": f"bad {number}", "target_pose": Pose((0.4, 0.1, 0.3), DOWN), **goal}
+        refusal = bridge.submit(BrainCommand(**fields))
         bridge.advance_frame()
-    assert bridge.take_results()[0].success
+        results = bridge.take_results()
+        assert [result.code for result in results] == [code]
+        assert refusal in (None, results[0])
+        assert bridge.submit(BrainCommand(f"good {number}", gripper=0.05)) is None
+        for _ in range(20):
+            bridge.advance_frame()
+        assert bridge.take_results()[0].success
 
 
-@pytest.mark.parametrize("sim", [-1, 1])
-def test_a_goal_for_an_arm_that_is_not_there_is_refused(robot, sim):
-    with pytest.raises(ConfigError, match=f"sim is {sim}"):
-        robot.simulation.bridge.submit(BrainCommand("a", gripper=0.05), sim)
+def test_a_goal_for_an_unknown_arm_is_refused(robot):
+    for sim in (-1, 1):
+        with pytest.raises(ConfigError, match=f"sim is {sim}"):
+            robot.simulation.bridge.submit(BrainCommand("a", gripper=0.05), sim)

@@ -21,7 +21,7 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_the_defaults(tmp_
     assert config.dataset.num_episodes == 50
 
 
-def test_what_is_encoded_is_parsed_back(tmp_path):
+def test_encoded_configurations_parse_back(tmp_path):
     import yaml
 
     config = parse(RecordConfig, [*REQUIRED, "--brain.safe_distance_m=0.4", "--dataset.tags=[x, y]"])
@@ -106,7 +106,7 @@ def test_files_that_are_no_configuration(tmp_path, name, content, message):
         parse(RecordConfig, [f"--config_path={tmp_path}"])
 
 
-def test_ctrl_c_before_anything_began_is_no_traceback(capsys):
+def test_ctrl_c_before_the_start_prints_no_traceback(capsys):
     def stopped(config):
         raise KeyboardInterrupt
 

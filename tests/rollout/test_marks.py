@@ -45,7 +45,7 @@ def test_it_waits_for_its_simulation_and_not_for_the_next_episode() -> None:
 
 
 @pytest.mark.parametrize("hard", [Event.ESTOP, Event.FAULT])
-def test_what_the_robot_did_stays(hard: Event) -> None:
+def test_estop_and_fault_take_precedence_over_marks(hard: Event) -> None:
     marks = Marks(2)
     marks.outcome("success")
     marks.outcome("success", 1)
@@ -82,18 +82,18 @@ def test_an_outcome_that_the_task_cannot_have_is_refused() -> None:
 
 
 def run(say: dict[tuple[int, int], Any], episodes: int = 3) -> list[Episode]:
-    """Run episodes of two simulations and call what is to be said when a simulation has done so many frames."""
+    """Run episodes of two simulations and call a mark when a simulation has done so many frames."""
     simulation = make_simulation(TurtleBot3Config(beams=36), 2)
     task = make_task(AvoidConfig(duration_s=2.0), 2, 10)
     loop = EpisodeLoop(simulation, task, GapFollowerBrain(GapFollowerConfig()))
     done = [0, 0]
 
-    def look(sim: int, values: dict[str, Any]) -> None:
+    def observe(sim: int, values: dict[str, Any]) -> None:
         done[sim] += 1
         if (sim, done[sim]) in say:
             say[sim, done[sim]](loop.marks)
 
-    loop.observer = look
+    loop.observer = observe
     return list(loop.run([EpisodeSpec(i, 2 * i) for i in range(episodes)]))
 
 
@@ -142,16 +142,16 @@ def test_keys_of_a_terminal_reach_a_recording(tmp_path: Path) -> None:
     ) as process:  # fmt: skip
         os.close(theirs)
         assert process.stdout is not None
-        said = b""
-        while b"s success, f failure" not in said:
+        output = b""
+        while b"s success, f failure" not in output:
             line = os.read(process.stdout.fileno(), 4096)
-            assert line, said.decode()
-            said += line
+            assert line, output.decode()
+            output += line
         while process.poll() is None:
-            os.write(ours, b"s")  # what is said between two episodes is forgotten, so it is said until it is heard
+            os.write(ours, b"s")  # marks between two episodes are dropped, so it is repeated until it takes effect
             time.sleep(0.2)
-        said += process.stdout.read()
+        output += process.stdout.read()
     os.close(ours)
-    assert process.returncode == 0, said.decode()
+    assert process.returncode == 0, output.decode()
     (episode,) = dataset_info(tmp_path / "d").episodes
     assert (episode.metadata["outcome"], episode.metadata["success"]) == ("success", True)

@@ -16,7 +16,7 @@ def everything(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
 
 
-def test_a_run_that_is_refused_leaves_nothing_and_one_that_begins_leaves_its_configuration(tmp_path: Path) -> None:
+def test_a_refused_run_leaves_no_folder_and_a_started_run_leaves_its_configuration(tmp_path: Path) -> None:
     config = parse(RecordConfig, options(tmp_path / "d", output_dir=tmp_path / "a/b/c"))
     with run_folder(config, "record") as folder:
         assert folder == tmp_path / "a/b/c"

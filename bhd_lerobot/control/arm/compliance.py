@@ -9,7 +9,7 @@ from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
 
-# Estimates of what a 500 Hz torque loop on an arm of this size is asked for; natural frequencies stay below 10 Hz, far
+# Estimates for a 500 Hz torque loop on an arm of this size; natural frequencies stay below 10 Hz, far
 # from the 80 Hz at which a damped loop with one tick of delay starts to ring.
 MAX_STIFFNESS = 5000.0  # [N/m]
 MAX_TURN_STIFFNESS = 300.0  # [N m/rad]

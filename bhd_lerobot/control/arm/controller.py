@@ -57,7 +57,7 @@ class ArmController(Controller):
         self._effort = np.asarray(limits.effort)
         self._lowest_effort = -self._effort
         self._largest_error = self._effort / self._stiffness
-        self._largest_error[-1] = np.inf  # a gripper that grips asks for more than it has, always
+        self._largest_error[-1] = np.inf  # a gripping gripper is always commanded more than its effort
         self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._work = np.zeros((n, width))
 
@@ -103,7 +103,7 @@ class ArmController(Controller):
             self._unwatched &= ~self.following
         np.multiply(self.velocity, self._lead, out=self.actuators)
         self.actuators += self.command
-        # A servo that is asked for more than it can give gives what it can: that is noted, and the command left alone.
+        # A servo beyond its effort gives its largest: that is flagged, and the command stays as it is.
         # Holding the command near the joint, to ask for no more, would be a second loop around the servo, which a few
         # milliseconds of latency turn into a brake.
         work = self._work
@@ -205,11 +205,11 @@ class ArmController(Controller):
 
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
         """Return the torques that the servos give beyond gravity [N m], the gripper's force last [N]."""
-        asked = np.subtract(self.actuators, reading.position)
-        asked *= self._stiffness
-        asked -= np.multiply(reading.velocity, self._damping, out=self._work)
-        np.maximum(asked, self._lowest_effort, out=asked)
-        return np.minimum(asked, self._effort, out=asked)
+        effort = np.subtract(self.actuators, reading.position)
+        effort *= self._stiffness
+        effort -= np.multiply(reading.velocity, self._damping, out=self._work)
+        np.maximum(effort, self._lowest_effort, out=effort)
+        return np.minimum(effort, self._effort, out=effort)
 
     # --- goals -------------------------------------------------------------------------------------------------------
 
@@ -222,7 +222,7 @@ class ArmController(Controller):
         return self.goals.cancel(sim, task_id)
 
     def take_results(self, sim: int) -> list[CommandResult]:
-        """Return the results of one arm that nobody has taken yet."""
+        """Return the results of one arm that were not taken yet."""
         return self.goals.take_results(sim)
 
     def feedback(self, sim: int) -> Feedback | None:

@@ -171,10 +171,8 @@ class Equilibrium:
 
 
 def _norm(vectors: Array) -> Array:
-    """Return the lengths of vectors, shape (n, 1)."""
     return np.asarray(np.sqrt(np.square(vectors).sum(axis=1, keepdims=True)))
 
 
 def _clip(vectors: Array, longest: float) -> Array:
-    """Return vectors shortened to a length."""
     return vectors * (longest / np.maximum(_norm(vectors), longest))

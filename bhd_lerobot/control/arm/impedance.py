@@ -53,7 +53,6 @@ class ImpedanceController(Controller):
         frame_ticks: ticks in a frame, over which a setpoint is approached.
         compliance: stiffness and damping to start with; the default if None.
         limits: how fast the equilibrium may move; the default if None.
-        observer_gain: bandwidth of the contact estimate [1/s].
 
     Raises:
         ConfigError: the arm does not take torques.
@@ -70,7 +69,6 @@ class ImpedanceController(Controller):
         *,
         compliance: Compliance | None = None,
         limits: EquilibriumLimits | None = None,
-        observer_gain: float = OBSERVER_GAIN,
     ) -> None:
         if arm.actuation != "torque":
             raise ConfigError(f"The arm {arm.name!r} has actuation={arm.actuation!r}; impedance needs 'torque'.")
@@ -78,7 +76,7 @@ class ImpedanceController(Controller):
         self.joints = len(arm.limits.names)
         self.dynamics = ArmDynamics(arm)
         dof = self.dynamics.dof
-        self.contact = ContactObserver(n, dof, control_hz, observer_gain)
+        self.contact = ContactObserver(n, dof, control_hz, OBSERVER_GAIN)
         opening_limits = (arm.limits.velocity[-1], arm.limits.acceleration[-1])
         self.equilibrium = Equilibrium(n, control_hz, frame_ticks, limits or EquilibriumLimits(), opening_limits)
         self.command, self.actuators = np.zeros((n, WIDTH)), np.zeros((n, self.joints))
@@ -130,11 +128,11 @@ class ImpedanceController(Controller):
         values, to = np.asarray(wrench, np.float64), slice(None) if mask is None else mask
         if values.shape != (6,) or not np.isfinite(values).all():
             raise ConfigError(f"The wrench is {values.tolist()}; it must be 6 finite numbers.")
-        asked = np.array([np.linalg.norm(values[:3]), np.linalg.norm(values[3:])])
+        requested = np.array([np.linalg.norm(values[:3]), np.linalg.norm(values[3:])])
         least = self._largest[to].min(axis=0, initial=np.inf)
-        if (asked > least).any():
+        if (requested > least).any():
             raise ConfigError(
-                f"The wrench has {asked[0]:.6g} N and {asked[1]:.6g} N m; max_force and max_moment of the "
+                f"The wrench has {requested[0]:.6g} N and {requested[1]:.6g} N m; max_force and max_moment of the "
                 f"compliance are {least[0]:.6g} N and {least[1]:.6g} N m."
             )
         self._wanted_wrench[to] = values
@@ -152,11 +150,11 @@ class ImpedanceController(Controller):
             mask = mask & ~bad
         if not mask.any():
             return
-        asked = np.where(mask[:, None], values, self.command)
-        places = asked[:, [0, 1, 2, 7]]
+        setpoint = np.where(mask[:, None], values, self.command)
+        places = setpoint[:, [0, 1, 2, 7]]
         clipped = np.minimum(np.maximum(places, self._lower), self._upper)
         self._limits[mask & (clipped != places).any(axis=1)] |= int(Limit.POSITION)
-        self.equilibrium.set_setpoint(clipped[:, :3], rotation_matrices(asked[:, 3:7]), clipped[:, 3:], mask)
+        self.equilibrium.set_setpoint(clipped[:, :3], rotation_matrices(setpoint[:, 3:7]), clipped[:, 3:], mask)
         self._held &= ~mask
 
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
@@ -228,7 +226,7 @@ class ImpedanceController(Controller):
         return limits
 
     def efforts(self, reading: PlantReading) -> Array:
-        """Return the torques that the motors give, weight included [N m], and what the gripper is asked for [N]."""
+        """Return the torques of the motors, weight included [N m], and the commanded force of the gripper [N]."""
         efforts = self.actuators.copy()
         stiffness, damping = self.arm.servo_stiffness[-1], self.arm.servo_damping[-1]
         efforts[:, -1] = (efforts[:, -1] - reading.position[:, -1]) * stiffness - reading.velocity[:, -1] * damping

@@ -10,7 +10,7 @@ from bhd_lerobot.bodies.body import PositionLimits
 _GAIN = 50.0
 # The share of the acceleration limit that approaching a target may count on, so that discrete time leaves room.
 _APPROACH = 0.7
-# Which joints may come near an end of their range is looked up once in so many ticks.
+# Which joints may come near an end of their range is found once in so many ticks.
 _LOOK_TICKS = 20
 _NEVER = np.iinfo(np.int64).max
 
@@ -41,7 +41,7 @@ class SetpointFilter:
         self._slowest = -self._speed
         self._hardest = -self._acceleration
         self._closing = 2 * _APPROACH * self._acceleration
-        # Farther from an end of the range than this, any speed can be stopped in time, until the next look, too.
+        # Farther from an end of the range than this, any speed can be stopped in time, also until the next check.
         room = self._room_for(self._speed) + _LOOK_TICKS * self._speed / control_hz
         self._near_upper, self._near_lower = self._upper - room, self._lower + room
         self._next_look = 0
@@ -141,7 +141,6 @@ class SetpointFilter:
         np.copyto(position, position + velocity / self._hz, where=active)
 
     def _arrive(self) -> None:
-        """Let the targets rest that have arrived."""
         arrived = self._arrival == self._runs
         self._step[arrived] = self._feed[arrived] = 0.0
         self._arrival[arrived] = _NEVER

@@ -19,7 +19,7 @@ class ContactObserver:
     """Estimates the torques, and the wrench on the tool, that the surroundings put on n arms.
 
     It compares the generalised momentum with the one that the commanded torques account for, so that it needs no
-    accelerations. What it knows nothing of counts as contact: friction in the joints, and a payload's weight.
+    accelerations. What is not modelled counts as contact: friction in the joints, and a payload's weight.
 
     Attributes:
         torque: external joint torques [N m], shape (n, 6).

@@ -138,7 +138,7 @@ class BaseController(Controller):
         return limits
 
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return the torques that the servos are asked for [N m], shape (n, joints)."""
+        """Return the commanded torques of the servos [N m], shape (n, joints)."""
         return (self.actuators - reading.velocity) * self._servo_gain
 
     def odometry(self) -> NDArray[np.float64]:

@@ -113,7 +113,6 @@ def _segment_distance(apart: Array, way1: Array, way2: Array, square1: Array, sq
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Return the inner product along the first axis."""
     product = a * b
     total: Array = product[0] + product[1]
     total += product[2]
@@ -121,7 +120,6 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _clipped(share: Array) -> Array:
-    """Clip to 0 to 1, in place."""
     np.maximum(share, 0.0, out=share)
     return np.minimum(share, 1.0, out=share)
 

@@ -19,7 +19,7 @@ NO_FAILURE = (ResultCode.SUCCEEDED, ResultCode.CANCELLED, ResultCode.PREEMPTED, 
 
 
 class GoalBook:
-    """Sees to it that every goal of one episode ends in exactly one result.
+    """Ensures that every goal of one episode ends in exactly one result.
 
     Attributes:
         waiting: the goals that wait, the next one first.
@@ -113,6 +113,6 @@ class GoalBook:
         return result
 
     def take_results(self) -> list[CommandResult]:
-        """Return the results that nobody has taken yet, in the order in which the goals ended."""
+        """Return the results that were not taken yet, in the order in which the goals ended."""
         results, self._results = self._results, []
         return results

@@ -77,7 +77,7 @@ class GoalManager:
         self._braking = self._judged  # simulations that a brake is played for
         self._idle = True
 
-    # --- what a brain asks for ---------------------------------------------------------------------------------------
+    # --- requests of a brain -----------------------------------------------------------------------------------------
 
     def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
         """Take a goal; it starts as soon as it is planned.
@@ -115,7 +115,7 @@ class GoalManager:
         return code
 
     def take_results(self, sim: int) -> list[CommandResult]:
-        """Return the results that nobody has taken yet, in the order in which the goals ended."""
+        """Return the results that were not taken yet, in the order in which the goals ended."""
         return self._books[sim].take_results()
 
     def feedback(self, sim: int) -> Feedback | None:
@@ -128,7 +128,7 @@ class GoalManager:
         progress = 1.0 - min(1.0, left / int(self._planned[sim]))
         return Feedback(book.followed.task_id, phase, progress, left / self._hz, error)
 
-    # --- what the owner asks for -------------------------------------------------------------------------------------
+    # --- requests of the controller ----------------------------------------------------------------------------------
 
     def stop(  # noqa: PLR0917  the reference is three arrays
         self,
@@ -258,7 +258,7 @@ class GoalManager:
         self.phase[sim] = GoalPhase.CONVERTING
         now = State(*(array[sim] for array in reference))
         if self._orders.deferred and self._motion[sim] == _Motion.NONE and now.moving:
-            # It has followed setpoints. Where it is going to be is known only if it is told.
+            # It has followed setpoints. Where it is going to be is known only after a stop.
             self._brake(sim, reference, _Motion.BRAKE)
             self._changed(sim)
 
@@ -300,12 +300,10 @@ class GoalManager:
         self._opening[sim] = None
 
     def _end(self, sim: int, code: ResultCode, message: str) -> None:
-        """End the goal that is followed."""
         if self._books[sim].end(code, message):
             self.phase[sim] = GoalPhase.IDLE if code in NO_FAILURE else GoalPhase.ERROR
 
     def _end_all(self, sim: int, code: ResultCode, message: str) -> None:
-        """End the goal that is followed and those that wait."""
         if self._books[sim].end_all(code, message):
             self.phase[sim] = GoalPhase.IDLE if code in NO_FAILURE else GoalPhase.ERROR
 

@@ -1,4 +1,4 @@
-"""Asking for plans: at once, or from a planner that takes its time while the arm goes on moving."""
+"""Requests for plans: answered at once, or later by a planner that works while the arm moves."""
 
 import math
 from collections.abc import Callable
@@ -19,7 +19,7 @@ TIMEOUT_S = 2.0  # [s] that an answer may take
 
 
 class Planning(Protocol):
-    """Who plans goals, and how long that may take.
+    """Plans goals, at once or later.
 
     At most one request for each arm is out. None of the methods ever waits.
 
@@ -32,7 +32,7 @@ class Planning(Protocol):
     timeout: int
 
     def request(self, sim: int, command: BrainCommand, state: State, opening: float | None, start_tick: int) -> None:
-        """Ask for a plan; what was asked for before is not wanted any more.
+        """Request a plan; an earlier request is dropped.
 
         Args:
             sim: the arm.
@@ -49,11 +49,11 @@ class Planning(Protocol):
         """Take note that the plan that was polled last is being played: its rows must stay as they are."""
 
     def drop(self, sim: int) -> None:
-        """Want no answer any more."""
+        """Drop the request: no answer is returned any more."""
 
 
 class InlinePlanning:
-    """Plans when it is asked to: the answer is there in the same tick.
+    """Plans at the request: the answer is there in the same tick.
 
     Args:
         planner: the arms' planner.
@@ -74,7 +74,7 @@ class InlinePlanning:
         return self._answers.pop(sim, None)
 
     def begin(self, sim: int) -> None:
-        """Nothing is to be done: the plan is nobody else's."""
+        """Do nothing: the plan has no other owner."""
 
     def drop(self, sim: int) -> None:
         """Forget the plan."""
@@ -94,7 +94,7 @@ def lead_ticks(control_hz: int, lead_s: float = LEAD_S) -> int:
 
 @dataclass
 class _Order:
-    """A plan that was asked for and is not played yet."""
+    """A plan that was requested and is not played yet."""
 
     command: BrainCommand
     state: State
@@ -105,10 +105,10 @@ class _Order:
 
 
 class PlanOrders:
-    """The plans that n arms wait for, at most one each.
+    """The open requests for plans of n arms, at most one each.
 
     A plan is used only from the state that it was made for. For an arm that moves that is one tick: the one that lies
-    a lead after the request. If the answer is later, it is asked for again, from further ahead. An arm that is at rest
+    a lead after the request. If the answer is later, it is requested again, from further ahead. An arm that is at rest
     stays where it is, and its plan is never too late.
 
     Args:
@@ -124,7 +124,7 @@ class PlanOrders:
 
     @property
     def deferred(self) -> bool:
-        """Whether plans come later than they are asked for."""
+        """Whether plans come later than their requests."""
         return self._planning.lead > 0
 
     def wanted(self, sim: int) -> BrainCommand | None:
@@ -133,7 +133,7 @@ class PlanOrders:
         return None if order is None else order.command
 
     def drop(self, sim: int) -> None:
-        """Want no plan any more: an answer that comes later is ignored."""
+        """Drop the request of an arm: an answer that comes later is ignored."""
         if self._orders[sim] is not None:
             self._orders[sim] = None
             self._planning.drop(sim)
@@ -202,10 +202,10 @@ class PlanOrders:
         )
 
 
-def _same(one: State, other: State) -> bool:
+def _same(first: State, second: State) -> bool:
     # Counting is several times cheaper than `np.array_equal`.
     return not (
-        np.count_nonzero(one.position != other.position)
-        or np.count_nonzero(one.velocity != other.velocity)
-        or np.count_nonzero(one.acceleration != other.acceleration)
+        np.count_nonzero(first.position != second.position)
+        or np.count_nonzero(first.velocity != second.velocity)
+        or np.count_nonzero(first.acceleration != second.acceleration)
     )

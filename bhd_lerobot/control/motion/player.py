@@ -22,7 +22,7 @@ class TrajectoryPlayer:
     def __init__(self, n: int, dof: int) -> None:
         self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self._rows: NDArray[np.float64] = np.zeros((4096, 3, dof))
-        self._source = self._rows  # what the only trajectory is played from: the block, or somebody else's rows
+        self._source = self._rows  # what the only trajectory is played from: the block, or borrowed rows
         self._used = 0
         # The row that is next is the number of ticks so far and this.
         self._offset, self._end = np.zeros(n, np.intp), np.zeros(n, np.intp)
@@ -45,7 +45,7 @@ class TrajectoryPlayer:
         self._changed()
 
     def borrow(self, rows: NDArray[np.float64]) -> None:
-        """Play somebody else's rows from the next tick on, without copying them; for one simulation.
+        """Play rows of another owner from the next tick on, without copying them; for one simulation.
 
         Args:
             rows: position, velocity and acceleration at each tick, shape (T, 3, dof). They must stay as they are until

@@ -57,7 +57,7 @@ class Supervisor:
         self._begun, self._deadline = np.zeros(n, np.int64), np.zeros(n, np.int64)  # ticks
         self._next_deadline = 0  # no goal that is followed has an earlier one
         self._since_end, self._still = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        # How far each joint is from its reference [rad; m]: the gripper's column is there, and is not looked at.
+        # How far each joint is from its reference [rad; m]: the gripper's column is not used.
         self._away = np.zeros((n, self._dof + 1))
         self._arm_away = self._away[:, : self._dof]
         self._off = np.zeros((n, self._dof), np.bool_)
@@ -89,10 +89,10 @@ class Supervisor:
         Args:
             ids: the simulations that follow a goal.
             playing: whose trajectory has not ended yet, shape (n,).
-            reference: what the plant was last told: positions and velocities, each of shape (n, dof + 1).
+            reference: what the plant was last commanded: positions and velocities, each of shape (n, dof + 1).
             measured: what it did: positions and velocities, each of shape (n, dof + 1).
         """
-        # All rows, also of those that follow nothing, and nothing but comparisons: this is asked every tick.
+        # All rows, also of those that follow nothing, and nothing but comparisons: this runs every tick.
         np.subtract(measured[0], reference[0], out=self._away)
         np.abs(self._away, out=self._away)
         np.greater(self._arm_away, PATH_TOLERANCE, out=self._off)
@@ -102,8 +102,8 @@ class Supervisor:
         on_time = self._tick < self._next_deadline
         if on_time and np.count_nonzero(playing[ids]) == len(ids) and not np.count_nonzero(self._off):
             return []
-        look = ids if not on_time else ids[~playing[ids] | self._off[ids].any(axis=1)]
-        verdicts = [self._judge(int(sim), bool(playing[sim]), measured) for sim in look]
+        due = ids if not on_time else ids[~playing[ids] | self._off[ids].any(axis=1)]
+        verdicts = [self._judge(int(sim), bool(playing[sim]), measured) for sim in due]
         if not on_time:
             self._next_deadline = int(self._deadline[ids].min())
         return [verdict for verdict in verdicts if verdict is not None]
@@ -133,7 +133,6 @@ class Supervisor:
         return verdict
 
     def _judge_end(self, sim: int, position: Array, velocity: Array) -> Verdict | None:
-        """Judge a goal whose trajectory has ended."""
         dof = self._dof
         self._since_end[sim] += 1
         off, speed = np.abs(position - self._target[sim]), np.abs(velocity)

@@ -24,8 +24,8 @@ class RealtimeConfig:
         recorder_timeout_s: the same for the recorder's process [s].
         most_misses: after so many ticks in a row that came a period or more too late the robot stops, with FAULT.
         most_catch_up: so many missed ticks at the most are caught up at once by the simulation.
-        plant_process: run the simulated world in a process of its own, which stops the robot by itself when it hears
-            nothing from the cerebellum, as a motor controller would.
+        plant_process: run the simulated world in a process of its own, which stops the robot by itself when it gets
+            no commands of the cerebellum, as a motor controller would.
         plant_timeout_s: it does that after so long without a command, and the cerebellum goes to FAULT after so long
             without a sign of life of it [s]; at least two control ticks.
         buffer_s: so long may the recorder fall behind before a state is lost, and counted [s].
@@ -45,11 +45,6 @@ class RealtimeConfig:
     buffer_s: float = 8.0
 
     def __post_init__(self) -> None:
-        """Refuse values that cannot be honoured.
-
-        Raises:
-            ConfigError: names the value and the valid ones.
-        """
         for name in ("brain_timeout_s", "recorder_timeout_s", "plant_timeout_s", "buffer_s"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ConfigError(

@@ -288,7 +288,7 @@ class LiveLink:
             self.check()
             raise RealtimeError(f"The {name}'s process closed its pipe.") from None
         if kind in ("failed", "refused"):
-            raise RealtimeError(f"The {name}'s process could not do what was asked: {value}")
+            raise RealtimeError(f"The {name}'s process refused the request: {value}")
         if kind != wanted:
             raise RealtimeError(f"The {name}'s process answered {kind!r} where {wanted!r} was expected.")
         return value

@@ -146,7 +146,7 @@ class PlantProcess:
         world.place(scene, seed)
         grid = TickGrid(0, loop.period_ns)
         if not self._warm:
-            # Ticks that nobody follows: what happens for the first time takes longest.
+            # Warm-up ticks: the first executions take longest.
             for index in range(self._warm_up_ticks):
                 world.read(loop.reading)
                 world.write(loop.stop.command(loop.reading))

@@ -1,4 +1,4 @@
-"""How a plant that hears no commands any more brings its robot to rest, by itself and with its own sensors only."""
+"""How a plant that gets no commands any more brings its robot to rest, by itself and with its own sensors only."""
 
 from typing import Protocol
 

@@ -152,7 +152,7 @@ class LiveProcess:
         gc.collect()  # the loop runs without a collector
 
     def _warm_up(self, scene: Any, seed: int) -> None:
-        """Run ticks that nobody sees: what happens for the first time takes longest."""
+        """Run ticks before the first real one: first executions take longest."""
         self._reset(scene, seed)
         grid = TickGrid(0, self._loop.period_ns)
         for tick in range(self._warm_up_ticks):
@@ -177,7 +177,7 @@ class LiveProcess:
         self._serve_bridge(now_ns)
         if os.getppid() == self._parent:
             return
-        # Nobody is left to work for: come to rest (the watchdog on the brain sees to that), then end.
+        # The brain's process has ended: come to rest (its watchdog sees to that), then end.
         self._orphan_ticks += 1
         moving = self._simulation.cerebellum.mode[0] in (Mode.TRACKING, Mode.STOPPING)
         if not moving or self._orphan_ticks > self._most_orphan_ticks:
@@ -228,17 +228,17 @@ def run_worker(make: Callable[[LiveSpec, Connection], Worker]) -> int:
             finally:
                 process.close()
     except BhdError as error:
-        _say(connection, f"{type(error).__name__}: {error}")
+        _send_failure(connection, f"{type(error).__name__}: {error}")
         return 2
     except Exception:
-        _say(connection, traceback.format_exc())
+        _send_failure(connection, traceback.format_exc())
         return 1
     return 0
 
 
-def _say(connection: Connection, what: str) -> None:
-    with contextlib.suppress(OSError):  # the brain's process is gone: nobody wants to know
-        connection.send(("failed", what))
+def _send_failure(connection: Connection, message: str) -> None:
+    with contextlib.suppress(OSError):  # the brain's process has ended
+        connection.send(("failed", message))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """A robot on the wall clock, with the interface of a `Simulation` of one.
 
 Cerebellum, physics and recorder run in processes of their own. Here is a mirror: a simulation of the same kind that is
-put into published states, to tell what is true and to render images.
+put into published states, to compute the truth that tasks judge by and to render images.
 """
 
 import itertools
@@ -37,7 +37,7 @@ class LiveFrame:
         number: its number in the episode.
         seen: the observation that it began with.
         physics: the simulator's generalised positions and velocities at its start, shape (1, nq + nv).
-        requested: what the brain last asked for by its end, in the space of the actions, shape (1, actions).
+        requested: the last setpoint of the brain by its end, in the space of the actions, shape (1, actions).
         end: the state at its end.
         touches: what was touched during it, by kind.
         lateness_ns: the latest start of one of its ticks [ns].
@@ -101,7 +101,6 @@ class LiveSimulation(Simulation):
     # --- the mirror --------------------------------------------------------------------------------------------------
 
     def _show(self, state: Any, touches: NDArray[np.bool_] | None = None) -> None:
-        """Put the mirror into a published state."""
         if self._shown is not state:
             self._shown = state
             mirror = self.mirror
@@ -135,7 +134,7 @@ class LiveSimulation(Simulation):
 
     @property
     def touches(self) -> tuple[NDArray[np.bool_], ...]:
-        """What the mirror was last told about touches."""
+        """What was touched in the frame that the mirror shows."""
         return self.mirror.touches
 
     @property
@@ -204,7 +203,7 @@ class LiveSimulation(Simulation):
         return self._frame_of(state, time.monotonic_ns())
 
     def _newest(self) -> Any:
-        """Return the newest state; what a process said that has ended, or is stopped, is none."""
+        """Return the newest state; the last state of a process that has ended, or is stopped, does not count."""
         self.link.check()
         state = self.live_bridge.latest
         silence = (time.monotonic_ns() - int(state["sensed_ns"])) / NANOSECONDS
@@ -281,7 +280,7 @@ class LiveSimulation(Simulation):
         begun, end = before["state"], after["state"]
         return LiveFrame(
             number=int(before["frame"]),
-            seen=self._frame_of(begun, int(begun["sensed_ns"])),  # if the brain did not look at it, nobody waited
+            seen=self._frame_of(begun, int(begun["sensed_ns"])),  # a brain that did not observe it did not wait for it
             physics=begun["physics"].copy(),
             requested=self.mirror.to_action(end["requested"]),
             end=end,
@@ -309,7 +308,7 @@ class LiveSimulation(Simulation):
                 link.check()
                 raise RealtimeError(
                     f"Frame {number} was due {_SILENCE_S:g} s ago and has not come: the real-time process or the "
-                    "recorder is stopped, or gets no processor time. The robot holds by itself when it hears nothing."
+                    "recorder is stopped, or gets no processor time. Without commands the robot holds by itself."
                 )
             if left > 0:
                 time.sleep(left / NANOSECONDS)

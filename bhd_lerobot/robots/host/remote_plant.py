@@ -18,14 +18,14 @@ _ODOMETRY = ("x.pos", "y.pos", "theta.pos")
 
 
 def plant_shape(simulation: Simulation) -> PlantShape:
-    """Return the sizes of what the plant of a robot publishes; a second of it is kept."""
+    """Return the sizes of what the plant of a robot publishes; the ring holds one second."""
     return PlantShape(
         joints=simulation.cerebellum.controller.joints,
         positions=simulation.world.qpos.shape[1],
         velocities=simulation.world.qvel.shape[1],
         features=len(simulation.observation_names),
         touches=len(simulation.touches),
-        kept=simulation.rates.control_hz,
+        capacity=simulation.rates.control_hz,
     )
 
 
@@ -56,7 +56,7 @@ class RemoteSimulation(Simulation):
         self.sensor_period_s = own.sensor_period_s
         self.remote = self.cerebellum.plant = RemotePlant(link)
         self._taken: Any = None
-        self._touches: NDArray[np.int64] = np.zeros(len(own.touches), np.int64)  # that it told of
+        self._touches: NDArray[np.int64] = np.zeros(len(own.touches), np.int64)  # counts taken so far
         has_odometry = set(_ODOMETRY) <= set(own.observation_names)
         first = own.observation_names.index(_ODOMETRY[0]) if has_odometry else 0
         self._odometry = slice(first, first + len(_ODOMETRY)) if has_odometry else None

@@ -25,7 +25,7 @@ SENSOR_STREAM = 1
 
 @dataclass(frozen=True)
 class Frame:
-    """What was seen at the start of a frame, of n robots.
+    """The observation at the start of a frame, of n robots.
 
     Attributes:
         state: the observation's floats, shape (n, features).
@@ -40,7 +40,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class FrameReport:
-    """What the cerebellum did during a frame, of n robots.
+    """Report of a frame, of n robots.
 
     Attributes:
         applied: the command at the end of the frame, in the space of the actions, shape (n, actions).
@@ -52,7 +52,7 @@ class FrameReport:
         results: how goals ended, or were refused, during the frame, by simulation.
         refusals: in words why setpoints were refused, by simulation, where a `Reason` does not say it all.
         live: the `LiveFrame` of a robot on the wall clock.
-        missed: the frames before this one that went by on the wall clock while the brain was thinking.
+        missed: the frames before this one that went by on the wall clock during inference.
     """
 
     applied: NDArray[np.float64]
@@ -118,7 +118,7 @@ class Simulation(ABC):
         action_names: names of the action's floats, in order.
         observation_names: names of the observation's floats, in order.
         camera_names: the cameras that are observed.
-        view: the camera that looks at the robot from outside, for videos.
+        view: the camera outside of the robot, for videos.
         video_speed: how much faster than the robot was a video of it is shown.
         running: which robots are in an episode, shape (n,).
         is_live: whether it runs on the wall clock, in processes of its own.
@@ -159,7 +159,7 @@ class Simulation(ABC):
         self._camera: Camera | None = None
         self._render_thread: RenderThread | None = None
 
-    # --- what a kind of robot says ------------------------------------------------------------------------------------
+    # --- what a kind of robot defines --------------------------------------------------------------------------------
 
     @abstractmethod
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
@@ -186,7 +186,7 @@ class Simulation(ABC):
 
     @abstractmethod
     def truth(self, report: FrameReport | None = None) -> Any:
-        """Return what the simulator knows that a task judges by; touches since the start of the last frame.
+        """Return the ground truth that a task judges by; touches since the start of the last frame.
 
         Args:
             report: the frame at the end of which it is true; only on the wall clock it need not be the last.
@@ -196,11 +196,6 @@ class Simulation(ABC):
     @abstractmethod
     def touches(self) -> tuple[NDArray[np.bool_], ...]:
         """What was touched since the start of the last frame, by kind, live, each of shape (n,)."""
-
-    def _clear_touches(self) -> None:
-        """Forget the touches so far: a frame begins."""
-        for flags in self.touches:
-            flags[:] = False
 
     def _step(self) -> None:
         """Let one control tick of physics go by."""
@@ -317,7 +312,8 @@ class Simulation(ABC):
 
     def _frame(self, receipt: Receipt) -> FrameReport:
         """Let one frame go by, and report what happened in it and to the command that it began with."""
-        self._clear_touches()
+        for flags in self.touches:
+            flags[:] = False
         self.bridge.advance_frame()
         self.world.check()
         limits, watchdog = self.cerebellum.take_flags()

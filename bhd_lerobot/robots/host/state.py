@@ -36,7 +36,7 @@ def state_dtype(simulation: Simulation) -> np.dtype:
     - ``requested``, ``setpoints``: the setpoint taken last, and how many were taken; ``command_age_ns``: its age if it
       is followed; ``waiting``: entries in the queue.
     - ``limits``, ``watchdogs``, ``refusals``, ``touches``: how often each was raised so far, of `LIMITS`, `WATCHDOGS`,
-      `Reason`, and of what the simulation tells about touches. Limits are counted once a frame.
+      `Reason`, and of the kinds of touches of the simulation. Limits are counted once a frame.
     - ``feedback``: how far the goal is that is followed, once a frame.
     - ``observation``: the observation's floats; ``sensed_ns``: when they were read, monotonic; ``oldest_ns``: how much
       older the oldest reading in them was.
@@ -96,7 +96,7 @@ class StatePublisher:
         self._limits[:] = self._watchdogs[:] = self._touches[:] = 0
 
     def publish(self, slot: Slot, start_ns: int, ended_ns: int, grid: TickGrid) -> None:
-        """Publish what is so at the end of a tick.
+        """Publish the state at the end of a tick.
 
         Args:
             slot: the tick.
@@ -158,7 +158,7 @@ class StatePublisher:
             field["limits"][:] = self._limits
         raised = int(watchdog[0])
         if raised:
-            self._watchdogs += [bool(raised & one) for one in WATCHDOGS]
+            self._watchdogs += [bool(raised & watchdog) for watchdog in WATCHDOGS]
             field["watchdogs"][:] = self._watchdogs
 
 
@@ -166,4 +166,4 @@ def raised(before: Any, after: Any) -> tuple[int, int]:
     """Return the `Limit` and `Watchdog` flags that were raised between two published states."""
     limits = sum(int(limit) for limit, more in zip(LIMITS, after["limits"] > before["limits"], strict=True) if more)
     seen: NDArray[np.bool_] = after["watchdogs"] > before["watchdogs"]
-    return limits, sum(int(one) for one, more in zip(WATCHDOGS, seen, strict=True) if more)
+    return limits, sum(int(flag) for flag, more in zip(WATCHDOGS, seen, strict=True) if more)

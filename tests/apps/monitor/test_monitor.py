@@ -160,7 +160,7 @@ def test_what_nobody_holds_any_more_is_not_watched() -> None:
     )
     subprocess.run([sys.executable, "-c", code], check=False)
     assert files(name)
-    with pytest.raises(RealtimeError, match="nobody holds it any more"):
+    with pytest.raises(RealtimeError, match="no process holds it any more"):
         SharedBlock.watch(name)
     shared_memory.sweep()
     assert not files(name)

@@ -39,7 +39,7 @@ def test_every_mode_has_the_damping_ratio(ratio: float) -> None:
         np.testing.assert_allclose(-poles.real / np.abs(poles), ratio, atol=1e-3)
 
 
-def test_what_has_no_spring_is_damped_too() -> None:
+def test_axes_without_stiffness_are_damped() -> None:
     mobility = np.eye(6)[None] / 10
     damping = critical_damping(mobility, np.zeros((1, 6, 6)), np.ones(1))
     assert np.linalg.eigvalsh(damping).min() > 1
@@ -162,7 +162,7 @@ def test_the_estimate_follows_a_step_with_its_time_constant() -> None:
     assert not observer.wrench.any()
 
 
-def test_the_wrench_is_what_the_joints_feel() -> None:
+def test_the_wrench_maps_to_joint_torques() -> None:
     rng = np.random.default_rng(2)
     jacobian = DYNAMICS.terms(HOME[None, :6], np.zeros((1, 6))).jacobian
     wrench = rng.uniform(-20, 20, (1, 6))

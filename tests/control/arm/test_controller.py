@@ -226,7 +226,7 @@ def test_a_setpoint_replaces_a_goal() -> None:
     rig.check()
 
 
-def test_a_goal_replaces_setpoints_and_is_finished_though_none_comes_any_more() -> None:
+def test_a_goal_replaces_setpoints_and_finishes_without_them() -> None:
     rig = Rig()
     values = HOME.copy()
     for _ in range(10):
@@ -240,7 +240,7 @@ def test_a_goal_replaces_setpoints_and_is_finished_though_none_comes_any_more() 
     rig.check()
 
 
-def test_one_arm_s_setpoint_leaves_the_goal_of_another_alone() -> None:
+def test_a_setpoint_of_one_arm_does_not_end_the_goal_of_another() -> None:
     rig = Rig(2)
     for sim in range(2):
         rig.go(sim, **SWEEP)
@@ -354,7 +354,7 @@ def test_a_reading_that_cannot_be_is_a_fault_and_ends_the_goal(what: float | str
     rig.check()
 
 
-def test_what_another_process_writes_into_the_queue_is_checked_again() -> None:
+def test_non_finite_queue_entries_stop_the_arm() -> None:
     rig = Rig(2)
     rig.stream(off(j0=0.2), 4)
     values = np.tile(off(j0=0.2), (2, 1))
@@ -403,7 +403,7 @@ def test_a_restarted_arm_behaves_like_a_new_one() -> None:
     assert used.results() == fresh.results()
 
 
-def test_flags_say_what_was_limited_and_are_cleared_by_reading() -> None:
+def test_limit_flags_are_set_and_cleared_by_reading() -> None:
     rig = Rig(3)
     values = np.tile(HOME, (3, 1))
     values[1] = off(j0=10.0)
@@ -433,7 +433,7 @@ def test_an_arm_that_is_held_fast_is_asked_for_more_effort_than_it_has_and_its_g
     rig.check()
 
 
-def test_at_rest_where_it_is_commanded_the_servos_are_asked_for_nothing() -> None:
+def test_servo_effort_is_zero_at_rest() -> None:
     rig = Rig()
     rig.tick(10)
     state = rig.cerebellum.state(rig.now)
@@ -477,7 +477,7 @@ def act(rig: Rig, kind: str, value: float) -> None:
 @settings(max_examples=20)
 @example([(("goal", 1.0), 137), (("stream", 0.0), 0), (("stream", 0.0), 0), (("goal", 0.0), 1), (("setpoint", 0.0), 1)])
 @given(st.lists(st.tuples(actions, st.integers(0, 200)), max_size=10))
-def test_whatever_happens_the_command_never_jumps_and_every_goal_has_one_result(script: list) -> None:
+def test_random_histories_have_no_jump_and_one_result_per_goal(script: list) -> None:
     rig = Rig()
     results = []
     for (kind, value), ticks in script:

@@ -149,7 +149,7 @@ def test_motors_are_never_asked_for_more_than_they_have_nor_for_jumps() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-3, 1e200])
-def test_a_quaternion_that_is_none_stops_the_arm(value: float) -> None:
+def test_an_invalid_quaternion_stops_the_arm(value: float) -> None:
     rig = StuckRig()
     rig.target[0, 3:7] = (value, 0, 0, 0)
     rig.send()

@@ -32,7 +32,7 @@ class Stream:
             self.rows.append(np.stack([self.position, self.velocity, self.acceleration]))
 
     def check(self) -> None:
-        """Assert that every limit was kept at every tick."""
+        """Assert that every limit held at every tick."""
         p, v, a = np.moveaxis(np.array(self.rows), 1, 0)
         assert np.isfinite(self.rows).all()
         assert (p - UPPER).max() <= SLACK
@@ -150,7 +150,7 @@ def test_at_the_goal_nothing_moves() -> None:
     assert (stream.history == HOME).all()
 
 
-def test_what_was_limited_is_flagged_and_nothing_else() -> None:
+def test_only_applied_limits_are_flagged() -> None:
     stream = Stream(3)
     values = np.tile(HOME, (3, 1))
     values[1, 0], values[2, 0] = HOME[0] + 7.0, HOME[0] - 2.0
@@ -188,14 +188,14 @@ def test_dropped_setpoints_are_not_followed_and_the_next_start_from_the_referenc
     before = stream.position.copy()
     stream.filter.run(stream.position, stream.velocity, stream.acceleration)
     assert np.array_equal(stream.position, before)
-    stream.velocity[:] = 0  # somebody else brought it to rest, somewhere else
+    stream.velocity[:] = 0  # it was brought to rest elsewhere by other means
     stream.position[:] = HOME
     stream.rows.clear()
     stream.frame(off(j0=0.001), 50)
     assert np.abs(stream.history[:, 0, 0] - HOME[0]).max() < 0.0011
 
 
-def test_a_restarted_arm_knows_nothing_of_its_past() -> None:
+def test_a_restart_clears_the_state_of_the_arm() -> None:
     used, fresh = Stream(2), Stream(2)
     used.frame(off(j0=9.0, j1=-1.0), 7)
     used.filter.restart(np.array([0, 1]))

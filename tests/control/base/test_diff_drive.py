@@ -84,7 +84,7 @@ def test_a_circle_closes(speed: float, rate: float) -> None:
 
 
 @given(st.lists(arrays(np.float64, (2, 2), elements=st.floats(-0.1, 0.1)), min_size=1, max_size=20))
-def test_odometry_at_is_what_an_update_would_give(steps: list[np.ndarray]) -> None:
+def test_odometry_at_matches_update_odometry(steps: list[np.ndarray]) -> None:
     drive = DiffDrive(DRIVE, 2)
     angles = np.zeros((2, 2))
     for step in steps:
@@ -114,9 +114,9 @@ def test_bases_are_independent_and_reset_alone() -> None:
         both.update_odometry(np.array([(0.02 * tick, 0.03 * tick), (-0.05 * tick, 0.01 * tick)]))
         alone.update_odometry(np.array([(-0.05 * tick, 0.01 * tick)]))
     assert both.odometry[1].tobytes() == alone.odometry[0].tobytes()
-    kept = both.odometry[1].tobytes()
+    before = both.odometry[1].tobytes()
     both.reset_odometry(np.array([0]), np.array([(1.0, 2.0)]))
     assert both.odometry[0].tolist() == [0, 0, 0]
-    assert both.odometry[1].tobytes() == kept
+    assert both.odometry[1].tobytes() == before
     both.update_odometry(np.array([(1.0, 2.0), (-0.05 * 49, 0.01 * 49)]))
     assert both.odometry[0].tolist() == [0, 0, 0]

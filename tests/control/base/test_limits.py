@@ -61,7 +61,7 @@ def test_change_arrives_exactly_after_the_ticks_that_it_takes(
 def test_wheel_speed(twist: np.ndarray) -> None:
     limited, changed = twist.copy(), np.zeros(N, np.bool_)
     any_limited = limits.limit_wheel_speed(limited, PER_SPEED, PER_YAW, WHEEL_LIMIT, changed)
-    np.testing.assert_array_equal(limited[:, 1], twist[:, 1])  # turning is kept
+    np.testing.assert_array_equal(limited[:, 1], twist[:, 1])  # turning is unchanged
     fastest = np.abs(limited[:, 0]) * PER_SPEED + np.abs(limited[:, 1]) * PER_YAW
     possible = np.abs(twist[:, 1]) * PER_YAW <= WHEEL_LIMIT
     assert (fastest[possible] <= WHEEL_LIMIT * (1 + 1e-9)).all()
@@ -89,7 +89,7 @@ def test_effort(speeds: np.ndarray, measured: np.ndarray, largest: float) -> Non
 
 
 @given(requested=COMMANDS, limit=LIMITS)
-def test_flags_are_kept_until_they_are_taken(requested: np.ndarray, limit: np.ndarray) -> None:
+def test_flags_accumulate_until_taken(requested: np.ndarray, limit: np.ndarray) -> None:
     everything = np.ones((N, 2), np.bool_)
     limits.limit_velocity(requested, limit, np.empty_like(requested), everything)
     limits.limit_change(requested, requested.copy(), np.ones((N, 2)), np.empty_like(requested), everything)

@@ -91,7 +91,7 @@ def test_distances_of_the_arm_against_samples() -> None:
         np.testing.assert_allclose(heights[model.lowest(posture)], table_found, atol=1e-12)
 
 
-def test_a_distance_does_not_depend_on_what_it_is_computed_with() -> None:
+def test_distances_do_not_depend_on_the_batch() -> None:
     model = CollisionModel(CHAIN)
     postures = np.random.default_rng(1).uniform(-7, 7, (60, 6))
     together = model.distances(postures)
@@ -124,7 +124,7 @@ def test_a_stretched_arm_is_clear_and_a_folded_one_is_not() -> None:
     assert float(model.distances(np.array([0, 0.5, 0, 0, 0, 0]))[1]) < 0  # below the table
 
 
-def test_nothing_to_check_is_infinitely_far() -> None:
+def test_an_empty_collision_check_returns_infinity() -> None:
     nothing = CollisionModel(dataclasses.replace(CHAIN, capsules=(), disjoint=()))
     assert [float(distance) for distance in nothing.distances(HOME)] == [math.inf, math.inf]
 

@@ -66,7 +66,7 @@ def test_the_coriolis_matrix_is_half_of_how_the_mass_matrix_changes() -> None:
     )
 
 
-def test_the_mobility_is_what_a_wrench_on_the_tool_does() -> None:
+def test_mobility_matches_the_response_to_a_tool_wrench() -> None:
     wrench = RNG.uniform(-10, 10, (40, 6))
     torque = np.einsum("kji,kj->ki", TERMS.jacobian, wrench)
     acceleration = np.linalg.solve(TERMS.mass, torque[..., None])

@@ -128,7 +128,7 @@ def test_a_free_last_joint_stays_where_it_is() -> None:
     assert np.nanmin(apart(found, posture)) < 1e-7
 
 
-def test_a_solution_does_not_depend_on_what_it_is_computed_with() -> None:
+def test_solutions_do_not_depend_on_the_batch() -> None:
     poses = KINEMATICS.tool(MANY[:60])
     frames, found, codes = KINEMATICS.frames(MANY[:60]), KINEMATICS.solutions(poses), KINEMATICS.check(MANY[:60])
     for index, (q, pose) in enumerate(zip(MANY[:60], poses, strict=True)):

@@ -122,7 +122,7 @@ FULL: dict[str, Any] = {"task_id": "a", "joint_target": joints(0.1)}
         ({"timeout_s": None}, ResultCode.BAD_TIMEOUT, "timeout_s is None"),
     ],
 )
-def test_what_does_not_fit_is_refused_as_an_arm_would(fields: dict[str, Any], code: ResultCode, words: str) -> None:
+def test_goals_that_do_not_fit_a_record_are_refused(fields: dict[str, Any], code: ResultCode, words: str) -> None:
     command = BrainCommand(**{**FULL, **fields})
     failure = check_encodable(command, DOF)
     assert failure is not None

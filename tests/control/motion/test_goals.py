@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.control.commands import GoalPhase, ResultCode
-from bhd_lerobot.control.geometry.kinematics import ArmKinematics
-from bhd_lerobot.control.motion.goals import GoalManager
-from bhd_lerobot.control.motion.planner import GoalPlanner
-from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, Rig, joints, moved
+from tests.control.goal_rig import ARM, HOME, HZ, Rig, joints, moved
 
 FAR = joints(2.0)
 NEAR = joints(0.2)
@@ -58,15 +55,6 @@ def test_a_goal_from_idle_to_idle(fields: dict[str, Any]) -> None:
     assert rig.results() == [("a", ResultCode.SUCCEEDED)]
     assert rig.results() == []
     assert not rig.manager.following.any()
-
-
-def test_goals_that_wait_follow_in_order() -> None:
-    rig = Rig()
-    for name, target in (("a", 0.1), ("b", 0.2), ("c", 0.3)):
-        assert rig.go(name, joint_target=joints(target)) is None
-    rig.run()
-    assert rig.results() == [(name, ResultCode.SUCCEEDED) for name in "abc"]
-    assert rig.position[0, :6].tolist() == list(joints(0.3))
 
 
 def test_feedback_counts_down() -> None:
@@ -394,7 +382,7 @@ def test_a_joint_that_trembles_has_not_arrived() -> None:
 
 
 @pytest.mark.parametrize("fields", [{}, {"joint_target": FAR}])
-def test_a_gripper_that_stalls_holds_something(fields: dict[str, Any]) -> None:
+def test_a_stalled_gripper_succeeds(fields: dict[str, Any]) -> None:
     rig, arm = lagging(0.02)
     arm.lowest_opening = 0.03
     rig.go("a", gripper=0.0, **fields)
@@ -409,7 +397,7 @@ def test_a_gripper_that_stalls_holds_something(fields: dict[str, Any]) -> None:
     assert rig.position[0, 6] == 0.0
 
 
-def test_a_gripper_that_arrives_says_so() -> None:
+def test_the_result_of_a_gripper_goal_names_the_opening() -> None:
     rig, _ = lagging(0.02)
     rig.go("a", gripper=0.02)
     rig.run()
@@ -421,8 +409,8 @@ def test_a_gripper_that_arrives_says_so() -> None:
 def test_a_gripper_that_creeps_has_a_second_and_a_half() -> None:
     rig = Rig()
 
-    def creep(one: Rig) -> None:
-        one.measured_position[0, 6], one.measured_velocity[0, 6] = 0.05, -0.003
+    def creep(creeping: Rig) -> None:
+        creeping.measured_position[0, 6], creeping.measured_velocity[0, 6] = 0.05, -0.003
 
     rig.disturb = creep
     rig.go("a", gripper=0.0)
@@ -522,7 +510,7 @@ def test_a_setpoint_takes_the_place_of_all_goals() -> None:
     assert rig.phase == GoalPhase.IDLE
     before = rig.position[0].copy()
     rig.tick(3)
-    assert np.array_equal(rig.position[0], before)  # whoever sends setpoints owns it
+    assert np.array_equal(rig.position[0], before)  # the sender of setpoints owns it
 
 
 def test_a_restart_forgets_everything_and_reports_nothing() -> None:
@@ -536,7 +524,7 @@ def test_a_restart_forgets_everything_and_reports_nothing() -> None:
     assert rig.phase == GoalPhase.IDLE
 
 
-def test_a_brain_hears_of_the_goals_of_its_own_arm_only() -> None:
+def test_results_and_feedback_are_separate_for_each_arm() -> None:
     rig = Rig(3)
     rig.go("a", 1, joint_target=NEAR)
     rig.run()
@@ -547,7 +535,7 @@ def test_a_brain_hears_of_the_goals_of_its_own_arm_only() -> None:
 # --- the rest --------------------------------------------------------------------------------------------------------
 
 
-def test_conversion_changes_nothing() -> None:
+def test_convert_leaves_the_reference_unchanged() -> None:
     rig = started()
     before = [array.copy() for array in rig.reference]
     plans = [rig.manager.convert(0, rig.manager._books[0].followed, rig.reference) for _ in range(2)]  # type: ignore[arg-type]
@@ -560,11 +548,6 @@ def test_every_code_is_produced_by_some_test() -> None:
     files = ("test_goals.py", "test_planner.py", "test_trajectory.py")
     text = "".join((Path(__file__).parent / name).read_text(encoding="utf-8") for name in files)
     assert [code.name for code in ResultCode if f"ResultCode.{code.name}" not in text] == []
-
-
-def test_the_manager_makes_its_own_kinematics() -> None:
-    assert isinstance(GoalManager(ARM, 1, HZ).planner.kinematics, ArmKinematics)
-    assert GoalPlanner(ARM, HZ, KINEMATICS).kinematics is KINEMATICS
 
 
 def test_a_tick_without_goals_does_nothing_for_any_robot() -> None:

@@ -68,8 +68,8 @@ REFUSALS: list[tuple[dict[str, Any], ResultCode, str]] = [
 ]
 
 
-@each_case(("fields", "code", "words"), REFUSALS)
-def test_what_is_wrong_with_a_goal_is_named(fields: dict[str, Any], code: ResultCode, words: str) -> None:
+@pytest.mark.parametrize(("fields", "code", "words"), REFUSALS)
+def test_invalid_goals_are_refused_with_a_reason(fields: dict[str, Any], code: ResultCode, words: str) -> None:
     failure = PLANNER.check(BrainCommand("a", **fields))
     assert failure is not None
     assert (failure.code, plan(**fields)) == (code, failure)
@@ -95,7 +95,7 @@ def test_a_goal_needs_a_name(task_id: Any) -> None:
         {"gripper": np.float32(0.05)},
     ],
 )
-def test_what_is_within_the_ranges_is_accepted(fields: dict[str, Any]) -> None:
+def test_goals_within_the_ranges_are_accepted(fields: dict[str, Any]) -> None:
     assert PLANNER.check(BrainCommand("a", **fields)) is None
 
 
@@ -171,14 +171,14 @@ def test_a_gentle_goal_does_not_carry_a_fast_arm_past_its_range() -> None:
         ({"joint_target": joints(0.0, 0.0, 1.5)}, ResultCode.SELF_COLLISION),
     ],
 )
-def test_a_way_that_cannot_be_gone_is_refused(fields: dict[str, Any], code: ResultCode) -> None:
+def test_blocked_paths_are_refused(fields: dict[str, Any], code: ResultCode) -> None:
     failure = plan(**fields)
     assert isinstance(failure, PlanFailure)
     assert failure.code == code
     assert len(failure.message) > 20
 
 
-def test_the_whole_way_is_checked_and_not_only_its_end() -> None:
+def test_the_whole_path_is_checked() -> None:
     # A full turn of the shoulder ends in the posture that it starts in, and goes through the table.
     failure = plan(joint_target=joints(0.0, 2 * np.pi))
     assert isinstance(failure, PlanFailure)
@@ -246,7 +246,7 @@ def test_the_same_goal_gives_the_same_plan() -> None:
     assert np.array_equal(first.trajectory.position, second.trajectory.position)
 
 
-def test_a_state_that_nothing_can_brake_stands_still() -> None:
+def test_an_unbrakeable_state_stops_at_once() -> None:
     brake = PLANNER.brake(State(HOME, np.full(7, NAN), ZEROS), hard=True)
     assert brake.ticks == 1
     assert np.array_equal(brake.target, HOME)

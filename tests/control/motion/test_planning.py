@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.commands import BrainCommand, GoalPhase, ResultCode
-from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
 from bhd_lerobot.control.motion.planning import MIN_LEAD, MOST_LEADS, InlinePlanning, lead_ticks
 from bhd_lerobot.control.motion.trajectory import PlanFailure, State
@@ -102,7 +101,7 @@ def test_a_plan_is_never_too_late_for_an_arm_that_is_at_rest() -> None:
 
 
 @pytest.mark.parametrize("latency", [1, LEAD + 1])
-def test_a_goal_that_preempts_starts_from_where_the_last_one_is_going_to_be(latency: int) -> None:
+def test_a_preempting_goal_starts_from_the_predicted_state(latency: int) -> None:
     rig, planning = rig_of(latency, ticks=100)
     undisturbed = Rig(planning=LatePlanning([]))  # type: ignore[arg-type]
     undisturbed.go("a", joint_target=FAR)
@@ -224,9 +223,9 @@ def test_a_goal_that_preempts_and_is_cancelled_while_it_is_planned_leaves_a_brak
     assert rig.results() == [("a", ResultCode.PREEMPTED), ("b", ResultCode.CANCELLED)]
 
 
-@each_case("ticks", [0, 50])
-@each_case("way", ["stop", "estop", "setpoint", "retreat", "restart", "preempt"])
-def test_what_ends_a_goal_while_it_is_planned_drops_the_request(way: str, ticks: int) -> None:
+@pytest.mark.parametrize("ticks", [0, 50], ids=["at rest", "moving"])
+@pytest.mark.parametrize("way", ["stop", "estop", "setpoint", "retreat", "restart", "preempt"])
+def test_ending_a_goal_during_planning_drops_the_request(way: str, ticks: int) -> None:
     rig, planning = rig_of(NEVER, ticks=ticks)
     rig.go("b", joint_target=BACK, preempt=True)
     rig.tick(3)
@@ -262,7 +261,7 @@ def test_what_ends_a_goal_while_it_is_planned_drops_the_request(way: str, ticks:
     assert rig.results() == [("after", ResultCode.SUCCEEDED)]
 
 
-def test_goals_that_wait_follow_in_order_and_none_is_asked_for_before_its_turn() -> None:
+def test_waiting_goals_are_planned_in_order_one_at_a_time() -> None:
     rig, planning = rig_of(3, LEAD + 20, 1)
     for name, target in (("a", 0.1), ("b", 0.2), ("c", 0.3)):
         assert rig.go(name, joint_target=joints(target)) is None
@@ -304,7 +303,7 @@ latencies = st.lists(st.integers(1, 30) | st.integers(1, 2 * TIMEOUT) | st.just(
 
 @settings(max_examples=100)
 @given(st.lists(actions, min_size=1, max_size=6), latencies, st.integers(MIN_LEAD, 40))
-def test_limits_hold_and_every_goal_has_one_result_whatever_the_planner_does(
+def test_limits_hold_and_every_goal_has_one_result_with_a_late_planner(
     script: list, latencies: list[int], lead: int
 ) -> None:
     planning = LatePlanning(latencies, lead)
@@ -334,7 +333,7 @@ def test_arms_are_planned_for_independently_of_each_other(script: list, other: l
 
 @settings(max_examples=40)
 @given(st.lists(actions, min_size=1, max_size=5))
-def test_planned_inline_is_what_it_is_without_saying(script: list) -> None:
+def test_inline_planning_is_the_default(script: list) -> None:
     plain, inline = Rig(), Rig(planning=InlinePlanning(PLANNER))  # type: ignore[arg-type]
     assert follow(plain, 0, script) == follow(inline, 0, script)
     assert np.array_equal(plain.history, inline.history)
@@ -392,8 +391,3 @@ def test_a_lead_is_a_whole_number_of_ticks(hz: int, lead_s: float, ticks: int) -
 def test_a_lead_is_positive(lead_s: float) -> None:
     with pytest.raises(ConfigError, match="lead is"):
         lead_ticks(500, lead_s)
-
-
-def test_the_manager_takes_what_plans_by_name_only() -> None:
-    with pytest.raises(TypeError):
-        GoalManager(ARM, 1, HZ, KINEMATICS, 8, LatePlanning([]))  # type: ignore[misc]

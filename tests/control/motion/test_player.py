@@ -28,7 +28,7 @@ def equal(state: State | None, row: np.ndarray) -> bool:
 
 
 @given(st.integers(1, 20), st.integers(0, 19), st.integers(1, 30), st.booleans())
-def test_what_lies_ahead_is_what_is_played_then_or_the_end(ticks: int, played: int, ahead: int, borrowed: bool) -> None:
+def test_ahead_matches_later_playback(ticks: int, played: int, ahead: int, borrowed: bool) -> None:
     player, rows = TrajectoryPlayer(1, 2), rows_of(ticks)
     player.start(0, trajectory(rows_of(5, 1)))
     play(player)
@@ -50,7 +50,7 @@ def test_what_lies_ahead_is_what_is_played_then_or_the_end(ticks: int, played: i
     assert equal(state, last[:, 0])
 
 
-def test_what_lies_ahead_of_one_of_many() -> None:
+def test_ahead_with_several_simulations() -> None:
     player, blocks = TrajectoryPlayer(3, 2), [rows_of(ticks, ticks) for ticks in (5, 9)]
     player.start(0, trajectory(blocks[0]))
     player.start(2, trajectory(blocks[1]))
@@ -61,7 +61,7 @@ def test_what_lies_ahead_of_one_of_many() -> None:
     assert player.ahead(1, 1) is None
 
 
-def test_a_look_ahead_is_a_copy() -> None:
+def test_ahead_returns_a_copy() -> None:
     player, rows = TrajectoryPlayer(1, 2), rows_of(4)
     player.borrow(rows)
     state = player.ahead(0, 2)
@@ -75,7 +75,7 @@ def test_borrowed_rows_are_played_where_they_lie() -> None:
     player.borrow(rows)
     assert player.remaining(0) == 6
     assert np.array_equal(play(player)[:, 0], rows[0])
-    rows[1] = 7.0  # whoever lends them must not; that it shows proves that nothing was copied
+    rows[1] = 7.0  # forbidden to the owner; that it shows proves that nothing was copied
     assert (play(player) == 7.0).all()
     player.stop(0)
     assert np.isnan(play(player)).all()
@@ -97,6 +97,6 @@ def test_borrowed_rows_and_its_own_take_turns(pieces: list[tuple[int, bool, int]
         assert player.remaining(0) == max(0, ticks - played)
 
 
-def test_one_of_many_may_not_borrow() -> None:
+def test_borrow_needs_a_single_simulation() -> None:
     with pytest.raises(ValueError, match="3 simulations"):
         TrajectoryPlayer(3, 2).borrow(rows_of(2))

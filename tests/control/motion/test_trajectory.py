@@ -139,7 +139,7 @@ def test_a_joint_that_cannot_stop_before_its_end_comes_to_rest_on_it() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_numbers_that_are_none_are_a_failure_and_not_an_exception(bad: float) -> None:
+def test_non_finite_numbers_return_a_failure(bad: float) -> None:
     start = State.of([bad], [0.0], [0.0])
     limits = MotionLimits(*(np.array([value]) for value in (3.0, 10.0, 100.0, -1.0, 1.0)))
     for answer in (to_target(start, [0.0], limits, HZ), to_rest(start, limits, HZ)):

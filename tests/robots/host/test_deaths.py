@@ -142,8 +142,8 @@ def test_a_stopped_recorder_loses_states_that_are_counted_exactly():
 
 def test_a_brain_that_is_stopped_and_then_killed_leaves_a_robot_that_holds_and_ends():
     name = unique("brain")
-    with driving_child(name, brain_timeout_s=TIMEOUT_S) as (child, said):
-        pids = said["pids"].values()
+    with driving_child(name, brain_timeout_s=TIMEOUT_S) as (child, report):
+        pids = report["pids"].values()
         for number in (signal.SIGSTOP, signal.SIGKILL):
             states = States(name)
             until(lambda read=states: read.has(Mode.TRACKING), "the base moves, at first or again")
@@ -197,7 +197,7 @@ def unprivileged() -> Iterator[ThreadPoolExecutor]:
         yield thread
 
 
-def test_without_the_right_to_sched_fifo_it_works_and_says_so(unprivileged):
+def test_without_sched_fifo_it_runs_and_reports_the_refusal(unprivileged):
     name = unique("unprivileged")
     robot = turtlebot(name)
     try:
@@ -214,15 +214,15 @@ def test_without_the_right_to_sched_fifo_it_works_and_says_so(unprivileged):
     assert is_gone(name)
 
 
-def test_without_that_right_and_with_require_realtime_nothing_starts(unprivileged, tmp_path, capsys):
+def test_require_realtime_without_sched_fifo_starts_nothing(unprivileged, tmp_path, capsys):
     name = unique("required")
     arguments = options(
         tmp_path / "d", robot__clock="realtime", robot__id=name, robot__require_realtime="true", n_envs=1
     )
     assert unprivileged.submit(main, arguments).result() == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "SCHED_FIFO" in said
-    assert "setcap" in said
-    assert "Traceback" not in said
+    output = " ".join(capsys.readouterr().err.split())
+    assert "SCHED_FIFO" in output
+    assert "setcap" in output
+    assert "Traceback" not in output
     assert not (tmp_path / "d").exists()
     assert is_gone(name)

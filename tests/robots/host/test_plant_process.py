@@ -50,7 +50,7 @@ START = 10 * NANOSECONDS
 
 
 class FakeWorld:
-    """Wheels that slow down by `brake` in a tick when they are commanded to stand, and else turn as they are told."""
+    """Wheels that slow down by `brake` in a tick when they are commanded to stand, and else turn as commanded."""
 
     def __init__(self, brake: float = 0.5) -> None:
         self.brake = brake
@@ -297,7 +297,7 @@ class Parts:
 
 
 @pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
-def test_a_robot_in_two_parts_does_and_sees_the_same_as_one_in_one_part(kind: str) -> None:
+def test_a_remote_plant_gives_the_same_states_as_a_local_plant(kind: str) -> None:
     parts = Parts(kind)
     rng = np.random.default_rng(0)
     start = parts.whole.cerebellum.command.copy()
@@ -397,7 +397,7 @@ def test_the_process_needs_neither_torch_nor_lerobot() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_time_out_that_means_nothing_is_refused(value: float) -> None:
+def test_invalid_plant_time_outs_are_refused(value: float) -> None:
     with pytest.raises(ConfigError, match=r"plant_timeout_s .*cannot be turned off"):
         RealtimeConfig(plant_timeout_s=value)
 
@@ -461,11 +461,11 @@ def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
         last: Any = None
         stopped: Any = None
 
-        def look() -> bool:
+        def find() -> bool:
             """Find the last tick before the stop and the first of it, before they are overwritten."""
             nonlocal last, stopped
             newest = len(link.states) - 1
-            rows = [link.states.copy(number) for number in range(max(0, newest - link.shape.kept + 2), newest + 1)]
+            rows = [link.states.copy(number) for number in range(max(0, newest - link.shape.capacity + 2), newest + 1)]
             for row in (row for row in rows if row is not None):
                 if row["phase"] == PlantPhase.DRIVEN:
                     last = row
@@ -473,7 +473,7 @@ def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
                     stopped = row
             return stopped is not None
 
-        until(look)
+        until(find)
         # The first tick on the plant's grid at which the last command was too old.
         assert last["command"] == stopped["command"]
         assert last["start_ns"] - last["command_ns"] <= timeout < stopped["start_ns"] - stopped["command_ns"]
@@ -484,6 +484,7 @@ def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
             assert not stopped["actuators"].any()
 
         until(lambda: np.abs(link.states.latest()["velocity"]).max() < 0.01)  # type: ignore[index]
+        until(lambda: live_link._processes["cerebellum"].poll() is not None)
         with pytest.raises(RealtimeError, match=r"cerebellum's process was killed by signal 9. The plant stops"):
             live_link.check()
         block_name, plant = live_link.block.name, live_link._processes["plant"]
@@ -508,7 +509,7 @@ def test_a_cerebellum_that_was_stopped_finds_a_fault_and_goes_on_after_a_reset()
         assert link.states.latest()["stops"] == 1  # type: ignore[index]
 
 
-def test_a_plant_that_is_stopped_or_killed_is_a_fault_and_an_error_that_says_so() -> None:
+def test_a_stopped_or_killed_plant_is_a_fault_and_an_error() -> None:
     with moving("turtlebot3") as (robot, _):
         live_link = robot.simulation.link
         os.kill(live_link.pids["plant"], signal.SIGSTOP)

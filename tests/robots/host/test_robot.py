@@ -128,12 +128,12 @@ def test_deactivation_ends_in_safe_off(driving):
         driving.send_action({"x.vel": 0.2, "theta.vel": 0.0})
 
 
-def test_what_is_no_input_is_refused(robot):
+def test_invalid_estop_inputs_are_refused(robot):
     with pytest.raises(ConfigError, match="file descriptor"):
         robot.add_estop_input("button")
 
 
-def test_the_same_id_twice_is_refused_and_harms_nobody(robot):
+def test_a_second_robot_of_the_same_id_is_refused(robot):
     second = turtlebot(NAME)
     with pytest.raises(RealtimeError, match=f"{NAME}.*running already"):
         second.connect()

@@ -66,7 +66,7 @@ def test_before_the_first_tick_the_robot_is_where_its_episode_begins(rig: Rig) -
     assert state["mode"].tolist() == [Mode.HOLD]
 
 
-def test_what_is_published_is_what_the_robot_senses_and_is(rig: Rig) -> None:
+def test_published_states_match_the_simulation(rig: Rig) -> None:
     for _ in range(45):
         rig.tick()
     state = rig.latest()
