@@ -4,13 +4,13 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from bhd_lerobot.datasets.storage.atomic import is_free, making, real, remove_abandoned
+from bhd_lerobot.datasets.storage.atomic import complete_interrupted, is_free, making, real, remove_abandoned
 from bhd_lerobot.datasets.storage.disk import Disk, write_errors
 from bhd_lerobot.errors import DatasetExistsError
 
 
 def refuse_existing(target: Path, option: str) -> None:
-    """Check that nothing is at a place yet, but perhaps an empty folder.
+    """Check that nothing is at a place yet, but perhaps an empty folder; first complete what was decided there.
 
     Args:
         target: the place.
@@ -22,6 +22,7 @@ def refuse_existing(target: Path, option: str) -> None:
     if target.is_symlink() and not target.exists():
         raise DatasetExistsError(f"{target} is a link to nothing. Remove it, or choose another {option}.")
     remove_abandoned(real(target))  # a name such as ``new/..`` is no name for a folder beside it
+    complete_interrupted(target)
     if not is_free(target):
         raise DatasetExistsError(f"{target} exists already. Remove it, or choose another {option}.")
 
