@@ -13,7 +13,10 @@ from bhd_lerobot.errors import ConfigError
 TYPES: dict[str, str] = {"corrected": "dagger"}
 """Values of `type`, in configurations and in the metadata of datasets: old to new."""
 
-KEYS: dict[str, str] = {}
+KEYS: dict[str, str] = {
+    "anchor": "PPO has no term that holds the actor near its checkpoint; a smaller ppo.lr or ppo.target_kl does",
+    "start_action": "an actor that starts from a checkpoint takes the first action of its chunk",
+}
 """Keys of configurations by their full names, in which `*` stands for anything: old to the new last part.
 
 A sentence, recognised by the space in it, says what replaces a removed key.

@@ -18,6 +18,7 @@ from bhd_lerobot.recording import record
 from bhd_lerobot.rollout import replay
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.training import train
+from bhd_lerobot.training.rl.config import RlConfig
 from tests.apps.view.support import served
 
 FIXTURES = Path(__file__).parent / "fixtures_0_1"
@@ -128,6 +129,11 @@ def test_a_configuration_with_old_names_is_refused_in_one_message(
     as_json.write_text(json.dumps({"brain": {"type": "corrected"}}))
     with pytest.raises(ConfigError, match=r"brain.type = corrected -> dagger"):
         parse(EvalConfig, ["--config_path=eval.json"])
+
+
+def test_removed_options_of_ppo_are_named_together() -> None:
+    with pytest.raises(ConfigError, match=r"anchor was removed: .*\n.*start_action was removed: .*first action"):
+        parse(RlConfig, ["--anchor.coef=0.1", "--start_action=2"])
 
 
 def test_a_configuration_with_the_new_names_is_read(folder: Path) -> None:
