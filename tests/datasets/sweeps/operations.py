@@ -190,10 +190,10 @@ def content(place: Path) -> str:
     """
     try:
         found = sorted([*place.rglob("meta/info.json"), *place.rglob("*.mcap")])
-        hidden = [path for path in found if any(part.startswith(".") for part in path.relative_to(place).parts)]
+        shown = [path for path in found if not any(part.startswith(".") for part in path.relative_to(place).parts)]
         if any(path.name == NOTES for path in place.glob("*")):
-            found.append(place / NOTES)
-        return _digest([path for path in found if path not in hidden]) if found else "nothing"
+            shown.append(place / NOTES)
+        return _digest(shown) if shown else "nothing"
     except RefusedError:
         return REFUSED
     except (OSError, KeyError, ValueError, pa.ArrowException) as error:
