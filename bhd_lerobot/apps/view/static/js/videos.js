@@ -10,7 +10,7 @@ const MIME = {
 };
 
 // Return something with an element and `show()`, which follows the time of the page.
-export function video(camera, episode, about) {
+export function cameraView(camera, episode, about) {
   return about.kind === "image" ? images(camera, episode) : video(camera, episode, about);
 }
 

@@ -2,7 +2,7 @@
 
 import { drawArm } from "./arm_view.js";
 import { byId, make } from "./dom.js";
-import { video } from "./videos.js";
+import { cameraView } from "./videos.js";
 import { drawScan } from "./scan_view.js";
 import { on, shown, state } from "./store.js";
 import { drawTop, sameScene } from "./top_view.js";
@@ -26,7 +26,7 @@ function arrange() {
 const follow = () => followers.forEach((show) => show());
 
 function build() {
-  const cards = [...videos(), ...scans(), ...tops(), ...arms()];
+  const cards = [...cameras(), ...scans(), ...tops(), ...arms()];
   followers = cards.flatMap((card) => card.follow);
   byId("views").replaceChildren(...cards.map((card) => card.element));
   byId("views").hidden = cards.length === 0;
@@ -54,11 +54,11 @@ function aspect([one, two, three]) {
   return one <= 4 && three > 4 ? [two, three] : [one, two];
 }
 
-function videos() {
+function cameras() {
   return state.dataset.cameras.map((camera) => {
     const sources = shown().flatMap(([name, episode]) => {
       const about = episode.videos.find((one) => one.key === camera.key);
-      return about ? [[name, video(camera, episode, about)]] : [];
+      return about ? [[name, cameraView(camera, episode, about)]] : [];
     });
     for (const [name, one] of sources) {
       one.element.classList.add(name);
