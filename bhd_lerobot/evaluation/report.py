@@ -101,7 +101,7 @@ def _sections(given: ReportInput) -> list[tuple[str, str, str]]:
 
 
 def replay_command(config: EvalConfig, folder: Path, one: EpisodeMetrics) -> str:
-    """Return the command that runs a single episode again, and videos it where videos can be made."""
+    """Return the command that runs a single episode again; it leaves a video where images can be rendered."""
     options = [
         f"--config_path={folder / 'config.yaml'}",
         f"--only=[{one.brain}]",
