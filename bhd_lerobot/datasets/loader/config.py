@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any, Self
 
 import torch
@@ -87,8 +88,11 @@ class LoaderConfig:
             ("num_workers", 0),
             ("world_size", 1),
         ):
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
+            value = getattr(self, name)
+            if not isinstance(value, Integral):
+                raise ConfigError(f"{name} is {value!r}; it must be a whole number, at least {least}.")
+            if value < least:
+                raise ConfigError(f"{name} is {value}; it must be at least {least}.")
         if not 0 <= self.rank < self.world_size:
             raise ConfigError(f"rank is {self.rank}; it must be from 0 to world_size - 1 = {self.world_size - 1}.")
         if not 0 <= self.intervention_weight < math.inf:
