@@ -35,7 +35,7 @@ def write_down(task: str, actions: np.ndarray, frames: int) -> tuple[list[Entry]
 
     def noted(what: int, call: Callable[..., Any], *, has_speeds: bool = False) -> Callable[..., Any]:
         def noting(*args: Any) -> Any:
-            given = tuple(one.copy() if isinstance(one, np.ndarray) else one for one in args)
+            given = tuple(arg.copy() if isinstance(arg, np.ndarray) else arg for arg in args)
             log.append((what, world.ctrl.copy(), *given) if has_speeds else (what, *given))
             return call(*args)
 

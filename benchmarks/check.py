@@ -62,7 +62,7 @@ def read(root: Path) -> None:
 def check(root: Path) -> None:
     """Check the dataset."""
     found = check_dataset(root)
-    if any(one.severity for one in found.findings):
+    if any(finding.severity for finding in found.findings):
         raise AssertionError(f"The dataset is not valid: {found.findings}")
 
 

@@ -231,7 +231,7 @@ def main() -> int:
             )
             times = measure(moves, folder / "data", folder, options.turns)
             for way in ("push", "pull"):
-                ours, bare = ([size / 1e6 / one for one in times[key]] for key in (way, f"bare {way}"))
+                ours, bare = ([size / 1e6 / time_ for time_ in times[key]] for key in (way, f"bare {way}"))
                 share = spread(ratios(ours, bare))
                 results[f"{place}_{way}"] = {"mb_per_s": spread(ours), "bare_mb_per_s": spread(bare), "ratio": share}
                 has_goal = place != "folder"

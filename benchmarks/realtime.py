@@ -150,7 +150,7 @@ def walk(
 def find(blocks: Sequence[dict[str, Any]], robot: str, loop: str, condition: str) -> dict[int, dict[str, Any]]:
     """Return the blocks of a loop of a robot under a condition, by their round."""
     wanted = (robot, loop, condition)
-    return {one["round"]: one for one in blocks if (one["robot"], one["loop"], one["condition"]) == wanted}
+    return {block["round"]: block for block in blocks if (block["robot"], block["loop"], block["condition"]) == wanted}
 
 
 def ratio(ours: dict[int, dict[str, Any]], theirs: dict[int, dict[str, Any]], key: str) -> float | None:
@@ -197,7 +197,7 @@ def run_python(robot: str, seconds: float, load: Load) -> Ticks:
         grants = privileges.acquire(RealtimeSettings(lock_memory=False))
         times = walk(world.step, period_ns, round(seconds * RATES[robot]))
     world.check()
-    return Ticks(times, period_ns, tuple(f"{one.name}: {one.detail}" for one in grants if not one.granted))
+    return Ticks(times, period_ns, tuple(f"{grant.name}: {grant.detail}" for grant in grants if not grant.granted))
 
 
 def build_twin(folder: Path) -> Path:
@@ -216,7 +216,7 @@ def build_twin(folder: Path) -> Path:
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     if done.returncode:
         lines = done.stderr.splitlines()
-        raise NotMeasuredError(f"{compiler}: {next((one for one in lines if 'error' in one), lines[-1:])}")
+        raise NotMeasuredError(f"{compiler}: {next((line for line in lines if 'error' in line), lines[-1:])}")
     return program
 
 
@@ -280,11 +280,11 @@ def run_robot(robot: str, seconds: float, load: Load, folder: Path | None = None
         if episode.writer is not None:
             episode.writer.discard()
         grants = simulation.grants  # type: ignore[attr-defined]
-    refused = tuple(f"{one['name']}: {one['detail']}" for one in grants if not one["granted"])
+    refused = tuple(f"{grant['name']}: {grant['detail']}" for grant in grants if not grant["granted"])
     if len(states) < 2 or episode.outcome.event.cause not in ("timeout", "success"):
         raise NotMeasuredError(f"the episode of {robot} ended with {episode.outcome.event.cause}, {len(states)} ticks")
     # The loop's warm-up, before the episode, was a segment of its own.
-    due, started, ended, executed, _ = np.array([one for one in states if one[-1] == states[-1][-1]], np.int64).T
+    due, started, ended, executed, _ = np.array([state for state in states if state[-1] == states[-1][-1]], np.int64).T
     if np.any(np.diff(executed) != 1):
         raise NotMeasuredError("states of the loop were overwritten before they were read")
     # A state says when the tick before it ended.
@@ -434,14 +434,16 @@ def peer_of(blocks: Sequence[dict[str, Any]], robot: str, loop: str) -> str:
     """Return what a loop is compared with."""
     if loop == VIDEO:
         return OURS
-    measured = {one["loop"] for one in blocks if one["robot"] == robot}
+    measured = {block["loop"] for block in blocks if block["robot"] == robot}
     return next((one for one in (TWIN, PYTHON) if one in measured and one != loop), "")
 
 
 def rows(blocks: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return a row for each loop and condition: medians over the blocks, the overall maximum, sums, and ratios."""
     table = []
-    for robot, loop, condition in dict.fromkeys((one["robot"], one["loop"], one["condition"]) for one in blocks):
+    for robot, loop, condition in dict.fromkeys(
+        (block["robot"], block["loop"], block["condition"]) for block in blocks
+    ):
         own = find(blocks, robot, loop, condition)
         peer = "" if loop == TWIN else peer_of(blocks, robot, loop)
         row: dict[str, Any] = {"robot": robot, "loop": loop, "condition": condition, "peer": peer}

@@ -287,7 +287,9 @@ def test_the_plugin_module_is_one_import() -> None:
     ],
 )
 def test_the_real_time_process_stays_light(packages: tuple[str, ...], unwanted: tuple[str, ...]) -> None:
-    modules = [f"{PACKAGE}.{module_name(p, SOURCE)}" for one in packages for p in sorted((SOURCE / one).rglob("*.py"))]
+    modules = [
+        f"{PACKAGE}.{module_name(p, SOURCE)}" for package in packages for p in sorted((SOURCE / package).rglob("*.py"))
+    ]
     assert len(modules) >= len(packages)
     program = (
         "import importlib, sys\n"

@@ -83,7 +83,7 @@ def test_a_dataset_is_resumed_with_the_brain_that_has_another_name(folder: Path)
     assert record.main([renamed(folder / "record.yaml"), "--resume=true", "--dataset.num_episodes=3"]) == 0
     after = pq.read_table(folder / "dataset/data")
     assert (len(after), after.slice(0, 60).equals(before)) == (90, True)
-    brains = [json.loads(one.metadata["brain"])["type"] for one in dataset_info(folder / "dataset").episodes]
+    brains = [json.loads(episode.metadata["brain"])["type"] for episode in dataset_info(folder / "dataset").episodes]
     assert brains == ["corrected", "corrected", "dagger"]
     assert data.main(["check", "dataset"]) == 0
     assert record.main([renamed(folder / "record.yaml"), "--resume=true", "--dataset.num_episodes=3"]) == 0

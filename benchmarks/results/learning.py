@@ -179,7 +179,7 @@ def evaluate(
 
 def values(results: Any, brain: str, key: str) -> list[Any]:
     """Return a value of each episode of a brain, in the order of the episodes."""
-    own = [one for one in results["episodes"] if one["brain"] == brain]
+    own = [result for result in results["episodes"] if result["brain"] == brain]
     return [one[key] for one in sorted(own, key=lambda one: int(one["episode"]))]
 
 

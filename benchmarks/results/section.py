@@ -48,7 +48,13 @@ class Section:
         lines += [f"| {row.what} | {row.value} | {row.goal} | {verdict[row.met]} |" for row in self.rows]
         for remark in self.remarks:
             lines += ["", remark]
-        lines += ["", "```bash", *(f"{one.command}   # {one.seconds:.0f} s" for one in self.commands), "```", ""]
+        lines += [
+            "",
+            "```bash",
+            *(f"{command.command}   # {command.seconds:.0f} s" for command in self.commands),
+            "```",
+            "",
+        ]
         return lines
 
 

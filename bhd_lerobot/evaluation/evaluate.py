@@ -134,7 +134,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         if (
             pool is None
             and simulation.camera_names
-            and (config.record.repo_id or any(one.timed.uses_images for one in runs))
+            and (config.record.repo_id or any(brain_run.timed.uses_images for brain_run in runs))
         ):
             simulation.start_rendering()  # a machine without OpenGL fails here, before the first episode
         if is_live:
@@ -146,22 +146,28 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         with run_folder(config, "eval") as output_dir:
             facts = _facts(config, simulation, runs)
         with progress_bars(console, "success") as progress:
-            bars = [progress.add_task(escape(one.label), total=len(config.indices), success="") for one in runs]
+            bars = [
+                progress.add_task(escape(brain_run.label), total=len(config.indices), success="") for brain_run in runs
+            ]
             for one, bar in zip(runs, bars, strict=True):
                 if stop or any(other.loop.emergency_stop for other in runs):
                     break
                 run_episodes(config, one, lambda: bool(stop), _shower(progress, bar, one))
         estop = None
-        if any(one.loop.emergency_stop for one in runs):
+        if any(brain_run.loop.emergency_stop for brain_run in runs):
             estop = ", ".join(pressed.causes) or "from another process"
     results = summarise(
-        facts, _versions(), {one.label: one.episodes for one in runs}, len(config.indices), config.reference
+        facts,
+        _versions(),
+        {brain_run.label: brain_run.episodes for brain_run in runs},
+        len(config.indices),
+        config.reference,
     )
     timing = {
         "made": datetime.now().astimezone().isoformat(timespec="seconds"),
         "n_envs": n,
         "clock": config.robot.clock,
-        "brains": {one.label: one.timing() for one in runs if one.timed.times},
+        "brains": {brain_run.label: brain_run.timing() for brain_run in runs if brain_run.timed.times},
     }
     result = EvalResult(output_dir, results, timing, output_dir / "report.html", stopped_by=stop, estop=estop)
     result.missed = _missed(config, results)
@@ -191,7 +197,7 @@ def _facts(config: EvalConfig, simulation: Simulation, runs: Sequence[BrainRun])
     return {
         "robot": {key: str(value) if isinstance(value, Path) else value for key, value in robot.items()},
         "task": runs[0].loop.task.parameters(),
-        "brains": {one.label: one.timed.parameters() for one in runs},
+        "brains": {brain_run.label: brain_run.timed.parameters() for brain_run in runs},
         "baseline": config.reference,
         "seed": config.seed,
         "split": config.split,
@@ -220,8 +226,10 @@ def _write(
     write_json(folder / RESULTS_NAME, result.results.plain())
     write_json(folder / "timing.json", result.timing)
     write_table(folder / "episodes.parquet", result.results.episodes)
-    states: dict[str, Any] = {f"state_{one.label}": np.array(one.initial_states) for one in runs}
-    states |= {f"episode_{one.label}": np.array([m.episode for m in one.episodes], np.int64) for one in runs}
+    states: dict[str, Any] = {f"state_{brain_run.label}": np.array(brain_run.initial_states) for brain_run in runs}
+    states |= {
+        f"episode_{brain_run.label}": np.array([m.episode for m in brain_run.episodes], np.int64) for brain_run in runs
+    }
     np.savez_compressed(folder / "initial_states.npz", **states)
     videos = _video(config, runs, preview, folder) if preview is not None else []
     write_report(
@@ -229,7 +237,7 @@ def _write(
             config=config,
             results=result.results,
             timing=result.timing,
-            trajectories={one.label: one.trajectories for one in runs},
+            trajectories={brain_run.label: brain_run.trajectories for brain_run in runs},
             videos=videos,
             no_videos=no_videos,
             folder=folder,
@@ -242,12 +250,12 @@ def _video(config: EvalConfig, runs: Sequence[BrainRun], preview: Preview, folde
     videos = []
     robot: Any = config.robot
     with closing(preview):
-        for one in runs:
-            for metrics, scene, states in one.videos:
-                path = folder / "videos" / f"{one.label}_{metrics.episode:04d}.mp4"
+        for brain_run in runs:
+            for metrics, scene, states in brain_run.videos:
+                path = folder / "videos" / f"{brain_run.label}_{metrics.episode:04d}.mp4"
                 path.parent.mkdir(exist_ok=True)
                 preview.write(scene, states, robot.fps, path)
-                videos.append(Video(one.label, metrics, path))
+                videos.append(Video(brain_run.label, metrics, path))
     return videos
 
 

@@ -88,14 +88,14 @@ def paired_forest(paired: Mapping[str, PairedSummary]) -> str:
 
 def outcome_bars(brains: Mapping[str, BrainSummary]) -> str:
     """Return a stacked bar for each brain: how its episodes ended, as shares, with their numbers."""
-    names = [name for name in OUTCOMES if any(name in one.outcomes for one in brains.values())]
+    names = [name for name in OUTCOMES if any(name in brain.outcomes for brain in brains.values())]
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
         left = np.zeros(len(brains))
         for name in names:
-            counts = np.array([one.outcomes.get(name, 0) for one in brains.values()], float)
-            shares = counts / np.maximum([one.episodes for one in brains.values()], 1)
+            counts = np.array([brain.outcomes.get(name, 0) for brain in brains.values()], float)
+            shares = counts / np.maximum([brain.episodes for brain in brains.values()], 1)
             colour, hatch = OUTCOMES[name]
             axes.barh(
                 range(len(brains)), shares, left=left, color=colour, hatch=hatch, edgecolor=_INK, linewidth=0.6,
@@ -129,7 +129,7 @@ def distributions(episodes: Mapping[str, Sequence[EpisodeMetrics]], jerk_unit: s
     def draw(figure: Figure) -> None:
         for axes, (title, name) in zip(figure.subplots(1, len(columns), sharey=True), columns, strict=True):
             for row, ran in enumerate(episodes.values()):
-                _draw_spread(axes, row, np.array([getattr(one, name) for one in ran], float), [o.success for o in ran])
+                _draw_spread(axes, row, np.array([getattr(run, name) for run in ran], float), [o.success for o in ran])
             axes.set_yticks(range(len(episodes)), list(episodes))
             axes.set_ylim(len(episodes) - 0.4, -0.6)
             axes.set_xlabel(title)
@@ -162,7 +162,7 @@ def notable_episodes(trajectories: Mapping[str, Mapping[int, Trajectory]], shown
     numbers = sorted({number for ran in trajectories.values() for number in ran})
     unusual = dict.fromkeys(numbers, 0)
     for ran in trajectories.values():
-        mostly = 2 * sum(one.success for one in ran.values()) >= len(ran)
+        mostly = 2 * sum(run.success for run in ran.values()) >= len(ran)
         for number, one in ran.items():
             unusual[number] += one.success != mostly
     ranked = [n for n in sorted(numbers, key=lambda n: (-unusual[n], n)) if unusual[n]][: (shown + 1) // 2]
@@ -220,7 +220,7 @@ def _draw_spread(axes: Axes, row: int, values: np.ndarray, success: Sequence[boo
 
 def _rate_limits(brains: Mapping[str, BrainSummary]) -> tuple[float, float]:
     """Return what part of 0 to 1 shows the success rates: all of it, unless all lie in its upper half."""
-    lowest = min((one.success.low for one in brains.values()), default=0.0)
+    lowest = min((brain.success.low for brain in brains.values()), default=0.0)
     start = 0.0 if lowest < 0.5 else math.floor(10 * lowest) / 10
     return start - 0.03 * (1 - start), 1 + 0.03 * (1 - start)
 

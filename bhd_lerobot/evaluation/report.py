@@ -69,7 +69,7 @@ class ReportInput:
 def write_report(given: ReportInput, path: Path) -> None:
     """Write the report."""
     cite = ("How to cite and repeat", "cite", _cite(given))
-    shown = [one for one in _sections(given) if one[2]] if given.results.episodes else []
+    shown = [section for section in _sections(given) if section[2]] if given.results.episodes else []
     shown.append(cite)
     links = "".join(f'<a href="#{key}">{title}</a>' for title, key, _ in shown)
     facts = given.results.config
@@ -127,7 +127,12 @@ def _lead(given: ReportInput) -> str:
     if results.is_partial:
         ran = ", ".join(f"{escape(label)} {one.episodes}" for label, one in results.brains.items())
         lead += f'<p class="warn"><b>Partial:</b> the run was stopped early. Episodes finished: {ran}.</p>'
-    return lead + "<ul class='found'>" + "".join(f"<li>{escape(one)}</li>" for one in sentences(results)) + "</ul>"
+    return (
+        lead
+        + "<ul class='found'>"
+        + "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences(results))
+        + "</ul>"
+    )
 
 
 def _summary(given: ReportInput) -> str:
@@ -198,7 +203,7 @@ def _safety(given: ReportInput) -> str:
 
     def occurring(kind: str) -> list[str]:
         return [name for name in getattr(next(iter(brains.values())), kind, {}) if any(
-            getattr(one, kind).get(name) for one in brains.values())]  # fmt: skip
+            getattr(brain, kind).get(name) for brain in brains.values())]  # fmt: skip
 
     limits, watchdogs = occurring("limits"), occurring("watchdogs")
     rows = []
@@ -263,7 +268,7 @@ def _last_image(video: Path) -> str:
 def _failures(given: ReportInput) -> str:
     parts = []
     for label, episodes in _by_brain(given).items():
-        failed = [one for one in episodes if not one.success]
+        failed = [episode for episode in episodes if not episode.success]
         if not failed:
             parts.append(f"<p><b>{escape(label)}</b>: none.</p>")
             continue
@@ -324,7 +329,10 @@ def _cite(given: ReportInput) -> str:
 
 
 def _by_brain(given: ReportInput) -> dict[str, list[EpisodeMetrics]]:
-    return {label: [one for one in given.results.episodes if one.brain == label] for label in given.results.brains}
+    return {
+        label: [episode for episode in given.results.episodes if episode.brain == label]
+        for label in given.results.brains
+    }
 
 
 def _listed(names: list[str]) -> str:
@@ -354,7 +362,7 @@ def table(head: list[str], rows: list[tuple[str, list[str]]], baseline: str | No
     top = "".join(f"<th>{escape(one)}</th>" for one in ["brain", *head])
     body = "".join(
         f"<tr{' class=baseline' if label == baseline and len(rows) > 1 else ''}><td class='name'>{escape(label)}</td>"
-        + "".join(f"<td>{one}</td>" for one in cells)
+        + "".join(f"<td>{text}</td>" for text in cells)
         + "</tr>"
         for label, cells in rows
     )

@@ -95,7 +95,7 @@ class EvalResults:
     @property
     def is_partial(self) -> bool:
         """Whether a brain ran fewer episodes than were requested."""
-        return any(one.episodes < self.requested for one in self.brains.values())
+        return any(brain.episodes < self.requested for brain in self.brains.values())
 
     def plain(self) -> dict[str, Any]:
         """Return everything as plain values; what is not a number is nothing."""
@@ -108,7 +108,7 @@ class EvalResults:
             "confidence": statistics.CONFIDENCE,
             "brains": {label: asdict(one) for label, one in self.brains.items()},
             "paired": {label: asdict(one) for label, one in self.paired.items()},
-            "episodes": [one.plain() for one in self.episodes],
+            "episodes": [episode.plain() for episode in self.episodes],
         }
 
 
@@ -138,31 +138,31 @@ def summarise(
 
 
 def _brain(label: str, episodes: Sequence[EpisodeMetrics]) -> BrainSummary:
-    successes = sum(one.success for one in episodes)
+    successes = sum(episode.success for episode in episodes)
     means = {}
     for name in MEANS:
-        values = np.array([getattr(one, name) for one in episodes], np.float64)
+        values = np.array([getattr(episode, name) for episode in episodes], np.float64)
         means[name] = statistics.mean(values[np.isfinite(values)])
     return BrainSummary(
         brain=label,
         episodes=len(episodes),
         successes=successes,
         success=statistics.wilson(successes, len(episodes)),
-        outcomes=dict(Counter(one.outcome for one in episodes).most_common()),
+        outcomes=dict(Counter(episode.outcome for episode in episodes).most_common()),
         means=means,
-        limits=_sum(one.limits for one in episodes),
-        watchdogs=_sum(one.watchdogs for one in episodes),
-        estops=sum(one.estops for one in episodes),
-        faults=sum(one.faults for one in episodes),
-        frames=sum(one.frames for one in episodes),
+        limits=_sum(episode.limits for episode in episodes),
+        watchdogs=_sum(episode.watchdogs for episode in episodes),
+        estops=sum(episode.estops for episode in episodes),
+        faults=sum(episode.faults for episode in episodes),
+        frames=sum(episode.frames for episode in episodes),
     )
 
 
 def _pair(
     episodes: Sequence[EpisodeMetrics], others: Sequence[EpisodeMetrics], label: str, baseline: str
 ) -> PairedSummary:
-    by_number = {one.episode: one for one in others}
-    pairs = [(one, by_number[one.episode]) for one in episodes if one.episode in by_number]
+    by_number = {metrics.episode: metrics for metrics in others}
+    pairs = [(episode, by_number[episode.episode]) for episode in episodes if episode.episode in by_number]
     success = [one.success for one, _ in pairs], [other.success for _, other in pairs]
     score = [one.score for one, _ in pairs], [other.score for _, other in pairs]
     return PairedSummary(
@@ -178,8 +178,8 @@ def _pair(
 
 def _sum(counts: Any) -> dict[str, int]:
     total: Counter[str] = Counter()
-    for one in counts:
-        total.update(one)  # keeps kinds that never occurred
+    for count in counts:
+        total.update(count)  # keeps kinds that never occurred
     return dict(total)
 
 
@@ -194,9 +194,9 @@ def write_table(path: Path, episodes: Sequence[EpisodeMetrics]) -> None:
     import pyarrow.parquet as pq
 
     rows = []
-    for one in episodes:
+    for episode in episodes:
         row: dict[str, Any] = {}
-        for name, value in one.plain().items():
+        for name, value in episode.plain().items():
             if isinstance(value, dict):
                 row |= {f"{name}.{kind}": number for kind, number in value.items()}
             else:
@@ -210,7 +210,7 @@ def _finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _finite(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_finite(part) for part in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

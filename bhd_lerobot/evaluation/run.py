@@ -60,7 +60,7 @@ class BrainRun:
     def timing(self) -> dict[str, Any]:
         """Return what was measured on the wall clock, as plain values."""
         calls = np.array(self.timed.times)
-        simulated = sum(one.length_s for one in self.episodes)
+        simulated = sum(episode.length_s for episode in self.episodes)
         quantiles = dict(zip(("p50_s", "p99_s", "max_s"), np.quantile(calls, (0.5, 0.99, 1.0)).tolist(), strict=True))
         per = self.wall_s if self.wall_s > 0 else np.inf
         return {
@@ -68,7 +68,7 @@ class BrainRun:
             "episodes_per_s": len(self.episodes) / per,
             "real_time_factor": simulated / per,
             "act": {"calls": len(calls), "robots_per_call": self.loop.simulation.n, **quantiles},
-            "episodes": {str(one.episode): one.wall for one in self.episodes if one.wall},
+            "episodes": {str(episode.episode): episode.wall for episode in self.episodes if episode.wall},
         }
 
 

@@ -111,7 +111,9 @@ def _overview(summary: DatasetSummary) -> str:
 
 
 def _outcomes(summary: DatasetSummary) -> str:
-    counts = Counter(str(one.metadata["outcome"]) for one in summary.episodes if one.metadata.get("outcome"))
+    counts = Counter(
+        str(episode.metadata["outcome"]) for episode in summary.episodes if episode.metadata.get("outcome")
+    )
     if not counts:
         return ""
     rows = [(name, str(count), f"{count / len(summary.episodes):.0%}") for name, count in counts.items()]
@@ -119,7 +121,9 @@ def _outcomes(summary: DatasetSummary) -> str:
 
 
 def _success(summary: DatasetSummary) -> str:
-    known = [bool(one.metadata["success"]) for one in summary.episodes if one.metadata.get("success") is not None]
+    known = [
+        bool(episode.metadata["success"]) for episode in summary.episodes if episode.metadata.get("success") is not None
+    ]
     if not known:
         return ""
     from scipy.stats import binomtest
@@ -169,7 +173,7 @@ def _origin(identity: Mapping[str, Any]) -> str:
 
 
 def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [headings, ["---"] * len(headings), *[[_cell(one) for one in row] for row in rows]]
+    lines = [headings, ["---"] * len(headings), *[[_cell(cell) for cell in row] for row in rows]]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 

@@ -28,7 +28,7 @@ def instead_of_resuming(config: RecordConfig, arguments: Sequence[str]) -> list[
     """
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
     episodes = dataset_info(root).episodes
-    known = {str(one.metadata.get("seed")) for one in episodes}
+    known = {str(episode.metadata.get("seed")) for episode in episodes}
     split = config.split
     seed = next(
         seed

@@ -270,9 +270,9 @@ def _draw_place(radius: float, objects: Sequence[TableObject], rng: np.random.Ge
     """Return a place for an object of this radius, apart from the others; None if there seems to be none."""
     for _ in range(_TRIES):
         place = rng.uniform(_AREA[0], _AREA[1])
-        for one in objects:
-            other = math.hypot(one.size_x, one.size_y) if one.kind == "box" else one.size_x
-            if math.hypot(place[0] - one.x, place[1] - one.y) < radius + other + _APART:
+        for item in objects:
+            other = math.hypot(item.size_x, item.size_y) if item.kind == "box" else item.size_x
+            if math.hypot(place[0] - item.x, place[1] - item.y) < radius + other + _APART:
                 break
         else:
             return np.asarray(place)

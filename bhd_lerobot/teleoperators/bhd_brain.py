@@ -59,7 +59,7 @@ class GoalStreamer:
             controller.run(reading)
         # A refusal is among the results, too, unless another goal has its name.
         ended = controller.take_results(0)
-        return controller.command[0].copy(), [one for one in refused if one not in ended] + ended
+        return controller.command[0].copy(), [name for name in refused if name not in ended] + ended
 
 
 class BhdBrain(Teleoperator):

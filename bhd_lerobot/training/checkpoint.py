@@ -97,11 +97,11 @@ def load(checkpoint: Path, parts: TrainingParts) -> tuple[int, dict[str, Any]]:
 
 def clean(output_dir: Path) -> None:
     """Remove what a kill left of unfinished checkpoints."""
-    for one in (output_dir / "checkpoints").glob(".*"):
-        if one.is_symlink():
-            one.unlink()
+    for path in (output_dir / "checkpoints").glob(".*"):
+        if path.is_symlink():
+            path.unlink()
         else:
-            shutil.rmtree(one, ignore_errors=True)
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def resume_command(checkpoint: Path) -> str:

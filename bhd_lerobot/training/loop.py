@@ -96,8 +96,8 @@ class Window:
         """Return the measurements of every step as plain numbers; waits for the device."""
         if not self.results:
             return list(self.before)
-        losses = torch.stack([one.loss for one in self.results]).tolist()
-        norms = torch.stack([one.grad_norm for one in self.results]).tolist()
+        losses = torch.stack([outcome.loss for outcome in self.results]).tolist()
+        norms = torch.stack([outcome.grad_norm for outcome in self.results]).tolist()
         rows = []
         for result, loss, norm in zip(self.results, losses, norms, strict=True):
             outputs = {key: float(one) for key, one in result.outputs.items() if _is_number(one)}
@@ -239,7 +239,7 @@ class TrainingLoop:
         """
         if not self._window.results:
             return
-        losses = torch.stack([one.loss for one in self._window.results])
+        losses = torch.stack([result.loss for result in self._window.results])
         bad = (~torch.isfinite(losses)).nonzero()
         if len(bad):
             place = int(bad[0, 0])
@@ -248,7 +248,7 @@ class TrainingLoop:
 
     def _diverged(self, step: int, loss: float, where: tuple[Any, Any]) -> DivergedError:
         name = f"step {step} (epoch {(step - 1) * self.options.batch_size // self.options.frames})"
-        if all(isinstance(one, Tensor) for one in where):
+        if all(isinstance(rows, Tensor) for rows in where):
             pairs = [f"{int(e)}:{int(f)}" for e, f in zip(*where, strict=True)]
             shown = ", ".join(pairs[:8]) + (f", … ({len(pairs)} samples)" if len(pairs) > 8 else "")
             name += f", batch of episode:frame {shown}"

@@ -108,7 +108,7 @@ def check_features(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, renam
     """
     features = {rename_map.get(k, k): one for k, one in dataset_to_policy_features(meta.features).items()}
     there = ", ".join(features)
-    if not any(one.type is FeatureType.ACTION for one in features.values()):
+    if not any(feature.type is FeatureType.ACTION for feature in features.values()):
         raise DatasetError(f"{meta.root} has no {ACTION!r}, so there is nothing to imitate. It has {there}.")
     for key, wanted in {**(policy.input_features or {}), **(policy.output_features or {})}.items():
         if wanted.type is FeatureType.VISUAL and key not in features and getattr(policy, "empty_cameras", 0) > 0:

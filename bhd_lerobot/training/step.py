@@ -127,7 +127,7 @@ class Learner:
             with torch.random.fork_rng([device] if device.type == "cuda" else []), torch.no_grad():
                 torch.manual_seed(seed)
                 for raw in batches:
-                    size = len(next(one for one in raw.values() if isinstance(one, Tensor)))
+                    size = len(next(value for value in raw.values() if isinstance(value, Tensor)))
                     with nullcontext() if self._is_plain else self._accelerator.autocast():
                         loss, _ = self.policy.forward(self.prepare(raw))
                     total += loss.double() * size

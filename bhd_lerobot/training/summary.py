@@ -29,8 +29,8 @@ _EXAMPLE_TASKS = {"turtlebot3": "avoid", "ur5": "pick"}
 
 def print_start(console: Console, config: BhdTrainConfig, policy: Any, data: TrainingData, step: int) -> None:
     """Print which policy is trained on which data."""
-    learnable = sum(one.numel() for one in policy.parameters() if one.requires_grad)
-    total = sum(one.numel() for one in policy.parameters())
+    learnable = sum(parameter.numel() for parameter in policy.parameters() if parameter.requires_grad)
+    total = sum(parameter.numel() for parameter in policy.parameters())
     frozen = f", {total - learnable:,} more are fixed" if total > learnable else ""
     held_out = f", {len(data.held_out_episodes)} held out" if data.held_out_episodes else ""
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))

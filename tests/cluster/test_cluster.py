@@ -137,7 +137,7 @@ def test_a_recording_is_the_same_although_a_worker_and_a_machine_die(cluster, tm
 
     def a_worker() -> int:
         # The pool may not have missed yet the one that was killed just now.
-        pids = [int(one.host.rpartition(" ")[2]) for one in pools[0]._workers if one.is_ready]
+        pids = [int(worker.host.rpartition(" ")[2]) for worker in pools[0]._workers if worker.is_ready]
         return next(pid for pid in pids if pid not in killed)
 
     def kill_a_worker() -> None:
@@ -424,7 +424,7 @@ def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(cl
 
     with open_pool(RayConfig(address=cluster.address), Console(file=io.StringIO())):
         others = [ray.remote(Busy).options(num_cpus=1).remote() for _ in range(2)]
-        ray.get([one.ready.remote() for one in others])
+        ray.get([other.ready.remote() for other in others])
         # Within the same program, which is so a driver already.
         _, _, error = run_pool(cluster, [fakes.ECHO], timeout_s=1.0)
     assert isinstance(error, ClusterError)

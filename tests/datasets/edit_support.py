@@ -71,7 +71,7 @@ def content(root: Path) -> list[Episode]:
 def assert_valid(root: Path) -> None:
     """Assert that `bhd-data check` finds no error: counts, files, videos, and statistics that are those of the data."""
     found = check_dataset(root, lambda robot: {})
-    assert [str(one) for one in found.findings if one.severity is Severity.ERROR] == []
+    assert [str(finding) for finding in found.findings if finding.severity is Severity.ERROR] == []
 
 
 def steps_of(action: Callable[[], object]) -> int:

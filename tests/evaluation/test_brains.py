@@ -73,9 +73,9 @@ def test_an_evaluation_runs_on_the_wall_clock(tmp_path):
     assert result.exit_status == 0
     assert "Emergency stop: " in printed
     episodes = result.results.episodes
-    assert [one.episode for one in episodes] == [0, 1]
-    assert all(one.frames == 10 for one in episodes)
+    assert [episode.episode for episode in episodes] == [0, 1]
+    assert all(episode.frames == 10 for episode in episodes)
     assert set(result.timing["brains"]["old"]["episodes"]) == {"0", "1"}
-    assert all(one.wall["inference_max_s"] > 0 for one in episodes)
+    assert all(episode.wall["inference_max_s"] > 0 for episode in episodes)
     assert "wall" not in (tmp_path / "results.json").read_text()
     assert "on the wall clock" in result.report.read_text()

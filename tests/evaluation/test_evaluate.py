@@ -86,18 +86,18 @@ def test_brains_get_the_same_episodes_which_are_held_out(whole):
 
 def test_other_brains_and_episodes_beside_it_change_nothing(whole, tmp_path):
     result, _ = run_eval(tmp_path, only="[new]", episodes="[7,2]", n_episodes=9, **FAILING)
-    alone = {one.episode: one for one in result.results.episodes}
+    alone = {episode.episode: episode for episode in result.results.episodes}
     assert sorted(alone) == [2, 7]
-    for one in whole[1].results.episodes:
-        if one.brain == "new" and one.episode in alone:
-            assert one == alone[one.episode]
+    for episode in whole[1].results.episodes:
+        if episode.brain == "new" and episode.episode in alone:
+            assert episode == alone[episode.episode]
 
 
 def test_another_seed_and_split_are_other_episodes(whole, tmp_path):
-    seen = {one.seed for one in whole[1].results.episodes}
+    seen = {episode.seed for episode in whole[1].results.episodes}
     for name, overrides in (("a", {"seed": 1}), ("b", {"split": "train"})):
         result, _ = run_eval(tmp_path / name, only="[old]", n_episodes=2, **overrides)
-        assert not seen & {one.seed for one in result.results.episodes}
+        assert not seen & {episode.seed for episode in result.results.episodes}
 
 
 def test_counts_and_files_agree(whole):
@@ -139,7 +139,7 @@ def test_an_episode_equals_the_one_that_is_recorded(whole, tmp_path):
     """bhd-record with the same seed and split has the same episodes."""
     run_record(tmp_path / "d", split="held_out", task__min_path_m=FAILING["task__min_path_m"], dataset__num_episodes=9)
     recorded = [row.metadata for row in dataset_info(tmp_path / "d").episodes]
-    old = [one for one in whole[1].results.episodes if one.brain == "old"]
+    old = [episode for episode in whole[1].results.episodes if episode.brain == "old"]
     assert [(r["seed"], r["score"], r["outcome"]) for r in recorded] == [(str(o.seed), o.score, o.outcome) for o in old]
 
 
@@ -147,7 +147,7 @@ def test_runs_are_recorded_as_a_dataset_for_each_brain(whole, tmp_path):
     run_eval(tmp_path / "e", n_episodes=9, record__repo_id="me/eval", record__root=tmp_path / "data", **FAILING)
     for label in ("old", "new"):
         info = dataset_info(tmp_path / "data" / label)
-        mine = [one for one in whole[1].results.episodes if one.brain == label]
+        mine = [episode for episode in whole[1].results.episodes if episode.brain == label]
         assert [row.metadata["score"] for row in info.episodes] == [one.score for one in mine]
         assert [row.frames for row in info.episodes] == [one.frames for one in mine]
     assert (tmp_path / "e" / "results.json").read_bytes() == (whole[0] / "results.json").read_bytes()
@@ -157,7 +157,7 @@ def test_a_failed_episode_is_run_again_by_the_command_in_the_report(whole, tmp_p
     from bhd_lerobot.evaluation.report import replay_command
 
     config = parse(EvalConfig, [f"--config_path={whole[0] / 'config.yaml'}"])
-    failed = next(one for one in whole[1].results.episodes if not one.success)
+    failed = next(episode for episode in whole[1].results.episodes if not episode.success)
     words = shlex.split(replay_command(config, whole[0], failed))
     assert words[0] == "bhd-eval"
     assert main(words[1:]) == 0
@@ -214,7 +214,7 @@ def test_a_signal_before_anything_is_finished_still_ends_in_a_report(tmp_path, m
 
 def test_fail_below_is_about_the_lower_end_of_the_interval(tmp_path):
     result, printed = run_eval(tmp_path / "a", fail_below=0.9)
-    assert all(one.success.value == 1 for one in result.results.brains.values())
+    assert all(brain.success.value == 1 for brain in result.results.brains.values())
     assert result.exit_status == 1  # 5 of 5 is not yet 90 %
     assert result.missed == ["old", "new"]
     assert "old missed fail_below" in printed

@@ -76,11 +76,14 @@ def test_the_page_needs_nothing_but_itself(page):
 
 def test_the_page_says_what_the_results_say(page):
     result, text = page
-    for one in result.results.brains.values():
-        assert f"{one.successes} of {one.episodes}" in text
-    for one in result.results.episodes:
-        row = rf"<td>{one.episode}</td><td>{one.outcome}</td>.*{one.seed}.*--only=\[{one.brain}\].*=\[{one.episode}\]"
-        assert bool(re.search(row, text)) == (not one.success)
+    for brain in result.results.brains.values():
+        assert f"{brain.successes} of {brain.episodes}" in text
+    for episode in result.results.episodes:
+        row = (
+            rf"<td>{episode.episode}</td><td>{episode.outcome}</td>.*{episode.seed}"
+            rf".*--only=\[{episode.brain}\].*=\[{episode.episode}\]"
+        )
+        assert bool(re.search(row, text)) == (not episode.success)
     assert "lerobot 0.6" in text
     digest = re.search(r"<code>([0-9a-f]{64})</code>", text)
     assert digest is not None
@@ -106,7 +109,7 @@ def test_videos_are_h264_in_the_page_or_the_page_says_why_there_are_none(page):
     if not videos:
         assert "No videos:" in text
         pytest.skip("no renderer here")
-    by_brain = {label: [one for one in videos if one.name.startswith(label)] for label in result.results.brains}
+    by_brain = {label: [video for video in videos if video.name.startswith(label)] for label in result.results.brains}
     for label, one in result.results.brains.items():
         failed = one.episodes - one.successes
         assert len(by_brain[label]) == (min(failed, run.VIDEOS) or 1)

@@ -61,4 +61,4 @@ class HubServer:
 
     def asked(self, pattern: str) -> list[str]:
         """Return the requests that match."""
-        return [one for one in self.requests if re.search(pattern, one)]
+        return [request for request in self.requests if re.search(pattern, request)]

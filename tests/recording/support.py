@@ -1,15 +1,18 @@
 """What the tests of the runs share."""
 
 import io
+import json
 from pathlib import Path
 
 import pyarrow.parquet as pq
 from rich.console import Console
 
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.record import record
+from bhd_lerobot.recording.record import main, record
 from bhd_lerobot.recording.report import RecordResult
 from bhd_lerobot.rollout.configuration import parse
+from tests.forks import Fork
+from tests.waiting import until
 
 
 def options(root: Path, **overrides: object) -> list[str]:
@@ -35,6 +38,21 @@ def run_record(root: Path, **overrides: object) -> tuple[RecordResult, str]:
     console = Console(file=io.StringIO(), width=160)
     result = record(parse(RecordConfig, options(root, **overrides)), console)
     return result, console.file.getvalue()
+
+
+def start(root: Path, episodes: int, **overrides: object) -> Fork:
+    """Record in a process of its own, and wait until so many episodes are saved or it has ended."""
+    process = Fork(main, options(root, **overrides), output=root.with_name(f"{root.name}.log"))
+    until(lambda: saved(root) >= episodes or process.poll() is not None, f"{episodes} episodes are saved")
+    return process
+
+
+def saved(root: Path) -> int:
+    """Return how many episodes a dataset has; none if it is not there."""
+    try:
+        return int(json.loads((root / "meta" / "info.json").read_text())["total_episodes"])
+    except (OSError, ValueError):
+        return 0
 
 
 def data_columns(root: Path) -> dict[str, list]:

@@ -100,8 +100,8 @@ def test_exactly_the_frames_that_the_expert_drove_are_flagged_and_its_actions_ar
         assert (action[~flags] == 0).all()
         assert (np.abs(action[flags]).max(axis=1) > 0).all()
         assert episode.interventions is not None
-        assert [(one.first, one.end) for one in episode.interventions] == [(5, 8), (13, 16)]
-        assert {one.cause for one in episode.interventions} == {"time is up"}
+        assert [(intervention.first, intervention.end) for intervention in episode.interventions] == [(5, 8), (13, 16)]
+        assert {intervention.cause for intervention in episode.interventions} == {"time is up"}
         assert episode.commands is None
         assert episode.goal_frames is None
 
@@ -152,7 +152,7 @@ def test_goals_take_over_an_arm_in_motion_without_a_jump_and_give_it_back(hold_s
         assert not by_goals[:15].any()
         assert by_goals[15:25].all()
         assert episode.interventions is not None
-        assert [(one.first, one.end) for one in episode.interventions] == episode.goal_frames
+        assert [(intervention.first, intervention.end) for intervention in episode.interventions] == episode.goal_frames
         assert episode.commands
         assert {frame for frame, _ in episode.commands} <= set(np.flatnonzero(by_goals).tolist())
         speed = np.diff(columns[keys.APPLIED_ACTION][:, :6], axis=0) * 25
@@ -247,7 +247,7 @@ def test_a_pick_that_the_learner_does_not_even_begin_succeeds() -> None:
     for episode in loop.run([EpisodeSpec(i, 2 * i) for i in range(4)]):
         assert episode.outcome.success
         assert episode.interventions is not None
-        assert [one.cause for one in episode.interventions] == ["no progress"]
+        assert [intervention.cause for intervention in episode.interventions] == ["no progress"]
         assert episode.plan["attempts"] >= 1
 
 

@@ -6,8 +6,6 @@ import os
 import pty
 import re
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -23,12 +21,13 @@ from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.shared_memory import names, sweep
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.record import record
+from bhd_lerobot.recording.record import main, record
 from bhd_lerobot.recording.report import ESTOP_STATUS, RecordResult
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.tasks.avoid import AvoidTask
 from bhd_lerobot.tasks.task import Event
-from tests.recording.support import data_columns, options, run_record
+from tests.forks import Fork
+from tests.recording.support import data_columns, options, run_record, saved
 from tests.robots.host.support import is_alive, is_gone, unique
 from tests.waiting import until
 
@@ -116,21 +115,11 @@ class Program:
         self.root, self.name = root, name
         self.person, device = pty.openpty()
         self.log = root.parent / "log"
-        with self.log.open("w") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-c", _MAIN, *live_options(root, robot__id=name, **overrides)],
-                stdin=device,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-            )
+        self.process = Fork(main, live_options(root, robot__id=name, **overrides), output=self.log, terminal=device)
         os.close(device)
 
     def saved(self) -> int:
-        try:
-            return int(json.loads((self.root / "meta" / "info.json").read_text())["total_episodes"])
-        except (OSError, ValueError):
-            return 0
+        return saved(self.root)
 
     def wait_for_second_episode(self) -> None:
         """Wait until one episode is saved and the next is under way."""
@@ -145,16 +134,7 @@ class Program:
 
     def close(self) -> None:
         self.process.kill()
-        self.process.wait()
         os.close(self.person)
-
-
-_MAIN = """
-import fcntl, sys, termios
-fcntl.ioctl(0, termios.TIOCSCTTY)
-from bhd_lerobot.recording.record import main
-sys.exit(main(sys.argv[1:]))
-"""
 
 
 @pytest.fixture
@@ -176,7 +156,7 @@ def test_a_key_stops_the_robot_and_the_run_then_a_kill_and_it_goes_on_every_time
     stopped = programs(root, name, **many)
     stopped.wait_for_second_episode()
     os.write(stopped.person, b" ")
-    assert stopped.process.wait(60) == ESTOP_STATUS, stopped.log.read_text()
+    assert stopped.process.wait() == ESTOP_STATUS, stopped.log.read_text()
     text = " ".join(stopped.log.read_text().split())
     assert "space or e, or kill -USR1" in text
     assert "Emergency stop (key)" in text
@@ -196,8 +176,7 @@ def test_a_key_stops_the_robot_and_the_run_then_a_kill_and_it_goes_on_every_time
     children = killed.children()
     assert len(children) == 2
     assert name in names()
-    killed.process.send_signal(signal.SIGKILL)
-    killed.process.wait()
+    killed.process.kill()
     until(lambda: not any(is_alive(pid) for pid in children), "the robot's processes end by themselves")
     sweep()
     assert is_gone(name)

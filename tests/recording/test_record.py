@@ -1,11 +1,8 @@
 """bhd-record: same seed same bytes, resume after any kill, signals, bad input, what is in the run folder."""
 
-import json
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -21,7 +18,7 @@ from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.configuration import encode, parse
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from tests.cases import each_case
-from tests.recording.support import data_columns, episode_rows, options, run_record
+from tests.recording.support import data_columns, episode_rows, options, run_record, start
 
 
 def test_same_seed_same_bytes_for_any_number_of_simulations(tmp_path):
@@ -131,32 +128,15 @@ def test_resume_refuses_another_recording_and_shows_the_difference(recorded):
             run_record(recorded[0], resume="true", dataset__num_episodes=5, **change)
 
 
-def _start(root: Path, **overrides) -> subprocess.Popen:
-    command = [sys.executable, "-m", "bhd_lerobot.recording.record", *options(root, **overrides)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def _wait_for_episodes(root: Path, count: int, process: subprocess.Popen) -> None:
-    while process.poll() is None:
-        try:
-            if json.loads((root / "meta" / "info.json").read_text())["total_episodes"] >= count:
-                return
-        except (OSError, ValueError):
-            pass
-        time.sleep(0.01)
-
-
 def test_killed_and_resumed_is_the_same_as_undisturbed(tmp_path):
     many = {"dataset__num_episodes": 20, "n_envs": 2, "seed": 1}
     run_record(tmp_path / "whole", **many)
     generator = random.Random(1)
     root = tmp_path / "killed"
     for wanted in (1, 13):
-        process = _start(root, resume="true", **many)
-        _wait_for_episodes(root, wanted, process)
+        process = start(root, wanted, resume="true", **many)
         time.sleep(generator.random() * 0.05)
         process.kill()
-        process.communicate()
     result, _ = run_record(root, resume="true", **many)
     assert result.episodes == 20
     assert data_columns(root) == data_columns(tmp_path / "whole")
@@ -164,11 +144,9 @@ def test_killed_and_resumed_is_the_same_as_undisturbed(tmp_path):
 
 
 def test_a_signal_ends_the_run_with_a_finalised_dataset(tmp_path, monkeypatch):
-    process = _start(tmp_path / "program", dataset__num_episodes=100_000, n_envs=2)
-    _wait_for_episodes(tmp_path / "program", 2, process)
+    process = start(tmp_path / "program", 2, dataset__num_episodes=100_000, n_envs=2)
     process.send_signal(signal.SIGTERM)
-    _, text = process.communicate()
-    ended = {"program": (process.returncode, text, signal.SIGTERM)}
+    ended = {"program": (process.wait(), (tmp_path / "program.log").read_text(), signal.SIGTERM)}
     for number in (signal.SIGINT, signal.SIGHUP):  # in this process
         save = record_module.DatasetRecorder.save
 

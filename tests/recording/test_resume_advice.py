@@ -12,7 +12,7 @@ from tests.recording.support import options
 
 
 def seeds(root: Path) -> list[str]:
-    return [one.metadata["seed"] for one in dataset_info(root).episodes]
+    return [episode.metadata["seed"] for episode in dataset_info(root).episodes]
 
 
 def test_the_commands_that_are_told_do_what_was_meant(tmp_path: Path, capsys) -> None:

@@ -1,10 +1,6 @@
 """bhd-record and bhd-replay with the UR5: goals, plans, instructions, and the same bytes for any number of arms."""
 
 import json
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -15,7 +11,7 @@ from bhd_lerobot.errors import ConfigError, RenderingError
 from bhd_lerobot.rollout.provenance import scene_from_json
 from bhd_lerobot.rollout.replay import Replay
 from tests.cases import each_case
-from tests.recording.support import data_columns, episode_rows, options, run_record
+from tests.recording.support import data_columns, episode_rows, run_record, start
 
 PICK = {
     "robot__type": "ur5",
@@ -169,18 +165,7 @@ def test_an_instruction_without_a_matching_object_is_not_carried_out_and_says_wh
 
 def test_killed_and_resumed_is_the_same_as_undisturbed(recorded, tmp_path):
     root = tmp_path / "killed"
-    many = {**PICK, **SPOKEN, "resume": "true"}
-    command = [sys.executable, "-m", "bhd_lerobot.recording.record", *options(root, **many)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE)
-    while process.poll() is None:
-        try:
-            if json.loads((root / "meta" / "info.json").read_text())["total_episodes"] >= 1:
-                break
-        except (OSError, ValueError):
-            pass
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
+    start(root, 1, **PICK, **SPOKEN, resume="true").kill()
     record(root, **SPOKEN, n_envs=2, resume="true")
     assert data_columns(root) == data_columns(recorded)
 

@@ -2,8 +2,6 @@
 
 import os
 import pty
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import pytest
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
+from bhd_lerobot.recording.record import main
 from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
@@ -21,6 +20,8 @@ from bhd_lerobot.rollout.marks import Marks
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.task import OUTCOMES, Event
+from tests.forks import Fork
+from tests.waiting import until
 
 ALL = np.array([True, True])
 NOTHING = np.zeros(2, np.int64)
@@ -127,31 +128,19 @@ def test_keys_of_a_terminal_reach_a_recording(tmp_path: Path) -> None:
     from bhd_lerobot.datasets.format.summary import dataset_info
 
     ours, theirs = pty.openpty()
-    code = "import os, sys; os.setsid(); import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); " + (
-        "from bhd_lerobot.recording.record import main; sys.exit(main())"
-    )
-    root = Path(__file__).resolve().parents[2]
+    root, log = Path(__file__).resolve().parents[2], tmp_path / "log"
     arguments = [
         f"--config_path={root}/configs/record/turtlebot3_avoid.yaml", "--robot.clock=realtime", "--robot.beams=36",
         f"--dataset.root={tmp_path}/d", "--dataset.repo_id=t/t", "--dataset.num_episodes=1", "--preview_video=false",
         f"--output_dir={tmp_path}/o", "--dataset.episode_time_s=600",
     ]  # fmt: skip
-    with subprocess.Popen(
-        [sys.executable, "-c", code, *arguments],
-        stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env={**os.environ, "PYTHONPATH": str(root)},
-    ) as process:  # fmt: skip
-        os.close(theirs)
-        assert process.stdout is not None
-        output = b""
-        while b"s success, f failure" not in output:
-            line = os.read(process.stdout.fileno(), 4096)
-            assert line, output.decode()
-            output += line
-        while process.poll() is None:
-            os.write(ours, b"s")  # marks between two episodes are dropped, so it is repeated until it takes effect
-            time.sleep(0.2)
-        output += process.stdout.read()
+    process = Fork(main, arguments, output=log, terminal=theirs)
+    os.close(theirs)
+    until(lambda: process.poll() is not None or "s success, f failure" in log.read_text())
+    while process.poll() is None:
+        os.write(ours, b"s")  # marks between two episodes are dropped, so it is repeated until it takes effect
+        time.sleep(0.2)
     os.close(ours)
-    assert process.returncode == 0, output.decode()
+    assert process.wait() == 0, log.read_text()
     (episode,) = dataset_info(tmp_path / "d").episodes
     assert (episode.metadata["outcome"], episode.metadata["success"]) == ("success", True)

@@ -1,7 +1,6 @@
 """Brains as teleoperators, alone and under the stock command lines."""
 
 import json
-import subprocess
 import sys
 
 import numpy as np
@@ -15,6 +14,7 @@ from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
 from bhd_lerobot.teleoperators.bhd_brain import BhdBrain
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
+from tests.forks import Fork
 
 
 @pytest.fixture
@@ -74,18 +74,19 @@ def test_its_lifecycle(tmp_path):
     assert not teleop.is_connected
 
 
-STOCK = """
-import sys
-from lerobot.datasets import LeRobotDataset
-from lerobot.scripts import lerobot_record, lerobot_replay
+def record_and_replay(robot: str, fps: int, *options: str) -> None:
+    """Run LeRobot's commands, and print what is in the dataset."""
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.scripts import lerobot_record, lerobot_replay
 
-def run(robot, fps, *options):
     common = [f"--robot.type={robot}", "--play_sounds=false", f"--dataset.root={robot}"]
-    common += [f"--dataset.repo_id=test/{robot}", *(one for one in options if one.startswith("--robot"))]
-    sys.argv = ["lerobot-record", *common, "--teleop.type=bhd_brain", "--dataset.single_task=Go.",
-                f"--dataset.fps={fps}", "--dataset.num_episodes=1", "--dataset.episode_time_s=1",
-                "--dataset.reset_time_s=0", "--dataset.push_to_hub=false",
-                *(one for one in options if one.startswith("--teleop"))]
+    common += [f"--dataset.repo_id=test/{robot}", *(option for option in options if option.startswith("--robot"))]
+    sys.argv = [
+        "lerobot-record", *common, "--teleop.type=bhd_brain", "--dataset.single_task=Go.",
+        f"--dataset.fps={fps}", "--dataset.num_episodes=1", "--dataset.episode_time_s=1",
+        "--dataset.reset_time_s=0", "--dataset.push_to_hub=false",
+        *(option for option in options if option.startswith("--teleop")),
+    ]  # fmt: skip
     lerobot_record.main()
     dataset = LeRobotDataset(f"test/{robot}", root=robot)
     assert dataset.meta.robot_type == robot, dataset.meta.robot_type
@@ -95,20 +96,22 @@ def run(robot, fps, *options):
     lerobot_replay.main()
     print("REPLAYED")
 
-run("turtlebot3", 10)
-run("ur5", 25, "--robot.scene=pick", "--teleop.brain.type=pick")
-"""
 
-
-def test_stock_record_and_replay_work(tmp_path):
-    """`lerobot-record` and `lerobot-replay` of both robots, in one process because importing LeRobot takes seconds."""
-    result = subprocess.run([sys.executable, "-c", STOCK], capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert result.returncode == 0, result.stderr[-3000:]
-    recorded = [line.split(" ", 3) for line in result.stdout.splitlines() if line.startswith("RECORDED")]
+def test_stock_record_and_replay_work(tmp_path, monkeypatch):
+    """`lerobot-record` and `lerobot-replay` of both robots, in processes of their own: they end with these."""
+    monkeypatch.chdir(tmp_path)
+    outputs = []
+    for options in (("turtlebot3", 10), ("ur5", 25, "--robot.scene=pick", "--teleop.brain.type=pick")):
+        log = tmp_path / "log"
+        status = Fork(record_and_replay, *options, output=log).wait()
+        outputs.append(log.read_text())
+        assert status == 0, outputs[-1]
+    lines = "".join(outputs).splitlines()
+    recorded = [line.split(" ", 3) for line in lines if line.startswith("RECORDED")]
     assert [int(width) for _, _, width, _ in recorded] == [362, 14]
     for (_, frames, _, _), fps in zip(recorded, (10, 25), strict=True):
         assert 5 <= int(frames) <= fps + 1
     base, arm = (json.loads(action) for *_, action in recorded)
     assert np.allclose(base, [0.2, 0.0])
     assert not np.allclose(arm, UR5Config().body().home, atol=0.05)  # it was on its way
-    assert result.stdout.count("REPLAYED") == 2
+    assert lines.count("REPLAYED") == 2

@@ -71,7 +71,7 @@ def drain(streamer, commands, frames=100, behind=0.0):
 def test_the_stream_is_the_trajectory_of_the_goal():
     goal = BrainCommand("a", target_pose=Pose((0.4, 0.1, 0.3), (0.0, 1.0, 0.0, 0.0)), gripper=0.03)
     references, results = drain(GoalStreamer(ARM, RATES, HOME), [goal])
-    assert [(one.task_id, one.code) for one in results] == [("a", ResultCode.SUCCEEDED)]
+    assert [(result.task_id, result.code) for result in results] == [("a", ResultCode.SUCCEEDED)]
     speed = np.abs(np.diff(references, axis=0)) * RATES.fps
     assert (speed <= np.array(ARM.limits.velocity) + 1e-9).all()
     assert references[-1, 6] == pytest.approx(0.03)

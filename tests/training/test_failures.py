@@ -33,11 +33,11 @@ def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def refused(arguments: list[str], error: type[BhdError], match: str) -> None:
     """Assert that a command line is refused and leaves nothing behind."""
-    folders = [Path(one.partition("=")[2]) for one in arguments if one.startswith("--output_dir=")]
-    before = [one.exists() for one in folders]
+    folders = [Path(argument.partition("=")[2]) for argument in arguments if argument.startswith("--output_dir=")]
+    before = [folder.exists() for folder in folders]
     with pytest.raises(error, match=match):
         run_train(arguments)
-    assert [one.exists() for one in folders] == before
+    assert [folder.exists() for folder in folders] == before
 
 
 def test_an_error_is_one_sentence_and_status_2(data: Path, tmp_path: Path, capfd: pytest.CaptureFixture) -> None:

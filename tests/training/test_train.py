@@ -1,9 +1,7 @@
 import json
 import os
 import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import draccus
@@ -18,7 +16,9 @@ from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.training import checkpoint
 from bhd_lerobot.training.log import MetricsFile
 from bhd_lerobot.training.train import main
+from tests.forks import Fork
 from tests.training.support import ACT, MLP, curve, make_dataset, options, run_train
+from tests.waiting import until
 
 
 @pytest.fixture(scope="module")
@@ -126,30 +126,13 @@ def test_a_resumed_run_continues_to_the_same_bits(
     assert (tmp_path / "cut" / weights).read_bytes() == (tmp_path / "whole" / weights).read_bytes()
 
 
-def spawn(arguments: list[str]) -> subprocess.Popen:
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "bhd_lerobot.cli.train", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
-
-
-def wait_for(condition, process: subprocess.Popen) -> None:
-    while not condition():
-        assert process.poll() is None, process.stdout.read()
-        time.sleep(0.01)
-
-
 def test_sigkill_anywhere_and_resuming_gives_the_undisturbed_curve(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "cut"
     # A constant learning rate, because another one depends on the number of steps.
     common = {"log_freq": 7, "save_freq": 10, "policy": {**MLP, "policy.scheduler": "constant"}}
-    process = spawn(options(data, run, steps=5000, **common))
-    try:
-        wait_for(lambda: len(list((run / "checkpoints").glob("0*"))) > 3, process)
-        process.kill()
-        process.wait()
-    finally:
-        process.kill()
-        process.stdout.close()
+    process = Fork(main, options(data, run, steps=5000, **common), output=tmp_path / "output")
+    until(lambda: len(list((run / "checkpoints").glob("0*"))) > 3 or process.poll() is not None)
+    assert process.kill() == -signal.SIGKILL, (tmp_path / "output").read_text()
     done = json.loads((run / "checkpoints" / "last" / "training_state" / "training_step.json").read_text())["step"]
     assert 0 < done < 5000
     run_train(["--resume=true", f"--config_path={run}", f"--steps={done + 25}"])

@@ -95,10 +95,10 @@ def _print(found: DatasetCheck, console: Console, is_valid: bool) -> None:
         table = Table(title=str(found.root), title_justify="left")
         for heading in ("", "check", "where", "what"):
             table.add_column(heading, overflow="fold")
-        for one in found.findings:
-            colour = _COLOURS[one.severity]
-            what = escape(one.what + (f". {one.remedy}" if one.remedy else ""))
-            table.add_row(f"[{colour}]{one.severity.word}[/]", one.check, escape(one.where), what)
+        for finding in found.findings:
+            colour = _COLOURS[finding.severity]
+            what = escape(finding.what + (f". {finding.remedy}" if finding.remedy else ""))
+            table.add_row(f"[{colour}]{finding.severity.word}[/]", finding.check, escape(finding.where), what)
         console.print(table)
     errors, warnings = found.count(Severity.ERROR), found.count(Severity.WARNING)
     console.print(
@@ -120,5 +120,5 @@ def _plain(found: DatasetCheck, is_valid: bool) -> dict[str, object]:
         "episodes": found.episodes,
         "frames": found.frames,
         "checks": list(CHECKS),
-        "findings": [{**asdict(one), "severity": one.severity.word} for one in found.findings],
+        "findings": [{**asdict(finding), "severity": finding.severity.word} for finding in found.findings],
     }

@@ -146,14 +146,14 @@ def _episode_columns(summary: DatasetSummary, timings: Sequence[TimingSummary | 
     )
     timing = [(heading, ["" if t is None else cell(t) for t in timings]) for heading, cell in measured]
     metadata = [episode.metadata for episode in summary.episodes]
-    seed = ("seed", [str(one.get("seed", "")) for one in metadata])
+    seed = ("seed", [str(values.get("seed", "")) for values in metadata])
     simulated = all(t is None or t.clock == "lockstep" for t in timings)
     return [
         ("episode", [str(one.index) for one in summary.episodes]),
         ("frames", [str(one.frames) for one in summary.episodes]),
         ("seconds", [f"{one.frames / summary.fps:.1f}" for one in summary.episodes]),
-        ("outcome", [str(one.get("outcome", "")) for one in metadata]),
-        ("score", [_score(one.get("score")) for one in metadata]),
+        ("outcome", [str(values.get("outcome", "")) for values in metadata]),
+        ("score", [_score(values.get("score")) for values in metadata]),
         *([seed, *timing] if simulated else [*timing, seed]),
     ]
 

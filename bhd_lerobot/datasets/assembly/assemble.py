@@ -189,7 +189,7 @@ def _info(sources: Sequence[DatasetState], episodes: int, frames: int, tasks: in
         if any(infos):
             # Values that differ between the encoders are unknown for the mixture.
             feature["info"] = {
-                name: value if all(one.get(name) == value for one in infos) else None
+                name: value if all(other.get(name) == value for other in infos) else None
                 for name, value in infos[0].items()
             }
     return info | {

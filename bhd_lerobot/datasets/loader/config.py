@@ -72,7 +72,7 @@ class LoaderConfig:
 
     def __new__(cls, **fields: Any) -> Self:
         """Refuse a field that does not exist."""
-        names = [one.name for one in dataclasses.fields(cls)]
+        names = [field.name for field in dataclasses.fields(cls)]
         for name in fields:
             if name not in names:
                 raise ConfigError(unknown_name("field of LoaderConfig", name, names))

@@ -78,7 +78,7 @@ def _is_vector(kind: pa.DataType) -> bool:
 
 
 def _is_flat(mean: Any) -> bool:
-    return isinstance(mean, list) and not any(isinstance(one, list) for one in mean)
+    return isinstance(mean, list) and not any(isinstance(value, list) for value in mean)
 
 
 def _difference(info: Mapping[str, Any], sizes: Mapping[str, int | None], complete: bool) -> str:

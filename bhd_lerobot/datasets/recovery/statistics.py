@@ -51,7 +51,7 @@ def stats_of(
             if 3 not in (feature["shape"][0], feature["shape"][-1]):
                 continue  # depth: its statistics are in metres, by the encoder's scale
             images = _video(new, key, row) if feature["dtype"] == "video" else _images(table, key)
-            own[key] = statistics.image_stats(np.stack([statistics.image_histogram(one) for one in images]))
+            own[key] = statistics.image_stats(np.stack([statistics.image_histogram(image) for image in images]))
         for key, stat in own.items():
             for name, values in stat.items():
                 stacked.setdefault(key, {}).setdefault(name, []).append(

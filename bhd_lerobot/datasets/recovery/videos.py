@@ -221,7 +221,7 @@ class Videos:
         """Yield the videos after those of the readable rows, as long as their numbers have no gap."""
         slots = [slot_of(row, f"videos/{key}") for row in self._rows.values() if not wrong_part(row, key)]
         slot: layout.Slot | None = max(slots, default=None)
-        seen = {self._root / layout.video_file(key, one) for one in slots}
+        seen = {self._root / layout.video_file(key, place) for place in slots}
         while True:
             slot = layout.next_slot(slot, self._chunks)
             path = self._root / layout.video_file(key, slot)

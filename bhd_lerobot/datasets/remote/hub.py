@@ -80,7 +80,7 @@ class HubDataset:
                 )
             self.commit = info.sha
             tree = api.list_repo_tree(self.name, repo_type="dataset", revision=self.commit, recursive=True)
-            self._listed = {one.path: _file(one) for one in tree if hasattr(one, "blob_id")}
+            self._listed = {entry.path: _file(entry) for entry in tree if hasattr(entry, "blob_id")}
             return dict(self._listed)
 
     def read(self, path: str) -> bytes | None:
@@ -162,7 +162,7 @@ class HubDataset:
         place: dict[str, Any] = {"repo_id": self.name, "repo_type": "dataset", "revision": self._branch}
         # At first all the content, which takes long and is not visible yet; what arrived is not sent again.
         self._api.preupload_lfs_files(additions=additions, free_memory=False, **place)
-        if ignored := [one.path_in_repo for one in additions if getattr(one, "_should_ignore", False)]:
+        if ignored := [addition.path_in_repo for addition in additions if getattr(addition, "_should_ignore", False)]:
             raise TransferError(
                 f"Could not upload the dataset to {self.name}: the repository's .gitignore names {listed(ignored)}, "
                 "and the Hub would leave them out. Change that file there; nothing was changed."

@@ -43,12 +43,12 @@ def explain(error: BaseException, name: str, revision: str | None = None) -> str
     """Return what an error means and what to do about it."""
     chain = _chain(error)
     meanings = _meanings(name, revision)
-    for one in chain:
+    for cause in chain:
         for kind, meaning in meanings:
-            if isinstance(one, kind) and (message := meaning(one)):
+            if isinstance(cause, kind) and (message := meaning(cause)):
                 return message
     text = " ".join(str(error).split())
-    is_xet = any("xet" in str(one).lower() for one in chain)
+    is_xet = any("xet" in str(cause).lower() for cause in chain)
     hint = " If this Hub does not know the Xet protocol, set HF_HUB_DISABLE_XET=1." if is_xet else ""
     return f"{text[:400].rstrip('.') or 'no reason given'} ({type(error).__name__}).{hint}"
 

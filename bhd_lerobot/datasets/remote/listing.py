@@ -210,7 +210,7 @@ _RECORDED = re.compile(rf"(data|meta/episodes)/{_CHUNK_FILE}\.parquet|videos/[^/
 
 def total(items: Iterable[Item | RemoteFile]) -> int:
     """Return the bytes of some files."""
-    return sum(one.size for one in items)
+    return sum(item.size for item in items)
 
 
 def megabytes(size: int) -> str:

@@ -167,9 +167,11 @@ class _Pull:
             TransferError: a file is not what was put there.
         """
         there, folders = self._there, (self._root, self._staging.folder)
-        sizes = [{path: (one / path).stat().st_size for path in there if (one / path).is_file()} for one in folders]
+        sizes = [
+            {path: (folder / path).stat().st_size for path in there if (folder / path).is_file()} for folder in folders
+        ]
         found = self._remote.verified(
-            [path for path in there if any(one.get(path) == there[path].size for one in sizes)]
+            [path for path in there if any(size.get(path) == there[path].size for size in sizes)]
         )
         if damaged := [path for path in found if there[path].digest not in (None, found[path].digest)]:
             raise TransferError(
@@ -230,7 +232,7 @@ class _Pull:
         """Return the chosen episodes, with those that were chosen before, and the files that hold them."""
         staging, name = self._staging.folder, self._remote.name
         try:
-            chosen = {int(one) for one in select(staging)}
+            chosen = {int(index) for index in select(staging)}
             files_of(staging, sorted(chosen))  # refuses those that do not exist
         except DatasetError as error:
             raise type(error)(str(error).replace(str(staging), name)) from error

@@ -29,7 +29,7 @@ def wrong_name(name: object) -> str:
     if name in ("", ".", "..") or "/" in name or "\\" in name:
         return f"{name!r} would lead to another folder"
     # Controls end a path (NUL) or change what a terminal shows; lone surrogates cannot be encoded.
-    if any(unicodedata.category(one) in ("Cc", "Cs") for one in name):
+    if any(unicodedata.category(character) in ("Cc", "Cs") for character in name):
         return f"{name!r} has characters that cannot be in a file's name"
     return f"{name[:40]!r}… is too long" if len(name.encode()) > _LONGEST else ""
 
@@ -109,13 +109,13 @@ def check_links(root: Path) -> None:
             continue
         seen.add(target)
         with contextlib.suppress(OSError), os.scandir(path) as entries:  # reading it fails later with a message
-            pending += [Path(one.path) for one in entries if one.is_symlink() or one.is_dir()]
+            pending += [Path(entry.path) for entry in entries if entry.is_symlink() or entry.is_dir()]
 
 
 def _places(whole: Path) -> list[Path]:
     """Return the folders that links in a dataset may lead to besides itself."""
     declared = os.environ.get(LINKED_FOLDERS, "").split(os.pathsep)
-    places = [Path(one).expanduser().resolve() for one in declared if one]
+    places = [Path(place).expanduser().resolve() for place in declared if place]
     # <cache>/datasets--user--name/snapshots/<commit>, whose files are links into <cache>/datasets--user--name/blobs.
     for folder in (whole, *whole.parents):
         if folder.parent.name == "snapshots" and folder.parent.parent.name.startswith("datasets--"):

@@ -90,7 +90,7 @@ _ALWAYS: Sequence[tuple[str, Cell]] = (
 def _episodes(report: TimingReport, width: int) -> Table:
     everything = (*report.episodes, report.total)
     columns = [
-        (heading, [cell(one) for one in everything])
+        (heading, [cell(value) for value in everything])
         for heading, cell in (*_ALWAYS, *(_SIMULATED if report.simulated else _MEASURED))
     ]
     shown = fitting(columns, width)

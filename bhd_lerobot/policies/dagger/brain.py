@@ -190,7 +190,7 @@ class DaggerBrain:
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters, with those of learner and expert: which weights, for example."""
-        own = {one.name: getattr(self.config, one.name) for one in fields(self.config)}
+        own = {field.name: getattr(self.config, field.name) for field in fields(self.config)}
         return {
             "type": self.name,
             **own,

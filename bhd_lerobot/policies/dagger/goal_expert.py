@@ -158,7 +158,7 @@ class GoalExpert:
                 else:
                     turn.is_new, turn.own = False, self._before(sim, seen)
                     self._restart(sim)
-            elif turn.is_first and any(not one.success for one in ended) and turn.homes < _HOMES:
+            elif turn.is_first and any(not result.success for result in ended) and turn.homes < _HOMES:
                 turn.own, turn.homes = [UPRIGHT, HOME], turn.homes + 1
                 self._restart(sim)
                 ended = []
@@ -211,8 +211,8 @@ class GoalExpert:
     ) -> tuple[CommandResult | None, list[CommandResult]]:
         """Return the result of our own goal, and those of the expert's, under the names that it gave."""
         prefix = f"{turn.number}.{turn.homes}."
-        own = [one for one in results if one.task_id == turn.pending]
-        ended = [one for one in results if one.task_id.startswith(prefix)]
+        own = [result for result in results if result.task_id == turn.pending]
+        ended = [result for result in results if result.task_id.startswith(prefix)]
         return (own[-1] if own else None), [replace(one, task_id=one.task_id.removeprefix(prefix)) for one in ended]
 
     def _restart(self, sim: int) -> None:
@@ -242,11 +242,11 @@ class GoalExpert:
             return None
         table = seen.environment_state[sim, self._objects].reshape(MAX_OBJECTS, len(OBJECT_FIELDS))
         tip = self._kinematics.tool(q)[:3, 3]
-        for one in read_objects(table):
-            bottom = one.position[2] - one.size[2] / 2
-            apart = np.hypot(tip[0] - one.position[0], tip[1] - one.position[1])
-            if bottom > _HELD_LIFT and apart < _HELD_APART and abs(tip[2] - one.position[2]) < one.size[2] / 2 + 0.03:
-                return one
+        for item in read_objects(table):
+            bottom = item.position[2] - item.size[2] / 2
+            apart = np.hypot(tip[0] - item.position[0], tip[1] - item.position[1])
+            if bottom > _HELD_LIFT and apart < _HELD_APART and abs(tip[2] - item.position[2]) < item.size[2] / 2 + 0.03:
+                return item
         return None
 
     def _home_near(self, q: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -45,4 +45,4 @@ class LanguageBrain(PickBrain):
         super()._begin(sim, seed, own or instruction)
 
     def _make_plan(self, work: _Work, objects: Sequence[SeenObject]) -> Plan:
-        return self._planner.plan(work.instruction, [scene_object(one) for one in objects])
+        return self._planner.plan(work.instruction, [scene_object(item) for item in objects])

@@ -63,10 +63,10 @@ def _in_folder(folder: Path) -> Path:
     if last.is_dir():
         return last
     # A copy may have lost the link.
-    steps = [one for one in checkpoints.glob(f"*/{PRETRAINED_MODEL_DIR}") if one.parent.name.isdigit()]
+    steps = [path for path in checkpoints.glob(f"*/{PRETRAINED_MODEL_DIR}") if path.parent.name.isdigit()]
     if steps:
         return max(steps, key=lambda one: int(one.parent.name))
-    found = ", ".join(sorted(one.name for one in folder.iterdir())[:8]) or "nothing"
+    found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
     raise ConfigError(
         f"There is no policy in {folder}: neither {CONFIG_FILE}, {PRETRAINED_MODEL_DIR}/ nor "
         f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}/{PRETRAINED_MODEL_DIR}/. There is: {found}. "

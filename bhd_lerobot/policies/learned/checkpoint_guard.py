@@ -50,7 +50,7 @@ _BEWARE = "Do not use the checkpoint unless you know who made it."
 
 def plugin_packages() -> set[str]:
     """Return the packages whose classes a checkpoint may name: LeRobot, this one, and installed plug-ins of LeRobot."""
-    names = {str(one.metadata["Name"] or "") for one in metadata.distributions()}
+    names = {str(distribution.metadata["Name"] or "") for distribution in metadata.distributions()}
     return {"lerobot", "bhd_lerobot"} | {name for name in names if name.startswith(_PLUGIN_PREFIXES)}
 
 

@@ -110,10 +110,10 @@ class PickBrain(GoalBrain):
         Raises:
             InstructionError: there is none.
         """
-        for one in objects:
-            if one.target:
+        for item in objects:
+            if item.target:
                 skills = (Skill.LOCATE, Skill.APPROACH, Skill.GRASP, Skill.LIFT, Skill.HOLD)
-                return make_plan(work.instruction, scene_object(one), skills)
+                return make_plan(work.instruction, scene_object(item), skills)
         raise InstructionError("No object on the table is the one that the task is about.")
 
     # --- from one goal to the next -----------------------------------------------------------------------------------
@@ -131,7 +131,7 @@ class PickBrain(GoalBrain):
                 return self._give_up(sim, str(error))
             work.step = 1  # the object was located when the plan was made
             work.stage = ""
-        target = next((one for one in objects if one.index == work.plan.target), None)
+        target = next((item for item in objects if item.index == work.plan.target), None)
         if target is None:
             return self._give_up(sim, "the object is gone")
         if result is not None:
@@ -166,7 +166,7 @@ class PickBrain(GoalBrain):
     def _approach(self, sim: int, target: SeenObject, objects: Sequence[SeenObject]) -> BrainCommand | None:
         """Return the goal that brings the open gripper above the object."""
         work = self._work[sim]
-        others = [one for one in objects if one.index != target.index]
+        others = [item for item in objects if item.index != target.index]
         work.grasp = plan_grasp(target, others, MAX_OPENING)
         if work.grasp is None:
             return self._give_up(sim, f"the {scene_object(target).name} does not fit between the fingers")

@@ -207,7 +207,7 @@ class MlpConfig(PreTrainedConfig):
             ("scheduler", self.scheduler, SCHEDULES),
         ):
             if value not in valid:
-                raise ConfigError(unknown_name(f"policy.{name}", value, [one for one in valid if one]))
+                raise ConfigError(unknown_name(f"policy.{name}", value, [option for option in valid if option]))
         if not 0 <= self.dropout < 1:
             raise ConfigError(f"policy.dropout is {self.dropout}; it must be in [0, 1).")
         if self.feature_clip is not None and not self.feature_clip > 0:

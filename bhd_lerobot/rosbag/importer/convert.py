@@ -205,7 +205,7 @@ class _RobotBag:
             return
         cmd = self._tracks["cmd"].times
         sensors = [track.times for role, track in self._tracks.items() if role != "cmd"]
-        begin, end = min(int(one.min()) for one in sensors), max(int(one.max()) for one in sensors)
+        begin, end = min(int(sensor.min()) for sensor in sensors), max(int(sensor.max()) for sensor in sensors)
         if int(cmd.max()) < begin - NANO or int(cmd.min()) > end + NANO:
             raise DatasetError(
                 f"{self._bag.path}: {self._tracks['cmd'].topic} is from {cmd.min() / NANO:.1f} to "
@@ -223,7 +223,7 @@ class _RobotBag:
         options = self._options
         parts = segments(
             self._tracks,
-            [one.place for one in self._exported],
+            [episode.place for episode in self._exported],
             stamps=options.stamps,
             max_speed=options.max_speed if "odom" in self._tracks and options.pose else None,
             max_gap_s=options.max_gap_s,
@@ -233,7 +233,7 @@ class _RobotBag:
         for part in parts:
             # The pose began anew, not the clock: a command from before is still in force.
             begin = begin if part.why == "reset" else part.first
-            begun = [one for one in self._exported if one.place <= part.first] or self._exported[:1]
+            begun = [episode for episode in self._exported if episode.place <= part.first] or self._exported[:1]
             of_commands = part._replace(first=begin)
             tracks = {
                 role: track.part((of_commands if role == "cmd" else part).mask(track))

@@ -99,9 +99,9 @@ def _episode(message: bytes, received: int, place: int) -> ExportedEpisode:
     features, metadata = json.loads(found.features), json.loads(found.metadata)
     kinds, topics = json.loads(found.metadata_types), json.loads(found.topics)
     parts: dict[str, list[Part]] = {}
-    for one in topics:
-        part = PARTS[one["kind"]](one["topic"], tuple(one["names"]))
-        parts.setdefault(one["feature"], []).append(part)
+    for topic in topics:
+        part = PARTS[topic["kind"]](topic["topic"], tuple(topic["names"]))
+        parts.setdefault(topic["feature"], []).append(part)
     if not 1 <= found.fps <= _MOST_FPS:
         raise ValueError(f"it has {found.fps} frames a second")
     episode = ExportedEpisode(

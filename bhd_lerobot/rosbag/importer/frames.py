@@ -29,11 +29,14 @@ def static_frames(messages: Sequence[bytes]) -> tuple[Static, int]:
             transforms = decode(TF, message).transforms
         except DatasetError:
             transforms = None
-        if transforms is None or not np.isfinite([_quaternion(one) for one in transforms]).all():
+        if transforms is None or not np.isfinite([_quaternion(transform) for transform in transforms]).all():
             lost += times
             continue
-        for one in transforms:
-            frames[one.child_frame_id.lstrip("/")] = (one.header.frame_id.lstrip("/"), _matrix(_quaternion(one)))
+        for transform in transforms:
+            frames[transform.child_frame_id.lstrip("/")] = (
+                transform.header.frame_id.lstrip("/"),
+                _matrix(_quaternion(transform)),
+            )
     return frames, lost
 
 

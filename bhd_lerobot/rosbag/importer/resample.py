@@ -83,7 +83,7 @@ def clock_jumps(times: Sequence[Times], order: Sequence[Times], step_ns: int = S
         order: their places among all messages of the bag.
         step_ns: by how much a clock that has jumped goes back.
     """
-    if not any((np.diff(one) < -step_ns).any() for one in times):
+    if not any((np.diff(reading) < -step_ns).any() for reading in times):
         return np.zeros(0, np.int64)  # a bag may also have been written topic by topic
     places = np.concatenate(list(order))
     by_place = np.argsort(places, kind="stable")

@@ -110,7 +110,7 @@ def resampled_scans(
     """
     n = len(ranges)
     result = np.empty((n, beams))
-    lengths = np.array([len(one) for one in ranges], np.int64)
+    lengths = np.array([len(scan) for scan in ranges], np.int64)
     keys = np.stack([lengths, *(geometry[name] for name in GEOMETRY)], axis=1)
     turn = tuple(rotation.reshape(-1).tolist())
     kinds, which = np.unique(keys, axis=0, return_inverse=True)

@@ -113,7 +113,7 @@ def _resets(
 ) -> list[int]:
     """Return where the odometry's pose jumps."""
     track = tracks["odom"]
-    begin = min(int(one.times.min()) for one in tracks.values())
+    begin = min(int(sensor.times.min()) for sensor in tracks.values())
     places, jumps = [], []
     for part in parts:
         rows = np.flatnonzero(part.mask(track))

@@ -71,8 +71,8 @@ def wanted_topic(bag: Bag, role: str, name: str) -> Topic:
     option, types, topics = f"--{role}", TYPES[role], bag.topics
     if name not in topics or not topics[name].count:
         _refuse_arm(bag)
-        there = ", ".join(f"{one.name} ({one.msgtype}, {one.count})" for one in topics.values()) or "none"
-        fitting = [one.name for one in topics.values() if one.msgtype in types and one.count]
+        there = ", ".join(f"{topic.name} ({topic.msgtype}, {topic.count})" for topic in topics.values()) or "none"
+        fitting = [topic.name for topic in topics.values() if topic.msgtype in types and topic.count]
         hint = f" Of the right type: {', '.join(fitting)}." if fitting else ""
         what = "no message of" if name in topics else "no topic"
         raise DatasetError(
@@ -143,7 +143,7 @@ def publisher_notes(bag: Bag, wanted: Mapping[str, Topic]) -> list[str]:
     read = wanted["cmd"].name
     others = [one for one in bag.topics.values() if one.msgtype in TYPES["cmd"] and one.count and one.name != read]
     if others:
-        there = ", ".join(f"{one.name} ({one.count})" for one in others)
+        there = ", ".join(f"{other.name} ({other.count})" for other in others)
         notes.append(
             f"there are commands on other topics, too: {there}. The action is of {read} alone ({wanted['cmd'].count}); "
             "if that is not what drove the robot, name the topic with --cmd"

@@ -193,7 +193,7 @@ def _values(role: str, topic: Topic, messages: Messages, decoded: list[Any], rea
     if role == "scan":
         return _scans(topic, decoded, reading)
     if role == "odom":
-        children = [one.child_frame_id for one in decoded]
+        children = [message.child_frame_id for message in decoded]
         frames.check_base_frame(topic.name, frames.the_frame(topic.name, children), reading.options.odom_frame)
         speeds, pose = odometry(decoded)
         stamps = header_stamps(decoded)  # by which they were measured; of some drivers they are not set
@@ -210,7 +210,7 @@ def _values(role: str, topic: Topic, messages: Messages, decoded: list[Any], rea
 
 def _scans(topic: Topic, scans: Sequence[Any], reading: _Reading) -> Array:
     options, notes = reading.options, reading.notes
-    frame = frames.the_frame(topic.name, [one.header.frame_id for one in scans])
+    frame = frames.the_frame(topic.name, [scan.header.frame_id for scan in scans])
     rotation, source = frames.scanner_rotation(topic.name, frame, reading.static, options.scan_frame, options.scan_yaw)
     if reading.static_lost and source not in ("/tf_static", "--scan_yaw"):
         raise DatasetError(
@@ -221,19 +221,19 @@ def _scans(topic: Topic, scans: Sequence[Any], reading: _Reading) -> Array:
         ahead = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
         over = ", upside down" if rotation[2, 2] < 0 else ""
         notes.append(f"{topic.name}: the scanner is turned by {ahead:.1f} degrees{over}, from {source}")
-    counts = {len(one.ranges) for one in scans}
+    counts = {len(scan.ranges) for scan in scans}
     if counts != {options.beams}:
         few = f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
         notes.append(f"{topic.name}: scans of {few} beams became {options.beams}, each the nearest by angle")
-    reach = min((one.range_max for one in scans if one.range_max > 0), default=np.inf)
+    reach = min((scan.range_max for scan in scans if scan.range_max > 0), default=np.inf)
     if reach < options.lidar.range_max * (1 - 1e-6):
         notes.append(
             f"{topic.name}: the scanner sees to {reach:.2f} m (range_max); where nothing came back, the dataset "
             f"has {options.lidar.range_max:g} m all the same"
         )
     return resampled_scans(
-        [one.ranges for one in scans],
-        {name: np.array([getattr(one, name) for one in scans]) for name in GEOMETRY},
+        [scan.ranges for scan in scans],
+        {name: np.array([getattr(scan, name) for scan in scans]) for name in GEOMETRY},
         lidar=options.lidar,
         beams=options.beams,
         rotation=rotation,

@@ -33,10 +33,10 @@ class JointsPart(Part):
 
     @override
     def decode(self, messages: Sequence[Any]) -> Array:
-        if any(one.name != self.joints for one in messages):
+        if any(message.name != self.joints for message in messages):
             raise DatasetError(f"The joints of {self.topic} are not {', '.join(self.joints)}.")
         with_speeds = len(self.names) > len(self.joints)
-        return self.table([[*one.position, *(one.velocity if with_speeds else ())] for one in messages])
+        return self.table([[*message.position, *(message.velocity if with_speeds else ())] for message in messages])
 
 
 class PosePart(Part):
@@ -53,8 +53,8 @@ class PosePart(Part):
     def decode(self, messages: Sequence[Any]) -> Array:
         return np.concatenate(
             [
-                numbers([one.pose.position for one in messages], XYZ),
-                numbers([one.pose.orientation for one in messages], WXYZ),
+                numbers([message.pose.position for message in messages], XYZ),
+                numbers([message.pose.orientation for message in messages], WXYZ),
             ],
             axis=1,
         )

@@ -48,7 +48,7 @@ class TwistPart(Part):
 
     @override
     def decode(self, messages: Sequence[Any]) -> Array:
-        return twists([one.twist for one in messages])
+        return twists([message.twist for message in messages])
 
 
 class BareTwistPart(Part):
@@ -67,7 +67,7 @@ class BareTwistPart(Part):
 
 def twists(messages: Sequence[Any]) -> Array:
     """Return the forward speeds and yaw rates in `geometry_msgs/msg/Twist`, shape (n, 2)."""
-    return np.array([(one.linear.x, one.angular.z) for one in messages], np.float64).reshape(-1, 2)
+    return np.array([(message.linear.x, message.angular.z) for message in messages], np.float64).reshape(-1, 2)
 
 
 def twist_tree(values: Array) -> dict[str, Any]:
@@ -135,14 +135,14 @@ def odometry(messages: Sequence[Any]) -> tuple[Array, Array]:
 
     The yaw of a quaternion that was never set, all zeros, is not a number.
     """
-    poses = [one.pose.pose for one in messages]
-    w, x, y, z = numbers([one.orientation for one in poses], WXYZ).T
+    poses = [message.pose.pose for message in messages]
+    w, x, y, z = numbers([pose.orientation for pose in poses], WXYZ).T
     flat = (x == 0) & (y == 0)
     # Half the angle is precise also where a yaw of exactly zero, or one with its sign, has to come back.
     yaw = np.where(flat, 2 * np.arctan2(z, w), np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
     yaw[(w == 0) & flat & (z == 0)] = np.nan
-    place = numbers([one.position for one in poses], XYZ)
-    return twists([one.twist.twist for one in messages]), np.stack([*place[:, :2].T, _unwrapped(yaw)], axis=1)
+    place = numbers([pose.position for pose in poses], XYZ)
+    return twists([message.twist.twist for message in messages]), np.stack([*place[:, :2].T, _unwrapped(yaw)], axis=1)
 
 
 def _unwrapped(yaw: Array) -> Array:
@@ -186,7 +186,7 @@ class GyroPart(Part):
 
     @override
     def decode(self, messages: Sequence[Any]) -> Array:
-        return numbers([one.angular_velocity for one in messages], XYZ)
+        return numbers([message.angular_velocity for message in messages], XYZ)
 
 
 @dataclass(frozen=True)
@@ -221,5 +221,5 @@ class ScanPart(Part):
 
     @override
     def decode(self, messages: Sequence[Any]) -> Array:
-        ranges = self.table([one.ranges for one in messages])
-        return np.where(np.isposinf(ranges), np.array([[one.range_max] for one in messages]), ranges)
+        ranges = self.table([message.ranges for message in messages])
+        return np.where(np.isposinf(ranges), np.array([[message.range_max] for message in messages]), ranges)

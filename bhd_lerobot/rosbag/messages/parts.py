@@ -59,7 +59,7 @@ def header(stamps: NDArray[np.int64], frame: str = "") -> dict[str, Any]:
 
 def header_stamps(messages: Sequence[Any]) -> NDArray[np.int64]:
     """Return the stamps [ns] of messages with a header, shape (n,)."""
-    return np.array([one.header.stamp.sec * NANO + one.header.stamp.nanosec for one in messages], np.int64)
+    return np.array([message.header.stamp.sec * NANO + message.header.stamp.nanosec for message in messages], np.int64)
 
 
 def head_stamps(heads: Sequence[bytes]) -> NDArray[np.int64]:
@@ -120,7 +120,7 @@ class NumbersPart(Part):
 
     @override
     def decode(self, messages: Sequence[Any]) -> Array:
-        return self.table([one.values for one in messages])
+        return self.table([message.values for message in messages])
 
 
 class IntegersPart(NumbersPart):
@@ -131,7 +131,7 @@ class IntegersPart(NumbersPart):
 
 def numbers(parts: Sequence[Any], names: Sequence[str]) -> Array:
     """Return attributes of parts of messages, such as of vectors, shape (n, len(names))."""
-    return np.array([[getattr(one, name) for name in names] for one in parts], np.float64).reshape(-1, len(names))
+    return np.array([[getattr(part, name) for name in names] for part in parts], np.float64).reshape(-1, len(names))
 
 
 def own_topic(key: str) -> str:

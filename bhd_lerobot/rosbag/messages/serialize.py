@@ -74,4 +74,4 @@ def _value(description: Any, value: Any, row: int) -> Any:
     if int(element[0]) == _BASE and element[1][0] != "string":
         values = (np.zeros(count if kind == _ARRAY else 0)) if value is None else np.asarray(value)
         return np.ascontiguousarray(values[row] if values.ndim == 2 else values, np.dtype(element[1][0]))
-    return [_value(element, one, row) for one in value or ()]
+    return [_value(element, part, row) for part in value or ()]

@@ -88,7 +88,7 @@ class Motion:
         physics = _columns_of(features.get(keys.PHYSICS_STATE, {}).get("names"), columns.get(keys.PHYSICS_STATE))
         angles |= {joint: physics[angle] for joint, (angle, _) in view.wheels.items() if angle in physics}
         tool = np.stack([state[name] for name in TOOL], axis=1) if set(TOOL) <= state.keys() else None
-        return cls({one.joint: angles[one.joint] for one in view.joints if one.joint in angles}, tool)
+        return cls({joint.joint: angles[joint.joint] for joint in view.joints if joint.joint in angles}, tool)
 
 
 def _columns_of(names: Any, values: NDArray[Any] | None) -> dict[str, Array]:
@@ -99,28 +99,28 @@ def _columns_of(names: Any, values: NDArray[Any] | None) -> dict[str, Array]:
 
 def still_frames(view: RobotView, motion: Motion) -> list[StaticFrame]:
     """Return the frames that sit still and have a place: not those on links whose joints are not recorded."""
-    lost = {one.child for one in view.joints if one.joint not in motion.angles}
+    lost = {joint.child for joint in view.joints if joint.joint not in motion.angles}
     found = []
-    for one in view.frames:
-        if one.parent in lost and not (one.parent == TOOL_FRAME and motion.tool is not None):
-            lost.add(one.child)
+    for frame in view.frames:
+        if frame.parent in lost and not (frame.parent == TOOL_FRAME and motion.tool is not None):
+            lost.add(frame.child)
         else:
-            found.append(one)
+            found.append(frame)
     return found
 
 
 def moving_transforms(view: RobotView, frames: Frames, motion: Motion) -> list[bytes]:
     """Return messages for ``/tf`` of the links of a robot; none if no joint of it is recorded, nor its tool's pose."""
     transforms = []
-    for one in view.joints:
-        if one.joint in motion.angles:
-            half = motion.angles[one.joint] / 2
-            w, x, y, z = one.rotation
+    for joint in view.joints:
+        if joint.joint in motion.angles:
+            half = motion.angles[joint.joint] / 2
+            w, x, y, z = joint.rotation
             c, s = np.cos(half), np.sin(half)
             turned = np.stack([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], axis=1)
-            place = np.broadcast_to(one.position, (len(half), 3))
+            place = np.broadcast_to(joint.position, (len(half), 3))
             pose = np.concatenate([place, turned], axis=1)
-            transforms.append(_transform(frames.stamps, one.parent, one.child, pose))
+            transforms.append(_transform(frames.stamps, joint.parent, joint.child, pose))
     if not transforms and motion.tool is not None:
         transforms.append(_transform(frames.stamps, ARM_FRAME, TOOL_FRAME, motion.tool))
     return encode(TF, {"transforms": transforms}, len(frames.stamps)) if transforms else []
@@ -130,7 +130,8 @@ def static_transforms(frames: Sequence[StaticFrame], stamp: int) -> list[bytes]:
     """Return one message for ``/tf_static``; none if there is no such frame."""
     stamps = np.array([stamp])
     transforms = [
-        _transform(stamps, one.parent, one.child, np.array([[*one.position, *one.rotation]])) for one in frames
+        _transform(stamps, frame.parent, frame.child, np.array([[*frame.position, *frame.rotation]]))
+        for frame in frames
     ]
     return encode(TF, {"transforms": transforms}, 1) if transforms else []
 

@@ -325,8 +325,8 @@ def parse_rl(arguments: Sequence[str]) -> RlConfig:
     """
     prefix = f"--{configuration.CONFIG_PATH}="
     found = [
-        f"{prefix}{_config_file(Path(one.removeprefix(prefix)))}" if one.startswith(prefix) else one
-        for one in arguments
+        f"{prefix}{_config_file(Path(argument.removeprefix(prefix)))}" if argument.startswith(prefix) else argument
+        for argument in arguments
     ]
     return configuration.parse(RlConfig, found)
 

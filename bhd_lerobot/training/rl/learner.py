@@ -144,10 +144,10 @@ class MlpActorCritic(ActorCriticPolicy):
         if fresh:
             parts += [(self.mlp_extractor.policy_net, 2**0.5), (self.action_net, 0.01)]
         for module, gain in parts:
-            for one in module.modules():
-                if isinstance(one, nn.Linear):
-                    nn.init.orthogonal_(one.weight, gain=gain)
-                    nn.init.zeros_(one.bias)
+            for layer in module.modules():
+                if isinstance(layer, nn.Linear):
+                    nn.init.orthogonal_(layer.weight, gain=gain)
+                    nn.init.zeros_(layer.bias)
         kwargs: dict[str, Any] = {**self.optimizer_kwargs, "lr": lr_schedule(1)}
         self.optimizer = self.optimizer_class(self.parameters(), **kwargs)
 
@@ -175,8 +175,8 @@ class WarmedUpPPO(PPO):
     def train(self) -> None:
         """Learn from the samples that were gathered."""
         frozen = self.num_timesteps <= self._warmup
-        for one in self.policy.actor_parameters():
-            one.requires_grad_(not frozen)
+        for actor_parameter in self.policy.actor_parameters():
+            actor_parameter.requires_grad_(not frozen)
         super().train()
 
 
@@ -274,11 +274,11 @@ def _means(episodes: list[dict[str, Any]]) -> Row:
     if not episodes:
         return {}
     values = {
-        "return": [one["episode"]["r"] for one in episodes],
-        "success": [one["is_success"] for one in episodes],
-        "score": [one["score"] for one in episodes],
-        "length": [one["episode"]["l"] for one in episodes],
+        "return": [episode["episode"]["r"] for episode in episodes],
+        "success": [episode["is_success"] for episode in episodes],
+        "score": [episode["score"] for episode in episodes],
+        "length": [episode["episode"]["l"] for episode in episodes],
     }
     row: Row = {"episodes": len(episodes)} | {key: float(np.mean(each)) for key, each in values.items()}
-    failures = [one["event"] for one in episodes if not one["is_success"]]
+    failures = [episode["event"] for episode in episodes if not episode["is_success"]]
     return row | {cause: failures.count(cause) / len(episodes) for cause in sorted(set(failures))}

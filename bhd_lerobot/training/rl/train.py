@@ -220,7 +220,7 @@ class _Run:
 
     def _diverged(self, learner: Any) -> BhdError | None:
         """Return the error if the weights are no numbers any more; the learner's own is about their product only."""
-        if all(bool(torch.isfinite(one).all()) for one in learner.policy.parameters()):
+        if all(bool(torch.isfinite(parameter).all()) for parameter in learner.policy.parameters()):
             return None
         kept = "there is none yet" if self._result.checkpoint is None else f"{self._result.checkpoint} is intact"
         return BhdError(

@@ -77,11 +77,11 @@ def level(episodes: Sequence[Episode]) -> Level | None:
     if not episodes:
         return None
     n = len(episodes)
-    causes = Counter(one.outcome.event.cause for one in episodes if one.outcome.event != Event.SUCCESS)
+    causes = Counter(episode.outcome.event.cause for episode in episodes if episode.outcome.event != Event.SUCCESS)
     return Level(
         episodes=n,
-        score=float(np.mean([one.outcome.score for one in episodes])),
-        success=float(np.mean([one.outcome.success for one in episodes])),
-        reward=float(np.mean([np.sum(one.columns[keys.REWARD]) for one in episodes])),
+        score=float(np.mean([episode.outcome.score for episode in episodes])),
+        success=float(np.mean([episode.outcome.success for episode in episodes])),
+        reward=float(np.mean([np.sum(episode.columns[keys.REWARD]) for episode in episodes])),
         failures={cause: count / n for cause, count in sorted(causes.items())},
     )

@@ -328,7 +328,9 @@ def test_variants_of_what_is_wrong(tmp_path: Path) -> None:
 def test_our_own_package_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checks, "DISTRIBUTION", "no-such-distribution")
     for findings in (checks.check_python(), checks.check_versions()):
-        assert [one.cause for one in findings] == ["`no-such-distribution` is not installed in this environment"]
+        assert [finding.cause for finding in findings] == [
+            "`no-such-distribution` is not installed in this environment"
+        ]
 
 
 @pytest.mark.parametrize(
@@ -358,9 +360,9 @@ Provides-Extra: test
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(checks, "DISTRIBUTION", "fake-hand")
     findings = checks.check_versions(("brain",), installed(brain=version, absent=None))
-    assert [one.cause for one in findings if one.status is not Status.OK] == causes
+    assert [finding.cause for finding in findings if finding.status is not Status.OK] == causes
     if not causes:
-        assert [one.found for one in findings] == [f"brain {version}, required: <2,>=1"]
+        assert [finding.found for finding in findings] == [f"brain {version}, required: <2,>=1"]
 
 
 def test_the_documentation_has_the_same_table() -> None:

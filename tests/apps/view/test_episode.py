@@ -86,7 +86,7 @@ def test_an_arm_is_rigid_its_fingers_are_as_far_apart_as_its_opening(arm) -> Non
         np.testing.assert_allclose(
             np.linalg.norm(np.diff(capsules[:, number], axis=1)[:, 0], axis=1), wanted, atol=1e-5
         )
-    names = [one.name for one in chain.capsules]
+    names = [capsule.name for capsule in chain.capsules]
     left, right = capsules[:, names.index("finger_left"), 0], capsules[:, names.index("finger_right"), 0]
     gap = np.linalg.norm(left - right, axis=1) - 2 * chain.capsules[names.index("finger_left")].radius
     np.testing.assert_allclose(gap, physics[:, 6:8].sum(axis=1), atol=1e-5)

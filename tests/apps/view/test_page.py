@@ -307,7 +307,7 @@ def test_a_mark_is_shown_and_on_disk(browser, base, tmp_path) -> None:
         page.click(".card-a button:has-text('more')")
         assert "looked at it" in page.text_content("dialog")
     edits = [json.loads(line) for line in (root / "meta/edits.jsonl").read_text().splitlines()]
-    assert [one["episodes"][0].get("outcome", [None, None])[1] for one in edits] == ["success", "collision", None]
+    assert [edit["episodes"][0].get("outcome", [None, None])[1] for edit in edits] == ["success", "collision", None]
 
 
 def test_changes_on_disk_are_reported(browser, base, tmp_path) -> None:

@@ -109,7 +109,9 @@ def damage_parquet(path: Path, rng: np.random.Generator) -> str:
 
     ways: dict[str, Callable[[], pa.Table]] = {
         "drop": lambda: table.drop_columns([name]),
-        "rename": lambda: table.rename_columns([f"{one}x" if one == name else one for one in table.column_names]),
+        "rename": lambda: table.rename_columns(
+            [f"{column_name}x" if column_name == name else column_name for column_name in table.column_names]
+        ),
         "twice": lambda: table.append_column(name, column),
         "type": lambda: put(other_type(rows, column, rng)),
         "type ": lambda: put(other_type(rows, column, rng)),
@@ -153,7 +155,7 @@ def other_value(column: pa.ChunkedArray, rng: np.random.Generator) -> pa.Array:
         told = next((value for value in values if value and value.startswith("{")), "{}")
         with contextlib.suppress(ValueError):
             fields = json.loads(told)
-            for name in [one for one in fields if rng.random() < 0.2]:
+            for name in [field for field in fields if rng.random() < 0.2]:
                 fields[name] = VALUES[rng.integers(len(VALUES))]
             others += [json.dumps(fields)] * 10
     elif pa.types.is_list(kind):

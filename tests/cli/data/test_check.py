@@ -39,7 +39,7 @@ def test_a_recorded_dataset_is_valid(recorded: Path, capsys) -> None:
     values = json.loads(capsys.readouterr().out)
     assert values["valid"] is True
     assert values["episodes"] == 3
-    assert {one["severity"] for one in values["findings"]} <= {"note", "warning"}
+    assert {value["severity"] for value in values["findings"]} <= {"note", "warning"}
 
 
 def test_errors_and_with_strict_warnings_end_with_status_1(recorded: Path, tmp_path: Path, capsys, monkeypatch) -> None:

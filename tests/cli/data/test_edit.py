@@ -28,7 +28,7 @@ def test_merge_filter_delete_split_mark(recorded: Path, tmp_path: Path, capsys) 
     assert main.main(["delete", str(tmp_path / "all"), "--episodes", "0-5"]) == 0
     assert content(tmp_path / "all") == whole
     assert main.main(["mark", str(two), "--episodes", "1,3-4", "--outcome", "stuck", "--note", "wheel"]) == 0
-    assert [one.metadata["outcome"] for one in dataset_info(two).episodes].count("stuck") == 3
+    assert [episode.metadata["outcome"] for episode in dataset_info(two).episodes].count("stuck") == 3
     assert main.main(["filter", str(two), "--outcome", "success", "--output", str(tmp_path / "good")]) == 0
     assert content(tmp_path / "good") == [whole[0], whole[2], whole[5]]
     arguments = ["filter", str(two), "--episodes", "0-3", "--outcome", "stuck,timeout", "--output", str(tmp_path / "s")]
@@ -88,7 +88,7 @@ def test_check_with_fix(recorded: Path, tmp_path: Path, capsys) -> None:
 def test_bad_input_ends_in_a_message(recorded: Path, tmp_path: Path, capsys, arguments: list[str], words: str) -> None:
     names = {"R": str(recorded), "X": str(tmp_path / "x"), "N": str(tmp_path / "none")}
     before = {path: path.stat().st_mtime_ns for path in recorded.rglob("*")}
-    assert main.main([names.get(one, one) for one in arguments]) == 2
+    assert main.main([names.get(argument, argument) for argument in arguments]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
     assert {path: path.stat().st_mtime_ns for path in recorded.rglob("*")} == before

@@ -212,7 +212,7 @@ def test_an_independent_reader_sees_what_was_recorded_of_a_base(turtlebot3, base
     wheels = topics["/joint_states"][-1][1]
     assert list(wheels.name) == ["wheel_left_joint", "wheel_right_joint"]
     assert list(wheels.position) == columns["simulation.state"][-1, 7:9].tolist()
-    frames = {one.child_frame_id: one for one in topics["/tf_static"][0][1].transforms}
+    frames = {transform.child_frame_id: transform for transform in topics["/tf_static"][0][1].transforms}
     assert frames["base_scan"].transform.translation.z + frames["base_link"].transform.translation.z == 0.182
     episode = topics["/bhd/episode"][0][1]
     assert (episode.task, episode.frames, episode.episode_index) == (dataset_info(turtlebot3).episodes[0].task, n, 0)
@@ -225,7 +225,7 @@ def test_each_scan_is_exported_once_with_infinity_for_no_return(turtlebot3, base
         topics = decoded(base_bags / name / f"{name}.mcap")
         start = topics["/bhd/episode"][0][0]
         scans = [message for _, message in topics["/scan"]]
-        measured = np.array([stamp(one) for one in scans])
+        measured = np.array([stamp(scan) for scan in scans])
         # 5 Hz at 10 frames a second, and stamped when it was measured
         assert np.diff(measured).tolist() == [NANO // 5] * (len(scans) - 1)
         assert measured[0] == start
@@ -245,8 +245,8 @@ def test_an_independent_reader_sees_what_was_recorded_of_an_arm(ur5, arm):
     columns = read_episode(ur5, 1)
     state = columns["observation.state"].astype(np.float64)
     joints = [message for _, message in arm["/joint_states"]]
-    assert np.array_equal([one.position for one in joints], state[:, :7])
-    assert np.array_equal([one.velocity for one in joints], state[:, 7:])
+    assert np.array_equal([joint.position for joint in joints], state[:, :7])
+    assert np.array_equal([joint.velocity for joint in joints], state[:, 7:])
     assert list(joints[0].name)[:2] == ["shoulder_pan_joint", "shoulder_lift_joint"]
     assert np.array_equal([m.position for _, m in arm["/joint_command"]], columns["action"].astype(np.float64))
     texts = [message.subtask for _, message in arm["/bhd/outcome"]]
@@ -292,19 +292,21 @@ def test_rosbags_reads_it_with_embedded_definitions_and_the_metadata_that_ros_ne
 @pytest.mark.parametrize(("robot", "expected"), [("base", "odom"), ("arm", "base_link")])
 def test_every_frame_is_in_one_tree(request, robot, expected):
     topics = request.getfixturevalue(robot)
-    transforms = [one for name in ("/tf", "/tf_static") for _, message in topics[name] for one in message.transforms]
+    transforms = [
+        transform for name in ("/tf", "/tf_static") for _, message in topics[name] for transform in message.transforms
+    ]
     parents = {}
-    for one in transforms:
-        turn = one.transform.rotation
+    for transform in transforms:
+        turn = transform.transform.rotation
         assert turn.x**2 + turn.y**2 + turn.z**2 + turn.w**2 == pytest.approx(1)
-        assert parents.setdefault(one.child_frame_id, one.header.frame_id) == one.header.frame_id
+        assert parents.setdefault(transform.child_frame_id, transform.header.frame_id) == transform.header.frame_id
     (root,) = set(parents.values()) - parents.keys()
     assert root == expected
     used = {message.header.frame_id for name, sent in topics.items() if not name.startswith(("/bhd", "/tf"))
             for _, message in sent}  # fmt: skip
     assert used - {""} <= {root, *parents}
     # Nothing is sent before the transform that places it.
-    begin = min(stamp(one) for one in transforms)
+    begin = min(stamp(transform) for transform in transforms)
     assert all(stamp(message) >= begin for _, message in topics["/scan"])
 
 
@@ -447,7 +449,7 @@ def test_the_same_dataset_gives_the_same_bytes(turtlebot3, tmp_path):
 def test_a_video_has_its_cameras_geometry():
     view = robot_view("turtlebot3")
     assert np.degrees(view.fovy["front"]) == pytest.approx(48.8)
-    optical = next(one for one in view.frames if one.child == "front_optical_frame")
+    optical = next(frame for frame in view.frames if frame.child == "front_optical_frame")
     w, x, y, z = optical.rotation
     ahead = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
     assert ahead == pytest.approx((np.cos(np.radians(10)), 0, -np.sin(np.radians(10))), abs=1e-4)
@@ -532,7 +534,7 @@ def test_bags_of_two_datasets_do_not_become_one(base_bags, arm, ur5, tmp_path, c
 def test_options_have_precedence_over_an_exported_bag(turtlebot3, base_bags, tmp_path):
     info = back(base_bags, tmp_path / "back", "--fps=5", "--task=Turn.", "--outcome=failure")
     assert (info.fps, info.tasks) == (5, ("Turn.",))
-    assert {one.metadata["outcome"] for one in info.episodes} == {"failure"}
+    assert {episode.metadata["outcome"] for episode in info.episodes} == {"failure"}
     ours, theirs = read_episode(turtlebot3, 0), read_episode(tmp_path / "back", 0)
     n = len(theirs["action"])
     np.testing.assert_allclose(ours["observation.state"][::2][:n], theirs["observation.state"], atol=1e-6)

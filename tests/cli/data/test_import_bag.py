@@ -140,7 +140,7 @@ def test_gaps_are_flagged_or_begin_an_episode(tmp_path, capsys):
     total = late.sum() + read_episode(tmp_path / "d", 1)["control.late"].sum()
     assert f"{total} of {info.frames} frames, in " in late_note
     assert columns["control.time"][-1] < 3.3
-    assert [json.loads(one.metadata["source"])["why"] for one in info.episodes] == ["start", "gap"]
+    assert [json.loads(episode.metadata["source"])["why"] for episode in info.episodes] == ["start", "gap"]
     assert main.main(["check", str(tmp_path / "d")]) == 0
     one = imported(source, tmp_path / "one", "--max_gap=2")
     assert len(one.episodes) == 1
@@ -369,7 +369,7 @@ def test_several_bags_become_several_episodes(tmp_path, plain):
     for index in range(2):
         write(folder / f"drive_{index}", drive(seed=index + 1))
     info = imported(folder, tmp_path / "d")
-    assert [json.loads(one.metadata["source"])["bag"] for one in info.episodes] == ["drive_0", "drive_1"]
+    assert [json.loads(episode.metadata["source"])["bag"] for episode in info.episodes] == ["drive_0", "drive_1"]
     arguments = ["import", str(plain), str(folder), "--repo_id=t/t", f"--root={tmp_path / 'e'}", TASK]
     assert main.main(arguments) == 0
     assert len(dataset_info(tmp_path / "e").episodes) == 3

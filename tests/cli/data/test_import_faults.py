@@ -184,7 +184,7 @@ def test_an_odometry_that_starts_anew_begins_an_episode(tmp_path, messages, caps
 
 def test_time_without_a_sensor_is_reported_at_both_ends_and_after_a_break(tmp_path, messages, capsys):
     def received(topic, first, last):
-        return [one for one in messages if one[0] != topic or first <= (one[1] - START) / NANO <= last]
+        return [message for message in messages if message[0] != topic or first <= (message[1] - START) / NANO <= last]
 
     imported(write(tmp_path / "dies", received("/scan", 0, 2)), tmp_path / "a")
     error = capsys.readouterr().err
@@ -202,8 +202,8 @@ def test_time_without_a_sensor_is_reported_at_both_ends_and_after_a_break(tmp_pa
 
 
 def test_a_command_stays_in_force_when_the_pose_starts_anew(tmp_path, messages, capsys):
-    commands = [one for one in messages if one[0] == "/cmd_vel"]
-    once = [one for one in messages if one[0] != "/cmd_vel" or one is commands[0]]
+    commands = [message for message in messages if message[0] == "/cmd_vel"]
+    once = [message for message in messages if message[0] != "/cmd_vel" or message is commands[0]]
     late = START + 2 * NANO
     bag = write(tmp_path / "bag", changed(once, "/odom", lambda at: reset_odometry(at, dx=9.0), since=late))
     imported(bag, tmp_path / "d", "--odometry", "--beams=36", "--command_timeout=inf")

@@ -99,7 +99,7 @@ def test_a_dataset_is_named_in_one_way(recorded, capsys, monkeypatch):
         assert stop.value.code == 2
         error = capsys.readouterr().err
         assert "name the dataset, in one way: its folder (ROOT or --root), or --repo_id" in error
-        assert all(one in error for one in arguments)
+        assert all(argument in error for argument in arguments)
 
 
 def test_help_names_every_value_by_what_it_is():

@@ -70,7 +70,9 @@ def test_there_and_back(hub: HubServer, recorded: Path, tmp_path: Path, capsys) 
     assert {**content(tmp_path / "e")} == before | {
         name: hub.dataset("me/avoid").files()[name].content for name in ("README.md", "preview.png")
     }
-    assert not [one for one in check_dataset(tmp_path / "e", limits_of).findings if one.severity.word == "error"]
+    assert not [
+        finding for finding in check_dataset(tmp_path / "e", limits_of).findings if finding.severity.word == "error"
+    ]
     # The card came along; to push what was pulled sends nothing.
     assert main.main(["push", str(tmp_path / "e"), "me/avoid"]) == 0
     assert "nothing to send" in capsys.readouterr().out
@@ -89,10 +91,10 @@ def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) ->
     for key in summary.features:
         assert f"| `{key}` |" in card
     assert "m/s" in card
-    outcomes = [str(one.metadata["outcome"]) for one in summary.episodes]
+    outcomes = [str(episode.metadata["outcome"]) for episode in summary.episodes]
     for outcome in set(outcomes):
         assert f"| {outcome} | {outcomes.count(outcome)} | {outcomes.count(outcome) / 4:.0%} |" in card
-    successes = sum(bool(one.metadata["success"]) for one in summary.episodes)
+    successes = sum(bool(episode.metadata["success"]) for episode in summary.episodes)
     share = wilson(successes, 4)
     assert f"{successes} of 4 episodes succeeded: {share.value:.1%}" in card
     assert f"{share.low:.1%} to {share.high:.1%}" in card

@@ -108,11 +108,11 @@ def test_a_tolerance_in_the_configuration_is_checked(tmp_path):
 
 def test_all_episodes_together_are_sums_maxima_and_bounds(measured):
     report = timing_report.load_timing(measured)
-    parts, total = [one.summary for one in report.episodes], report.total.summary
+    parts, total = [episode.summary for episode in report.episodes], report.total.summary
     for name in ("ticks", "skipped", "overruns", "frames", "late_frames", "drops"):
-        assert getattr(total, name) == sum(getattr(one, name) for one in parts)
+        assert getattr(total, name) == sum(getattr(part, name) for part in parts)
     for name in ("lateness_p99", "lateness_max", "duration_p50", "age_max", "inference_max"):
-        assert getattr(total, name) == max(getattr(one, name) for one in parts)
+        assert getattr(total, name) == max(getattr(part, name) for part in parts)
     assert len(report.total.intervals) == 3 * (FRAMES - 1)  # from one episode to the next there is none
     assert total.tolerated == parts[0].tolerated
     changes = ({"rate_error": 0.5}, {"rate_error": -2.0}, {"rate_error": 1.0, "tolerated": {"lateness": 1.0}})
@@ -161,7 +161,7 @@ def test_json_holds_everything_and_draws_only_if_asked(measured, tmp_path, capsy
     monkeypatch.chdir(tmp_path)
     assert main.main(["timing", str(measured), "--json"]) == 0
     values = json.loads(capsys.readouterr().out)
-    assert [one["index"] for one in values["episodes"]] == [0, 1, 2]
+    assert [value["index"] for value in values["episodes"]] == [0, 1, 2]
     assert values["clock"] == "realtime"
     assert values["all"]["late_frames"] == 6
     assert values["episodes"][1]["realtime"] == GRANTS

@@ -4,7 +4,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Iterator
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -31,16 +31,9 @@ from bhd_lerobot.errors import (
     DatasetWriteError,
     UnsupportedDatasetError,
 )
-from tests.datasets import support
+from tests.datasets import kill_jobs, support
 from tests.datasets.edit_support import NUMBERS, assert_valid, content, record, steps_of
-from tests.datasets.kill_support import KillServer
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[KillServer]:
-    server = KillServer()
-    yield server
-    server.close()
+from tests.forks import Fork
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +153,7 @@ def test_edits_are_logged(tmp_path: Path) -> None:
     assert edits_of(roots[0]) == []
 
 
-def test_a_kill_at_any_step_leaves_the_old_or_the_new(server: KillServer, tmp_path: Path) -> None:
+def test_a_kill_at_any_step_leaves_the_old_or_the_new(tmp_path: Path) -> None:
     origin = record(tmp_path / "origin", [0, 1, 2, 3])
     old = content(origin)
     new = [old[0], old[2], old[3]]
@@ -168,7 +161,7 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new(server: KillServer, tmp_pa
     seen = set()
     for step in range(steps):
         root = shutil.copytree(origin, tmp_path / f"d{step}")
-        assert server.edit("delete", [root], step, episodes=[1])
+        assert Fork(kill_jobs.delete, root, [1], step).wait() == -signal.SIGKILL
         repair(root)
         assert content(root) in (old, new)
         seen.add(len(content(root)))

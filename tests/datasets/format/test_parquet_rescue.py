@@ -73,7 +73,7 @@ def test_without_the_footer_everything_is_found(tmp_path: Path, rows: list[int],
     with pytest.raises(pa.ArrowInvalid):
         pq.read_table(tmp_path / "f.parquet")
     found = rescue(tmp_path / "f.parquet", SCHEMA)
-    assert [one.to_pydict() for one in found.groups] == [one.to_pydict() for one in tables]
+    assert [group.to_pydict() for group in found.groups] == [one.to_pydict() for one in tables]
     assert (found.problem, found.lost_bytes) == ("it has no footer", 0)
 
 
@@ -83,7 +83,7 @@ def test_a_file_with_a_footer_is_read(tmp_path: Path) -> None:
         for one in tables:
             writer.write_table(one)
     found = rescue(tmp_path / "f.parquet", SCHEMA)
-    assert [one.to_pydict() for one in found.groups] == [one.to_pydict() for one in tables]
+    assert [group.to_pydict() for group in found.groups] == [one.to_pydict() for one in tables]
     assert not found.problem
 
 
@@ -97,7 +97,7 @@ def test_only_whole_row_groups_of_a_truncated_file_are_found(tmp_path: Path) -> 
         (tmp_path / "torn.parquet").write_bytes(data[:size])
         found = rescue(tmp_path / "torn.parquet", SCHEMA)
         whole = sum(end <= size for end in ends)
-        assert [one.to_pydict() for one in found.groups] == expected[:whole], size
+        assert [group.to_pydict() for group in found.groups] == expected[:whole], size
         assert found.lost_bytes == size - (ends[whole - 1] if whole else 4 if size >= 4 else 0), size
 
 
@@ -112,7 +112,7 @@ def test_damage_never_raises(tmp_path: Path) -> None:
         (tmp_path / "damaged.parquet").write_bytes(bytes(damaged))
         found = rescue(tmp_path / "damaged.parquet", SCHEMA)
         assert len(found.groups) <= 3
-        assert all(one.schema.equals(SCHEMA) for one in found.groups)
+        assert all(group.schema.equals(SCHEMA) for group in found.groups)
 
 
 def test_a_file_of_another_format_is_rejected(tmp_path: Path) -> None:

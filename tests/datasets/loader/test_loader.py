@@ -164,7 +164,7 @@ def test_pytorch_data_loader_and_slices(plain: Path) -> None:
     ours, theirs = both(plain, delta_timestamps={"action": CHUNK})
     for mine, other in zip(DataLoader(ours, 7), DataLoader(theirs, 7), strict=True):
         support.assert_same(mine, other)
-    assert [one["index"].item() for one in ours[3:6]] == [3, 4, 5]
+    assert [our["index"].item() for our in ours[3:6]] == [3, 4, 5]
     with pytest.raises(IndexError, match=f"Sample {len(ours)}"):
         ours[len(ours)]
 

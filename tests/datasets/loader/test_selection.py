@@ -108,7 +108,7 @@ def test_the_split_by_instruction_is_that_of_lerobot(plain: Path, share: float) 
 
 def described(instructions: list[str]) -> Any:
     """Metadata of a dataset with an episode of each of these instructions."""
-    n, episodes = len(instructions), {"tasks": [[one] for one in instructions]}
+    n, episodes = len(instructions), {"tasks": [[instruction] for instruction in instructions]}
     return SimpleNamespace(root=Path("toy"), total_episodes=n, total_frames=n, episodes=episodes)
 
 

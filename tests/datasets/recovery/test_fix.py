@@ -28,7 +28,7 @@ def damage(path: Path, change) -> None:
 
 
 def errors(root: Path) -> list[str]:
-    return [str(one) for one in check_dataset(root).findings if one.severity is Severity.ERROR]
+    return [str(finding) for finding in check_dataset(root).findings if finding.severity is Severity.ERROR]
 
 
 DAMAGES = {

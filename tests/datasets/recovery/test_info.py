@@ -64,7 +64,7 @@ def test_an_interrupted_recording_of_ours_loses_nothing(other: Path, tmp_path: P
     report = repair(root, other)
     assert (report.episodes, report.lost) == (3, ())
     assert_valid(root)
-    assert [one.metadata["seed"] for one in dataset_info(root).episodes] == [0, 1, 2]
+    assert [episode.metadata["seed"] for episode in dataset_info(root).episodes] == [0, 1, 2]
 
 
 def test_info_that_is_not_needed_or_cannot_be_used_changes_nothing(recorded: Path, other: Path, tmp_path: Path) -> None:

@@ -5,10 +5,10 @@ import json
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,32 +23,26 @@ from bhd_lerobot.datasets.recovery.repair import repair, settle
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError, DatasetWriteError
+from tests.datasets import corruption_jobs
 from tests.datasets.edit_support import Episode, assert_valid, content
-from tests.datasets.kill_support import KillServer
+from tests.forks import Fork
 
 CAMERA = "observation.images.top"
 
 
-@pytest.fixture(scope="module")
-def lerobot() -> Iterator[KillServer]:
-    server = KillServer("tests.datasets.corruption_server")
-    yield server
-    server.close()
-
-
-def recorded(server: KillServer, root: Path, video: str, episodes: int, die: str = "never", **job: Any) -> Path:
-    server.start({"root": str(root), "video": video, "episodes": episodes, "die": die, **job})
-    status = server.end()
-    assert (status == 0) == (die == "never"), status
+def recorded(root: Path, video: str, episodes: int, die: str = "never", **job: Any) -> Path:
+    job |= {"root": str(root), "video": video, "episodes": episodes, "die": die}
+    status = Fork(corruption_jobs.run, job).wait()
+    assert status == (0 if die == "never" else -signal.SIGKILL)
     return root
 
 
 @pytest.fixture(scope="module")
-def truth(lerobot: KillServer, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Episode]]:
+def truth(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Episode]]:
     """What a recording that nobody kills is like."""
     folder = tmp_path_factory.mktemp("truth")
     episodes = {"none": 8, "video": 4, "image": 3}
-    return {video: content(recorded(lerobot, folder / video, video, count)) for video, count in episodes.items()}
+    return {video: content(recorded(folder / video, video, count)) for video, count in episodes.items()}
 
 
 def loaded(root: Path, frames: int) -> None:
@@ -77,11 +71,9 @@ def loaded(root: Path, frames: int) -> None:
         ("image", 3, "saved", 3),
     ],
 )
-def test_every_whole_episode_is_recovered(
-    lerobot: KillServer, truth: dict, tmp_path: Path, case: tuple[str, int, str, int]
-) -> None:
+def test_every_whole_episode_is_recovered(truth: dict, tmp_path: Path, case: tuple[str, int, str, int]) -> None:
     video, episodes, die, recovered = case
-    root = recorded(lerobot, tmp_path / "d", video, episodes, die)
+    root = recorded(tmp_path / "d", video, episodes, die)
     report = repair(root)
     assert report.episodes == recovered
     assert bool(report.lost) == (recovered < episodes)
@@ -101,8 +93,8 @@ def test_every_whole_episode_is_recovered(
     assert not repair(root)  # and now there is nothing to do
 
 
-def test_losses_are_reported(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "stream", 3, "encoding")
+def test_losses_are_reported(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "stream", 3, "encoding")
     for folder in root.glob("tmp*"):
         shutil.rmtree(folder)
     report = repair(root)
@@ -113,8 +105,8 @@ def test_losses_are_reported(lerobot: KillServer, tmp_path: Path) -> None:
     assert str(report.aside) in text
 
 
-def test_the_damaged_files_are_kept(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "video", 2, "encoding")
+def test_the_damaged_files_are_kept(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "video", 2, "encoding")
     before = {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
     for number in (1, 2):
         report = repair(root)
@@ -125,28 +117,27 @@ def test_the_damaged_files_are_kept(lerobot: KillServer, tmp_path: Path) -> None
         shutil.copytree(aside, root)
 
 
-def test_a_session_that_went_on_and_was_killed(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "none", 3)
-    recorded(lerobot, root, "none", 4, "frames")
+def test_a_session_that_went_on_and_was_killed(truth: dict, tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "none", 3)
+    recorded(root, "none", 4, "frames")
     assert repair(root).episodes == 7
     assert [(e.task, e.columns) for e in content(root)] == [(e.task, e.columns) for e in truth["none"][:7]]
-    recorded(lerobot, root, "none", 1)  # LeRobot itself goes on with it
+    recorded(root, "none", 1)  # LeRobot itself goes on with it
     assert [e.columns for e in content(root)] == [e.columns for e in truth["none"]]
 
 
-def test_random_kills_lose_no_saved_episode(lerobot: KillServer, tmp_path: Path) -> None:
+def test_random_kills_lose_no_saved_episode(tmp_path: Path) -> None:
     rng = random.Random(11)
-    another = recorded(lerobot, tmp_path / "another", "none", 1)
+    another = recorded(tmp_path / "another", "none", 1)
     for kill in range(4):
         root, progress = tmp_path / f"d{kill}", tmp_path / f"progress{kill}"
         job = {"video": "none", "episodes": 10_000, "die": "never", "progress": str(progress)}
-        pid = lerobot.start({"root": str(root), **job})
+        victim = Fork(corruption_jobs.run, {"root": str(root), **job})
         wanted = rng.randrange(2, 16)
         while not progress.exists() or progress.read_text().count("\n") < wanted:
             time.sleep(0.002)
         time.sleep(rng.random() * 0.03)
-        os.kill(pid, 9)
-        lerobot.end()
+        victim.kill()
         saved = progress.read_text().count("\n")
         if (root / "meta/info.json").read_text():
             report = repair(root)
@@ -158,8 +149,8 @@ def test_random_kills_lose_no_saved_episode(lerobot: KillServer, tmp_path: Path)
         assert_valid(root)
 
 
-def test_a_torn_video_costs_the_episodes_behind_the_tear(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
-    origin = recorded(lerobot, tmp_path / "origin", "video", 3, "saved")
+def test_a_torn_video_costs_the_episodes_behind_the_tear(truth: dict, tmp_path: Path) -> None:
+    origin = recorded(tmp_path / "origin", "video", 3, "saved")
     size = next(origin.glob("videos/*/*/*.mp4")).stat().st_size
     seen = set()
     for missing in (1, 60, 120, 180, 240, 300):
@@ -179,8 +170,8 @@ def test_a_torn_video_costs_the_episodes_behind_the_tear(lerobot: KillServer, tr
     assert {2, 1} <= seen
 
 
-def test_truncated_data_cost_the_episodes_behind_the_cut(lerobot: KillServer, truth: dict, tmp_path: Path) -> None:
-    origin = recorded(lerobot, tmp_path / "origin", "none", 4, "saved")
+def test_truncated_data_cost_the_episodes_behind_the_cut(truth: dict, tmp_path: Path) -> None:
+    origin = recorded(tmp_path / "origin", "none", 4, "saved")
     size = next(origin.glob("data/*/*.parquet")).stat().st_size
     for share in (0.3, 0.6, 0.9):
         root = shutil.copytree(origin, tmp_path / f"d{share}")
@@ -191,8 +182,8 @@ def test_truncated_data_cost_the_episodes_behind_the_cut(lerobot: KillServer, tr
         assert [e.columns for e in content(root)] == [e.columns for e in truth["none"][: report.episodes]]
 
 
-def test_lost_instructions_are_reported_and_distinguished(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "none", 4, "saved")
+def test_lost_instructions_are_reported_and_distinguished(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "none", 4, "saved")
     (root / "meta/tasks.parquet").write_bytes(b"PAR1")
     report = repair(root)
     assert any("meta/tasks.parquet" in line for line in report.lost)
@@ -201,8 +192,8 @@ def test_lost_instructions_are_reported_and_distinguished(lerobot: KillServer, t
     assert all("lost" in text for text in texts)
 
 
-def test_nothing_left_changes_nothing(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+def test_nothing_left_changes_nothing(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "none", 2, "saved")
     os.truncate(next(root.glob("data/*/*.parquet")), 40)
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
     with pytest.raises(DatasetCorruptError, match=r"No whole episode of .* can be recovered; nothing was changed"):
@@ -214,12 +205,10 @@ def test_nothing_left_changes_nothing(lerobot: KillServer, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("by", "episodes"), [("folder", 9), ("file", 1), ("hand", 1), ("hand", 9)])
-def test_info_of_another_recording_is_used(
-    lerobot: KillServer, truth: dict, tmp_path: Path, by: str, episodes: int
-) -> None:
+def test_info_of_another_recording_is_used(truth: dict, tmp_path: Path, by: str, episodes: int) -> None:
     """Whatever it counts: that is no loss of this one."""
-    root = recorded(lerobot, tmp_path / "d", "none", 4, "saved")
-    another = recorded(lerobot, tmp_path / "another", "none", episodes)
+    root = recorded(tmp_path / "d", "none", 4, "saved")
+    another = recorded(tmp_path / "another", "none", episodes)
     info = root / "meta/info.json"
     info.write_text("{")
     with pytest.raises(DatasetCorruptError, match=f"repair {root} --info OTHER"):
@@ -256,8 +245,8 @@ OTHER_INFO: tuple[tuple[dict[str, Any], str], ...] = (
 )
 
 
-def test_info_of_another_robot_is_refused(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "video", 2, "saved")
+def test_info_of_another_robot_is_refused(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "video", 2, "saved")
     info = root / "meta/info.json"
     origin = info.read_bytes()
     for (change, message), by_hand in itertools.product(OTHER_INFO, (False, True)):
@@ -279,8 +268,8 @@ def test_info_of_another_robot_is_refused(lerobot: KillServer, tmp_path: Path) -
         assert not (tmp_path / "d.damaged-1").exists()
 
 
-def test_info_of_another_is_given_back_if_nothing_can_be_recovered(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "video", 2, "saved")
+def test_info_of_another_is_given_back_if_nothing_can_be_recovered(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "video", 2, "saved")
     donor = changed_info(root, tmp_path / "other.json", {})
     shutil.rmtree(root / "videos")
     for break_it in (lambda path: path.write_text("{"), Path.unlink):
@@ -292,8 +281,8 @@ def test_info_of_another_is_given_back_if_nothing_can_be_recovered(lerobot: Kill
         assert not (tmp_path / "d.damaged-1").exists()
 
 
-def test_a_camera_without_any_video_is_named(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+def test_a_camera_without_any_video_is_named(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "none", 2, "saved")
     (root / "meta/stats.json").unlink()
     camera = {"observation.images.rear": {"dtype": "video", "shape": [32, 48, 3], "names": None}}
     changed_info(root, root / "meta/info.json", camera)
@@ -301,10 +290,8 @@ def test_a_camera_without_any_video_is_named(lerobot: KillServer, tmp_path: Path
         repair(root)
 
 
-def test_a_full_disk_leaves_the_dataset_as_it_was(
-    lerobot: KillServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+def test_a_full_disk_leaves_the_dataset_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = recorded(tmp_path / "d", "none", 2, "saved")
     before = {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()}
 
     def full(self: Disk, path: Path, data: bytes) -> None:
@@ -318,8 +305,8 @@ def test_a_full_disk_leaves_the_dataset_as_it_was(
     assert repair(root).episodes == 2
 
 
-def test_a_recording_that_goes_on_is_left_alone(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "none", 2, "saved")
+def test_a_recording_that_goes_on_is_left_alone(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "none", 2, "saved")
     path = next(root.glob("data/*/*.parquet"))
     code = "import sys; f = open(sys.argv[1], 'ab'); print('open', flush=True); sys.stdin.read()"
     with subprocess.Popen(
@@ -333,18 +320,18 @@ def test_a_recording_that_goes_on_is_left_alone(lerobot: KillServer, tmp_path: P
     assert repair(root).episodes == 2
 
 
-def test_a_valid_dataset_of_lerobot_is_not_changed(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "video", 2)
+def test_a_valid_dataset_of_lerobot_is_not_changed(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "video", 2)
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
     assert not repair(root)
     assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
     assert not (tmp_path / "d.damaged-1").exists()
 
 
-def test_episodes_are_renumbered_without_a_gap(lerobot: KillServer, tmp_path: Path) -> None:
+def test_episodes_are_renumbered_without_a_gap(tmp_path: Path) -> None:
     """An episode that is lost in the middle leaves no hole."""
-    root = recorded(lerobot, tmp_path / "d", "none", 3)
-    recorded(lerobot, root, "none", 3, "saved")
+    root = recorded(tmp_path / "d", "none", 3)
+    recorded(root, "none", 3, "saved")
     (root / "data/chunk-000/file-000.parquet").write_bytes(b"")
     report = repair(root)
     assert report.episodes == 3
@@ -358,10 +345,10 @@ def test_episodes_are_renumbered_without_a_gap(lerobot: KillServer, tmp_path: Pa
 
 
 @pytest.fixture(scope="module")
-def sessions(lerobot: KillServer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two sessions of three episodes each, with a video of its own for each session."""
-    root = recorded(lerobot, tmp_path_factory.mktemp("sessions") / "d", "video", 3)
-    return recorded(lerobot, root, "video", 3)
+    root = recorded(tmp_path_factory.mktemp("sessions") / "d", "video", 3)
+    return recorded(root, "video", 3)
 
 
 def numbers(root: Path) -> list[int]:
@@ -413,23 +400,25 @@ def test_a_video_with_unused_frames_is_valid(sessions: Path, tmp_path: Path) -> 
     assert numbers(tmp_path / "kept") == [0, 2]
 
 
-def test_an_episode_that_was_recorded_again(lerobot: KillServer, tmp_path: Path) -> None:
+def test_an_episode_that_was_recorded_again(tmp_path: Path) -> None:
     """No file records which of its two attempts a video shows."""
-    root = recorded(lerobot, tmp_path / "d", "video", 4, "saved", again=2)
+    root = recorded(tmp_path / "d", "video", 4, "saved", again=2)
     report = repair(root)
     assert numbers(root) == [0, 1]
     assert "episode 2: a first attempt, which was recorded again" in report.lost
 
 
-def test_a_kill_in_the_first_episode_of_a_second_session(lerobot: KillServer, tmp_path: Path) -> None:
+def test_a_kill_in_the_first_episode_of_a_second_session(tmp_path: Path) -> None:
     """No count is wrong then, and yet LeRobot loads nothing: a file without a footer lies there."""
-    root = recorded(lerobot, tmp_path / "d", "video", 2)
-    recorded(lerobot, root, "video", 1, "encoding")
-    assert [one.check for one in check_dataset(root).findings if one.severity is Severity.ERROR] == ["files"]
+    root = recorded(tmp_path / "d", "video", 2)
+    recorded(root, "video", 1, "encoding")
+    assert [finding.check for finding in check_dataset(root).findings if finding.severity is Severity.ERROR] == [
+        "files"
+    ]
     assert repair(root).episodes == 3
     assert numbers(root) == [0, 1, 2]
     loaded(root, 18)
-    first = recorded(lerobot, tmp_path / "first", "video", 1, "encoding")
+    first = recorded(tmp_path / "first", "video", 1, "encoding")
     assert repair(first).episodes == 1
 
 
@@ -442,21 +431,21 @@ def test_torn_statistics_are_computed_anew(sessions: Path, tmp_path: Path) -> No
     assert_valid(root)
 
 
-def test_marks_and_columns_of_others_survive(lerobot: KillServer, tmp_path: Path) -> None:
-    root = recorded(lerobot, tmp_path / "d", "none", 3)
+def test_marks_and_columns_of_others_survive(tmp_path: Path) -> None:
+    root = recorded(tmp_path / "d", "none", 3)
     mark(root, [1], outcome="success", note="seen")
-    recorded(lerobot, root, "none", 2, "saved")
+    recorded(root, "none", 2, "saved")
     repair(root)
     assert [one.metadata.get("bhd/outcome") for one in content(root)] == [None, "success", None, None, None]
     assert [edit.get("note") for edit in edits_of(root)] == ["seen", None]
     assert edits_of(root)[-1]["episodes"] == [0, 1, 2, 3, 4]
 
 
-def test_our_own_dataset_that_lerobot_went_on_with(lerobot: KillServer, tmp_path: Path) -> None:
+def test_our_own_dataset_that_lerobot_went_on_with(tmp_path: Path) -> None:
     for count, die in ((1, "counting"), (2, "saved")):
-        root = recorded(lerobot, tmp_path / f"d{count}", "none", 3)
+        root = recorded(tmp_path / f"d{count}", "none", 3)
         (root / "meta/bhd.json").write_text(json.dumps({"format": 1, "recording": {"seed": 1}, "video": {}}))
-        recorded(lerobot, root, "none", count, die)
+        recorded(root, "none", count, die)
         if count == 1:  # our recorder does not throw away what it did not write
             with pytest.raises(DatasetCorruptError, match="bhd-data repair"):
                 settle(root, Disk())

@@ -60,9 +60,9 @@ def test_data_without_a_footer_are_recovered_and_nothing_is_lost(recorded: Path,
         with pytest.raises(ConfigError, match="Leave --info out"):
             repair(root, recorded)
         before = snapshot(root)
-        remedies = [one.remedy for one in check_dataset(root).findings if one.where == DATA]
+        remedies = [finding.remedy for finding in check_dataset(root).findings if finding.where == DATA]
         assert remedies
-        assert all("bhd-data repair" in one for one in remedies)
+        assert all("bhd-data repair" in remedy for remedy in remedies)
         report = repair(root)
         assert (report.episodes, report.lost) == (4, ())
         assert "lost: nothing" in str(report)
@@ -88,9 +88,9 @@ def test_episodes_without_rows_are_recovered_and_lost_columns_are_named(
 ) -> None:
     root = copied(recorded, tmp_path / "d")
     damage(root / EPISODES)
-    remedies = [one.remedy for one in check_dataset(root).findings]
-    assert any("bhd-data repair" in one for one in remedies)
-    assert not any("removes" in one for one in remedies)
+    remedies = [finding.remedy for finding in check_dataset(root).findings]
+    assert any("bhd-data repair" in remedy for remedy in remedies)
+    assert not any("removes" in remedy for remedy in remedies)
     with pytest.raises(DatasetCorruptError, match=r"episode 0 is not described|magic bytes"):
         dataset_info(root)
     report = repair(root)
@@ -113,7 +113,7 @@ def test_readable_rows_keep_their_columns(tmp_path: Path) -> None:
     cut(20)(root / "meta/episodes/chunk-000/file-001.parquet")
     report = repair(root)
     assert report.episodes == 3
-    assert [one.metadata.get("seed") for one in dataset_info(root).episodes] == [0, None, 2]
+    assert [episode.metadata.get("seed") for episode in dataset_info(root).episodes] == [0, None, 2]
     assert report.lost == ("meta/episodes: bhd/ok, bhd/outcome, bhd/score, bhd/seed, bhd/start of episode 1",)
 
 
@@ -151,7 +151,9 @@ def with_events(root: Path, endings: list[Event]) -> Path:
 
 
 def outcomes(root: Path) -> list[tuple[Any, Any]]:
-    return [(one.metadata.get("outcome"), one.metadata.get("success")) for one in dataset_info(root).episodes]
+    return [
+        (episode.metadata.get("outcome"), episode.metadata.get("success")) for episode in dataset_info(root).episodes
+    ]
 
 
 def test_outcomes_and_marks_are_restored(tmp_path: Path) -> None:
@@ -258,7 +260,7 @@ def test_leftovers_of_edits_and_recordings_are_distinguished(recorded: Path, tmp
     recorder._lock.release()
     (unfinished / ".bhd/compact/new").mkdir(parents=True)
     for root, message in ((edited, "Repeat the edit"), (unfinished, "a recording was interrupted")):
-        (found,) = [one for one in check_dataset(root).findings if one.where == ".bhd"]
+        (found,) = [finding for finding in check_dataset(root).findings if finding.where == ".bhd"]
         assert message in f"{found.what}. {found.remedy}"
     repair(edited)
     assert content(edited) == content(recorded)
@@ -309,7 +311,7 @@ def test_pages_that_are_damaged_cost_their_episodes_only(tmp_path: Path) -> None
     report = repair(root)
     assert report.episodes == 2
     assert any("file-001.parquet" in line for line in report.lost)
-    assert [one.metadata["seed"] for one in dataset_info(root).episodes] == [0, 2]
+    assert [episode.metadata["seed"] for episode in dataset_info(root).episodes] == [0, 2]
     table = pq.read_table(root / DATA)
     assert table["episode_index"].to_pylist() == [0] * support.length(0) + [1] * support.length(2)
     assert edits_of(root)[-1]["episodes"] == [0, 2]

@@ -180,7 +180,7 @@ def test_no_command_follows_a_link_out_of_the_dataset(root: Path, tmp_path: Path
             assert LINKED_FOLDERS in str(caught.value)
         assert not (tmp_path / "kept").exists()
         if name not in (layout.INFO, "data/chunk-000"):
-            found = [str(one) for one in check_dataset(root).findings]
+            found = [str(finding) for finding in check_dataset(root).findings]
             assert any("link leads out of the dataset" in one for one in found)
         place.unlink()
         (root / ".step").unlink()

@@ -9,17 +9,16 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from tests.datasets.sweeps import faults
 from tests.datasets.sweeps.operations import NOTES, OPERATIONS, REFUSED, Operation, content, leftovers
+from tests.forks import Fork
 
-ROOT = Path(__file__).parents[3]
 IS_FULL = os.environ.get("BHD_SWEEP") == "full"
 FAULTS = ("kill", "interrupt", "full")
 
@@ -33,18 +32,11 @@ NEW = re.compile(r"had been (completed|made|pulled|merged)|are gone, and those b
 DECIDED = "next command completes it"
 
 
+@dataclass(frozen=True)
 class Runner:
-    """The process that runs the commands."""
+    """Runs commands, and keeps their output in a folder."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("server.py"))],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )
+    folder: Path
 
     def run(
         self,
@@ -57,29 +49,17 @@ class Runner:
         step: int = -1,
     ) -> tuple[int, str, int]:
         """Return exit status, output, and how many changes were seen, if it came to an end."""
-        output = self.folder / "output"
-        counted = Path(f"{output}.steps")
+        output, counted = self.folder / "output", self.folder / "steps"
         counted.unlink(missing_ok=True)
-        job = {"argv": argv, "cwd": str(ROOT), "watched": str(watched), "target": str(target), "output": str(output)}
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(json.dumps({**job, "place": place, "fault": fault, "step": step}) + "\n")
-        self.process.stdin.flush()
-        status = int(self.process.stdout.readline())
+        run = partial(faults.run, place=place, target=target, kind=fault, step=step)
+        status = Fork(run, argv, watched, counted, output=output).wait()
         steps = int(counted.read_text()) if counted.exists() else 0
         return status, output.read_text(encoding="utf-8", errors="replace"), steps
 
-    def close(self) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self.process.wait()
-
 
 @pytest.fixture(scope="module")
-def runner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runner]:
-    runner = Runner(tmp_path_factory.mktemp("runner"))
-    yield runner
-    runner.close()
+def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
+    return Runner(tmp_path_factory.mktemp("runner"))
 
 
 def chosen(steps: int, offset: int) -> list[int]:

@@ -113,7 +113,7 @@ def edit_json(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
 
 
 def bad(found: DatasetCheck) -> list[Finding]:
-    return [one for one in found.findings if one.severity > Severity.NOTE]
+    return [finding for finding in found.findings if finding.severity > Severity.NOTE]
 
 
 # --- valid -----------------------------------------------------------------------------------------------------------
@@ -124,13 +124,13 @@ def test_a_valid_dataset_has_no_finding_and_is_not_changed(valid: Path) -> None:
     found = check_dataset(valid, limits)
     assert bad(found) == []
     assert (found.episodes, found.frames) == (EPISODES, sum(map(length, range(EPISODES))))
-    assert [one.what for one in found.findings if one.check == "outcome"] == ["success 6"]
+    assert [finding.what for finding in found.findings if finding.check == "outcome"] == ["success 6"]
     assert contents(valid) == before
 
 
 def test_a_dataset_of_stock_lerobot_is_valid(tmp_path: Path) -> None:
     root = loader_support.record_stock(tmp_path / "stock", cameras=True)
-    assert [one for one in check_dataset(root).findings if one.severity == Severity.ERROR] == []
+    assert [finding for finding in check_dataset(root).findings if finding.severity == Severity.ERROR] == []
 
 
 # --- damage ----------------------------------------------------------------------------------------------------------
@@ -221,7 +221,7 @@ def test_damaged_numbers_are_found(valid: Path, tmp_path: Path) -> None:
         data_file(root).write_bytes(origin)
         edit(data_file(root), damage)
         found = check_dataset(root, limits)
-        matching = [one for one in found.findings if (one.severity, one.check) == (severity, check)]
+        matching = [finding for finding in found.findings if (finding.severity, finding.check) == (severity, check)]
         assert any(where in one.where and re.search(what, one.what) for one in matching), found.findings
         assert all(one.remedy for one in matching if severity is not Severity.NOTE)
         # The change of the data changed the statistics, too; there are no other findings.
@@ -242,7 +242,7 @@ def test_a_column_with_gaps_is_found_and_the_rest_is_checked(valid: Path, tmp_pa
 
 
 def test_a_gripper_that_closes_once_in_every_episode_does_not_jump(valid: Path) -> None:
-    assert not [one for one in check_dataset(valid).findings if one.check == "jumps"]
+    assert not [finding for finding in check_dataset(valid).findings if finding.check == "jumps"]
 
 
 def episodes_file(root: Path) -> Path:
@@ -307,9 +307,11 @@ def test_damaged_files_are_found(valid: Path, tmp_path: Path) -> None:
         root = Path(shutil.copytree(valid, tmp_path / case))
         damage(root)
         found = check_dataset(root)
-        matching = [one for one in found.findings if (one.severity, one.check) == (Severity.ERROR, check)]
+        matching = [
+            finding for finding in found.findings if (finding.severity, finding.check) == (Severity.ERROR, check)
+        ]
         assert any(where in one.where and what in one.what for one in matching), (case, found.findings)
-        assert {one.check for one in found.findings} <= set(CHECKS)
+        assert {finding.check for finding in found.findings} <= set(CHECKS)
         assert found.worst == Severity.ERROR
 
 
@@ -441,9 +443,9 @@ def test_datasets_edited_by_lerobot_have_warnings_of_unused_statistics(
     assert {"index", "episode_index"} <= stale <= {"index", "episode_index", "task_index"}
     # What a policy is normalised with stays an error there, too.
     edit_json(folder / "merged/meta/stats.json", lambda all_: all_["action"]["mean"].reverse())
-    assert [one.where for one in check_dataset(folder / "merged").findings if one.severity == Severity.ERROR] == [
-        "meta/stats.json: action"
-    ]
+    assert [
+        finding.where for finding in check_dataset(folder / "merged").findings if finding.severity == Severity.ERROR
+    ] == ["meta/stats.json: action"]
 
 
 def test_a_dataset_without_episodes_is_an_error_with_a_remedy(tmp_path: Path) -> None:

@@ -315,7 +315,7 @@ def test_a_damaged_value_inside_a_file_is_found_by_repair(tmp_path: Path) -> Non
     report = repair(root)
     assert report.episodes == 2
     assert any("file-000.parquet" in line for line in report.lost)
-    assert [one.metadata["seed"] for one in dataset_info(root).episodes][-1] == 2
+    assert [episode.metadata["seed"] for episode in dataset_info(root).episodes][-1] == 2
 
 
 def test_an_error_in_the_block_is_not_hidden_by_one_of_finalising(

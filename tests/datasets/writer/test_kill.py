@@ -1,25 +1,17 @@
 """No saved episode is ever lost: processes are killed with SIGKILL at random moments and at every single step."""
 
-import os
 import random
 import signal
 import time
-from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from bhd_lerobot.datasets.recovery.repair import repair
-from tests.datasets import support
-from tests.datasets.kill_support import KillServer
+from tests.datasets import kill_jobs, support
+from tests.forks import Fork
 from tests.waiting import until
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[KillServer]:
-    server = KillServer()
-    yield server
-    server.close()
 
 
 def saved_episodes(progress: Path) -> int:
@@ -32,7 +24,7 @@ def wait_for(progress: Path, lines: int) -> None:
 
 
 @pytest.mark.parametrize(("video", "kills"), [(False, 20), (True, 4)])
-def test_random_kills_lose_nothing(server: KillServer, tmp_path: Path, video: bool, kills: int) -> None:
+def test_random_kills_lose_nothing(tmp_path: Path, video: bool, kills: int) -> None:
     """One dataset lives through many kills, while saving and while compacting, and goes on every time."""
     rng = random.Random(7)
     root, progress = tmp_path / "dataset", tmp_path / "progress"
@@ -40,12 +32,11 @@ def test_random_kills_lose_nothing(server: KillServer, tmp_path: Path, video: bo
         # Every second victim finalises after each episode, so that kills hit the compaction as well.
         finalize = kill % 2 == 1
         before = progress.read_text().count("\n") if progress.exists() else 0
-        job = {"root": str(root), "progress": str(progress), "video": video, "die_at": None, "finalize": finalize}
-        pid = server.start({**job, "episodes": 1 if finalize else 10_000, "sessions": 10_000})
+        save = partial(kill_jobs.save, video=video, finalize=finalize, sessions=10_000)
+        victim = Fork(save, root, progress, 1 if finalize else 10_000)
         wait_for(progress, before + rng.randrange(4))
         time.sleep(rng.uniform(0, 0.012))
-        os.kill(pid, signal.SIGKILL)
-        assert server.end() == -signal.SIGKILL
+        assert victim.kill() == -signal.SIGKILL
         if not root.exists():
             continue
         saved = saved_episodes(progress)
@@ -59,14 +50,13 @@ def test_random_kills_lose_nothing(server: KillServer, tmp_path: Path, video: bo
 
 @pytest.mark.parametrize("video", [False, True])
 @pytest.mark.parametrize("phase", ["save", "finalize"])
-def test_kill_at_every_step(server: KillServer, tmp_path: Path, video: bool, phase: str) -> None:
+def test_kill_at_every_step(tmp_path: Path, video: bool, phase: str) -> None:
     """The process dies before its first, second, ... change of the disk, until it survives."""
     episodes, died_at = 3, 0
     while True:
         root, progress = tmp_path / f"dataset-{died_at}", tmp_path / f"progress-{died_at}"
-        job = {"root": str(root), "progress": str(progress), "video": video, "episodes": episodes}
-        server.start({**job, "die_at": died_at, "finalize": phase == "finalize"})
-        code = server.end()
+        save = partial(kill_jobs.save, video=video, die_at=died_at, finalize=phase == "finalize")
+        code = Fork(save, root, progress, episodes).wait()
         saved = saved_episodes(progress)
         if code == 0:
             break

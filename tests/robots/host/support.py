@@ -2,8 +2,7 @@
 
 import json
 import os
-import subprocess
-import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +16,7 @@ from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.robots.host.state import WATCHDOGS
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+from tests.forks import Fork
 from tests.waiting import until
 
 
@@ -102,37 +102,29 @@ class States:
         return any(state["mode"][0] == wanted for state in self.read().all)
 
 
-CHILD = """
-import json, sys, time
-from tests.robots.host.support import drive, turtlebot
-robot = turtlebot({name!r}, **{options!r})
-robot.connect()
-drive(robot)
-print(json.dumps({{"pids": robot.simulation.link.pids}}), flush=True)
-while True:
-    robot.send_action({{"x.vel": 0.2, "theta.vel": 0.0}})
-    time.sleep(0.05)
-"""
+def drive_on(name: str, options: dict[str, Any]) -> None:
+    """Connect a base, drive it, say which its processes are, and go on."""
+    robot = turtlebot(name, **options)
+    robot.connect()
+    drive(robot)
+    print(json.dumps({"pids": robot.simulation.link.pids}), flush=True)
+    while True:
+        robot.send_action({"x.vel": 0.2, "theta.vel": 0.0})
+        time.sleep(0.05)
 
 
 @contextmanager
-def driving_child(name: str, **options: Any) -> Iterator[tuple[subprocess.Popen, dict]]:
+def driving_child(name: str, log: Path, **options: Any) -> Iterator[tuple[Fork, dict]]:
     """Run a program that connects a base and drives it; yield it, and what it says about its robot.
 
     Args:
         name: the robot's id.
+        log: where its output goes.
         options: of `turtlebot`.
     """
-    process = subprocess.Popen(
-        [sys.executable, "-c", CHILD.format(name=name, options=options)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
-    )
+    process = Fork(drive_on, name, options, output=log)
     try:
-        assert process.stdout is not None
-        yield process, json.loads(process.stdout.readline())
+        until(lambda: process.poll() is not None or log.read_text().endswith("\n"), "the base drives")
+        yield process, json.loads(log.read_text())
     finally:
         process.kill()
-        process.communicate()

@@ -140,9 +140,9 @@ def test_a_stopped_recorder_loses_states_that_are_counted_exactly():
     assert is_gone(name)
 
 
-def test_a_brain_that_is_stopped_and_then_killed_leaves_a_robot_that_holds_and_ends():
+def test_a_brain_that_is_stopped_and_then_killed_leaves_a_robot_that_holds_and_ends(tmp_path):
     name = unique("brain")
-    with driving_child(name, brain_timeout_s=TIMEOUT_S) as (child, report):
+    with driving_child(name, tmp_path / "log", brain_timeout_s=TIMEOUT_S) as (child, report):
         pids = report["pids"].values()
         for number in (signal.SIGSTOP, signal.SIGKILL):
             states = States(name)

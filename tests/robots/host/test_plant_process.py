@@ -106,7 +106,7 @@ class LoopRig:
         while self.sent <= min(self.now, self.dies):
             self.remote.write(np.full((1, 2), 6.0))
             self.sent += PERIOD
-        for when in [one for one in self.happens if one <= self.now]:
+        for when in [happen for happen in self.happens if happen <= self.now]:
             self.happens.pop(when)(self)
         assert self.now < START + 60 * NANOSECONDS, "the loop does not end"
 

@@ -35,7 +35,7 @@ def frames(sensors, extra):
         places = [newest(times, grid.times) for times in (*sensors, extra)]
         age = grid.ages.max(axis=0)
         for column, time in enumerate(grid.times.tolist()):
-            seen[time] = (*(int(one[column]) for one in places), int(age[column]), bool(age[column] > 300 * MS))
+            seen[time] = (*(int(place[column]) for place in places), int(age[column]), bool(age[column] > 300 * MS))
     return seen
 
 

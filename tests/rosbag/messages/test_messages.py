@@ -37,7 +37,10 @@ def test_trees_of_arrays_become_messages():
     assert np.array_equal(scan.ranges, ranges[1])
     assert (joints.name, joints.position.tolist(), joints.velocity.tolist()) == (["a", "bcd", ""], [3.0, 4.0, 5.0], [])
     assert (numbers.frame_index, numbers.values.tolist()) == (-4, ranges[1, :2].tolist())
-    assert [(one.child_frame_id, one.transform.rotation.w) for one in moved.transforms] == [("a", 1.0), ("bb", 1.0)]
+    assert [(transform.child_frame_id, transform.transform.rotation.w) for transform in moved.transforms] == [
+        ("a", 1.0),
+        ("bb", 1.0),
+    ]
     with pytest.raises(KeyError, match="no field"):
         encode(SCAN, {"beams": 3}, 1)
 
@@ -122,6 +125,6 @@ def test_a_scan_is_never_stamped_before_an_observation_that_did_not_have_it():
     stream = scan_stream(part, Frames(0, np.arange(4), observed), values, age)
     received, messages = zip(*stream.messages, strict=True)
     assert received == (observed[0], observed[2])
-    first, second = header_stamps([decode(SCAN, one) for one in messages])
+    first, second = header_stamps([decode(SCAN, message) for message in messages])
     assert first == pytest.approx(observed[0] - 5 * 10**6, abs=100)
     assert second == observed[1] + 1

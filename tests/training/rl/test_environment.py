@@ -112,7 +112,7 @@ def test_an_episode_whose_time_is_over_is_truncated_and_the_next_begins_in_the_s
         # It stood still: what it saw last is what it saw before, but for the noise of a scan; the new arena is another.
         assert np.abs(info["terminal_observation"] - before[sim]).max() < np.abs(features[sim] - before[sim]).max()
         assert info["episode"]["l"] == 10
-    assert [member.course.episode for member in rig.env.members] == [one + STREAM for one in episodes]
+    assert [member.course.episode for member in rig.env.members] == [episode + STREAM for episode in episodes]
     assert len(rig.episodes) == N
 
 
@@ -142,7 +142,7 @@ def test_what_is_reported_is_the_tasks_own_return_whatever_the_learner_gets() ->
         rig = Rig(60, reward=reward)
         collide(rig)
         rig.adapter.close()
-        reported.append([{key: one[key] for key in ("episode", "score", "event")} for one in rig.episodes])
+        reported.append([{key: episode[key] for key in ("episode", "score", "event")} for episode in rig.episodes])
     assert reported[0] == reported[1]
     assert reported[0][0]["episode"]["r"] >= 0
 

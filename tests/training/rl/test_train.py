@@ -1,9 +1,10 @@
 import io
 import json
+import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
+from bhd_lerobot.training import checkpoint as checkpoints
 from bhd_lerobot.training.rl import checkpoint
 from bhd_lerobot.training.rl import train as module
 from bhd_lerobot.training.rl.config import RlConfig, is_rl, parse_rl
@@ -29,6 +31,7 @@ from bhd_lerobot.training.rl.features import in_units
 from bhd_lerobot.training.rl.learner import make_learner
 from bhd_lerobot.training.rl.parts import make_parts, single_action
 from bhd_lerobot.training.rl.train import RlResult, main, train
+from tests.forks import Fork
 
 # How much the network's rows may differ when they are computed beside others, in m/s and rad/s.
 TOLERANCE = 2e-6
@@ -86,7 +89,7 @@ def actions(folder: Path, states: np.ndarray, fps: int = 10) -> np.ndarray:
     brain.bind(names, contract.action_names or (), fps, ())
     n = states.shape[1]
     brain.reset(np.arange(n), [0] * n, n)
-    return np.stack([np.asarray(brain.act(Observation(names, one.astype(np.float64), {}))) for one in states])
+    return np.stack([np.asarray(brain.act(Observation(names, state.astype(np.float64), {}))) for state in states])
 
 
 @pytest.fixture(scope="module")
@@ -154,33 +157,26 @@ def test_what_cannot_be_resumed_is_refused_and_a_torn_checkpoint_is_never_loaded
         train(parse_rl(command), Console(file=io.StringIO()))
 
 
-KILLED = """
-import os, signal, sys
-from bhd_lerobot.training import checkpoint
-from bhd_lerobot.training.rl.train import main
+def dying(name: str, calls: int, arguments: list[str]) -> int:
+    """Train, and die in a function of the checkpoints after some calls of it."""
+    left, function = iter(range(calls)), getattr(checkpoints, name)
 
-name, calls = sys.argv[1], iter(range(int(sys.argv[2])))
-function = getattr(checkpoint, name)
+    def die(*values: Any) -> Any:
+        if next(left, None) is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*values)
 
-def dying(*arguments):
-    if next(calls, None) is None:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return function(*arguments)
-
-setattr(checkpoint, name, dying)
-main(sys.argv[3:])
-"""
+    setattr(checkpoints, name, die)
+    return main(arguments)
 
 
 def test_a_run_that_is_killed_while_it_saves_goes_on_from_the_last_complete_checkpoint(tmp_path: Path) -> None:
-    script, folder = tmp_path / "killed.py", tmp_path / "run"
-    script.write_text(KILLED)
+    folder = tmp_path / "run"
     again = [f"--config_path={folder}", "--resume=true"]
     # The second checkpoint first before it is renamed, then before `last` leads to it.
     for name, calls, arguments in (("_flush", 1, options(folder)), ("point", 0, again)):
-        command = [sys.executable, script, name, str(calls), *arguments]
-        killed = subprocess.run(command, capture_output=True, check=False)
-        assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+        killed = Fork(dying, name, calls, arguments, output=tmp_path / "log")
+        assert killed.wait() == -signal.SIGKILL, (tmp_path / "log").read_text()
         assert (folder / "checkpoints" / "last").readlink().name == "000000000"
     assert main(again) == 0
     assert {one.name for one in (folder / "checkpoints").iterdir()} == {

@@ -1,32 +1,19 @@
-"""Runs commands in forked processes, and lets something happen to them before a given change of the file system.
+"""Commands to which something happens before a given change of the file system.
 
-Started once, so that a run costs a fork and not an import. Reads one JSON job a line, and answers with the exit status
-and the number of changes seen. The changes are those that Python itself reports (`sys.addaudithook`), whichever library
-makes them, and the steps of `Disk` that Python does not report.
+The changes are those that Python itself reports (`sys.addaudithook`), whichever library makes them, and the steps of
+`Disk` that Python does not report.
 """
 
 import errno
-import gc
-import json
 import os
 import signal
 import sys
 from pathlib import Path
 from typing import Any
 
-# Imported before the forks, because every child would import them again on its first use.
-import av  # noqa: F401
-import mcap.writer  # noqa: F401
-import pandas as pd  # noqa: F401
-import pyarrow.dataset  # noqa: F401
-import rosbags.rosbag2  # noqa: F401
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata  # noqa: F401
-
 from bhd_lerobot.cli.data import main as data
 from bhd_lerobot.datasets.remote import staging
 from bhd_lerobot.datasets.storage import atomic, disk
-from bhd_lerobot.hub import transfer  # noqa: F401
-from bhd_lerobot.rosbag.messages.types import type_store
 from tests.datasets import support
 
 REMOVALS = ("os.remove", "os.rmdir")
@@ -85,59 +72,39 @@ def record(root: Path, episodes: int) -> int:
     return 0
 
 
-def run(job: dict[str, Any]) -> None:
-    """Do a job, and leave its exit status and the number of changes in its report."""
-    os.chdir(job["cwd"])
+def run(argv: list[str], watched: Path, counted: Path, *, place: str, target: Path, kind: str, step: int) -> int:
+    """Run a command, write down how many changes were seen, and return its exit status.
+
+    Args:
+        argv: the arguments of `bhd-data`, or ``record``, a folder and a number of episodes.
+        watched: the folder whose changes are counted.
+        counted: where the number of changes goes.
+        place: "plain", "fixed" if the target can be replaced by no other folder, "no exchange" of two names.
+        target: what the command makes or changes.
+        kind: "kill", "interrupt", "full", or "none".
+        step: the change before which that happens.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    with open(job["output"], "wb") as output:
-        os.dup2(output.fileno(), 1)
-        os.dup2(output.fileno(), 2)
-    if job["place"] == "fixed":
-        os.makedirs(job["target"], exist_ok=True)
-        atomic.is_fixed = lambda place: str(place) == job["target"]
+    if place == "fixed":
+        target.mkdir(parents=True, exist_ok=True)
+        atomic.is_fixed = lambda place: Path(place) == target
         staging.is_fixed = atomic.is_fixed
-    elif job["place"] == "no exchange":
+    elif place == "no exchange":
 
         def swap(*_: object) -> None:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
 
         disk.Disk.swap = swap
-    fault = Fault(job["watched"], job["fault"], job["step"])
+    fault = Fault(str(watched), kind, step)
     sys.addaudithook(fault.audit)
     disk._before_step = fault.before_step
-    if job["argv"][0] == "record":
-        status = record(Path(job["argv"][1]), int(job["argv"][2]))
+    if argv[0] == "record":
+        status = record(Path(argv[1]), int(argv[2]))
     else:
         try:
-            status = data.main(job["argv"])
+            status = data.main(argv)
         except SystemExit as end:
             status = int(end.code or 0)
     fault.is_on = False
-    sys.stdout.flush()
-    sys.stderr.flush()
-    Path(job["output"] + ".steps").write_text(str(fault.steps), encoding="utf-8")
-    os._exit(status)
-
-
-def main() -> None:
-    """Serve jobs until the input ends."""
-    type_store()
-    data._parser()  # imports every command
-    gc.collect()
-    gc.freeze()  # or a child that collects garbage copies every page
-    for line in sys.stdin:
-        child = os.fork()
-        if child == 0:
-            try:
-                run(json.loads(line))
-            except BaseException:
-                import traceback
-
-                traceback.print_exc()
-                os._exit(99)
-        _, status = os.waitpid(child, 0)
-        print(os.waitstatus_to_exitcode(status), flush=True)
-
-
-if __name__ == "__main__":
-    main()
+    counted.write_text(str(fault.steps), encoding="utf-8")
+    return status

@@ -1,15 +1,7 @@
-"""Records with stock LeRobot in forked processes that kill themselves.
+"""What processes do that leave corrupted datasets: they record with stock LeRobot, and kill themselves."""
 
-Started once, so that a corrupted dataset costs no import.
-
-Reads one JSON job per line and answers with how the child ended.
-"""
-
-import gc
-import json
 import os
 import signal
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -114,28 +106,3 @@ def run(job: dict[str, Any]) -> None:
             dataset.add_frame(frame(first + job["episodes"], index, video))
         die()
     dataset.finalize()
-
-
-def main() -> None:
-    """Serve jobs until the input ends."""
-    gc.collect()
-    gc.freeze()  # or a child that collects garbage copies every page
-    for line in sys.stdin:
-        child = os.fork()
-        if child == 0:
-            quiet = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(quiet, 1)
-            if os.environ.get("BHD_WRECK_ERRORS") is None:
-                os.dup2(quiet, 2)
-            try:
-                run(json.loads(line))
-            except BaseException:
-                os._exit(1)
-            os._exit(0)
-        print(child, flush=True)
-        _, status = os.waitpid(child, 0)
-        print(os.waitstatus_to_exitcode(status), flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,32 @@
+"""Imported once by the process from which `tests.forks` forks: what programs of this package import when they begin."""
+
+import gc
+
+# Libraries that are imported on first use, so that every child would import them again.
+import av
+import mcap.writer
+import pandas as pd
+import pyarrow.dataset
+import rosbags.rosbag2
+import stable_baselines3
+import torch
+from lerobot.datasets import lerobot_dataset
+from lerobot.scripts import lerobot_record, lerobot_replay
+
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.evaluation import evaluate
+from bhd_lerobot.hub import transfer
+from bhd_lerobot.recording import record
+from bhd_lerobot.rosbag.messages.types import type_store
+from bhd_lerobot.training import train
+from bhd_lerobot.training.rl import train as rl
+
+__all__ = [
+    "av", "evaluate", "lerobot_dataset", "lerobot_record", "lerobot_replay", "mcap", "pd", "pyarrow", "record", "rl",
+    "rosbags", "stable_baselines3", "torch", "train", "transfer",
+]  # fmt: skip
+
+type_store()
+main._parser()  # imports every command
+gc.collect()
+gc.freeze()  # or a child that collects garbage copies every page
