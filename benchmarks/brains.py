@@ -18,7 +18,7 @@ from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import Event, Outcome
 
@@ -74,7 +74,7 @@ def measure(brain: Brain, seeds: list[int]) -> Result:
     """Run a brain on the arenas of these seeds."""
     config = TurtleBot3Config()
     n = min(SIDE_BY_SIDE, len(seeds))
-    simulation = TurtleBot3Simulation(config, n)
+    simulation = BaseSimulation(config, n)
     outcomes = [one.outcome for one in run(simulation, AvoidTask(AvoidConfig(), n, config.fps), brain, seeds)]
     state = simulation.observe().state
     return Result(outcomes, {n: act_ms(brain, simulation.observation_names, state, n) for n in (1, 64)})

@@ -19,7 +19,7 @@ from bhd_lerobot.evaluation.statistics import mean, wilson
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, Outcome
 
@@ -94,7 +94,7 @@ def main() -> int:
 def drive(config: NavigateConfig, seeds: list[int], n: int) -> tuple[list[Outcome], np.ndarray]:
     """Run the brain in the scenes of these seeds, n side by side; return the outcomes, and the times of its calls."""
     robot, brain = TurtleBot3Config(), TimedBrain()
-    episodes = run(TurtleBot3Simulation(robot, n), NavigateTask(config, n, robot.fps), brain, seeds)
+    episodes = run(BaseSimulation(robot, n), NavigateTask(config, n, robot.fps), brain, seeds)
     return [episode.outcome for episode in episodes], np.array(brain.times)
 
 

@@ -36,7 +36,7 @@ from bhd_lerobot.recording.record import record
 from bhd_lerobot.recording.report import RecordResult
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.sim.camera import Camera
@@ -66,7 +66,7 @@ def real_time(folder: Path, robot: str, n: int, episodes: int, *options: str) ->
 def bare_step(robot: str, n: int, simulated_s: float = 20.0) -> float:
     """Return simulated seconds in a second of the physics steps, and of the TurtleBot3 the scans, alone."""
     simulation: Any = (
-        TurtleBot3Simulation(TurtleBot3Config(), n) if robot == "turtlebot3" else UR5Simulation(UR5Config(), n)
+        BaseSimulation(TurtleBot3Config(), n) if robot == "turtlebot3" else UR5Simulation(UR5Config(), n)
     )
     fps = simulation.rates.fps
     task = AvoidTask(AvoidConfig(), n, fps) if robot == "turtlebot3" else PickTask(PickConfig(), n, fps)
@@ -83,9 +83,9 @@ def bare_step(robot: str, n: int, simulated_s: float = 20.0) -> float:
     return n * simulated_s / (time.perf_counter() - started)
 
 
-def make_scene() -> TurtleBot3Simulation:
+def make_scene() -> BaseSimulation:
     """Return a simulation in a random arena."""
-    simulation = TurtleBot3Simulation(TurtleBot3Config())
+    simulation = BaseSimulation(TurtleBot3Config())
     simulation.reset(np.zeros(1, int), [AvoidTask(AvoidConfig(), 1, 10).sample(0)], [0])
     return simulation
 

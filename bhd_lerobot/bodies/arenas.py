@@ -4,7 +4,7 @@ Every arena is closed, all of it that the robot's centre can be in is connected,
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -101,18 +101,24 @@ def make_arena(name: str, seed: int, random_start: bool = False) -> Arena:
     Raises:
         ConfigError: there is no such arena.
     """
-    if name == "random":
-        return random_arena(seed)
-    if name == "turtlebot3_world":
-        arena = turtlebot3_world()
-    elif name == "empty":
-        arena = _closed("empty", 3.0, 3.0, [], (0.0, 0.0, 0.0))
-    else:
+    if name not in ARENAS:
         raise ConfigError(unknown_name("arena", name, ARENAS))
-    return _with_random_start(arena, seed) if random_start else arena
+    arena = ARENAS[name](seed)
+    return _with_random_start(arena, seed) if random_start and name != "random" else arena
 
 
-ARENAS = ("turtlebot3_world", "random", "empty")
+def register_arena(name: str, make: Callable[[int], Arena]) -> None:
+    """Add an arena to those that robots and tasks can choose by name.
+
+    Args:
+        name: its name.
+        make: makes it, given a seed: equal seeds must give equal arenas.
+
+    Raises:
+        ConfigError: another arena has this name.
+    """
+    if ARENAS.setdefault(name, make) is not make:
+        raise ConfigError(f"There is an arena {name!r} already; that of {make.__module__} needs another name.")
 
 
 def turtlebot3_world() -> Arena:
@@ -164,6 +170,10 @@ def random_arena(seed: int) -> Arena:
             vars(arena)["reachable"] = points, arena._reached(clearance)
             return arena
     raise ConfigError(f"No arena could be generated from seed {seed}.")  # 1000 failures in a row
+
+
+def _empty() -> Arena:
+    return _closed("empty", 3.0, 3.0, [], (0.0, 0.0, 0.0))
 
 
 def _with_random_start(arena: Arena, seed: int) -> Arena:
@@ -312,3 +322,11 @@ def _distance(shape: Shape, x: NDArray[np.float64], y: NDArray[np.float64]) -> N
         return outside
     # At a corner; elsewhere one of the two is 0, and what is left is the other.
     return np.hypot(ax, ay, out=outside, where=beside_x & beside_y)
+
+
+ARENAS: dict[str, Callable[[int], Arena]] = {
+    "turtlebot3_world": lambda _: turtlebot3_world(),
+    "random": random_arena,
+    "empty": lambda _: _empty(),
+}
+"""What makes an arena of a seed, by name."""

@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import PositionLimits
-from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, ConfiguredBrain, Observation, find_columns
+from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
 
 _SPEED, _POSITION = ".vel", ".pos"
 
@@ -52,7 +50,7 @@ class NoopBrain(ConfiguredBrain):
     """
 
     name = "noop"
-    robot_type = ANY_ROBOT
+    robot_kind = ANY_ROBOT
 
     def __init__(self, config: BrainConfig | None = None) -> None:
         self.config = config or NoopConfig()
@@ -62,25 +60,19 @@ class NoopBrain(ConfiguredBrain):
         self._sources: NDArray[np.intp] = np.zeros(0, np.intp)
         self._width = 0
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Find the positions among the observations.
 
         Raises:
             ConfigError: an action is neither a speed nor a position that is observed.
         """
-        held = [name for name in action_names if not name.endswith(_SPEED)]
+        held = [name for name in robot.action_names if not name.endswith(_SPEED)]
         odd = [name for name in held if not name.endswith(_POSITION)]
         if odd:
             raise ConfigError(f"The brain {self.name!r} does not know how to hold the action {odd[0]!r}.")
-        self._sources = find_columns(observation_names, held, self.name, "observation")
-        self._targets = find_columns(action_names, held, self.name, "action")
-        self._width = len(action_names)
+        self._sources = find_columns(robot.observation_names, held, self.name, "observation")
+        self._targets = find_columns(robot.action_names, held, self.name, "action")
+        self._width = len(robot.action_names)
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Hold what is seen next."""
@@ -117,31 +109,23 @@ class RandomBrain(NoopBrain):
         self._from = self._to = np.zeros((0, 0))
         self._frame = np.zeros(0, np.int64)
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Find the range of every action.
 
         Raises:
             ConfigError: these are not the actions of a body that it knows.
         """
-        super().bind(observation_names, action_names, fps, environment_names)
-        self._period = max(1, round(self.config.period_s * fps))
-        for body in (turtlebot3_burger(), ur5()):
-            limits = body.limits
-            if tuple(limits.names) == tuple(action_names):
-                speeds = np.array(limits.velocity)
-                bounds = (limits.lower, limits.upper) if isinstance(limits, PositionLimits) else (-speeds, speeds)
-                self._lower, self._upper = np.array(bounds[0]), np.array(bounds[1])
-                return
-        raise ConfigError(
-            f"The brain 'random' knows no range for the actions {', '.join(action_names)}. It drives a turtlebot3, and "
-            "a ur5 with --robot.action_space=joint."
-        )
+        super().bind(robot)
+        self._period = max(1, round(self.config.period_s * robot.fps))
+        limits = None if robot.body is None else robot.body.limits
+        if limits is None or tuple(limits.names) != tuple(robot.action_names):
+            raise ConfigError(
+                f"The brain 'random' knows no range for the actions {', '.join(robot.action_names)}. It drives a "
+                "simulated base, and an arm with --robot.action_space=joint."
+            )
+        speeds = np.array(limits.velocity)
+        bounds = (limits.lower, limits.upper) if isinstance(limits, PositionLimits) else (-speeds, speeds)
+        self._lower, self._upper = np.array(bounds[0]), np.array(bounds[1])
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Start anew from each episode's seed."""

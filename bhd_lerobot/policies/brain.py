@@ -8,6 +8,7 @@ import draccus
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.errors import ConfigError
 
@@ -51,7 +52,7 @@ else:
 
 
 ANY_ROBOT = "any"
-"""What a brain for every robot has as its `robot_type`."""
+"""What a brain for every robot has as its `robot_kind`."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,25 @@ class Observation:
     running: NDArray[np.bool_] | None = None
 
 
+@dataclass(frozen=True)
+class RobotFeatures:
+    """What a brain needs to know of the robots that it will drive.
+
+    Attributes:
+        observation_names: features of the observation's floats, in order.
+        action_names: features of the action, in order.
+        fps: frames a second [Hz].
+        environment_names: names of what the task reports to the brain, in order; empty if nothing.
+        body: the robot's hardware; None if it is not known.
+    """
+
+    observation_names: Sequence[str]
+    action_names: Sequence[str]
+    fps: int
+    environment_names: Sequence[str] = ()
+    body: Body | None = None
+
+
 class Brain(Protocol):
     """A rule or a network that drives n robots.
 
@@ -83,21 +103,15 @@ class Brain(Protocol):
     """
 
     name: str
-    robot_type: str
-    """The robots that it is for; `ANY_ROBOT` if it finds out when it is bound."""
+    robot_kind: str
+    """The robots that it is for: ``"base"``, ``"arm"``, or `ANY_ROBOT` if it finds out when it is bound."""
     uses_images: bool
     """Whether `act` uses the observation's images. If not, it is not kept waiting for them and may not get any."""
     has_plan: bool
     """Whether it works step by step, and `subtasks` and `plan` say what it does."""
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
-        """Learn the order of the features that it will see and command, and the frame rate [Hz].
+    def bind(self, robot: RobotFeatures) -> None:
+        """Learn what robot it will drive.
 
         Raises:
             ConfigError: a feature that the brain needs is missing.

@@ -90,7 +90,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     n = 1 if config.robot.clock == "realtime" or not is_here else min(config.n_envs, config.dataset.num_episodes)
     simulation = make_robot(config.robot, n, config.threads)
     # Innermost first: what is recorded is finalised, then the signals' handlers come back, then the renderer is freed.
-    marks = Marks(n, outcomes_of(config.task.get_choice_name(type(config.task)), config.robot.type))
+    marks = Marks(n, outcomes_of(config.task.get_choice_name(type(config.task))))
     pressed = EstopInputs(simulation.bridge.estop, marks.on_key)
     with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)

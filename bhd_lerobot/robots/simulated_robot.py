@@ -5,7 +5,7 @@ import weakref
 from abc import abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from lerobot.robots.robot import Robot
@@ -40,6 +40,7 @@ class SimulatedRobot(Robot):
     once, and a robot that gets no command for too long decelerates and holds.
     """
 
+    simulation_class: ClassVar[type[Simulation]]
     config: Any
 
     def __init__(self, config: Any) -> None:
@@ -56,9 +57,11 @@ class SimulatedRobot(Robot):
     def __str__(self) -> str:
         return self.name if self.id is None else f"{self.name} {self.id!r}"
 
-    @abstractmethod
     def make_simulation(self) -> Simulation:
         """Return a new simulation of one robot."""
+        simulation: Any = self.simulation_class
+        made: Simulation = simulation(self.config)
+        return made
 
     @abstractmethod
     def make_scene(self) -> Any:

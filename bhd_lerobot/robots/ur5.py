@@ -26,6 +26,7 @@ class UR5(SimulatedRobot):
     """
 
     config_class = UR5Config
+    simulation_class = UR5Simulation
     name = "ur5"
 
     def __init__(self, config: UR5Config) -> None:
@@ -36,10 +37,6 @@ class UR5(SimulatedRobot):
         elif config.scene == "pick":
             self._task = PickTask(PickConfig(), 1, config.fps)
         self._scene: TableScene | None = None
-
-    def make_simulation(self) -> UR5Simulation:
-        """Return a new simulation of one robot."""
-        return UR5Simulation(self.config)
 
     def make_scene(self) -> TableScene:
         """Return the configured scene."""

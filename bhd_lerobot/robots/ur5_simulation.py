@@ -79,6 +79,7 @@ class UR5Simulation(Simulation):
         planning: who plans goals; they are planned in the tick that they start in if None.
     """
 
+    robot_kind = "arm"
     action_names = JOINT_ACTIONS
 
     def __init__(

@@ -13,7 +13,7 @@ from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.robots.faults import add_faults
 from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
@@ -58,7 +58,7 @@ class EpisodeLoop:
         self.simulation, self.task, self.brain = simulation, task, brain
         self.tolerance = tolerance or TimingTolerance()
         self.emergency_stop = False
-        self.marks = Marks(simulation.n, outcomes_of(task.name, task.robot_type))
+        self.marks = Marks(simulation.n, outcomes_of(task.name))
         self._last_frame = -1  # number of the last frame on the wall clock
         self._open_images: Callable[[], Any] | None = None
         self._frames = max(1, round(task.duration_s * simulation.rates.fps))
@@ -69,7 +69,15 @@ class EpisodeLoop:
         self._truth: Any = None
         self._results: Mapping[int, Sequence[CommandResult]] = {}
         environment = task.environment_names
-        brain.bind(simulation.observation_names, simulation.action_names, simulation.rates.fps, environment)
+        brain.bind(
+            RobotFeatures(
+                simulation.observation_names,
+                simulation.action_names,
+                simulation.rates.fps,
+                environment,
+                simulation.body,
+            )
+        )
 
     def run(
         self,

@@ -68,7 +68,7 @@ class AvoidTask(ConfiguredTask):
     """
 
     name = "avoid"
-    robot_type = "turtlebot3"
+    robot_kind = "base"
     environment_names: tuple[str, ...]
 
     def __init__(self, config: AvoidConfig, n: int, fps: int) -> None:

@@ -100,7 +100,7 @@ class NavigateTask(ConfiguredTask):
     """
 
     name = "navigate"
-    robot_type = "turtlebot3"
+    robot_kind = "base"
     environment_names: tuple[str, ...] = ENVIRONMENT
 
     def __init__(self, config: NavigateConfig, n: int, fps: int) -> None:

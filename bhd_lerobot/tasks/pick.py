@@ -85,7 +85,7 @@ class PickTask(ConfiguredTask):
     """
 
     name = "pick"
-    robot_type = "ur5"
+    robot_kind = "arm"
     environment_names = ENVIRONMENT
 
     def __init__(self, config: PickConfig, n: int, fps: int) -> None:

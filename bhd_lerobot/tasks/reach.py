@@ -68,7 +68,7 @@ class ReachTask(ConfiguredTask):
     """
 
     name = "reach"
-    robot_type = "ur5"
+    robot_kind = "arm"
     environment_names = ENVIRONMENT
 
     def __init__(self, config: ReachConfig, n: int, fps: int) -> None:

@@ -49,21 +49,19 @@ OUTCOMES = tuple(event.cause for event in Event if event not in (Event.NOTHING, 
 _NEVER: dict[str, tuple[Event, ...]] = {
     "avoid": (Event.WRONG_OBJECT, Event.DROPPED, Event.UNREACHABLE),
     "navigate": (Event.WRONG_OBJECT, Event.DROPPED),
-    "turtlebot3": (Event.WRONG_OBJECT, Event.DROPPED),
     "reach": (Event.WRONG_OBJECT, Event.DROPPED, Event.STUCK),
     "pick": (Event.STUCK,),
 }
-"""What cannot happen in a task, or to a robot: a base holds nothing, and only a base gets stuck."""
+"""What cannot happen in a task: a base holds nothing, and only a base gets stuck."""
 
 
-def outcomes_of(task: str | None, robot: str | None) -> tuple[str, ...]:
+def outcomes_of(task: str | None) -> tuple[str, ...]:
     """Return what an episode can end with, by name, whoever says so.
 
     Args:
         task: the task's type; None if it is not known.
-        robot: the robot's type; None if it is not known.
     """
-    never = {event.cause for name in (task, robot) if name is not None for event in _NEVER.get(name, ())}
+    never = {event.cause for event in _NEVER.get(task or "", ())}
     return tuple(name for name in OUTCOMES if name not in never)
 
 
@@ -146,13 +144,13 @@ class Task(Protocol):
 
     Attributes:
         name: its name.
-        robot_type: the robot that it is for.
+        robot_kind: the kind of robot that it is for: ``"base"`` or ``"arm"``.
         duration_s: longest duration of an episode [s].
         environment_names: names of what the task reports to the brain, in order; empty if nothing.
     """
 
     name: str
-    robot_type: str
+    robot_kind: str
     duration_s: float
     environment_names: tuple[str, ...]
 

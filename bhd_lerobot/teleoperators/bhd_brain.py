@@ -13,8 +13,8 @@ from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.commands import BrainCommand, Chunk, CommandResult, Goals, Mixed
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.policies.brain import Brain, Observation
-from bhd_lerobot.registry import action_names_of, brains_for, make_brain, robot_of_brain
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
+from bhd_lerobot.registry import action_names_of, brains_for, is_for, make_brain, robot_of_brain, robots_of
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 
@@ -90,7 +90,7 @@ class BhdBrain(Teleoperator):
         """The actions that it gives: those of the robot that it drives, if that is connected already."""
         names = action_names_of(self.config.brain)
         robots = connected_robots()
-        if len(robots) == 1 and robot_of_brain(self.config.brain) in ("", robots[0].name):
+        if len(robots) == 1 and is_for(robot_of_brain(self.config.brain), robots[0].name):
             names = robots[0].action_names
         return dict.fromkeys(names, float)
 
@@ -136,14 +136,16 @@ class BhdBrain(Teleoperator):
             raise DeviceNotConnectedError(f"{self} is not connected. Call connect() first.")
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
-            if robot_of_brain(self.config.brain) not in ("", robot.name):
+            if not is_for(robot_of_brain(self.config.brain), robot.name):
                 raise ConfigError(
                     f"The brain {self._brain_name!r} does not drive a {robot.name}. Choose one that does by "
                     f"--teleop.brain.type: {', '.join(brains_for(robot.name))}."
                 )
             self._brain = make_brain(self.config.brain)
             names, _ = robot.environment
-            self._brain.bind(robot.observation_names, robot.action_names, self.config.fps or robot.config.fps, names)
+            fps = self.config.fps or robot.config.fps
+            body = robot.simulation.body
+            self._brain.bind(RobotFeatures(robot.observation_names, robot.action_names, fps, names, body))
             self._brain.reset(np.zeros(1, np.intp), [self.config.seed], 1, [robot.instruction])
             self._robot, self._streamer, self._results, self._chunk = robot, None, [], []
         seen = robot.last_observation
@@ -212,7 +214,7 @@ class BhdBrain(Teleoperator):
         if len(robots) != 1:
             found = ", ".join(str(robot) for robot in robots) or "none"
             raise ConfigError(
-                f"bhd_brain drives one simulated robot of its own process; connected are: {found}. "
-                "Use --robot.type=turtlebot3 or ur5, and --teleop.robot_id if there are several."
+                f"bhd_brain drives one simulated robot of its own process; connected are: {found}. Use --robot.type="
+                f"{' or '.join(robots_of(''))}, and --teleop.robot_id if there are several."
             )
         return robots[0]

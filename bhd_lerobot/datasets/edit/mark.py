@@ -89,7 +89,7 @@ def mark(
 
 def possible_outcomes(state: DatasetState, row: Row) -> tuple[str, ...]:
     """Return what an episode can have ended with, by its task and its robot; all outcomes if these are unknown."""
-    return outcomes_of(_task_of(state, row), state.info.get("robot_type"))
+    return outcomes_of(_task_of(state, row))
 
 
 def _task_of(state: DatasetState, row: Row) -> str | None:

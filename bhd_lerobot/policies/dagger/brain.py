@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Mixed
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Observation
+from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Observation, RobotFeatures
 from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
 from bhd_lerobot.policies.dagger.takeover import DisagreementWatch, PatienceWatch, StallWatch, Watch, collision_watch
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
@@ -85,7 +85,7 @@ class DaggerBrain:
     """
 
     name = "dagger"
-    robot_type = ANY_ROBOT
+    robot_kind = ANY_ROBOT
 
     def __init__(self, config: DaggerConfig, learner: Brain, expert: Brain) -> None:
         self.config, self.learner, self.expert = config, learner, expert
@@ -97,7 +97,6 @@ class DaggerBrain:
                 f"brain.disagreement compares setpoints, and the expert {expert.name!r} gives goals. Leave it out; "
                 "brain.collision_s, brain.stall_s and brain.patience_s say when it takes over."
             )
-        self.robot_type = robot_of_both(learner.robot_type, expert.robot_type)
         self.uses_images = learner.uses_images or expert.uses_images
         self.has_plan = expert.has_plan
         self._watches: list[Watch] = []
@@ -109,32 +108,28 @@ class DaggerBrain:
         self._causes: list[str] = []
         self._shown: NDArray[np.bool_] = np.zeros(0, np.bool_)
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Bind learner and expert, and find what is to be watched."""
         config = self.config
-        self.learner.bind(observation_names, action_names, fps, environment_names)
-        (self._goals or self.expert).bind(observation_names, action_names, fps, environment_names)
-        self._width = len(action_names)
+        self.learner.bind(robot)
+        (self._goals or self.expert).bind(robot)
+        self._width = len(robot.action_names)
 
         def frames(time_s: float) -> int:
-            return max(1, round(time_s * fps))
+            return max(1, round(time_s * robot.fps))
 
         self._hold = None if config.hold_s is None else frames(config.hold_s)
         self._watches, self._collision = [], None
         if config.collision_s is not None:
-            self._collision = collision_watch(config.collision_s, observation_names, action_names, fps)
+            self._collision = collision_watch(
+                config.collision_s, robot.observation_names, robot.action_names, robot.fps
+            )
             self._watches.append(self._collision)
         if config.disagreement is not None:
-            watch = DisagreementWatch(config.disagreement, frames(config.disagreement_s), action_names)
+            watch = DisagreementWatch(config.disagreement, frames(config.disagreement_s), robot.action_names)
             self._watches.append(watch)
         if config.stall_s is not None:
-            self._watches.append(StallWatch(frames(config.stall_s), observation_names, fps))
+            self._watches.append(StallWatch(frames(config.stall_s), robot.observation_names, robot.fps))
         if config.patience_s is not None:
             self._watches.append(PatienceWatch(frames(config.patience_s)))
 
@@ -230,17 +225,6 @@ class DaggerBrain:
                 self._driving[sim], self._driven[sim], self._causes[sim] = True, 0, watch.cause
                 if self._goals is not None:
                     self._goals.take_over(sim)
-
-
-def robot_of_both(learner: str, expert: str) -> str:
-    """Return the robot that learner and expert drive.
-
-    Raises:
-        ConfigError: they drive different ones.
-    """
-    if ANY_ROBOT not in (learner, expert) and learner != expert:
-        raise ConfigError(f"brain.learner drives a {learner}, but brain.expert drives a {expert}.")
-    return expert if learner == ANY_ROBOT else learner
 
 
 def _setpoints(decision: Any, name: str, who: str) -> Array:

@@ -11,7 +11,7 @@ from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
-from bhd_lerobot.policies.brain import Observation, find_columns
+from bhd_lerobot.policies.brain import Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
 from bhd_lerobot.policies.manipulation.grasp import SeenObject, read_objects
 
@@ -100,25 +100,19 @@ class GoalExpert:
         self._turns: list[_Turn] = []
         self._most_idle = 1
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Find the joints, and the objects if there are any."""
-        self.brain.bind(observation_names, action_names, fps, environment_names)  # type: ignore[attr-defined]
+        self.brain.bind(robot)  # type: ignore[attr-defined]
         *joints, gripper = self._names
-        self._joints = find_columns(observation_names, joints, self.brain.name, "observation")
+        self._joints = find_columns(robot.observation_names, joints, self.brain.name, "observation")
         speeds = [name.replace(".pos", ".vel") for name in joints]
-        self._speeds = find_columns(observation_names, speeds, self.brain.name, "observation")
-        self._opening = int(find_columns(observation_names, [gripper], self.brain.name, "observation")[0])
+        self._speeds = find_columns(robot.observation_names, speeds, self.brain.name, "observation")
+        self._opening = int(find_columns(robot.observation_names, [gripper], self.brain.name, "observation")[0])
         wanted = [f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS]
         self._objects = None
-        if set(wanted) <= set(environment_names):
-            self._objects = find_columns(environment_names, wanted, self.brain.name, "environment")
-        self._most_idle = max(1, round(_IDLE_S * fps))
+        if set(wanted) <= set(robot.environment_names):
+            self._objects = find_columns(robot.environment_names, wanted, self.brain.name, "environment")
+        self._most_idle = max(1, round(_IDLE_S * robot.fps))
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Start episodes."""

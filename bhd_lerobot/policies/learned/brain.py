@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Observation
+from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Observation, RobotFeatures
 from bhd_lerobot.policies.learned.contract import WEIGHT_FILES, PolicyContract, find_checkpoint
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class LearnedBrain:
     """
 
     name = "learned"
-    robot_type = ANY_ROBOT
+    robot_kind = ANY_ROBOT
     has_plan = False
 
     def __init__(self, config: LearnedBrainConfig) -> None:
@@ -83,7 +83,6 @@ class LearnedBrain:
         folder = find_checkpoint(config.path)
         self.contract = PolicyContract.load(folder)
         self.loaded = load_policy(folder, config.device, config.n_action_steps)
-        self.robot_type = self.contract.robot_type or ANY_ROBOT
         self.uses_images = bool(self.loaded.cameras)
         self.inference = make_inference(self.loaded, sample=config.sample, exact=config.exact, threads=config.threads)
         if config.stream and self.inference.steps == 1:
@@ -113,13 +112,7 @@ class LearnedBrain:
             return ANY_ROBOT
         return PolicyContract.load(config.path).robot_type or ANY_ROBOT
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Check that these are the features and the rate that the policy was trained on.
 
         Raises:
@@ -129,10 +122,10 @@ class LearnedBrain:
         inputs = self.loaded.inputs
         has_environment = _ENVIRONMENT in inputs
         self.contract.check(
-            observation_names if _STATE in inputs else None,
-            action_names,
-            fps,
-            environment_names if has_environment else None,
+            robot.observation_names if _STATE in inputs else None,
+            robot.action_names,
+            robot.fps,
+            robot.environment_names if has_environment else None,
             who=who,
         )
         if not self.contract.is_known:
@@ -141,7 +134,11 @@ class LearnedBrain:
                 "checked, not which they are, nor the robot, nor the frame rate.",
                 who,
             )
-        for key, names in ((_STATE, observation_names), (_ENVIRONMENT, environment_names), (_ACTION, action_names)):
+        for key, names in (
+            (_STATE, robot.observation_names),
+            (_ENVIRONMENT, robot.environment_names),
+            (_ACTION, robot.action_names),
+        ):
             width = self.loaded.width(key)
             if (key in inputs or key == _ACTION) and width not in (None, len(names)):
                 raise ConfigError(
@@ -149,7 +146,7 @@ class LearnedBrain:
                     f"{', '.join(names[:6]) or 'none'}{', …' if len(names) > 6 else ''}. Use the robot options and the "
                     "task of its dataset."
                 )
-        self._action_names = tuple(action_names)
+        self._action_names = tuple(robot.action_names)
         self._next = np.zeros(0, np.int64)
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:

@@ -52,7 +52,7 @@ class GoalBrain(ConfiguredBrain, ABC):
     A subclass decides in `_decide` what comes next; it is called at the start and whenever a goal has ended.
     """
 
-    robot_type = "ur5"
+    robot_kind = "arm"
     has_plan = True
 
     def __init__(self) -> None:

@@ -11,7 +11,7 @@ from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import InstructionError
-from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns
+from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain, GoalBrainConfig
 from bhd_lerobot.policies.manipulation.grasp import (
     Grasp,
@@ -79,17 +79,11 @@ class PickBrain(GoalBrain):
         self._columns: NDArray[np.intp] = np.zeros(0, np.intp)
         self._opening = 0
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Find the objects and the gripper."""
         wanted = [f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS]
-        self._columns = find_columns(environment_names, wanted, self.name, "environment")
-        self._opening = int(find_columns(observation_names, ["gripper.pos"], self.name, "observation")[0])
+        self._columns = find_columns(robot.environment_names, wanted, self.name, "environment")
+        self._opening = int(find_columns(robot.observation_names, ["gripper.pos"], self.name, "observation")[0])
 
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the plan of one simulation, how far it got, and what was in the way."""

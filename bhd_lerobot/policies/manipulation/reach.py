@@ -1,7 +1,6 @@
 """The scripted brain of the reach task."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
-from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns
+from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain, GoalBrainConfig
 
 _TARGET = tuple(f"target_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
@@ -38,15 +37,9 @@ class ReachBrain(GoalBrain):
         self._tries: dict[int, int] = {}
         self._home = ur5().home
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Find the target."""
-        self._columns = find_columns(environment_names, _TARGET, self.name, "environment")
+        self._columns = find_columns(robot.environment_names, _TARGET, self.name, "environment")
 
     def _begin(self, sim: int, seed: int, instruction: str) -> None:
         self._tries[sim] = 0

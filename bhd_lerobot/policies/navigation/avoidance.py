@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, find_columns, find_scan
+from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns, find_scan
 
 _ROUNDING = 1e-6  # [m]
 
@@ -50,7 +50,7 @@ class AvoidanceBrain(ConfiguredBrain):
     """
 
     name = "avoidance"
-    robot_type = "turtlebot3"
+    robot_kind = "base"
 
     def __init__(self, config: AvoidanceConfig | None = None) -> None:
         self.config = config or AvoidanceConfig()
@@ -59,18 +59,12 @@ class AvoidanceBrain(ConfiguredBrain):
         self._forward = self._turn = 0
         self._width = 0
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Find the scan and the twist."""
-        self._scan, angles = find_scan(observation_names, self.name)
+        self._scan, angles = find_scan(robot.observation_names, self.name)
         self._front = np.abs(angles) <= math.radians(self.config.front_sector_deg) + 1e-9
-        self._forward, self._turn = find_columns(action_names, ("x.vel", "theta.vel"), self.name, "action")
-        self._width = len(action_names)
+        self._forward, self._turn = find_columns(robot.action_names, ("x.vel", "theta.vel"), self.name, "action")
+        self._width = len(robot.action_names)
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Nothing to forget: the rule has no memory."""

@@ -1,6 +1,5 @@
 """What brains have in common that drive along free paths: parameters, inputs and the twist."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError, check_positive
-from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, find_columns
+from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.navigation.clearance import LONGEST, Paths
 from bhd_lerobot.policies.navigation.scan import ScanReader
 from bhd_lerobot.policies.navigation.steering import Steering
@@ -70,26 +69,20 @@ class DrivingConfig(BrainConfig):
 class DrivingBrain(ConfiguredBrain):
     """Reads a scan and the measured twist, and commands a twist along one of `_paths`, for `_n` robots."""
 
-    robot_type = "turtlebot3"
+    robot_kind = "base"
     has_narrow = True
     """Whether it drives through places with less room than usual, which needs a table of its own."""
     config: Any
     _paths: Paths
     _n: int
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Find the scan and the twist, and prepare the look-up table for this number of beams."""
         config = self.config
-        self._reader = ScanReader(observation_names, self.name, (config.range_min_m, config.range_max_m))
-        self._measured = find_columns(observation_names, _TWIST, self.name, "observation")
-        self._commanded = find_columns(action_names, _TWIST, self.name, "action")
-        self._width, self._dt = len(action_names), 1.0 / fps
+        self._reader = ScanReader(robot.observation_names, self.name, (config.range_min_m, config.range_max_m))
+        self._measured = find_columns(robot.observation_names, _TWIST, self.name, "observation")
+        self._commanded = find_columns(robot.action_names, _TWIST, self.name, "action")
+        self._width, self._dt = len(robot.action_names), 1.0 / robot.fps
         self._steering = Steering(
             self._paths,
             self._reader,

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError, check_positive
-from bhd_lerobot.policies.brain import BrainConfig, Observation
+from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.clearance import HALF_TRACK, QUANTUM, SPACING, make_paths
 from bhd_lerobot.policies.navigation.driving import PLACE_SPACING, DrivingBrain, DrivingConfig
 from bhd_lerobot.policies.navigation.steering import keep_heading, wrap
@@ -92,16 +92,10 @@ class GapFollowerBrain(DrivingBrain):
         self._weight, self._all = weight[:, None] * moved, float(weight.sum())
         self.reset(np.zeros(0, np.intp), [], 0)
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Find the scan and the twist, and prepare the look-up table for this number of beams."""
-        super().bind(observation_names, action_names, fps, environment_names)
-        self._memory_frames = max(1, round(min(self.config.memory_s * fps, 2**29)))
+        super().bind(robot)
+        self._memory_frames = max(1, round(min(self.config.memory_s * robot.fps, 2**29)))
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Forget where the robots have been; the seeds are not used, the rule draws nothing."""

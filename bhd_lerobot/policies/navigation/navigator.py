@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError, check_positive
-from bhd_lerobot.policies.brain import BrainConfig, Observation, find_columns
+from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.navigation.clearance import (
     HALF_TRACK,
     HEADINGS,
@@ -110,17 +110,11 @@ class NavigatorBrain(DrivingBrain):
         self._spot = np.array([np.flatnonzero(spot & (number == k))[0] for k in range(HEADINGS)])
         self.reset(np.zeros(0, np.intp), [], 0)
 
-    def bind(
-        self,
-        observation_names: Sequence[str],
-        action_names: Sequence[str],
-        fps: int,
-        environment_names: Sequence[str] = (),
-    ) -> None:
+    def bind(self, robot: RobotFeatures) -> None:
         """Find the scan, the twist and the goal, and prepare the look-up table for this number of beams."""
-        super().bind(observation_names, action_names, fps, environment_names)
-        self._goal_columns = find_columns(environment_names, GOAL, self.name, "environment")
-        self._replan_frames = max(1, round(min(self.config.replan_s * fps, 2**29)))
+        super().bind(robot)
+        self._goal_columns = find_columns(robot.environment_names, GOAL, self.name, "environment")
+        self._replan_frames = max(1, round(min(self.config.replan_s * robot.fps, 2**29)))
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Forget what was seen; the seeds are not used, the rule draws nothing."""

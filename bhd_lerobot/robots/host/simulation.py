@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,6 +108,7 @@ class Simulation(ABC):
         bridge: how commands get to the cerebellum; a `LockstepBridge` that steps this simulation if None.
 
     Attributes:
+        robot_kind: what tasks and brains are for: ``"base"`` or ``"arm"``.
         config: the robot's configuration.
         n: how many robots.
         rates: the rates.
@@ -126,6 +127,7 @@ class Simulation(ABC):
         grants: what the real-time process was granted and refused, as plain values; None on the lockstep clock.
     """
 
+    robot_kind: ClassVar[str]
     action_names: tuple[str, ...]
     view = "overview"
     video_speed = 1

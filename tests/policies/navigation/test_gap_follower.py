@@ -12,7 +12,7 @@ from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.clearance import LIDAR_X, QUANTUM, ClearanceTable, Level, make_paths
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
@@ -255,7 +255,7 @@ def test_many_robots_decide_like_each_alone_to_the_last_bit() -> None:
 
 
 def run(brain: Brain, seeds: list[int], n: int, beams: int = 120, seconds: float = 60.0) -> list[Outcome]:
-    simulation = TurtleBot3Simulation(TurtleBot3Config(beams=beams), n)
+    simulation = BaseSimulation(TurtleBot3Config(beams=beams), n)
     loop = EpisodeLoop(simulation, AvoidTask(AvoidConfig(duration_s=seconds, min_path_m=0.0), n, 10), brain)
     return [e.outcome for e in loop.run([EpisodeSpec(index, seed) for index, seed in enumerate(seeds)])]
 
@@ -282,7 +282,7 @@ def test_it_gets_out_of_a_dead_end(beams: int) -> None:
     starts = [(1.3, 0.0, 0.0), (1.1, 0.1, 0.3), (1.1, -0.12, -0.5)]
     arenas = [Arena("dead end", walls, (-2.0, 2.0, -2.0, 2.0), start) for start in starts]
     ids = np.arange(len(starts))
-    simulation = TurtleBot3Simulation(TurtleBot3Config(beams=beams), len(ids))
+    simulation = BaseSimulation(TurtleBot3Config(beams=beams), len(ids))
     brain = GapFollowerBrain()
     brain.bind(simulation.observation_names, simulation.action_names, 10)
     simulation.reset(ids, arenas, [1, 2, 3])

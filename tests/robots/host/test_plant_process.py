@@ -36,7 +36,7 @@ from bhd_lerobot.robots.host.remote_plant import RemoteSimulation, plant_shape
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import WATCHDOGS
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
-from bhd_lerobot.robots.turtlebot3_simulation import TurtleBot3Simulation
+from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.sim.plant import SimulatedPlant
@@ -232,8 +232,8 @@ def test_an_arm_comes_to_rest_and_stays_there_by_itself(actuation: Any) -> None:
 ARENA = make_arena("random", seed=3)
 
 
-def turtlebot3() -> TurtleBot3Simulation:
-    return TurtleBot3Simulation(TurtleBot3Config(odometry=True, imu=True), 1, 1)
+def turtlebot3() -> BaseSimulation:
+    return BaseSimulation(TurtleBot3Config(odometry=True, imu=True), 1, 1)
 
 
 def arm() -> UR5Simulation:
@@ -386,7 +386,7 @@ def test_a_new_scene_forgets_a_stop(kind: str) -> None:
 
 
 def test_the_process_needs_neither_torch_nor_lerobot() -> None:
-    modules = ("host.plant_process", "turtlebot3_simulation", "ur5_simulation")
+    modules = ("host.plant_process", "base_simulation", "ur5_simulation")
     code = "".join(f"import bhd_lerobot.robots.{module}\n" for module in modules)
     code += "import sys; print(sorted({'torch', 'lerobot'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -1,4 +1,4 @@
-"""n simulated TurtleBot3s under one cerebellum."""
+"""n simulated bases on two wheels under one cerebellum."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -16,11 +16,11 @@ from bhd_lerobot.sim.world import World
 from bhd_lerobot.tasks.task import BaseTruth
 
 if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
-    from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+    from bhd_lerobot.robots.config import MobileBaseConfig
 
 
-class TurtleBot3Simulation(Simulation):
-    """n simulated TurtleBot3s.
+class BaseSimulation(Simulation):
+    """n simulated bases.
 
     Args:
         config: the robot.
@@ -28,13 +28,14 @@ class TurtleBot3Simulation(Simulation):
         threads: threads that step the physics; all processors if None.
     """
 
+    robot_kind = "base"
     action_names = ("x.vel", "theta.vel")
     video_speed = 4
 
-    def __init__(self, config: "TurtleBot3Config", n: int = 1, threads: int | None = None) -> None:
+    def __init__(self, config: "MobileBaseConfig", n: int = 1, threads: int | None = None) -> None:
         body = config.body()
         if body.lidar is None:
-            raise AssertionError("The Burger has a lidar.")
+            raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
         world = World(body, n, physics_hz=config.physics_hz, threads=threads)
         self.plant = SimulatedPlant(world)
         self.lidar = Lidar(world, body.lidar, config.beams)
@@ -45,7 +46,7 @@ class TurtleBot3Simulation(Simulation):
             Cerebellum(body, self.plant, config.control_hz, controller=self._controller),
             action_names=self.action_names,
             observation_names=observation_names(config),
-            camera_names=("front",) if config.camera else (),
+            camera_names=tuple(body.cameras) if config.camera else (),
         )
         self._touch = self.world.sensor(body.touch_sensor)[:, 0]
         self._gyro = self.world.sensor("imu_gyro")
@@ -123,7 +124,7 @@ class TurtleBot3Simulation(Simulation):
         self._next_scan = (int(running.min()) if len(running) else self.tick) + self._scan_ticks
 
 
-def observation_names(config: "TurtleBot3Config") -> tuple[str, ...]:
+def observation_names(config: "MobileBaseConfig") -> tuple[str, ...]:
     """Return the names of the observation's floats, in order."""
     names = ["x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(config.beams))]
     if config.odometry:

@@ -1,0 +1,82 @@
+"""Robots, tasks, brains and policies of other packages: imported before a command reads its options.
+
+A plug-in is a distribution whose name follows LeRobot's rule (``lerobot_robot_…``, ``lerobot_policy_…``, and so on),
+one with an entry point of the group `ENTRY_POINTS`, or a module that a command line names with LeRobot's own option
+``--….discover_packages_path``. It registers what it has while it is imported.
+"""
+
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from typing import Any
+
+from bhd_lerobot.errors import ConfigError
+
+ENTRY_POINTS = "bhd_lerobot.plugins"
+"""The group of entry points; each names a module."""
+
+PREFIXES = ("lerobot_robot_", "lerobot_camera_", "lerobot_teleoperator_", "lerobot_policy_", "lerobot_env_")
+"""How the names of distributions begin that LeRobot imports."""
+
+_OPTION = "discover_packages_path"
+_imported: set[str] = set()
+
+
+def load_plugins(report: Callable[[str], object] | None = None) -> None:
+    """Import every plug-in that is installed, once.
+
+    Args:
+        report: called with a sentence for each that cannot be imported, the others are imported all the same; printed
+            on standard error if None.
+    """
+    for name, load in _installed():
+        if name in _imported:
+            continue
+        _imported.add(name)
+        try:
+            load()
+        except Exception as error:  # whatever a module raises while it is imported
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            text = f"The plug-in {name} cannot be imported, and what it has is missing: {reason}"
+            report(text) if report else print(f"warning: {text}", file=sys.stderr)
+
+
+def load_named(arguments: Sequence[str]) -> list[str]:
+    """Import the modules that a command line names; return its other arguments.
+
+    Args:
+        arguments: of the command line; ``--robot.discover_packages_path=my_robots`` names one, by any option in front.
+
+    Raises:
+        ConfigError: a module cannot be imported.
+    """
+    left: list[str] = []
+    rest = list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        option, sign, value = argument.partition("=")
+        if not option.startswith("--") or option.rpartition(".")[2].removeprefix("--") != _OPTION:
+            left.append(argument)
+            continue
+        name = value if sign else (rest.pop(0) if rest else "")
+        try:
+            importlib.import_module(name)
+        except Exception as error:  # whatever a module raises while it is imported, also a name that is none
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise ConfigError(
+                f"{option} names {name!r}, which cannot be imported: {reason}. Give a module that Python finds here, "
+                "installed or in PYTHONPATH."
+            ) from error
+    return left
+
+
+def _installed() -> list[tuple[str, Callable[[], Any]]]:
+    found: dict[str, Callable[[], Any]] = {}
+    for distribution in metadata.distributions():
+        name = str(distribution.metadata["Name"] or "")
+        if name.startswith(PREFIXES):
+            found[name] = lambda name=name: importlib.import_module(name)
+    for entry in metadata.entry_points(group=ENTRY_POINTS):
+        found.setdefault(entry.value, entry.load)
+    return sorted(found.items(), key=lambda item: item[0])

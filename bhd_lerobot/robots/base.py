@@ -1,0 +1,41 @@
+"""A simulated base on two wheels as a LeRobot robot."""
+
+from typing import ClassVar
+
+from bhd_lerobot.bodies.arenas import Arena, make_arena
+from bhd_lerobot.robots.base_simulation import BaseSimulation, observation_names
+from bhd_lerobot.robots.simulated_robot import SimulatedRobot
+
+
+class SimulatedBase(SimulatedRobot):
+    """A base with a lidar. A subclass says its name and its configuration, which says its body.
+
+    Action: `x.vel` [m/s] forward, `theta.vel` [rad/s] counter-clockwise. Observation: the same two as measured by the
+    wheel encoders, `scan_000.pos` and on [m]; by option `x.pos`, `y.pos`, `theta.pos` (wheel odometry), `imu_x.vel`,
+    `imu_y.vel`, `imu_z.vel` (gyroscope), and the images of the body's cameras.
+
+    Args:
+        config: the configuration.
+    """
+
+    simulation_class: ClassVar[type[BaseSimulation]] = BaseSimulation
+
+    def make_scene(self) -> Arena:
+        """Return the configured arena."""
+        return make_arena(self.config.arena, self.config.seed)
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """Names of the observation's floats, in order."""
+        return observation_names(self.config)
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the action's floats, in order."""
+        return self.simulation_class.action_names
+
+    @property
+    def camera_shapes(self) -> dict[str, tuple[int, int, int]]:
+        """Image shapes (height, width, 3) by camera name."""
+        cameras = self.config.body().cameras if self.config.camera else {}
+        return {name: (camera.height, camera.width, 3) for name, camera in cameras.items()}

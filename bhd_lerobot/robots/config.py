@@ -1,0 +1,105 @@
+"""What the configurations of all simulated robots have in common."""
+
+from abc import abstractmethod
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.robots.config import RobotConfig
+
+from bhd_lerobot.bodies.arenas import ARENAS
+from bhd_lerobot.bodies.body import MobileBase, Rates
+from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.robots.host.config import CLOCKS, RealtimeConfig
+from bhd_lerobot.sim.lidar import check_beams
+
+
+@dataclass(kw_only=True)
+class SimulatedRobotConfig(RobotConfig):
+    """Options of every simulated robot.
+
+    Attributes:
+        fps: actions a second [Hz]; one `send_action` advances simulated time by 1 / fps. Record at the same rate.
+        clock: ``"lockstep"``: simulated time, advanced by `send_action`, as fast as the machine can; ``"realtime"``:
+            the wall clock, in processes of its own.
+        require_realtime: with ``clock = "realtime"``, refuse to start if the system does not grant SCHED_FIFO.
+        realtime: how it runs on the wall clock.
+        control_hz: cerebellum ticks a second [Hz], a multiple of fps.
+        physics_hz: physics steps a second [Hz], a multiple of control_hz.
+        seed: seed of the scene and of the sensor noise when the robot is used by itself.
+        camera: observe the robot's cameras as well.
+        camera_width: width of their images [px].
+        camera_height: height of their images [px].
+    """
+
+    fps: int
+    clock: str = "lockstep"
+    require_realtime: bool = False
+    realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
+    control_hz: int
+    physics_hz: int
+    seed: int = 0
+    camera: bool = False
+    camera_width: int = 320
+    camera_height: int = 240
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_choice("clock", CLOCKS)
+        if self.seed < 0:
+            raise ConfigError(f"robot.seed is {self.seed}; seeds start at 0.")
+        _ = self.rates
+
+    def _check_choice(self, name: str, valid: Collection[str]) -> None:
+        if getattr(self, name) not in valid:
+            raise ConfigError(unknown_name(name, getattr(self, name), valid))
+
+    @property
+    def rates(self) -> Rates:
+        """The three rates."""
+        return Rates(self.physics_hz, self.control_hz, self.fps)
+
+    @abstractmethod
+    def body(self) -> Any:
+        """Return the hardware that this configuration describes."""
+
+
+@dataclass(kw_only=True)
+class MobileBaseConfig(SimulatedRobotConfig):
+    """Options of every base on two driven wheels with a lidar. A subclass says what it is made of, in `body`.
+
+    Attributes:
+        arena: where the robot is when it is used by itself: ``"turtlebot3_world"``, ``"random"`` or ``"empty"``. In a
+            task the task decides.
+        beams: range readings in an observation, a divisor of those of the lidar, evenly spaced.
+        lidar_noise_std: standard deviation of the range noise [m]; 0 turns it off.
+        odometry: observe `x.pos`, `y.pos` and `theta.pos` from the wheel encoders as well.
+        imu: observe the angular velocity from the IMU, `imu_x.vel`, `imu_y.vel` and `imu_z.vel`, as well.
+        command_timeout_s: age of the last command at which the robot ramps to rest [s].
+    """
+
+    fps: int = 10
+    control_hz: int = 200
+    physics_hz: int = 200
+    arena: str = "turtlebot3_world"
+    beams: int = 360
+    lidar_noise_std: float = 0.01
+    odometry: bool = False
+    imu: bool = False
+    command_timeout_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check_choice("arena", ARENAS)
+        lidar = self.body().lidar
+        if lidar is None:
+            raise ConfigError(f"The body of {type(self).__name__} has no lidar, which a simulated base needs.")
+        check_beams(self.beams, lidar)
+        if self.control_hz % lidar.rate_hz:
+            raise ConfigError(
+                f"control_hz is {self.control_hz}; it must be a multiple of the lidar's {lidar.rate_hz} Hz."
+            )
+
+    @abstractmethod
+    def body(self) -> MobileBase:
+        """Return the hardware that this configuration describes."""
