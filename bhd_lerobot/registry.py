@@ -211,8 +211,8 @@ def check_brain(key: str, brain: BrainConfig, robot_type: str) -> None:
         raise ConfigError(f"{key}: {error}") from error
     if not is_for(driven, robot_type):
         raise ConfigError(
-            f"{key}.type is {brain.get_choice_name(type(brain))!r}, which drives {_with_article(driven)}; robot.type is "
-            f"{robot_type!r}. Brains for it: {', '.join(brains_for(robot_type))}."
+            f"{key}.type is {brain.get_choice_name(type(brain))!r}, which drives {_with_article(driven)}; robot.type "
+            f"is {robot_type!r}. Brains for it: {', '.join(brains_for(robot_type))}."
         )
 
 

@@ -117,6 +117,7 @@ class LidarSpec:
         range_max: longest range [m]; a beam without a return reads `range_max`.
         rate_hz: scans a second.
         noise_std: standard deviation of the Gaussian range noise [m]; 0 turns it off.
+        ahead: where the site is, ahead of the wheel axis [m].
     """
 
     site: str
@@ -125,6 +126,7 @@ class LidarSpec:
     range_max: float
     rate_hz: int
     noise_std: float
+    ahead: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -271,13 +273,16 @@ class MobileBase(Body):
         touch_sensor: name of the contact sensor that counts touches with the scene.
         radius: radius of the vertical cylinder around the root body's origin that holds the whole robot [m].
         height: height of the robot [m].
+        outline: rectangles around the middle of the wheel axis that together hold the robot, seen from above: rear,
+            front, and half the width of each [m].
     """
 
     drive: WheelDrive
     lidar: LidarSpec | None
     touch_sensor: str = "touch"
-    radius: float = 0.0
-    height: float = 0.0
+    radius: float
+    height: float
+    outline: tuple[tuple[float, float, float], ...]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -86,9 +86,16 @@ def turtlebot3_burger(
             encoder_ticks=4096,
         ),
         lidar=LidarSpec(
-            site="lidar", beams=LIDAR_BEAMS, range_min=0.12, range_max=3.5, rate_hz=5, noise_std=lidar_noise_std
+            site="lidar",
+            beams=LIDAR_BEAMS,
+            range_min=0.12,
+            range_max=3.5,
+            rate_hz=5,
+            noise_std=lidar_noise_std,
+            ahead=-0.032,
         ),
         cameras={"front": CameraSpec("front", camera_width, camera_height)},
         radius=0.124,  # the rear corners of the hull; the outer rims of the tyres are at 0.095 m
         height=0.192,
+        outline=((-0.102, 0.038, 0.070), (-0.033, 0.033, 0.089)),  # hull and wheels, as in turtlebot3_burger.xml
     )

@@ -121,15 +121,13 @@ class DaggerBrain:
         self._hold = None if config.hold_s is None else frames(config.hold_s)
         self._watches, self._collision = [], None
         if config.collision_s is not None:
-            self._collision = collision_watch(
-                config.collision_s, robot.observation_names, robot.action_names, robot.fps
-            )
+            self._collision = collision_watch(config.collision_s, robot)
             self._watches.append(self._collision)
         if config.disagreement is not None:
-            watch = DisagreementWatch(config.disagreement, frames(config.disagreement_s), robot.action_names)
+            watch = DisagreementWatch(config.disagreement, frames(config.disagreement_s), robot)
             self._watches.append(watch)
         if config.stall_s is not None:
-            self._watches.append(StallWatch(frames(config.stall_s), robot.observation_names, robot.fps))
+            self._watches.append(StallWatch(frames(config.stall_s), robot))
         if config.patience_s is not None:
             self._watches.append(PatienceWatch(frames(config.patience_s)))
 

@@ -1,19 +1,16 @@
 """When a learner needs help: it gets nowhere, is about to hit something, takes too long, or differs from the expert."""
 
 import math
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import PositionLimits
-from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.body import Arm, Body, MobileBase, PositionLimits
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation, find_columns, find_scan
-from bhd_lerobot.policies.navigation.clearance import HULL, LIDAR_X, WHEELS
+from bhd_lerobot.policies.brain import Observation, RobotFeatures, find_columns, find_scan
+from bhd_lerobot.policies.navigation.clearance import Footprint
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -24,9 +21,8 @@ _STOP_POSTURES = 6  # along the way on which an arm comes to rest
 _STOP_SHARE = 1.3  # of the way that a stop takes; while it is planned, the arm speeds up for a moment
 _ARC_POINTS = 6  # along the way of a base
 _BASE_ROOM = 0.005  # [m] beside the outline
-_NO_RETURN = 3.49  # [m] a beam that reads more has hit nothing
-_BASE, _ARM = turtlebot3_burger(), ur5()
-_DOF = len(_ARM.limits.names) - 1
+_ROUNDING = 0.01  # [m] a beam that reads its largest range, but for this, has hit nothing
+_TWIST = ("x.vel", "theta.vel")
 
 
 class Watch(Protocol):
@@ -87,20 +83,20 @@ class StallWatch:
 
     Args:
         frames: for so many frames.
-        names: the observation's features.
-        fps: frames a second [Hz].
+        robot: the robot, whose body is known.
 
     Raises:
-        ConfigError: these are not the features of a robot that it knows.
+        ConfigError: it does not observe where it is.
     """
 
     cause = "no progress"
 
-    def __init__(self, frames: int, names: Sequence[str], fps: int) -> None:
-        self._window, self._dt = frames + 1, 1.0 / fps
-        self._is_base = "x.vel" in names
-        wanted = ("x.vel", "theta.vel") if self._is_base else _ARM.limits.names[:-1]
-        self._columns = find_columns(names, wanted, "dagger", "observation")
+    def __init__(self, frames: int, robot: RobotFeatures) -> None:
+        self._window, self._dt = frames + 1, 1.0 / robot.fps
+        self._is_base = isinstance(robot.body, MobileBase)
+        names = _TWIST if self._is_base else _body_of(robot).limits.names[:-1]
+        self._width = 2 if self._is_base else len(names)
+        self._columns = find_columns(robot.observation_names, names, "dagger", "observation")
         self._pose: Array = np.zeros((0, 3))
         self._past: Array = np.zeros((0, 0, 0))
         self._frames = np.zeros(0, np.int64)
@@ -109,7 +105,7 @@ class StallWatch:
         """Begin the learner's turn."""
         if len(self._frames) != n:
             self._frames, self._pose = np.zeros(n, np.int64), np.zeros((n, 3))
-            self._past = np.zeros((n, self._window, 2 if self._is_base else _DOF))
+            self._past = np.zeros((n, self._window, self._width))
         self._frames[ids] = 0
 
     def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
@@ -134,7 +130,7 @@ class DisagreementWatch(_FrameCounter):
     Args:
         share: by more than this share of an action's range,
         frames: for so many frames in a row.
-        names: the action's features.
+        robot: the robot.
 
     Raises:
         ConfigError: the range of an action is not known.
@@ -142,10 +138,18 @@ class DisagreementWatch(_FrameCounter):
 
     cause = "disagreement"
 
-    def __init__(self, share: float, frames: int, names: Sequence[str]) -> None:
+    def __init__(self, share: float, frames: int, robot: RobotFeatures) -> None:
         self._share, self._most = share, frames
         super().__init__()
-        self._range = _ranges(names)
+        limits = None if robot.body is None else robot.body.limits
+        if limits is None or tuple(limits.names) != tuple(robot.action_names):
+            raise ConfigError(
+                "brain.disagreement is a share of an action's range, which is not known of "
+                f"{', '.join(robot.action_names)}. Leave it out, or drive a simulated base, or an arm with "
+                "--robot.action_space=joint."
+            )
+        is_arm = isinstance(limits, PositionLimits)
+        self._range = np.array(limits.upper) - np.array(limits.lower) if is_arm else 2 * np.array(limits.velocity)
 
     def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Count the frames of disagreement."""
@@ -161,16 +165,18 @@ class BaseCollisionWatch:
 
     Args:
         horizon_s: within this time [s].
-        observed: the observation's features.
-        actions: the action's features.
+        robot: the robot.
+        body: its body, with a lidar.
     """
 
     cause = "about to collide"
 
-    def __init__(self, horizon_s: float, observed: Sequence[str], actions: Sequence[str]) -> None:
-        self._scan, self._angles = find_scan(observed, "dagger")
-        self._twist = find_columns(actions, ("x.vel", "theta.vel"), "dagger", "action")
-        self._limit = np.array(_BASE.limits.velocity)
+    def __init__(self, horizon_s: float, robot: RobotFeatures, body: MobileBase) -> None:
+        assert body.lidar is not None
+        self._scan, self._angles = find_scan(robot.observation_names, "dagger")
+        self._twist = find_columns(robot.action_names, _TWIST, "dagger", "action")
+        self._limit = np.array(body.limits.velocity)
+        self._footprint, self._no_return = Footprint.of(body), body.lidar.range_max - _ROUNDING
         self._times = horizon_s * np.arange(1, _ARC_POINTS + 1) / _ARC_POINTS
 
     def restart(self, ids: NDArray[np.intp], n: int) -> None:
@@ -179,8 +185,8 @@ class BaseCollisionWatch:
     def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Compare the robot's outline on its way with what the scan shows."""
         ranges = seen.state[:, self._scan]
-        is_hit = (ranges > 0) & (ranges < _NO_RETURN)
-        x = LIDAR_X + ranges * np.cos(self._angles)
+        is_hit = (ranges > 0) & (ranges < self._no_return)
+        x = self._footprint.lidar_x + ranges * np.cos(self._angles)
         y = ranges * np.sin(self._angles)
         twist = np.clip(wanted[:, self._twist], -self._limit, self._limit)
         danger = np.zeros(len(ranges), np.bool_)
@@ -192,7 +198,7 @@ class BaseCollisionWatch:
             cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
             dx, dy = x - ahead[:, None], y - aside[:, None]
             along, across = cos * dx + sin * dy, np.abs(cos * dy - sin * dx)
-            for rear, front, half in (HULL, WHEELS):
+            for rear, front, half in self._footprint.outline:
                 inside = (along > rear - _BASE_ROOM) & (along < front + _BASE_ROOM) & (across < half + _BASE_ROOM)
                 danger |= (inside & is_hit).any(axis=1)
         return danger
@@ -202,24 +208,23 @@ class ArmCollisionWatch:
     """The arm could not come to rest any more before it touches the table or itself.
 
     Args:
-        observed: the observation's features.
-        actions: the action's features; if they are not joint positions, only what the arm does now counts.
-        fps: frames a second [Hz].
+        robot: the robot; if its actions are not joint positions, only what the arm does now counts.
+        body: its body.
     """
 
     cause = "about to collide"
 
-    def __init__(self, observed: Sequence[str], actions: Sequence[str], fps: int) -> None:
-        joints = _ARM.limits.names[:_DOF]
-        self._position = find_columns(observed, joints, "dagger", "observation")
+    def __init__(self, robot: RobotFeatures, body: Arm) -> None:
+        limits, dof = body.limits, len(body.chain.joints)
+        joints, actions = limits.names[:dof], robot.action_names
+        self._position = find_columns(robot.observation_names, joints, "dagger", "observation")
         speeds = [name.replace(".pos", ".vel") for name in joints]
-        self._velocity = find_columns(observed, speeds, "dagger", "observation")
+        self._velocity = find_columns(robot.observation_names, speeds, "dagger", "observation")
         self._actions = find_columns(actions, joints, "dagger", "action") if set(joints) <= set(actions) else None
-        self._model, self._fps = ArmKinematics(_ARM.chain, _ARM.limits).collision, fps
-        limits = _ARM.limits
-        self._speed, self._change = np.array(limits.velocity[:_DOF]), np.array(limits.acceleration[:_DOF])
-        self._delay = self._change / np.array(limits.jerk[:_DOF])
-        self._least = _ARM.chain.min_distance
+        self._model, self._fps = ArmKinematics(body.chain, limits).collision, robot.fps
+        self._speed, self._change = np.array(limits.velocity[:dof]), np.array(limits.acceleration[:dof])
+        self._delay = self._change / np.array(limits.jerk[:dof])
+        self._least = body.chain.min_distance
 
     def restart(self, ids: NDArray[np.intp], n: int) -> None:
         """It remembers nothing."""
@@ -243,29 +248,26 @@ class ArmCollisionWatch:
         return np.asarray(near.any(axis=0) & ~(near[0] & leaves))
 
 
-def collision_watch(horizon_s: float, observed: Sequence[str], actions: Sequence[str], fps: int) -> Watch:
-    """Return what watches a robot with these features for collisions.
+def collision_watch(horizon_s: float, robot: RobotFeatures) -> Watch:
+    """Return what watches a robot for collisions.
 
     Raises:
-        ConfigError: there is none for such a robot.
+        ConfigError: its shape is not known.
     """
-    if "x.vel" in actions:
-        return BaseCollisionWatch(horizon_s, observed, actions)
-    if set(_ARM.limits.names) <= set(observed):
-        return ArmCollisionWatch(observed, actions, fps)
+    match robot.body:
+        case MobileBase(lidar=lidar) as base if lidar is not None:
+            return BaseCollisionWatch(horizon_s, robot, base)
+        case Arm() as arm:
+            return ArmCollisionWatch(robot, arm)
     raise ConfigError(
-        f"brain.collision_s foresees collisions of a turtlebot3 and of a ur5, not of a robot with the actions "
-        f"{', '.join(actions)}. Leave it out: --brain.collision_s=null."
+        "brain.collision_s foresees collisions of simulated arms and of simulated bases with a lidar, not of a robot "
+        f"with the actions {', '.join(robot.action_names)}. Leave it out: --brain.collision_s=null."
     )
 
 
-def _ranges(names: Sequence[str]) -> Array:
-    for limits in (_BASE.limits, _ARM.limits):
-        if tuple(limits.names) == tuple(names):
-            if isinstance(limits, PositionLimits):
-                return np.array(limits.upper) - np.array(limits.lower)
-            return 2 * np.array(limits.velocity)
-    raise ConfigError(
-        f"brain.disagreement is a share of an action's range, which is not known of {', '.join(names)}. Leave it out, "
-        "or drive a turtlebot3, or a ur5 with --robot.action_space=joint."
-    )
+def _body_of(robot: RobotFeatures) -> Body:
+    if robot.body is None:
+        raise ConfigError(
+            "brain.stall_s needs a robot whose joints are known: a simulated one. Leave it out: --brain.stall_s=null."
+        )
+    return robot.body

@@ -11,20 +11,14 @@ Method: C. Schlegel, "Fast local obstacle avoidance under kinematic and dynamic 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.turtlebot3 import WHEEL_SEPARATION
+from bhd_lerobot.bodies.body import MobileBase
 
 Array = NDArray[np.float64]
-
-# The Burger's outline around the wheel axis, as in bodies/turtlebot3_burger.xml: rear, front, half width [m].
-HULL = (-0.102, 0.038, 0.070)
-WHEELS = (-0.033, 0.033, 0.089)
-LIDAR_X = -0.032  # [m] the range finder behind the wheel axis
-HALF_TRACK = WHEEL_SEPARATION / 2  # [m] from the robot's middle to a wheel
 
 HEADINGS = 48  # directions all around
 SPACING = 2 * math.pi / HEADINGS
@@ -34,6 +28,43 @@ QUANTUM = 0.02  # [m] of path, the unit of the table
 LONGEST = 255 * QUANTUM  # [m]
 _BIN = 0.02  # [m] of range
 _ARC_STEP = 0.05  # [m] of arc, between two places where the outline is tested
+
+
+class Footprint(NamedTuple):
+    """What of a base decides where it fits, seen from above.
+
+    Attributes:
+        outline: rectangles around the middle of the wheel axis: rear, front, half the width [m].
+        lidar_x: where the range finder is, ahead of the wheel axis [m].
+        half_track: from the robot's middle to a wheel [m].
+    """
+
+    outline: tuple[tuple[float, float, float], ...]
+    lidar_x: float
+    half_track: float
+
+    @classmethod
+    def of(cls, body: MobileBase) -> Self:
+        """Return the footprint of a base with a lidar."""
+        assert body.lidar is not None
+        return cls(body.outline, body.lidar.ahead, body.drive.wheel_separation / 2)
+
+    def distance(self, x: Array, y: Array) -> Array:
+        """Return the distance from points in the robot's frame to its outline [m], 0 inside."""
+        distance = np.full(x.shape, np.inf)
+        for rear, front, half in self.outline:
+            beyond = np.maximum(np.maximum(rear - x, x - front), 0.0)
+            beside = np.maximum(np.abs(y) - half, 0.0)
+            np.minimum(distance, np.hypot(beyond, beside), out=distance)
+        return distance
+
+    def ahead(self, x: Array, y: Array, room: Array) -> Array:
+        """Return how far the robot can go straight before a point is nearer than `room` [m]."""
+        free = np.full(x.shape, LONGEST)
+        for _, front, half in self.outline:
+            met = (np.abs(y) < half + room) & (x > front)
+            np.minimum(free, np.where(met, np.maximum(x - front - room, 0.0), LONGEST), out=free)
+        return free
 
 
 class Level(NamedTuple):
@@ -60,6 +91,7 @@ class Paths:
         turn: length of the turn [m], shape (K,).
         mirror: number of the path to the other side, shape (K,).
         ratio: full speed as a share of the wheels' highest rim speed.
+        footprint: of the robot.
     """
 
     heading: Array
@@ -67,6 +99,7 @@ class Paths:
     turn: Array
     mirror: NDArray[np.intp]
     ratio: float
+    footprint: Footprint
 
     def points(self, length: Array) -> tuple[Array, Array]:
         """Return x and y of the robot after some lengths [m], each of shape (lengths, K).
@@ -75,7 +108,7 @@ class Paths:
             length: the same for all paths, shape (lengths,), or for each its own, shape (lengths, K).
         """
         length = length[:, None] if length.ndim == 1 else length
-        rate, side = _rate(self.radius, self.ratio), np.sign(self.heading)
+        rate, side = _rate(self.radius, self.ratio, self.footprint.half_track), np.sign(self.heading)
         angle = np.minimum(length / rate, np.abs(self.heading))
         ahead = np.maximum(length - self.turn, 0.0)
         x = self.radius * np.sin(angle) + ahead * np.cos(angle)
@@ -83,17 +116,18 @@ class Paths:
         return x, y
 
 
-def _rate(radius: Array, ratio: float) -> Array:
+def _rate(radius: Array, ratio: float, half_track: float) -> Array:
     """Return the length of a turn by one radian [m/rad]; the outer wheel or the speed limit decides."""
-    return np.maximum(radius, (radius + HALF_TRACK) * ratio)
+    return np.maximum(radius, (radius + half_track) * ratio)
 
 
-def make_paths(full_speed: float, rim_speed: float) -> Paths:
+def make_paths(full_speed: float, rim_speed: float, footprint: Footprint) -> Paths:
     """Return the paths of all families.
 
     Args:
         full_speed: forward speed when driving straight [m/s].
         rim_speed: highest speed of a wheel's rim [m/s].
+        footprint: of the robot.
     """
     steps: list[int] = []
     radius: list[float] = []
@@ -109,7 +143,8 @@ def make_paths(full_speed: float, rim_speed: float) -> Paths:
     mirror = [index.get((-k, r), index[k, r]) for k, r in zip(steps, radius, strict=True)]
     heading, radii = np.array(steps) * SPACING, np.array(radius)
     ratio = full_speed / rim_speed
-    return Paths(heading, radii, np.abs(heading) * _rate(radii, ratio), np.array(mirror, np.intp), ratio)
+    turn = np.abs(heading) * _rate(radii, ratio, footprint.half_track)
+    return Paths(heading, radii, turn, np.array(mirror, np.intp), ratio, footprint)
 
 
 class ClearanceTable:
@@ -129,7 +164,10 @@ class ClearanceTable:
         angle = 2 * np.pi * np.arange(sectors) / sectors
         self._cos, self._sin = np.cos(angle), np.sin(angle)
         self._row = np.arange(sectors) * bins
-        self._tables = _build(paths.ratio, sectors, bins, spread, levels)
+        self._footprint = paths.footprint
+        # Of the rectangles, the one that reaches the farthest back.
+        self._rear, _, self._half = min(paths.footprint.outline)
+        self._tables = _build(paths.footprint, paths.ratio, sectors, bins, spread=spread, levels=levels)
 
     def rows(self, ranges: Array) -> NDArray[np.intp]:
         """Return where to look up the ranges [m] of a scan, shape (n, sectors)."""
@@ -141,19 +179,20 @@ class ClearanceTable:
 
     def behind(self, ranges: Array) -> Array:
         """Return the room straight behind the hull [m], infinite where nothing is, shape (n,)."""
-        rear, _, half = HULL
-        x, y = LIDAR_X + ranges * self._cos, ranges * self._sin
-        return np.where((x < rear) & (np.abs(y) < half + 0.01), rear - x, np.inf).min(axis=1)
+        x, y = self._footprint.lidar_x + ranges * self._cos, ranges * self._sin
+        return np.where((x < self._rear) & (np.abs(y) < self._half + 0.01), self._rear - x, np.inf).min(axis=1)
 
 
 @lru_cache(maxsize=4)
-def _build(ratio: float, sectors: int, bins: int, spread: float, levels: tuple[Level, ...]) -> list[NDArray[np.uint8]]:
+def _build(
+    footprint: Footprint, ratio: float, sectors: int, bins: int, *, spread: float, levels: tuple[Level, ...]
+) -> list[NDArray[np.uint8]]:
     """Return a table for each level, shape (sectors * bins, K)."""
-    paths = make_paths(ratio, 1.0)
+    paths = make_paths(ratio, 1.0, footprint)
     reading = (np.arange(bins) + 0.5) * _BIN
     angle = 2 * np.pi * np.arange(sectors)[:, None] / sectors
-    x, y = LIDAR_X + reading * np.cos(angle), reading * np.sin(angle)
-    now = _distance(x, y)
+    x, y = footprint.lidar_x + reading * np.cos(angle), reading * np.sin(angle)
+    now = footprint.distance(x, y)
     rooms = [
         np.minimum(level.margin + reading * math.sin(spread), np.maximum(now - level.slack, 0.0)) for level in levels
     ]
@@ -164,40 +203,21 @@ def _build(ratio: float, sectors: int, bins: int, spread: float, levels: tuple[L
         turned = [np.full(x.shape, LONGEST) for _ in levels]  # where on the arc a point is met
         for step in range(round(math.radians(limit) / SPACING) * parts + 1):
             phi = step * SPACING / parts
-            length = phi * max(radius, (radius + HALF_TRACK) * ratio)
+            length = phi * max(radius, (radius + footprint.half_track) * ratio)
             cos, sin = math.cos(phi), math.sin(phi)
             dx, dy = x - radius * sin, y - radius * (1 - cos)
             px, py = cos * dx + sin * dy, cos * dy - sin * dx  # the points, seen from a robot on the arc
-            distance = _distance(px, py)
+            distance = footprint.distance(px, py)
             for met, room in zip(turned, rooms, strict=True):
                 np.minimum(met, np.where(distance < room, length, LONGEST), out=met)
             if step % parts:
                 continue
             column = np.flatnonzero((paths.radius == radius) & (np.abs(paths.heading - phi) < 1e-9))
             for table, met, room in zip(tables, turned, rooms, strict=True):
-                whole = np.minimum(met, length + _ahead(px, py, room))
+                whole = np.minimum(met, length + footprint.ahead(px, py, room))
                 for k in column:
                     quanta = np.floor(np.minimum(whole, LONGEST) / QUANTUM + 1e-9).astype(np.uint8)
                     if paths.mirror[k] != k:
                         table[:, :, paths.mirror[k]] = quanta[flipped]
                     table[:, :, k] = quanta
     return [table.reshape(sectors * bins, -1) for table in tables]
-
-
-def _ahead(x: Array, y: Array, room: Array) -> Array:
-    """Return how far the robot can go straight before a point is nearer than `room` [m]."""
-    free = np.full(x.shape, LONGEST)
-    for _, front, half in (HULL, WHEELS):
-        met = (np.abs(y) < half + room) & (x > front)
-        np.minimum(free, np.where(met, np.maximum(x - front - room, 0.0), LONGEST), out=free)
-    return free
-
-
-def _distance(x: Array, y: Array) -> Array:
-    """Return the distance from points to the robot's outline [m], 0 inside."""
-    distance = np.full(x.shape, np.inf)
-    for rear, front, half in (HULL, WHEELS):
-        beyond = np.maximum(np.maximum(rear - x, x - front), 0.0)
-        beside = np.maximum(np.abs(y) - half, 0.0)
-        np.minimum(distance, np.hypot(beyond, beside), out=distance)
-    return distance

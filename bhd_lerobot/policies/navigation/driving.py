@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.errors import ConfigError, check_positive
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
-from bhd_lerobot.policies.navigation.clearance import LONGEST, Paths
+from bhd_lerobot.policies.navigation.clearance import LONGEST, Footprint, Paths, make_paths
 from bhd_lerobot.policies.navigation.scan import ScanReader
 from bhd_lerobot.policies.navigation.steering import Steering
 
@@ -77,8 +78,18 @@ class DrivingBrain(ConfiguredBrain):
     _n: int
 
     def bind(self, robot: RobotFeatures) -> None:
-        """Find the scan and the twist, and prepare the look-up table for this number of beams."""
+        """Find the scan and the twist, and prepare the look-up table for this shape and this number of beams.
+
+        Raises:
+            ConfigError: a feature is missing, or the robot's shape is not known.
+        """
         config = self.config
+        if not isinstance(robot.body, MobileBase) or robot.body.lidar is None:
+            raise ConfigError(
+                f"The brain {self.name!r} needs to know the shape of its robot; it drives simulated bases with a lidar."
+            )
+        self._paths = make_paths(config.forward_speed, config.rim_speed, Footprint.of(robot.body))
+        self._prepare(self._paths)
         self._reader = ScanReader(robot.observation_names, self.name, (config.range_min_m, config.range_max_m))
         self._measured = find_columns(robot.observation_names, _TWIST, self.name, "observation")
         self._commanded = find_columns(robot.action_names, _TWIST, self.name, "action")
@@ -93,6 +104,9 @@ class DrivingBrain(ConfiguredBrain):
             range_max=config.range_max_m,
             has_narrow=self.has_narrow,
         )
+
+    def _prepare(self, paths: Paths) -> None:
+        """Compute what follows from the paths alone."""
 
     def _check_count(self, observation: Observation) -> None:
         if len(observation.state) != self._n:

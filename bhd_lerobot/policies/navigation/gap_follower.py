@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError, check_positive
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures
-from bhd_lerobot.policies.navigation.clearance import HALF_TRACK, QUANTUM, SPACING, make_paths
+from bhd_lerobot.policies.navigation.clearance import QUANTUM, SPACING, Paths
 from bhd_lerobot.policies.navigation.driving import PLACE_SPACING, DrivingBrain, DrivingConfig
 from bhd_lerobot.policies.navigation.steering import keep_heading, wrap
 
@@ -77,11 +77,14 @@ class GapFollowerBrain(DrivingBrain):
     has_narrow = False
 
     def __init__(self, config: GapFollowerConfig | None = None) -> None:
-        self.config = config = config or GapFollowerConfig()
-        self._paths = paths = make_paths(config.forward_speed, config.rim_speed)
+        self.config = config or GapFollowerConfig()
+        self.reset(np.zeros(0, np.intp), [], 0)
+
+    def _prepare(self, paths: Paths) -> None:
+        config = self.config
         # What a path's turn takes away from its length, as a share of half a turn on the spot.
         lost = paths.turn - np.abs(paths.heading) * paths.radius
-        self._price = config.turn_weight * lost / (HALF_TRACK * math.pi)
+        self._price = config.turn_weight * lost / (paths.footprint.half_track * math.pi)
         length = PLACE_SPACING * np.arange(1, int(config.horizon_m / PLACE_SPACING + 1e-9) + 1, dtype=np.float64)
         x, y = paths.points(length)
         self._path_x, self._path_y = (x / _CELL).astype(np.float32), (y / _CELL).astype(np.float32)  # (points, K)
@@ -90,7 +93,6 @@ class GapFollowerBrain(DrivingBrain):
         moved = np.hypot(np.diff(x, axis=0, prepend=0.0), np.diff(y, axis=0, prepend=0.0)) > PLACE_SPACING / 2
         weight = np.round(1000 * config.discount ** np.arange(len(length))).astype(np.int16)
         self._weight, self._all = weight[:, None] * moved, float(weight.sum())
-        self.reset(np.zeros(0, np.intp), [], 0)
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the scan and the twist, and prepare the look-up table for this number of beams."""

@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 from bhd_lerobot.errors import ConfigError, check_positive
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.navigation.clearance import (
-    HALF_TRACK,
     HEADINGS,
-    LIDAR_X,
     LONGEST,
     QUANTUM,
     SPACING,
-    make_paths,
+    Paths,
 )
 from bhd_lerobot.policies.navigation.driving import PLACE_SPACING, DrivingBrain, DrivingConfig
 from bhd_lerobot.policies.navigation.goal_map import GoalMap
@@ -91,8 +89,11 @@ class NavigatorBrain(DrivingBrain):
     name = "navigator"
 
     def __init__(self, config: NavigatorConfig | None = None) -> None:
-        self.config = config = config or NavigatorConfig()
-        self._paths = paths = make_paths(config.forward_speed, config.rim_speed)
+        self.config = config or NavigatorConfig()
+        self.reset(np.zeros(0, np.intp), [], 0)
+
+    def _prepare(self, paths: Paths) -> None:
+        config = self.config
         # Places after the turn: before its end, all paths to one side are alike.
         places = int(config.horizon_m / PLACE_SPACING + 1e-9)
         after = PLACE_SPACING * np.append(0.5, np.arange(1, places + 1))
@@ -108,7 +109,6 @@ class NavigatorBrain(DrivingBrain):
         number = np.round(paths.heading / SPACING).astype(np.int64) % HEADINGS
         spot = (paths.radius == 0) | (number == 0)
         self._spot = np.array([np.flatnonzero(spot & (number == k))[0] for k in range(HEADINGS)])
-        self.reset(np.zeros(0, np.intp), [], 0)
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the scan, the twist and the goal, and prepare the look-up table for this number of beams."""
@@ -166,7 +166,8 @@ class NavigatorBrain(DrivingBrain):
         # A scan is up to a frame old.
         smear = np.where(np.isfinite(rate), np.abs(rate), 1e3) * self._dt
         hit &= ranges * smear[:, None] <= _SMEAR
-        px, py = LIDAR_X + ranges * np.cos(self._reader.angles), ranges * np.sin(self._reader.angles)
+        px = self._paths.footprint.lidar_x + ranges * np.cos(self._reader.angles)
+        py = ranges * np.sin(self._reader.angles)
         self._map.mark(*_to_goal(px, py, pose[:, :, None]), hit)
 
     def _plan(self, pose: Array, awake: NDArray[np.bool_]) -> None:
@@ -224,7 +225,8 @@ class NavigatorBrain(DrivingBrain):
         ids = ids[free >= self._paths.turn[path] + distance[ids]]
         beside, away = np.abs(bearing[ids]), distance[ids]
         rate = np.minimum(beside / config.settle_s, config.turn_speed)
-        speed = np.clip(np.minimum(config.rim_speed - HALF_TRACK * rate, away / _BRAKE_S), 0.0, config.forward_speed)
+        rim = config.rim_speed - self._paths.footprint.half_track * rate
+        speed = np.clip(np.minimum(rim, away / _BRAKE_S), 0.0, config.forward_speed)
         forward, turn, heading = motion
         forward[ids] = np.where(beside < _AIM, speed, 0.0)
         turn[ids], heading[ids] = np.copysign(rate, bearing[ids]), bearing[ids]

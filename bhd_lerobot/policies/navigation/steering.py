@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.policies.navigation.clearance import HALF_TRACK, QUANTUM, ClearanceTable, Level, Paths
+from bhd_lerobot.policies.navigation.clearance import QUANTUM, ClearanceTable, Level, Paths
 from bhd_lerobot.policies.navigation.scan import ScanReader
 
 Array = NDArray[np.float64]
@@ -122,9 +122,10 @@ class Steering:
         """
         sims = np.arange(len(best))
         moving, radius = freedom.free[sims, best], self._paths.radius[best]
-        largest = np.where(radius > 0, self._rim_speed / (radius + HALF_TRACK), self._turn_speed)
+        half_track = self._paths.footprint.half_track
+        largest = np.where(radius > 0, self._rim_speed / (radius + half_track), self._turn_speed)
         turn = np.minimum(np.abs(heading) / self._settle, np.minimum(largest, self._turn_speed))
-        forward = np.clip(self._rim_speed - HALF_TRACK * turn, 0.0, self._forward_speed)
+        forward = np.clip(self._rim_speed - half_track * turn, 0.0, self._forward_speed)
         forward *= np.where(freedom.level > 0, _CAREFUL, 1.0)
         forward = np.where(moving & ((radius > 0) | (turn < _SPOT)), forward, 0.0)
         wedged = ~moving & (freedom.clear[sims, best] <= _WEDGED) & (self._table.behind(ranges) > _BACK_ROOM)
