@@ -9,6 +9,7 @@ from typing import Any
 
 from lerobot.robots.config import RobotConfig
 
+from bhd_lerobot.bodies.catalogue import BODIES
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig
@@ -91,7 +92,9 @@ def register_robot[T: type[SimulatedRobot]](robot: T) -> T:
     Raises:
         ConfigError: another robot has this name.
     """
-    _register(RobotConfig, ROBOTS, robot.name, robot.config_class, robot.simulation_class)
+    config: Any = robot.config_class
+    _register(RobotConfig, ROBOTS, robot.name, config, robot.simulation_class)
+    BODIES[robot.name] = lambda: config().body()
     return robot
 
 
@@ -242,6 +245,12 @@ def brains_for(robot_type: str) -> tuple[str, ...]:
     brains: Any = BRAINS.values()
     kinds = (kind_of_robot(robot_type), ANY_ROBOT)
     return tuple(sorted(brain.name for brain in brains if brain.robot_kind in kinds))
+
+
+def tasks_for(robot_type: str) -> tuple[str, ...]:
+    """Return the names of the tasks for a type of robot."""
+    tasks: Any = TASKS.values()
+    return tuple(sorted(task.name for task in tasks if is_for(task.robot_kind, robot_type)))
 
 
 def action_names_of(config: BrainConfig) -> tuple[str, ...]:

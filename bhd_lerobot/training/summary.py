@@ -13,7 +13,7 @@ from rich.table import Table
 
 from bhd_lerobot.errors import quoted
 from bhd_lerobot.policies.learned.contract import PolicyContract
-from bhd_lerobot.registry import robot_configs
+from bhd_lerobot.registry import robot_configs, tasks_for
 from bhd_lerobot.robots.host.simulation import describe
 from bhd_lerobot.tasks.task import TaskConfig
 from bhd_lerobot.training.checkpoint import resume_command
@@ -23,8 +23,6 @@ from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME
 
 if TYPE_CHECKING:
     from bhd_lerobot.training.train import TrainResult
-
-_EXAMPLE_TASKS = {"turtlebot3": "avoid", "ur5": "pick"}
 
 
 def print_start(console: Console, config: BhdTrainConfig, policy: Any, data: TrainingData, step: int) -> None:
@@ -94,7 +92,7 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
         rollout = f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={quoted(path)} --duration=60"
         return ["Let it drive the robot for a minute with:", f"  {rollout}"]
     if task not in TaskConfig.get_known_choices():
-        task = _EXAMPLE_TASKS[contract.robot_type]
+        task = tasks_for(contract.robot_type)[0]
         text = f"The dataset does not say its task. Evaluate it in simulation at {task!r}, for example, with:"
     else:
         text = "Evaluate it with:"

@@ -1,6 +1,5 @@
 """Where the robot and what is around it were in every frame, for the views from above and from the side."""
 
-import functools
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -9,18 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.apps.view.groups import names_of, scan_of
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import Arm, MobileBase
+from bhd_lerobot.bodies.catalogue import body_of
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS
-from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.state import Row
 
 Arrays = dict[str, NDArray]
 _AWAY_M = 10.0  # an object this high is absent: it floats out of sight
-_ARM_STATE = 6 + 2 + 7 * MAX_OBJECTS  # numbers of a UR5's position state
-_BASE_STATE = 9  # numbers of a TurtleBot3's
+_BASE_STATE = 9  # numbers of a base's position: its pose, and two wheels
 
 
 def scene_of(row: Row) -> dict[str, Any] | None:
@@ -52,6 +49,7 @@ def views_of(
         features: the dataset's features.
         columns: an episode's numeric columns, each of shape (frames, numbers).
     """
+    body = body_of(robot)
     observed = columns.get(keys.OBSERVATION_STATE)
     names = names_of(features[keys.OBSERVATION_STATE], observed.shape[1]) if observed is not None else []
     physics = columns.get(keys.PHYSICS_STATE)
@@ -59,52 +57,53 @@ def views_of(
     arrays: Arrays = {}
     scan = scan_of(names)
     if scan is not None:
-        lidar = turtlebot3_burger().lidar if robot == "turtlebot3" else None
+        lidar = body.lidar if isinstance(body, MobileBase) else None
         about["scan"] = {
             "column": keys.OBSERVATION_STATE,
             "first": scan[0],
             "beams": scan[1],
             "range_max": lidar.range_max if lidar else None,
-            "x": -0.032 if robot == "turtlebot3" else 0.0,  # of the scanner before the wheel axis [m]
+            "x": lidar.ahead if lidar else 0.0,
         }
-    if robot == "ur5" and (joints := _joints(names, observed, physics)) is not None:
-        capsules = _ur5().chain.capsules
+    if isinstance(body, Arm) and (joints := _joints(body, names, observed, physics)) is not None:
+        capsules = body.chain.capsules
         palm = next(number for number, capsule in enumerate(capsules) if capsule.name == "palm")
         about["arm"] = {"radii": [capsule.radius for capsule in capsules], "hand": palm}
-        arrays |= _arm(*joints)
-        if physics is not None and physics.shape[1] > _ARM_STATE:
-            arrays["objects"] = _objects(physics)
-    elif robot == "turtlebot3" and physics is not None and physics.shape[1] > _BASE_STATE:
-        about["base"] = {"from": "simulator", "radius": turtlebot3_burger().radius}
+        arrays |= _arm(body, *joints)
+        if physics is not None and physics.shape[1] > _arm_state(body):
+            arrays["objects"] = _objects(body, physics)
+    elif isinstance(body, MobileBase) and physics is not None and physics.shape[1] > _BASE_STATE:
+        about["base"] = {"from": "simulator", "radius": body.radius}
         w, x, y, z = physics[:, 3:7].T
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         arrays["base"] = np.column_stack([physics[:, :2], yaw]).astype(np.float32)
     elif observed is not None and {"x.pos", "y.pos", "theta.pos"} <= set(names):
-        about["base"] = {"from": "odometry", "radius": turtlebot3_burger().radius if robot == "turtlebot3" else 0.1}
+        about["base"] = {"from": "odometry", "radius": body.radius if isinstance(body, MobileBase) else 0.1}
         arrays["base"] = observed[:, [names.index(name) for name in ("x.pos", "y.pos", "theta.pos")]]
     return about, arrays
 
 
-@functools.cache
-def _ur5() -> Arm:
-    return ur5()
+def _arm_state(body: Arm) -> int:
+    """Return how many numbers the position of an arm with a gripper of two fingers and of all objects has."""
+    return len(body.chain.joints) + 2 + 7 * MAX_OBJECTS
 
 
 def _joints(
-    names: list[str], observed: NDArray | None, physics: NDArray | None
+    body: Arm, names: list[str], observed: NDArray | None, physics: NDArray | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return joint positions (frames, 6) and the gripper's opening (frames,), of the simulator if it is there."""
-    if physics is not None and physics.shape[1] > _ARM_STATE:
-        return physics[:, :6].astype(np.float64), physics[:, 6:8].sum(axis=1).astype(np.float64)
-    wanted = [f"{joint}.pos" for joint in _ur5().chain.joints]
+    """Return joint positions (frames, joints) and the gripper's opening (frames,), of the simulator if it is there."""
+    dof = len(body.chain.joints)
+    if physics is not None and physics.shape[1] > _arm_state(body):
+        return physics[:, :dof].astype(np.float64), physics[:, dof : dof + 2].sum(axis=1).astype(np.float64)
+    wanted = [f"{joint}.pos" for joint in body.chain.joints]
     if observed is None or not set(wanted) <= set(names):
         return None
     opening = observed[:, names.index("gripper.pos")] if "gripper.pos" in names else np.zeros(len(observed))
     return observed[:, [names.index(name) for name in wanted]].astype(np.float64), opening.astype(np.float64)
 
 
-def _arm(joints: NDArray[np.float64], opening: NDArray[np.float64]) -> Arrays:
-    chain = _ur5().chain
+def _arm(body: Arm, joints: NDArray[np.float64], opening: NDArray[np.float64]) -> Arrays:
+    chain = body.chain
     kinematics = ForwardKinematics(chain)
     frames = kinematics.frames(joints)
     capsules = np.empty((len(joints), len(chain.capsules), 2, 3), np.float32)
@@ -119,7 +118,11 @@ def _arm(joints: NDArray[np.float64], opening: NDArray[np.float64]) -> Arrays:
     return {"capsules": capsules.reshape(len(joints), -1, 6), "tool": tool.astype(np.float32)}
 
 
-def _objects(physics: NDArray) -> NDArray[np.float32]:
-    objects = physics[:, 8:_ARM_STATE].reshape(len(physics), MAX_OBJECTS, 7).astype(np.float32)
+def _objects(body: Arm, physics: NDArray) -> NDArray[np.float32]:
+    objects = (
+        physics[:, len(body.chain.joints) + 2 : _arm_state(body)]
+        .reshape(len(physics), MAX_OBJECTS, 7)
+        .astype(np.float32)
+    )
     objects[objects[..., 2] > _AWAY_M] = np.nan
     return objects

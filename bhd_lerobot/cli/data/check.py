@@ -3,7 +3,6 @@
 import argparse
 import json
 import sys
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -12,9 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bhd_lerobot.bodies.body import Arm, MobileBase, PositionLimits
-from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.body import Arm, PositionLimits
+from bhd_lerobot.bodies.catalogue import body_of
 from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.summary import is_being_written
@@ -24,7 +22,6 @@ from bhd_lerobot.datasets.validate.values import Limits
 from bhd_lerobot.errors import DatasetLockedError
 
 # No option of a robot changes its limits, and its configuration takes seconds to import.
-_BODIES: dict[str | None, Callable[[], Arm | MobileBase]] = {"turtlebot3": turtlebot3_burger, "ur5": ur5}
 _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
 
 
@@ -75,10 +72,10 @@ def check(root: Path, console: Console, *, as_json: bool, is_strict: bool, video
 
 
 def limits_of(robot_type: str | None) -> Limits:
-    """Return what a robot of ours keeps to: the ranges of its joints, or the largest speeds of a base."""
-    if robot_type not in _BODIES:
+    """Return what a known robot keeps to: the ranges of its joints, or the largest speeds of a base."""
+    body = body_of(robot_type)
+    if body is None:
         return {}
-    body = _BODIES[robot_type]()
     limits = body.limits
     if isinstance(limits, PositionLimits):
         low, high = np.asarray(limits.lower), np.asarray(limits.upper)

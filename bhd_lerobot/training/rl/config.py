@@ -13,7 +13,7 @@ from bhd_lerobot.envs.register import ENVIRONMENTS
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
-from bhd_lerobot.registry import robot_of_task
+from bhd_lerobot.registry import is_for, kind_of_robot, robot_of_task, robots_of
 from bhd_lerobot.rollout import configuration
 from bhd_lerobot.tasks.task import Event, TaskConfig
 
@@ -249,8 +249,8 @@ class RlConfig:
         self._check_names()
         self._check_numbers()
         _ = self.policy.actor()
-        if self.robot.type != robot_of_task(self.task):
-            raise ConfigError(f"robot.type is {self.robot.type!r}; this task is for {robot_of_task(self.task)!r}.")
+        if not is_for(wanted := robot_of_task(self.task), self.robot.type):
+            raise ConfigError(f"robot.type is {self.robot.type!r}; this task is for {' or '.join(robots_of(wanted))}.")
         if self.validation.seed == self.seed:
             raise ConfigError(
                 f"validation.seed and seed are both {self.seed}; the policy would be judged on the episodes that it "
@@ -279,7 +279,7 @@ class RlConfig:
         for event in self.reward.events:
             if event not in _EVENTS:
                 raise ConfigError(unknown_name("event in reward.events", event, _EVENTS))
-        if self.reward.potential == "pose" and "ur5" not in self.robot.type:
+        if self.reward.potential == "pose" and kind_of_robot(self.robot.type) != "arm":
             raise ConfigError("reward.potential is 'pose'; only a task with a target pose of the tool has it (reach).")
 
     def _check_numbers(self) -> None:
