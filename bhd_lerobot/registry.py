@@ -9,6 +9,7 @@ from typing import Any
 
 from lerobot.robots.config import RobotConfig
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.catalogue import BODIES
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
@@ -60,7 +61,7 @@ class _Dagger(DaggerBrain):
 ROBOTS: dict[type[RobotConfig], type[Simulation]] = {TurtleBot3Config: BaseSimulation, UR5Config: UR5Simulation}
 """The simulations of the robots, by configuration."""
 
-TASKS: dict[type[TaskConfig], Callable[[Any, int, int], Task]] = {
+TASKS: dict[type[TaskConfig], Callable[..., Task]] = {
     AvoidConfig: AvoidTask,
     NavigateConfig: NavigateTask,
     PickConfig: PickTask,
@@ -285,9 +286,16 @@ def make_robot(config: Any, n: int = 1, threads: int | None = None) -> Simulatio
     return make_live(simulation, config.id) if config.clock == "realtime" else simulation
 
 
-def make_task(config: TaskConfig, n: int, fps: int) -> Task:
-    """Return the task that a configuration describes, for n simulations at `fps` frames a second."""
-    made: Task = _made_by(TaskConfig, TASKS, config)(config, n, fps)
+def make_task(config: TaskConfig, n: int, fps: int, body: Body | None = None) -> Task:
+    """Return the task that a configuration describes, for n simulations at `fps` frames a second.
+
+    Args:
+        config: the configuration.
+        n: number of simulations.
+        fps: frames a second [Hz].
+        body: the robot's hardware; a TurtleBot3's or a UR5's if None.
+    """
+    made: Task = _made_by(TaskConfig, TASKS, config)(config, n, fps, body)
     return made
 
 

@@ -15,7 +15,7 @@ from scipy import ndimage
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.errors import ConfigError, unknown_name
 
-ROBOT_RADIUS = 0.124  # [m] the Burger around its wheel axis, as in bodies/turtlebot3.py
+BURGER_RADIUS = 0.124  # [m] of the TurtleBot3 Burger around its wheel axis, as in bodies/turtlebot3.py
 CLEARANCE = 0.051  # [m] what must be free beside the robot for a place to count as reachable
 RESOLUTION = 0.05  # [m] of the grid that reachability is computed on
 START_CLEARANCE = 0.35  # [m] from the robot's centre to the nearest obstacle at the start
@@ -33,6 +33,7 @@ class Arena:
         extent: x_min, x_max, y_min, y_max of the inside [m].
         start: x [m], y [m], yaw [rad] of the robot, world frame.
         goal: likewise, where a task sends the robot.
+        robot_radius: of the robot that is to get through [m].
     """
 
     name: str
@@ -40,6 +41,7 @@ class Arena:
     extent: tuple[float, float, float, float]
     start: tuple[float, float, float]
     goal: tuple[float, float, float] | None = None
+    robot_radius: float = BURGER_RADIUS
 
     def clearance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the distance from points to the nearest obstacle [m], negative inside one.
@@ -57,7 +59,7 @@ class Arena:
 
     def _reached(self, clearance: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return where the robot's centre can get to from the start, on the grid that the clearance is of."""
-        labels, _ = ndimage.label(clearance > ROBOT_RADIUS + CLEARANCE, _NEXT)
+        labels, _ = ndimage.label(clearance > self.robot_radius + CLEARANCE, _NEXT)
         row, column = _nearest(self.extent, self.start[:2])
         label = labels[row, column]
         reached: NDArray[np.bool_] = (labels == label) & (label > 0)
@@ -90,29 +92,32 @@ class Arena:
         return np.flatnonzero(is_free)
 
 
-def make_arena(name: str, seed: int, random_start: bool = False) -> Arena:
+def make_arena(name: str, seed: int, random_start: bool = False, *, robot_radius: float = BURGER_RADIUS) -> Arena:
     """Return an arena by name.
 
     Args:
-        name: ``"turtlebot3_world"``, ``"random"`` or ``"empty"``.
+        name: one of `ARENAS`.
         seed: decides everything about a random arena, and the start pose where it is random.
         random_start: start at a random free pose, not at the layout's own; a random arena always does.
+        robot_radius: of the robot that is to get through [m].
 
     Raises:
         ConfigError: there is no such arena.
     """
     if name not in ARENAS:
         raise ConfigError(unknown_name("arena", name, ARENAS))
-    arena = ARENAS[name](seed)
+    arena = ARENAS[name](seed, robot_radius)
+    if arena.robot_radius != robot_radius:
+        arena = replace(arena, robot_radius=robot_radius)
     return _with_random_start(arena, seed) if random_start and name != "random" else arena
 
 
-def register_arena(name: str, make: Callable[[int], Arena]) -> None:
+def register_arena(name: str, make: Callable[[int, float], Arena]) -> None:
     """Add an arena to those that robots and tasks can choose by name.
 
     Args:
         name: its name.
-        make: makes it, given a seed: equal seeds must give equal arenas.
+        make: makes it, given a seed and the radius of the robot [m]: equal seeds must give equal arenas.
 
     Raises:
         ConfigError: another arena has this name.
@@ -139,33 +144,37 @@ def turtlebot3_world() -> Arena:
     return Arena("turtlebot3_world", tuple(shapes), (-radius, radius, -apothem, apothem), (-2.0, -0.5, 0.0))
 
 
-def random_arena(seed: int) -> Arena:
+def random_arena(seed: int, robot_radius: float = BURGER_RADIUS) -> Arena:
     """Return a random rectangular arena with cylinders, boxes, walls, corridors and dead ends.
 
     Args:
         seed: any whole number from 0; equal seeds give equal arenas.
+        robot_radius: of the robot that is to get through [m].
     """
+    room = robot_radius + CLEARANCE
+    start_room = max(START_CLEARANCE, room)
     rng = np.random.default_rng(np.random.SeedSequence([0xA2E4A, int(seed)]))
     for _ in range(1000):
         half_x, half_y = rng.uniform(1.8, 3.0, size=2)
         obstacles: list[Shape] = []
         x, y = _axes((-half_x, half_x, -half_y, half_y))
         clearance = _clearance(_outer_walls(half_x, half_y), x, y)
-        free = clearance > ROBOT_RADIUS + CLEARANCE
+        free = clearance > room
         builders = (_cylinders, _boxes, _walls, _corridor, _dead_end)
         # Each arena has its own mixture: some are forests of posts, some mazes.
         for builder, count in zip(builders, rng.integers((2, 1, 0, 0, 0), (9, 6, 4, 2, 3)), strict=True):
             for _ in range(count):
                 group = builder(rng, half_x, half_y)
                 trial = _closer(clearance, group, x, y)
-                left = trial > ROBOT_RADIUS + CLEARANCE
+                left = trial > room
                 # Not crowded: at least a third of the floor stays free for the robot's centre.
                 if np.count_nonzero(left) / left.size > 1 / 3 and _stays_connected(free, left):
                     obstacles += group
                     clearance, free = trial, left
-        if (clearance > START_CLEARANCE).any():
+        if (clearance > start_room).any():
             points = _points(x, y)
-            arena = _closed("random", half_x, half_y, obstacles, _random_pose(points, clearance, rng))
+            start = _random_pose(points, clearance > start_room, rng)
+            arena = replace(_closed("random", half_x, half_y, obstacles, start), robot_radius=robot_radius)
             # The cached property's value, which whoever draws an arena asks for: its clearance is known already.
             vars(arena)["reachable"] = points, arena._reached(clearance)
             return arena
@@ -179,14 +188,14 @@ def _empty() -> Arena:
 def _with_random_start(arena: Arena, seed: int) -> Arena:
     rng = np.random.default_rng(np.random.SeedSequence([0x57A27, int(seed)]))
     points, reachable = arena.reachable
-    clearance = np.where(reachable, arena.clearance(points), -np.inf)
-    return replace(arena, start=_random_pose(points, clearance, rng))
+    room = max(START_CLEARANCE, arena.robot_radius + CLEARANCE)
+    return replace(arena, start=_random_pose(points, reachable & (arena.clearance(points) > room), rng))
 
 
 def _random_pose(
-    points: NDArray[np.float64], clearance: NDArray[np.float64], rng: np.random.Generator
+    points: NDArray[np.float64], is_free: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[float, float, float]:
-    candidates = points[clearance > START_CLEARANCE]
+    candidates = points[is_free]
     x, y = candidates[rng.integers(len(candidates))]
     return float(x), float(y), float(rng.uniform(-np.pi, np.pi))
 
@@ -324,9 +333,9 @@ def _distance(shape: Shape, x: NDArray[np.float64], y: NDArray[np.float64]) -> N
     return np.hypot(ax, ay, out=outside, where=beside_x & beside_y)
 
 
-ARENAS: dict[str, Callable[[int], Arena]] = {
-    "turtlebot3_world": lambda _: turtlebot3_world(),
+ARENAS: dict[str, Callable[[int, float], Arena]] = {
+    "turtlebot3_world": lambda _seed, _radius: turtlebot3_world(),
     "random": random_arena,
-    "empty": lambda _: _empty(),
+    "empty": lambda _seed, _radius: _empty(),
 }
-"""What makes an arena of a seed, by name."""
+"""What makes an arena of a seed and the radius of a robot [m], by name."""

@@ -210,7 +210,7 @@ def fingerprint(robot: Any, task: Any, fps: int) -> str:
     """
     simulation = make_simulation(dataclasses.replace(robot, camera=False), 1)
     brain = _Listener()
-    loop = EpisodeLoop(simulation, make_task(task, 1, fps), brain)
+    loop = EpisodeLoop(simulation, make_task(task, 1, fps, simulation.body), brain)
     for _ in loop.run([EpisodeSpec(0, 0)], lambda: brain.frames >= _PROBE_FRAMES):
         pass
     simulation.close()

@@ -36,7 +36,7 @@ class EpisodeServer:
         with unpacked(job) as brain_config:
             made = make_brain(brain_config)
         self._brain = TimedBrain(made)
-        task = make_task(job.task, job.n, job.fps)
+        task = make_task(job.task, job.n, job.fps, self._simulation.body)
         self._loop = EpisodeLoop(self._simulation, task, cast(Brain, self._brain), job.tolerance)
         if self._simulation.camera_names and (job.video is not None or made.uses_images):
             self._simulation.start_rendering()

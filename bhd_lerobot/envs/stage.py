@@ -82,7 +82,7 @@ class Stage:
     def __init__(self, robot: Any, task: Any, n: int = 1, threads: int | None = None) -> None:
         self.n = n
         self.simulation = make_simulation(robot, n, threads)
-        self.task = make_task(task, n, robot.fps)
+        self.task = make_task(task, n, robot.fps, self.simulation.body)
         self.frames = max(1, round(self.task.duration_s * robot.fps))
         self.seeds = np.zeros(n, np.int64)
         self.scenes: list[Any] = [None] * n

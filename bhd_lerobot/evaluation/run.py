@@ -87,7 +87,7 @@ def prepare(config: EvalConfig, label: str, simulation: Simulation, pool: Worker
     robot: Any = config.robot
     try:
         timed = TimedBrain(make_brain(config.brains[label]))
-        task = make_task(config.task, simulation.n, robot.fps)
+        task = make_task(config.task, simulation.n, robot.fps, simulation.body)
         brain = cast(Brain, timed)
         if pool is None:
             return BrainRun(label, EpisodeLoop(simulation, task, brain), timed)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.catalogue import body_of
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode, video_frames
 from bhd_lerobot.datasets.format.state import DatasetState, Row, slot_of
@@ -75,7 +77,7 @@ def _trajectories(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, 
         path = draw_trajectories(trajectories, Path(folder) / "trajectories.png", what)[0]
         return (
             path.read_bytes(),
-            f"{what}: the trajectory of {'the tool' if summary.robot_type == 'ur5' else 'the base'}",
+            f"{what}: the trajectory of {'the tool' if isinstance(body_of(summary.robot_type), Arm) else 'the base'}",
         )
 
 

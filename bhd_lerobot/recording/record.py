@@ -94,7 +94,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     pressed = EstopInputs(simulation.bridge.estop, marks.on_key)
     with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)
-        task = make_task(config.task, simulation.n, config.dataset.fps)
+        task = make_task(config.task, simulation.n, config.dataset.fps, simulation.body)
         brain = make_brain(config.brain)
         # A brain that does not fit the robot fails here, before a dataset exists.
         if is_here:

@@ -22,7 +22,7 @@ class SimulatedBase(SimulatedRobot):
 
     def make_scene(self) -> Arena:
         """Return the configured arena."""
-        return make_arena(self.config.arena, self.config.seed)
+        return make_arena(self.config.arena, self.config.seed, robot_radius=self.config.body().radius)
 
     @property
     def observation_names(self) -> tuple[str, ...]:

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.arenas import ARENAS, Arena, make_arena
+from bhd_lerobot.bodies.arenas import ARENAS, Arena
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
-from bhd_lerobot.tasks.task import BaseTruth, ConfiguredTask, Event, Outcome, PathLengths, TaskConfig
+from bhd_lerobot.tasks.task import BaseTask, BaseTruth, Event, Outcome, PathLengths, TaskConfig
 
 _BEARINGS_DEG = np.arange(0.0, 360.0, 22.5)
 _DISTANCES_M = np.arange(1, 9) * 0.25
@@ -53,7 +54,7 @@ class AvoidConfig(TaskConfig):
         check_positive("task", self, ("min_path_m", "stuck_path_m"), or_zero=True)
 
 
-class AvoidTask(ConfiguredTask):
+class AvoidTask(BaseTask):
     """The avoid task for n simulations.
 
     Success: the whole time without a contact, and a path of at least `min_path_m`. Score: the number of distinct cells
@@ -65,14 +66,14 @@ class AvoidTask(ConfiguredTask):
         config: the parameters.
         n: number of simulations.
         fps: frames a second [Hz].
+        body: the robot's hardware.
     """
 
     name = "avoid"
-    robot_kind = "base"
     environment_names: tuple[str, ...]
 
-    def __init__(self, config: AvoidConfig, n: int, fps: int) -> None:
-        super().__init__(config, n, fps)
+    def __init__(self, config: AvoidConfig, n: int, fps: int, body: Body | None = None) -> None:
+        super().__init__(config, n, fps, body)
         self.environment_names = TRAIL if config.trail else ()
         self._window = self._in_frames(config.stuck_time_s)
         # Cells by number, a row for each simulation; the rows grow with the largest arena seen.
@@ -85,7 +86,7 @@ class AvoidTask(ConfiguredTask):
 
     def sample(self, seed: int) -> Arena:
         """Return the arena of the episode with this seed."""
-        return make_arena(self.config.arena, seed, self.config.random_start)
+        return self._arena(self.config.arena, seed, self.config.random_start)
 
     def instruction(self, scene: Arena) -> str:
         """Return what a person would ask for."""

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.arenas import ARENAS, Arena, make_arena
+from bhd_lerobot.bodies.arenas import ARENAS, Arena
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
 from bhd_lerobot.tasks.geodesic import WayField, interpolate
-from bhd_lerobot.tasks.task import BaseTruth, ConfiguredTask, Event, Outcome, PathLengths, TaskConfig
+from bhd_lerobot.tasks.task import BaseTask, BaseTruth, Event, Outcome, PathLengths, TaskConfig
 
 ENVIRONMENT = ("goal_x", "goal_y", "goal_cos", "goal_sin")
 
@@ -74,7 +75,7 @@ class NavigateConfig(TaskConfig):
             )
 
 
-class NavigateTask(ConfiguredTask):
+class NavigateTask(BaseTask):
     """The navigate task for n simulations.
 
     Success: within the tolerances of the goal pose and at rest, for `hold_s` without a break. Failures: `collision`,
@@ -87,24 +88,24 @@ class NavigateTask(ConfiguredTask):
     to 1. The frame of a collision gives -0.5 instead. So an episode's rewards sum to 1 for a success, and lie between
     -0.5 and 0.5 without one, or between -1 and 0 with a collision.
 
-    A shortest way keeps `ROBOT_RADIUS + CLEARANCE` from all obstacles and goes in sixteen directions on a grid of 0.05
-    m, so it may be up to 2.8 % longer than the shortest one that there is.
+    A shortest way keeps the robot's radius and `CLEARANCE` from all obstacles and goes in sixteen directions on a grid
+    of 0.05 m, so it may be up to 2.8 % longer than the shortest one that there is.
 
     Args:
         config: the parameters.
         n: number of simulations.
         fps: frames a second [Hz].
+        body: the robot's hardware.
 
     Raises:
         ConfigError: a fixed arena has no place for such a goal.
     """
 
     name = "navigate"
-    robot_kind = "base"
     environment_names: tuple[str, ...] = ENVIRONMENT
 
-    def __init__(self, config: NavigateConfig, n: int, fps: int) -> None:
-        super().__init__(config, n, fps)
+    def __init__(self, config: NavigateConfig, n: int, fps: int, body: Body | None = None) -> None:
+        super().__init__(config, n, fps, body)
         self._hold, self._window = self._in_frames(config.hold_s), self._in_frames(config.stuck_time_s)
         # Lengths of ways, a grid for each simulation; the grids grow with the largest arena seen.
         self._ways: NDArray[np.float64] = np.zeros((n, 2, 2))
@@ -133,7 +134,7 @@ class NavigateTask(ConfiguredTask):
         for attempt in range(1 if fixed else _ARENA_TRIES):
             # The first try is the arena that the avoid task has for this seed.
             again = int(rng.integers(2**62)) if attempt else seed
-            arena = make_arena(config.arena, again, config.random_start)
+            arena = self._arena(config.arena, again, config.random_start)
             points, free = arena.reachable
             away = np.hypot(*(points - arena.start[:2]).transpose(2, 0, 1))
             free = free & (arena.clearance(points) >= config.goal_clearance_m)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
@@ -82,14 +83,15 @@ class PickTask(ConfiguredTask):
         config: the parameters.
         n: number of simulations.
         fps: frames a second [Hz].
+        body: the robot's hardware.
     """
 
     name = "pick"
     robot_kind = "arm"
     environment_names = ENVIRONMENT
 
-    def __init__(self, config: PickConfig, n: int, fps: int) -> None:
-        super().__init__(config, n, fps)
+    def __init__(self, config: PickConfig, n: int, fps: int, body: Body | None = None) -> None:
+        super().__init__(config, n, fps, body)
         self._hold = self._in_frames(config.hold_s)
         self._target = np.zeros(n, np.int64)
         self._present = np.zeros((n, MAX_OBJECTS), np.bool_)

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import ResultCode
@@ -65,14 +66,15 @@ class ReachTask(ConfiguredTask):
         config: the parameters.
         n: number of simulations.
         fps: frames a second [Hz].
+        body: the robot's hardware.
     """
 
     name = "reach"
     robot_kind = "arm"
     environment_names = ENVIRONMENT
 
-    def __init__(self, config: ReachConfig, n: int, fps: int) -> None:
-        super().__init__(config, n, fps)
+    def __init__(self, config: ReachConfig, n: int, fps: int, body: Body | None = None) -> None:
+        super().__init__(config, n, fps, body)
         self._hold = self._in_frames(config.hold_s)
         self._target = np.zeros((n, 7))
         self._camera_error = np.zeros((n, 3))

@@ -9,6 +9,8 @@ import draccus
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.arenas import BURGER_RADIUS, Arena, make_arena
+from bhd_lerobot.bodies.body import Body, MobileBase
 from bhd_lerobot.errors import ConfigError
 
 
@@ -186,17 +188,19 @@ class ConfiguredTask:
         config: the parameters.
         duration_s: longest duration of an episode [s].
         frames: the same [frames].
+        body: the robot's hardware; None if it is not known.
 
     Args:
         config: the parameters, with a `duration_s`.
         n: number of simulations.
         fps: frames a second [Hz].
+        body: the robot's hardware; that which its tasks were made for if None.
     """
 
     name: str
 
-    def __init__(self, config: Any, n: int, fps: int) -> None:
-        self.config = config
+    def __init__(self, config: Any, n: int, fps: int, body: Body | None = None) -> None:
+        self.config, self.body = config, body
         self.duration_s: float = config.duration_s
         self._fps = fps
         self.frames = self._in_frames(config.duration_s)
@@ -210,6 +214,17 @@ class ConfiguredTask:
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the task."""
         return {"type": self.name, **asdict(self.config)}
+
+
+class BaseTask(ConfiguredTask):
+    """What the tasks of bases have in common: arenas with room for the robot."""
+
+    robot_kind = "base"
+
+    def _arena(self, name: str, seed: int, random_start: bool = False) -> Arena:
+        """Return an arena that this robot can get through."""
+        radius = self.body.radius if isinstance(self.body, MobileBase) else BURGER_RADIUS
+        return make_arena(name, seed, random_start, robot_radius=radius)
 
 
 class PathLengths:

@@ -4,11 +4,11 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from bhd_lerobot.bodies.catalogue import body_of
 from bhd_lerobot.datasets.format import features as keys
 
 MAX_LINES = 8  # in one plot; more cannot be distinguished
 _SCAN = re.compile(r"scan_\d+\.pos")
-_OURS = ("turtlebot3", "ur5")
 _METRES = ("x", "y", "z", "gripper", "tool_x", "tool_y", "tool_z")
 _DELAYS = {keys.LATENESS: "lateness", keys.INFERENCE_TIME: "inference"}
 _AGES = {keys.AGE: "observation", keys.COMMAND_AGE: "command"}
@@ -39,9 +39,9 @@ def names_of(feature: Mapping[str, Any], width: int) -> list[str]:
 
 
 def unit_of(name: str, robot: str | None) -> str:
-    """Return the unit of a robot's number, of which only those of our robots are known; else nothing."""
+    """Return the unit of a robot's number, of which only those of simulated robots are known; else nothing."""
     stem, _, kind = name.rpartition(".")
-    if robot not in _OURS or kind not in ("pos", "vel") or stem.startswith("tool_q"):
+    if body_of(robot) is None or kind not in ("pos", "vel") or stem.startswith("tool_q"):
         return ""
     length = stem in _METRES or stem.startswith("scan_")
     return ("m" if length else "rad") + ("/s" if kind == "vel" else "")

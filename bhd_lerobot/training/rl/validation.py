@@ -60,7 +60,7 @@ class Validation:
 
     def run(self, brain: Any, stop: Callable[[], bool] = lambda: False) -> list[Episode]:
         """Return the episodes of a brain, given by its configuration."""
-        task = make_task(self._task_config, self._n, self._fps)
+        task = make_task(self._task_config, self._n, self._fps, self._simulation.body)
         return list(EpisodeLoop(self._simulation, task, make_brain(brain)).run(self._specs, stop))
 
     def checkpoint(self, folder: Any, stop: Callable[[], bool] = lambda: False) -> Level | None:
