@@ -11,6 +11,9 @@ from collections.abc import Callable, Sequence
 from importlib import metadata
 from typing import Any
 
+from bhd_lerobot.bodies.body import Arm, MobileBase
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
 
 ENTRY_POINTS = "bhd_lerobot.plugins"
@@ -18,6 +21,9 @@ ENTRY_POINTS = "bhd_lerobot.plugins"
 
 PREFIXES = ("lerobot_robot_", "lerobot_camera_", "lerobot_teleoperator_", "lerobot_policy_", "lerobot_env_")
 """How the names of distributions begin that LeRobot imports."""
+
+BODIES: dict[str, Callable[[], MobileBase | Arm]] = {"turtlebot3": turtlebot3_burger, "ur5": ur5}
+"""What makes the body of a robot with the options that it has by default, by the robot's type."""
 
 _OPTION = "discover_packages_path"
 _imported: set[str] = set()
@@ -69,6 +75,19 @@ def load_named(arguments: Sequence[str]) -> list[str]:
                 "installed or in PYTHONPATH."
             ) from error
     return left
+
+
+def body_of(robot_type: str | None) -> MobileBase | Arm | None:
+    """Return the body of a robot, for whoever reads its data and makes no robot; None if there is no such robot.
+
+    Args:
+        robot_type: as a dataset names it; None if it does not.
+    """
+    if robot_type is None:
+        return None
+    if robot_type not in BODIES:
+        load_plugins()
+    return BODIES[robot_type]() if robot_type in BODIES else None
 
 
 def _installed() -> list[tuple[str, Callable[[], Any]]]:

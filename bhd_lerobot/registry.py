@@ -10,8 +10,8 @@ from typing import Any
 from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.bodies.body import Body
-from bhd_lerobot.bodies.catalogue import BODIES
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.plugins import BODIES
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig
 from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig

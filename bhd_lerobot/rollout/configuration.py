@@ -21,6 +21,7 @@ import yaml
 
 from bhd_lerobot.command_line import asks_for_help, exit_status
 from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
+from bhd_lerobot.plugins import load_named, load_plugins
 from bhd_lerobot.renames import check_values
 
 CONFIG_PATH = "config_path"
@@ -92,10 +93,12 @@ def run(
     given = sys.argv[1:] if arguments is None else arguments
 
     def program() -> int | None:
-        if asks_for_help(given):
+        load_plugins()
+        left = load_named(given)
+        if asks_for_help(left):
             print(describe(config_class))
             return 0
-        return main(read(given) if read else parse(config_class, given))
+        return main(read(left) if read else parse(config_class, left))
 
     return exit_status(program, interrupted)
 

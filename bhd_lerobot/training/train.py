@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.utils.import_utils import register_third_party_plugins
 from rich.console import Console
 from rich.markup import escape
 
@@ -227,15 +226,10 @@ def _agreement(stop: StopRequest, accelerator: Any) -> Any:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train on a dataset; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
-
-    def read(given: Sequence[str]) -> Request:
-        register_third_party_plugins()
-        return parse_train(given)
-
     # Ctrl-C before the first step, or a second time while a step or a checkpoint was under way.
     interrupted = "Stopped; checkpoints that were written before are complete."
     return run(
-        lambda request: train(request).exit_status, BhdTrainConfig, arguments, read=read, interrupted=interrupted
+        lambda request: train(request).exit_status, BhdTrainConfig, arguments, read=parse_train, interrupted=interrupted
     )
 
 

@@ -62,10 +62,9 @@ def examine(root: Path, run: RunTrials = run_trials) -> list[Finding]:
 
 def robot_rates() -> dict[str, int]:
     """Return the default control rate of each robot [Hz]."""
-    from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-    from bhd_lerobot.bodies.ur5 import ur5
+    from bhd_lerobot.plugins import BODIES
 
-    return {"turtlebot3": turtlebot3_burger().control_hz, "ur5": ur5().control_hz}
+    return {name: body().control_hz for name, body in BODIES.items()}
 
 
 def _check_options(rate: int, seconds: float) -> None:

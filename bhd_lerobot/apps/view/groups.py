@@ -4,8 +4,8 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from bhd_lerobot.bodies.catalogue import body_of
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.plugins import body_of
 
 MAX_LINES = 8  # in one plot; more cannot be distinguished
 _SCAN = re.compile(r"scan_\d+\.pos")

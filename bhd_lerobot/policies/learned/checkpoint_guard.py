@@ -15,13 +15,11 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.plugins import PREFIXES
 from bhd_lerobot.policies.learned.checkpoint import CONFIG_FILE
 
 PROCESSOR_FILES = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
 """The files of a checkpoint that name processor steps."""
-
-_PLUGIN_PREFIXES = ("lerobot_robot_", "lerobot_camera_", "lerobot_teleoperator_", "lerobot_policy_", "lerobot_env_")
-"""Distributions that LeRobot's `register_third_party_plugins` imports."""
 
 # Some of LeRobot's policies and steps load a further model by name and run the code that lies beside it
 # (trust_remote_code). These are the keys that hold such names, and the names that LeRobot itself has there.
@@ -51,7 +49,7 @@ _BEWARE = "Do not use the checkpoint unless you know who made it."
 def plugin_packages() -> set[str]:
     """Return the packages whose classes a checkpoint may name: LeRobot, this one, and installed plug-ins of LeRobot."""
     names = {str(distribution.metadata["Name"] or "") for distribution in metadata.distributions()}
-    return {"lerobot", "bhd_lerobot"} | {name for name in names if name.startswith(_PLUGIN_PREFIXES)}
+    return {"lerobot", "bhd_lerobot"} | {name for name in names if name.startswith(PREFIXES)}
 
 
 def check_checkpoint(folder: Path) -> None:

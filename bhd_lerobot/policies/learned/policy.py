@@ -20,9 +20,9 @@ from lerobot.utils.constants import (
     POLICY_PREPROCESSOR_DEFAULT_NAME,
 )
 from lerobot.utils.device_utils import is_torch_device_available
-from lerobot.utils.import_utils import register_third_party_plugins
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.plugins import load_plugins
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import CONFIG_FILE, camera_name
 from bhd_lerobot.policies.mlp import configuration_mlp  # noqa: F401 - registers bhd_mlp
@@ -122,7 +122,7 @@ def _config(folder: Path, device: str) -> Any:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{file} cannot be read ({error!r}). Copy the checkpoint again.") from error
     if kind not in PreTrainedConfig.get_known_choices():
-        register_third_party_plugins()
+        load_plugins()
     if kind not in PreTrainedConfig.get_known_choices():
         known = ", ".join(sorted(PreTrainedConfig.get_known_choices()))
         raise ConfigError(
