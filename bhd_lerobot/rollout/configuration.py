@@ -12,7 +12,7 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,26 @@ def decode[T](config_class: type[T], values: dict[str, Any], prefix: str = "") -
         own = _own_error(error)
         reason = " ".join(str(own or _cause(error)).split())
         raise ConfigError(reason if own else f"The configuration cannot be used: {reason}") from error
+
+
+def from_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return keyword arguments as plain values, nested, as a file would hold them.
+
+    Args:
+        options: values by name; configurations, paths and tuples may stand where a file has dictionaries, texts and
+            lists.
+    """
+    return {name: _plain(value) for name, value in options.items()}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return draccus.encode(value)
+    if isinstance(value, Mapping):
+        return from_options(value)
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return str(value) if isinstance(value, Path) else value
 
 
 def encode(config: Any) -> dict[str, Any]:
@@ -214,6 +234,8 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None
 def _checked(key: str, value: Any, kind: Any) -> Any:
     """Return the value of an option whose keys, if it has any, all exist."""
     choices, entries = choices_of(kind), _entries(kind)
+    if choices and isinstance(value, str):  # in Python; a command line has --robot.type
+        value = {"type": value}
     if entries is not None and isinstance(value, dict):
         # Nothing in the place of an entry takes it out: a command line can drop what a file names.
         present = {name: entry for name, entry in value.items() if entry is not None}

@@ -67,6 +67,15 @@ def parse_train(arguments: Sequence[str]) -> Request:
     return _decoded(values, checkpoint)
 
 
+def request_of(values: dict[str, Any]) -> Request:
+    """Return what plain values, nested, ask for.
+
+    Raises:
+        ConfigError: an unknown key or policy, or a value of the wrong type.
+    """
+    return _decoded(values, None)
+
+
 def _resumed(path: Path, output_dir: Any) -> Path:
     """Return the checkpoint to go on with; the message names the run's folder where `output_dir` was given instead."""
     try:
