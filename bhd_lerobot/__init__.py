@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from bhd_lerobot.api import evaluate, make_brain, make_robot, make_task, record, replay, train
     from bhd_lerobot.bodies.arenas import Arena, make_arena, register_arena
     from bhd_lerobot.bodies.body import Arm, MobileBase, Shape
+    from bhd_lerobot.bodies.differential_base import differential_base
     from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
     from bhd_lerobot.bodies.ur5 import ur5
     from bhd_lerobot.control.commands import Chunk, Goals, Mixed
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from bhd_lerobot.envs.vector import BhdVectorEnv
     from bhd_lerobot.errors import BhdError
     from bhd_lerobot.evaluation.config import EvalConfig
-    from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures
+    from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_scan
     from bhd_lerobot.recording.config import RecordConfig
     from bhd_lerobot.registry import register_brain, register_robot, register_task
     from bhd_lerobot.robots.base import SimulatedBase
@@ -40,6 +41,7 @@ _MODULES = {
     "api": "evaluate make_brain make_robot make_task record replay train",
     "bodies.arenas": "Arena make_arena register_arena",
     "bodies.body": "Arm MobileBase Shape",
+    "bodies.differential_base": "differential_base",
     "bodies.turtlebot3": "turtlebot3_burger",
     "bodies.ur5": "ur5",
     "control.commands": "Chunk Goals Mixed",
@@ -54,7 +56,7 @@ _MODULES = {
     "envs.vector": "BhdVectorEnv",
     "errors": "BhdError",
     "evaluation.config": "EvalConfig",
-    "policies.brain": "BrainConfig ConfiguredBrain Observation RobotFeatures",
+    "policies.brain": "BrainConfig ConfiguredBrain Observation RobotFeatures find_scan",
     "recording.config": "RecordConfig",
     "registry": "register_brain register_robot register_task",
     "robots.base": "SimulatedBase",

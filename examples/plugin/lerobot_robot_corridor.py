@@ -1,0 +1,126 @@
+"""A base with large wheels, a corridor to drive through, and a brain that follows the wall on its right."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from lerobot.robots.config import RobotConfig
+
+import bhd_lerobot as bhd
+
+
+@RobotConfig.register_subclass("rover")
+@dataclass(kw_only=True)
+class RoverConfig(bhd.MobileBaseConfig):
+    """Options of the robot type ``rover``."""
+
+    def body(self) -> bhd.MobileBase:
+        """Return a box of 24 by 18 by 8 cm on wheels of 12 cm."""
+        return bhd.differential_base(
+            "rover", wheel_radius=0.06, wheel_separation=0.20, size=(0.24, 0.18, 0.08), mass=2.5,
+            max_velocity=(0.5, 2.5), colour=(0.8, 0.3, 0.2), lidar_noise_std=self.lidar_noise_std,
+            command_timeout_s=self.command_timeout_s, camera_width=self.camera_width, camera_height=self.camera_height,
+        )  # fmt: skip
+
+
+@bhd.register_robot
+class Rover(bhd.SimulatedBase):
+    """A rover."""
+
+    config_class = RoverConfig
+    name = "rover"
+
+
+def corridor(seed: int, robot_radius: float) -> bhd.Arena:
+    """Return two walls of 6 m, as far apart as the seed says."""
+    half = robot_radius + np.random.default_rng(seed).uniform(0.15, 0.35)
+    walls = [bhd.Shape("box", 0.0, side * (half + 0.05), 0.0, 3.0, 0.05) for side in (-1, 1)]
+    ends = [bhd.Shape("box", side * 3.05, 0.0, 0.0, 0.05, half + 0.1) for side in (-1, 1)]
+    return bhd.Arena("corridor", (*walls, *ends), (-3.0, 3.0, -half, half), (-2.4, 0.0, 0.0))
+
+
+bhd.register_arena("corridor", corridor)
+
+
+@dataclass
+class CorridorConfig(bhd.TaskConfig):
+    """The end of the corridor is `goal_m` from its middle; an episode lasts `duration_s`."""
+
+    goal_m: float = 2.0
+    duration_s: float = 30.0
+
+
+@bhd.register_task("corridor", CorridorConfig)
+class Corridor(bhd.BaseTask):
+    """Success: past the goal without a touch. Score: how much of the way was done."""
+
+    environment_names = ()
+
+    def __init__(self, config: CorridorConfig, n: int, fps: int, body: bhd.MobileBase | None = None) -> None:
+        super().__init__(config, n, fps, body)
+        self._x = np.zeros(n)
+
+    def sample(self, seed: int) -> bhd.Arena:
+        """Return the corridor of an episode."""
+        return self._arena("corridor", seed)
+
+    def instruction(self, scene: bhd.Arena) -> str:
+        """Return what a person would ask for."""
+        return "Drive to the other end of the corridor."
+
+    def begin(self, ids: np.ndarray, scenes: list[bhd.Arena]) -> None:
+        """Start episodes."""
+        self._frame[ids], self._x[ids] = 0, [scene.start[0] for scene in scenes]
+
+    def environment_state(self, truth: object) -> np.ndarray:
+        """Report nothing."""
+        return np.zeros((len(self._x), 0))
+
+    def judge(self, truth: object, running: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Reward the way forward; a touch, the goal and the time end an episode."""
+        x = np.where(running, truth.base_pose_in_world[:, 0], self._x)
+        reward, self._x = x - self._x, x
+        self._frame[running] += 1
+        event = np.where(self._frame >= self.frames, bhd.Event.TIMEOUT, bhd.Event.NOTHING)
+        event = np.where(x > self.config.goal_m, bhd.Event.SUCCESS, event)
+        event = np.where(truth.touched, bhd.Event.COLLISION, event)
+        return reward, np.where(running, event, bhd.Event.NOTHING)
+
+    def outcome(self, sim: int, event: bhd.Event) -> bhd.Outcome:
+        """Return how an episode ended."""
+        done = (self._x[sim] + 2.4) / (self.config.goal_m + 2.4)
+        return bhd.Outcome(event == bhd.Event.SUCCESS, event, float(np.clip(done, 0, 1)))
+
+
+@dataclass
+class WallFollowerConfig(bhd.BrainConfig):
+    """Keep `distance_m` from the wall on the right at `speed` [m/s]."""
+
+    distance_m: float = 0.35
+    speed: float = 0.3
+
+
+@bhd.register_brain("wall_follower", WallFollowerConfig)
+class WallFollower(bhd.ConfiguredBrain):
+    """Turns toward the wall by how far it is, and away from what is ahead."""
+
+    robot_kind = "base"
+
+    def __init__(self, config: WallFollowerConfig) -> None:
+        self.config = config
+
+    def bind(self, robot: bhd.RobotFeatures) -> None:
+        """Find the scan."""
+        self._scan, self._angles = bhd.find_scan(robot.observation_names, self.name)
+
+    def reset(self, ids: np.ndarray, seeds: list[int], n: int, instructions: list[str] = ()) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: bhd.Observation) -> np.ndarray:
+        """Return the twist of each robot, shape (n, 2)."""
+        ranges = observation.state[:, self._scan]
+        right = np.abs(self._angles + np.pi / 2) < 0.8
+        across = (ranges * -np.sin(self._angles))[:, right]
+        away = self._angles[right] + np.pi / 2
+        slope = (across * away).sum(axis=1) / (away**2).sum()  # the wall is nearer ahead than behind where it is below 0
+        turn = 3.0 * (self.config.distance_m - across.min(axis=1)) - 2.0 * slope
+        return np.stack([np.full(len(turn), self.config.speed), np.clip(turn, -1.5, 1.5)], axis=1)
