@@ -7,7 +7,7 @@ import numpy as np
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.tasks.pick import ENVIRONMENT
 
 OBSERVED = ("shoulder_pan.pos", "gripper.pos")
@@ -32,7 +32,7 @@ class Desk:
             for number, thing in enumerate(one.objects):
                 self.put(sim, number, thing, number == one.target_object)
         self.given: list[list[BrainCommand]] = [[] for _ in range(self.n)]
-        brain.bind(OBSERVED, OBSERVED, 25, ENVIRONMENT)
+        brain.bind(RobotFeatures(OBSERVED, OBSERVED, 25, ENVIRONMENT))
         brain.reset(np.arange(self.n), [0] * self.n, self.n, instructions or [""] * self.n)
 
     def put(self, sim: int, number: int, thing: TableObject, target: bool, lifted: float = 0.0) -> None:

@@ -9,7 +9,7 @@ from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.registry import brains_for, make_brain, make_simulation, make_task, robot_of_brain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -26,7 +26,8 @@ ARM = ur5().limits.names
 def actions(brain: Any, names: tuple[str, ...], frames: int, seeds: list[int], fps: int = 10) -> np.ndarray:
     """Return what a brain wants when the robots stand at 0.5, 1.5, …, shape (frames, n, actions)."""
     n = len(seeds)
-    brain.bind(("other", *names), names, fps)
+    body = next((one for one in (turtlebot3_burger(), ur5()) if one.limits.names == names), None)
+    brain.bind(RobotFeatures(("other", *names), names, fps, (), body))
     brain.reset(np.arange(n), seeds, n)
     state = np.tile(0.01 * np.arange(n)[:, None], (1, len(names) + 1))
     return np.array([brain.act(Observation(("other", *names), state + 0.001 * frame)) for frame in range(frames)])
@@ -111,11 +112,11 @@ def test_they_drive_every_robot() -> None:
 
 def test_what_they_cannot_do_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"hold the action 'grip\.force'"):
-        NoopBrain().bind(("a.pos",), ("grip.force",), 10)
+        NoopBrain().bind(RobotFeatures(("a.pos",), ("grip.force",), 10))
     with pytest.raises(ConfigError, match=r"tool_x\.pos"):
-        NoopBrain().bind(("a.pos",), ("tool_x.pos",), 10)
+        NoopBrain().bind(RobotFeatures(("a.pos",), ("tool_x.pos",), 10))
     with pytest.raises(ConfigError, match=r"knows no range for the actions x\.vel"):
-        RandomBrain().bind(("x.vel",), ("x.vel",), 10)
+        RandomBrain().bind(RobotFeatures(("x.vel",), ("x.vel",), 10))
     for options, match in (({"period_s": -1}, "period_s is -1"), ({"scale": 0}, "scale is 0"), ({"scale": 2}, "is 2")):
         with pytest.raises(ConfigError, match=match):
             RandomConfig(**options)

@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Brain, Observation, find_columns, find_scan
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, find_columns, find_scan
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from tests.cases import each_case
 
+BURGER = turtlebot3_burger()
 ACTIONS = ("x.vel", "theta.vel")
 BRAINS = (AvoidanceBrain, GapFollowerBrain)
 
@@ -60,8 +62,8 @@ def test_order_of_features_does_not_matter(brain_type: type[AvoidanceBrain] | ty
     back = ("imu_z.vel", *scan_names(90), "theta.vel", "gripper.pos", "x.vel")
     blank = np.full((4, 1), np.nan)
     one, other = brain_type(), brain_type()
-    one.bind(front, ACTIONS, 10)
-    other.bind(back, ("theta.vel", "gripper.pos", "x.vel"), 10)
+    one.bind(RobotFeatures(front, ACTIONS, 10, body=BURGER))
+    other.bind(RobotFeatures(back, ("theta.vel", "gripper.pos", "x.vel"), 10, body=BURGER))
     for brain in (one, other):
         brain.reset(np.arange(4), [0] * 4, 4)
     a = one.act(Observation(front, np.hstack([twist, scan])))
@@ -76,6 +78,6 @@ def test_a_brain_refuses_a_robot_without_its_features(
 ) -> None:
     brain: Brain = brain_type()
     with pytest.raises(ConfigError, match=f"{brain.name!r} needs a range scan"):
-        brain.bind(ACTIONS, ACTIONS, 10)
+        brain.bind(RobotFeatures(ACTIONS, ACTIONS, 10, body=BURGER))
     with pytest.raises(ConfigError, match=f"{brain.name!r} needs the action feature.*theta.vel"):
-        brain.bind((*ACTIONS, *scan_names(360)), ("x.vel",), 10)
+        brain.bind(RobotFeatures((*ACTIONS, *scan_names(360)), ("x.vel",), 10, body=BURGER))

@@ -11,7 +11,7 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import Goals, Mixed
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.baselines import NoopConfig, RandomBrain, RandomConfig
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
@@ -125,7 +125,7 @@ def test_a_rule_has_seen_the_whole_episode_and_does_what_it_would_do_with_that_m
     np.testing.assert_array_equal(np.array(spy.seen)[:, 0], episode.columns[keys.OBSERVATION_STATE].astype(float))
     other = GapFollowerBrain()
     simulation = make_simulation(TurtleBot3Config(beams=36), 1)
-    other.bind(simulation.observation_names, simulation.action_names, 10)
+    other.bind(RobotFeatures(simulation.observation_names, simulation.action_names, 10, body=simulation.body))
     other.reset(np.arange(1), [0], 1)
     advised = [other.act(Observation(simulation.observation_names, state))[0] for state in spy.seen]
     np.testing.assert_array_equal(episode.columns[keys.ACTION][10:], np.array(advised, np.float32)[10:])

@@ -23,7 +23,7 @@ FRAMES = 20
 class Script:
     """Plays the rows of a script: one by one, or `length` of them at a time, every `every` frames."""
 
-    name, robot_type, uses_images, has_plan = "script", "any", False, False
+    name, robot_kind, uses_images, has_plan = "script", "any", False, False
 
     def __init__(self, rows: np.ndarray, length: int = 0, every: int = 1) -> None:
         self.rows, self.length, self.every = rows, length, every

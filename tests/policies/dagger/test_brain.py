@@ -2,16 +2,18 @@
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import Chunk, CommandResult, Mixed, ResultCode
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomConfig
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.dagger.brain import LEARNER_DRIVES, DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.dagger.goal_expert import GoalExpert
 from bhd_lerobot.policies.dagger.takeover import (
@@ -35,12 +37,15 @@ TWIST = ("x.vel", "theta.vel")
 JOINTS = tuple(ur5().limits.names)
 ARM = (*JOINTS, *(name.replace(".pos", ".vel") for name in JOINTS))
 HOME = np.array(ur5().home)
+BURGER = turtlebot3_burger()
+DRIVEN = RobotFeatures(BASE, TWIST, 10, (), BURGER)
+UR = RobotFeatures(ARM, JOINTS, 25, (), ur5())
 
 
 class Fake:
     """Always wants the same, and remembers what it received."""
 
-    robot_type, uses_images, has_plan = "any", False, False
+    robot_kind, uses_images, has_plan = "any", False, False
 
     def __init__(self, name: str, value: float) -> None:
         self.name, self.value = name, value
@@ -79,7 +84,7 @@ def arm(q: np.ndarray, velocity: float | np.ndarray = 0.0) -> Observation:
 def made(n: int = 1, **values: Any) -> tuple[DaggerBrain, Fake, Fake]:
     learner, expert = Fake("learner", 0.1), Fake("expert", 0.2)
     brain = DaggerBrain(config(**values), learner, expert)
-    brain.bind(BASE, TWIST, 10)
+    brain.bind(DRIVEN)
     brain.reset(np.arange(n), list(range(n)), n)
     return brain, learner, expert
 
@@ -156,9 +161,9 @@ def test_what_does_not_fit_together_is_refused() -> None:
         make_brain(DaggerConfig(ReachBrainConfig(), PickBrainConfig()))
     with pytest.raises(ConfigError, match="disagreement compares setpoints, and the expert 'pick' gives goals"):
         make_brain(DaggerConfig(NoopConfig(), PickBrainConfig(), disagreement=0.3))
-    with pytest.raises(ConfigError, match=r"brain\.learner drives a turtlebot3, but brain\.expert drives a ur5"):
+    with pytest.raises(ConfigError, match=r"brain\.learner drives a base, but brain\.expert drives an arm"):
         robot_of_brain(DaggerConfig(AvoidanceConfig(), PickBrainConfig()))
-    assert robot_of_brain(DaggerConfig(NoopConfig(), PickBrainConfig())) == "ur5"
+    assert robot_of_brain(DaggerConfig(NoopConfig(), PickBrainConfig())) == "arm"
 
 
 def test_a_learner_that_gives_chunks_is_refused_by_name() -> None:
@@ -170,9 +175,9 @@ def test_a_learner_that_gives_chunks_is_refused_by_name() -> None:
 
 def test_a_robot_whose_collisions_it_cannot_foresee_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"not of a robot with the actions a\.pos.*--brain\.collision_s=null"):
-        collision_watch(0.5, ("a.pos",), ("a.pos",), 10)
+        collision_watch(0.5, RobotFeatures(("a.pos",), ("a.pos",), 10))
     with pytest.raises(ConfigError, match=r"not known of tool\.x"):
-        DisagreementWatch(0.1, 1, ("tool.x",))
+        DisagreementWatch(0.1, 1, RobotFeatures(("tool.x",), ("tool.x",), 10))
 
 
 def test_the_parameters_name_both_and_are_plain() -> None:
@@ -188,7 +193,7 @@ def test_the_parameters_name_both_and_are_plain() -> None:
 
 
 def test_a_base_that_drives_at_a_wall_is_about_to_collide_and_one_that_stands_or_backs_off_is_not() -> None:
-    watch = BaseCollisionWatch(0.5, BASE, TWIST)
+    watch = BaseCollisionWatch(0.5, DRIVEN, BURGER)
     seen = base()
     seen.state[0, 2] = 0.15  # straight ahead, 0.08 m before the robot's front
     for speed, turn, expected in [(0.22, 0.0, True), (0.0, 0.0, False), (-0.1, 0.0, False), (0.05, 0.0, False)]:
@@ -197,7 +202,7 @@ def test_a_base_that_drives_at_a_wall_is_about_to_collide_and_one_that_stands_or
 
 
 def test_an_arm_that_falls_to_the_table_is_about_to_collide_and_one_that_rises_is_not() -> None:
-    watch = ArmCollisionWatch(ARM, JOINTS, 25)
+    watch = ArmCollisionWatch(UR, ur5())
     down = np.zeros(7)
     down[1] = 1.0  # the shoulder leans forward
     low = HOME + np.array([0, 0.40, 0, 0, 0, 0, 0])
@@ -211,7 +216,7 @@ def test_an_arm_that_falls_to_the_table_is_about_to_collide_and_one_that_rises_i
 
 @pytest.mark.parametrize(("speed", "stalls"), [(0.0, True), (0.005, True), (0.2, False)])
 def test_a_base_that_gets_nowhere_stalls(speed: float, stalls: bool) -> None:
-    watch = StallWatch(20, BASE, 10)
+    watch = StallWatch(20, DRIVEN)
     watch.restart(np.arange(1), 1)
     looks = [bool(watch.check(base(speed=speed), np.zeros((1, 2)), None)[0]) for _ in range(30)]
     assert not any(looks[:20])
@@ -221,7 +226,7 @@ def test_a_base_that_gets_nowhere_stalls(speed: float, stalls: bool) -> None:
 
 
 def test_an_arm_that_turns_one_joint_does_not_stall() -> None:
-    watch = StallWatch(10, ARM, 25)
+    watch = StallWatch(10, UR)
     for turning, stalls in [(0.02, False), (0.0, True)]:
         watch.restart(np.arange(1), 1)
         looks = [watch.check(arm(HOME + turning * k), HOME[None], None)[0] for k in range(12)]
@@ -229,7 +234,7 @@ def test_an_arm_that_turns_one_joint_does_not_stall() -> None:
 
 
 def test_disagreement_counts_only_if_it_lasts() -> None:
-    watch = DisagreementWatch(0.25, 3, TWIST)
+    watch = DisagreementWatch(0.25, 3, DRIVEN)
     watch.restart(np.arange(1), 1)
     wide = 2 * 2.84 * 0.3  # rad/s, 0.3 of the range of the yaw rate
     looks = []
@@ -253,7 +258,7 @@ class Table(Desk):
         self.dagger = DaggerBrain(settings, NoopBrain(), expert)
         super().__init__(expert, [scene(CUP, BOX)])
         self.state = np.concatenate([q, np.zeros(7)])[None]
-        self.dagger.bind(ARM, JOINTS, 25, ENVIRONMENT)
+        self.dagger.bind(replace(UR, environment_names=ENVIRONMENT))
         self.dagger.reset(np.arange(1), [0], 1, [""])
 
     def look(self, results: Any = None, running: Any = None) -> dict[int, Any]:

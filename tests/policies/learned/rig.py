@@ -12,7 +12,7 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from numpy.typing import NDArray
 
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
@@ -153,5 +153,5 @@ def observations(n: int, frames: int, seed: int = 0, running: Any = None) -> Ite
 def make_brain(path: Path, **options: Any) -> LearnedBrain:
     """Return a brain, bound."""
     brain = LearnedBrain(LearnedBrainConfig(str(path), **options))
-    brain.bind(STATE, ACTIONS, FPS, ENVIRONMENT)
+    brain.bind(RobotFeatures(STATE, ACTIONS, FPS, ENVIRONMENT))
     return brain

@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from bhd_lerobot.errors import ActionError, ConfigError
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE, PolicyContract
 from bhd_lerobot.recording.config import RecordConfig
@@ -131,7 +131,7 @@ def test_an_average_over_chunks_looks_at_every_frame(tmp_path: Path) -> None:
 def test_a_robot_or_a_task_that_does_not_fit(folder: Path, arguments: Any, parts: tuple[str, ...]) -> None:
     brain = LearnedBrain(LearnedBrainConfig(str(folder)))
     with pytest.raises(ConfigError) as error:
-        brain.bind(*arguments)
+        brain.bind(RobotFeatures(*arguments))
     assert [part for part in (str(folder), *parts) if part not in str(error.value)] == []
 
 
@@ -143,14 +143,13 @@ def test_without_a_contract_the_shapes_are_checked_and_it_says_so(
         rig.make_brain(folder)
     assert "only the number of its inputs is checked" in caplog.text
     brain = LearnedBrain(LearnedBrainConfig(str(folder)))
-    assert brain.robot_type == "any"
     for arguments, what in (
         ((rig.STATE[1:], rig.ACTIONS, 10, rig.ENVIRONMENT), "14 numbers in 'observation.state'"),
         ((rig.STATE, ("a",), 10, rig.ENVIRONMENT), "2 numbers in 'action'"),
         ((rig.STATE, rig.ACTIONS, 10, ()), "2 numbers in 'observation.environment_state'"),
     ):
         with pytest.raises(ConfigError, match=what):
-            brain.bind(*arguments)
+            brain.bind(RobotFeatures(*arguments))
 
 
 def test_a_camera_that_the_robot_does_not_have(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from bhd_lerobot.bodies.tabletop import TableObject
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.commands import CommandResult, Goals, ResultCode
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
@@ -276,7 +276,7 @@ def test_a_new_episode_starts_from_nothing() -> None:
 
 def test_a_task_that_reports_no_objects_is_refused() -> None:
     with pytest.raises(ConfigError, match="'pick' needs the environment feature"):
-        PickBrain().bind(OBSERVED, OBSERVED, 25, ())
+        PickBrain().bind(RobotFeatures(OBSERVED, OBSERVED, 25, ()))
 
 
 # --- in the simulator ------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
@@ -30,7 +30,7 @@ class Desk:
         self.targets = np.tile(TARGET, (n, 1))
         self.last: dict[int, BrainCommand] = {}
         self.names: list[tuple[int, str]] = []
-        self.brain.bind(("a",), ("a",), 25, ENVIRONMENT)
+        self.brain.bind(RobotFeatures(("a",), ("a",), 25, ENVIRONMENT))
         self.brain.reset(np.arange(n), [0] * n, n)
 
     def look(self, results: dict[int, list[CommandResult]] | None = None) -> dict[int, BrainCommand]:
@@ -148,7 +148,7 @@ def test_a_new_episode_starts_from_nothing() -> None:
 
 def test_a_task_without_a_target_is_refused() -> None:
     with pytest.raises(ConfigError, match="'reach' needs the environment feature"):
-        ReachBrain().bind(("a",), ("a",), 25, ())
+        ReachBrain().bind(RobotFeatures(("a",), ("a",), 25, ()))
 
 
 # --- in the simulator ------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain, AvoidanceConfig
 from tests.cases import each_case
 
@@ -17,7 +17,7 @@ def decide(scan: np.ndarray, config: AvoidanceConfig | None = None) -> np.ndarra
     scan = np.atleast_2d(scan)
     names = tuple(f"scan_{beam:03d}.pos" for beam in range(scan.shape[1]))
     brain = AvoidanceBrain(config)
-    brain.bind(names, ACTIONS, 10)
+    brain.bind(RobotFeatures(names, ACTIONS, 10))
     brain.reset(np.arange(len(scan)), [0] * len(scan), len(scan))
     return brain.act(Observation(names, scan))
 
@@ -101,7 +101,7 @@ def test_the_observation_is_left_alone_and_nothing_is_remembered() -> None:
     scan = np.random.default_rng(1).uniform(0.3, 1.0, (3, 360))
     scan.flags.writeable = False
     brain = AvoidanceBrain()
-    brain.bind(NAMES, ACTIONS, 10)
+    brain.bind(RobotFeatures(NAMES, ACTIONS, 10))
     first = brain.act(Observation(NAMES, scan))
     for _ in range(3):
         assert np.array_equal(brain.act(Observation(NAMES, scan)), first)
@@ -116,7 +116,7 @@ def test_parameters_are_used() -> None:
 def test_readings_at_the_limits_are_valid_in_single_precision_too() -> None:
     brain = AvoidanceBrain()
     names = ["x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36))]
-    brain.bind(names, ["x.vel", "theta.vel"], 10)
+    brain.bind(RobotFeatures(names, ["x.vel", "theta.vel"], 10))
     for reading, expected in ((0.12, [0.0, 0.5]), (3.5, [0.2, 0.0])):
         state = np.full((1, 38), reading, np.float32).astype(np.float64)
         assert brain.act(Observation(tuple(names), state)).tolist() == [expected]

@@ -5,20 +5,21 @@ import pytest
 
 from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.bodies.body import Shape
-from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION
+from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION, turtlebot3_burger
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Brain, Observation
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
-from bhd_lerobot.policies.navigation.clearance import LIDAR_X, QUANTUM, ClearanceTable, Level, make_paths
+from bhd_lerobot.policies.navigation.clearance import QUANTUM, ClearanceTable, Footprint, Level, make_paths
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.base_simulation import BaseSimulation
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import Outcome, episode_seed
 from tests.cases import each_case
 
+BURGER = turtlebot3_burger()
 ACTIONS = ("x.vel", "theta.vel")
 BEAMS = (36, 40, 45, 60, 72, 90, 120, 180, 360)
 
@@ -29,7 +30,7 @@ def names_of(beams: int) -> tuple[str, ...]:
 
 def bound(beams: int, n: int, config: GapFollowerConfig | None = None) -> GapFollowerBrain:
     brain = GapFollowerBrain(config)
-    brain.bind(names_of(beams), ACTIONS, 10)
+    brain.bind(RobotFeatures(names_of(beams), ACTIONS, 10, body=BURGER))
     brain.reset(np.arange(n), [0] * n, n)
     return brain
 
@@ -181,25 +182,25 @@ def test_too_few_beams_are_refused(beams: int) -> None:
 
 def test_the_measured_twist_is_needed() -> None:
     with pytest.raises(ConfigError, match=r"'gap_follower' needs the observation feature\(s\) theta\.vel"):
-        GapFollowerBrain().bind(("x.vel", *names_of(90)[2:]), ACTIONS, 10)
+        GapFollowerBrain().bind(RobotFeatures(("x.vel", *names_of(90)[2:]), ACTIONS, 10, body=BURGER))
 
 
 # --- the table -------------------------------------------------------------------------------------------------------
 
 
 def test_straight_ahead_the_table_is_plain_geometry() -> None:
-    paths = make_paths(0.22, 0.2272)
+    paths = make_paths(0.22, 0.2272, Footprint.of(BURGER))
     straight = int(np.flatnonzero(paths.heading == 0)[0])
     table = ClearanceTable(paths, 360, 0.0, (Level(0.05, 0.005),), 3.5)
     for distance in (0.3, 0.7, 1.5, 3.0):
         scan = np.full((1, 360), 3.5)
         scan[0, 0] = distance
         free = table.clear(table.rows(scan), 0)[0, straight] * QUANTUM
-        assert free == pytest.approx(LIDAR_X + distance - 0.038 - 0.05, abs=2 * QUANTUM)
+        assert free == pytest.approx(BURGER.lidar.ahead + distance - 0.038 - 0.05, abs=2 * QUANTUM)
 
 
 def test_more_margin_never_gives_more_room() -> None:
-    paths = make_paths(0.22, 0.2272)
+    paths = make_paths(0.22, 0.2272, Footprint.of(BURGER))
     table = ClearanceTable(paths, 120, 0.01, (Level(0.1, 0.0), Level(0.05, 0.0), Level(0.0, 0.0)), 3.5)
     rows = table.rows(random_scans(50, 120, seed=2))
     wide, usual, tight = (table.clear(rows, level) for level in range(3))
@@ -210,7 +211,7 @@ def test_more_margin_never_gives_more_room() -> None:
 
 @pytest.mark.parametrize("sectors", [36, 120])
 def test_a_mirrored_scan_mirrors_the_room(sectors: int) -> None:
-    paths = make_paths(0.22, 0.2272)
+    paths = make_paths(0.22, 0.2272, Footprint.of(BURGER))
     table = ClearanceTable(paths, sectors, 0.01, (Level(0.05, 0.005),), 3.5)
     scan = random_scans(100, sectors, seed=6)
     room = table.clear(table.rows(scan), 0)
@@ -222,14 +223,16 @@ def test_a_mirrored_scan_mirrors_the_room(sectors: int) -> None:
 
 def test_an_obstacle_on_a_path_is_met_where_the_path_comes_to_it() -> None:
     """Whatever is put on the robot's centre line at some length, no path may go on past it."""
-    paths = make_paths(0.22, 0.2272)
+    paths = make_paths(0.22, 0.2272, Footprint.of(BURGER))
     table = ClearanceTable(paths, 360, 0.01, (Level(0.05, 0.005),), 3.5)
     lengths = np.array([0.6, 1.0, 2.0])
     for length, x, y in zip(lengths, *paths.points(lengths), strict=True):
-        for path in np.flatnonzero((np.hypot(x - LIDAR_X, y) > 0.3) & (np.hypot(x - LIDAR_X, y) < 3.4)):
-            angle = np.arctan2(y[path], x[path] - LIDAR_X)
+        for path in np.flatnonzero(
+            (np.hypot(x - BURGER.lidar.ahead, y) > 0.3) & (np.hypot(x - BURGER.lidar.ahead, y) < 3.4)
+        ):
+            angle = np.arctan2(y[path], x[path] - BURGER.lidar.ahead)
             scan = np.full((1, 360), 3.5)
-            scan[0, round(np.degrees(angle)) % 360] = np.hypot(x[path] - LIDAR_X, y[path])
+            scan[0, round(np.degrees(angle)) % 360] = np.hypot(x[path] - BURGER.lidar.ahead, y[path])
             assert table.clear(table.rows(scan), 0)[0, path] * QUANTUM <= length
 
 
@@ -284,7 +287,7 @@ def test_it_gets_out_of_a_dead_end(beams: int) -> None:
     ids = np.arange(len(starts))
     simulation = BaseSimulation(TurtleBot3Config(beams=beams), len(ids))
     brain = GapFollowerBrain()
-    brain.bind(simulation.observation_names, simulation.action_names, 10)
+    brain.bind(RobotFeatures(simulation.observation_names, simulation.action_names, 10, body=BURGER))
     simulation.reset(ids, arenas, [1, 2, 3])
     brain.reset(ids, [1, 2, 3], len(ids))
     outside = np.zeros(len(ids), np.bool_)

@@ -8,19 +8,20 @@ import pytest
 
 from bhd_lerobot.bodies.arenas import Arena, make_arena
 from bhd_lerobot.bodies.body import Shape
-from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION
+from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION, turtlebot3_burger
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.goal_map import CELL, GoalMap
 from bhd_lerobot.policies.navigation.navigator import GOAL, NavigatorBrain, NavigatorConfig
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.base_simulation import BaseSimulation
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from tests.cases import each_case
 
+BURGER = turtlebot3_burger()
 ACTIONS = ("x.vel", "theta.vel")
 OPEN = np.full(360, 3.5)
 
@@ -31,7 +32,7 @@ def names_of(beams: int) -> tuple[str, ...]:
 
 def bound(n: int = 1, beams: int = 360, config: NavigatorConfig | None = None) -> NavigatorBrain:
     brain = NavigatorBrain(config)
-    brain.bind(names_of(beams), ACTIONS, 10, GOAL)
+    brain.bind(RobotFeatures(names_of(beams), ACTIONS, 10, GOAL, body=BURGER))
     brain.reset(np.arange(n), [0] * n, n)
     return brain
 
@@ -208,14 +209,14 @@ def test_an_episode_does_not_depend_on_how_many_run_beside_it() -> None:
 
 def test_a_task_without_a_goal_is_refused_with_what_is_missing() -> None:
     with pytest.raises(ConfigError, match=r"'navigator' needs the environment feature.*goal_x.*does not report"):
-        NavigatorBrain().bind(names_of(90), ACTIONS, 10, ())
+        NavigatorBrain().bind(RobotFeatures(names_of(90), ACTIONS, 10, (), body=BURGER))
     with pytest.raises(ConfigError, match="received none"):
         bound().act(Observation(names_of(360), np.zeros((1, 362))))
 
 
 def test_a_robot_without_a_scan_or_with_few_beams_is_refused() -> None:
     with pytest.raises(ConfigError, match="needs a range scan"):
-        NavigatorBrain().bind(("x.vel", "theta.vel"), ACTIONS, 10, GOAL)
+        NavigatorBrain().bind(RobotFeatures(("x.vel", "theta.vel"), ACTIONS, 10, GOAL, body=BURGER))
     with pytest.raises(ConfigError, match="needs at least 36 beams"):
         bound(beams=20)
 

@@ -26,6 +26,7 @@ from bhd_lerobot.realtime.block import LiveBlock, Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, RemotePlant
 from bhd_lerobot.realtime.shared_memory import names
+from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.host.config import RealtimeConfig
@@ -36,7 +37,6 @@ from bhd_lerobot.robots.host.remote_plant import RemoteSimulation, plant_shape
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import WATCHDOGS
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.sim.plant import SimulatedPlant

@@ -17,7 +17,7 @@ pytest.importorskip("stable_baselines3")
 
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
@@ -86,7 +86,7 @@ def actions(folder: Path, states: np.ndarray, fps: int = 10) -> np.ndarray:
     contract = PolicyContract.load(folder)
     brain = LearnedBrain(LearnedBrainConfig(path=str(folder)))
     names = contract.observation_names or ()
-    brain.bind(names, contract.action_names or (), fps, ())
+    brain.bind(RobotFeatures(names, contract.action_names or (), fps, ()))
     n = states.shape[1]
     brain.reset(np.arange(n), [0] * n, n)
     return np.stack([np.asarray(brain.act(Observation(names, state.astype(np.float64), {}))) for state in states])
