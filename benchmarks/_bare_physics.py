@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from bhd_lerobot.envs.vector import BhdVectorEnv
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.base_simulation import BaseSimulation
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 
 STEP, SCAN, PLACE, RESET = range(4)
 Entry = tuple[Any, ...]

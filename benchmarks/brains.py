@@ -17,8 +17,8 @@ from bhd_lerobot.evaluation.statistics import mean, ratio_of_means, wilson
 from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.base_simulation import BaseSimulation
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import Event, Outcome
 

@@ -18,8 +18,8 @@ from benchmarks._turns import verdict, write
 from bhd_lerobot.evaluation.statistics import mean, wilson
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
-from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.base_simulation import BaseSimulation
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, Outcome
 

@@ -33,7 +33,7 @@ from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
-from bhd_lerobot.tasks.task import Task, TaskConfig
+from bhd_lerobot.tasks.task import NEVER, Task, TaskConfig
 
 
 class _Dagger(DaggerBrain):
@@ -109,6 +109,7 @@ def register_task[T](name: str, config: type[TaskConfig]) -> Callable[[type[T]],
     def register(task: type[T]) -> type[T]:
         task.name = name  # type: ignore[attr-defined]
         _register(TaskConfig, TASKS, name, config, task)
+        NEVER[name] = getattr(task, "never", ())
         return task
 
     return register

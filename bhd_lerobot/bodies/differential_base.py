@@ -4,7 +4,8 @@ from bhd_lerobot.bodies.body import CameraSpec, CommandLimits, LidarSpec, Mobile
 from bhd_lerobot.errors import ConfigError
 
 _TYRE = 0.009  # [m] half the width of a wheel
-_CASTER = 0.010  # [m] radius of the caster, on which the rear slides
+_CASTER = 0.010  # [m] radius of the casters, on which the ends slide
+_CASTER_CLEARANCE = 0.0005  # [m] under each of them when the robot stands on its wheels alone
 _WHEEL_KG = 0.03
 _LIDAR_OVER = 0.02  # [m] of the lidar over the hull
 # The TurtleBot3 Burger's [N m s/rad], for 1 kg on wheels of 0.033 m: the inertia that a wheel has to move, over the
@@ -19,6 +20,9 @@ _MJCF = """
       <geom type="ellipsoid" size="{r} {r} {tyre}" euler="1.5707963267948966 0 0" contype="0" conaffinity="3"
             friction="0.9 0.005 0.0001" group="3" mass="0"/>
     </default>
+    <default class="caster">
+      <geom type="sphere" size="{caster}" contype="0" conaffinity="1" condim="1" priority="1" group="3" mass="0.005"/>
+    </default>
     <default class="rim">
       <geom type="cylinder" size="{r} {tyre}" euler="1.5707963267948966 0 0" contype="0" conaffinity="0" group="1"
             mass="0" rgba="0.1 0.1 0.1 1"/>
@@ -31,8 +35,8 @@ _MJCF = """
             mass="{mass}" rgba="{colour} 1"/>
       <geom type="box" size="0.012 {half_y} {half_z}" pos="{nose} 0 {z}" contype="0" conaffinity="0" group="1" mass="0"
             rgba="0.95 0.85 0.2 1"/>
-      <geom name="caster" type="sphere" size="{caster}" pos="{caster_x} 0 {caster}" contype="0" conaffinity="1"
-            condim="1" priority="1" group="3" mass="0.005"/>
+      <geom name="caster_rear" class="caster" pos="-{caster_x} 0 {caster_z}"/>
+      <geom name="caster_front" class="caster" pos="{caster_x} 0 {caster_z}"/>
       <site name="imu" pos="{x} 0 {z}"/>
       <site name="lidar" pos="{x} 0 {lidar_z}"/>
       <geom type="cylinder" size="0.03 0.015" pos="{x} 0 {lidar_z}" contype="0" conaffinity="0" group="1" mass="0"
@@ -82,7 +86,7 @@ def differential_base(
     camera_width: int = 320,
     camera_height: int = 240,
 ) -> MobileBase:
-    """Return a box on two wheels in its middle and a caster at its rear, with a lidar on top and a camera in front.
+    """Return a box on two wheels in its middle and a caster at either end, with a lidar on top and a camera in front.
 
     Args:
         name: of the body.
@@ -109,8 +113,8 @@ def differential_base(
             raise ConfigError(f"{what} of the base {name!r} is {value}; it must be positive and finite.")
     if wheel_separation / 2 - _TYRE < width / 2:
         raise ConfigError(
-            f"wheel_separation of the base {name!r} is {wheel_separation}; with wheels of {2 * _TYRE} m beside a box of "
-            f"{width} m it must be at least {width + 2 * _TYRE:.3f}."
+            f"wheel_separation of the base {name!r} is {wheel_separation}; with wheels of {2 * _TYRE} m beside a box "
+            f"of {width} m it must be at least {width + 2 * _TYRE:.3f}."
         )
     half_track, ground = wheel_separation / 2, 2 * _CASTER
     top = ground + height
@@ -119,7 +123,7 @@ def differential_base(
     mjcf = _MJCF.format(
         name=name, r=wheel_radius, tyre=_TYRE, half_x=length / 2, half_y=width / 2, half_z=height / 2, x=0.0,
         z=ground + height / 2, mass=mass, colour=" ".join(map(str, colour)), nose=length / 2 - 0.012, caster=_CASTER,
-        caster_x=-length / 2 + _CASTER, lidar_z=top + _LIDAR_OVER, front=length / 2 + 0.002,
+        caster_x=length / 2 - _CASTER, caster_z=_CASTER + _CASTER_CLEARANCE, lidar_z=top + _LIDAR_OVER, front=length / 2 + 0.002,
         camera_z=ground + 0.7 * height, half_track=half_track, wheel=_WHEEL_KG, i_x=inertia / 4, i_y=inertia / 2,
         gain=_SERVO_GAIN * scale, torque=_SERVO_TORQUE * scale,
     )  # fmt: skip
@@ -145,9 +149,7 @@ def differential_base(
             servo_gain=_SERVO_GAIN * scale,
             encoder_ticks=4096,
         ),
-        lidar=LidarSpec(
-            site="lidar", beams=360, range_min=0.12, range_max=3.5, rate_hz=5, noise_std=lidar_noise_std
-        ),
+        lidar=LidarSpec(site="lidar", beams=360, range_min=0.12, range_max=3.5, rate_hz=5, noise_std=lidar_noise_std),
         cameras={"front": CameraSpec("front", camera_width, camera_height)},
         radius=float((max(length / 2, wheel_radius) ** 2 + (half_track + _TYRE) ** 2) ** 0.5),
         height=top + 2 * _LIDAR_OVER,

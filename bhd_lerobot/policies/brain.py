@@ -153,7 +153,12 @@ class ConfiguredBrain:
     name: str
     uses_images = False
     has_plan = False
-    config: Any
+
+    def __init__(self, config: Any) -> None:
+        self.config = config
+
+    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
+        """Forget nothing: what it does depends on the observation alone."""
 
     def subtasks(self) -> Sequence[str]:
         """Return nothing: there is no plan."""

@@ -86,7 +86,7 @@ class AvoidTask(BaseTask):
 
     def sample(self, seed: int) -> Arena:
         """Return the arena of the episode with this seed."""
-        return self._arena(self.config.arena, seed, self.config.random_start)
+        return self.arena(self.config.arena, seed, self.config.random_start)
 
     def instruction(self, scene: Arena) -> str:
         """Return what a person would ask for."""

@@ -134,7 +134,7 @@ class NavigateTask(BaseTask):
         for attempt in range(1 if fixed else _ARENA_TRIES):
             # The first try is the arena that the avoid task has for this seed.
             again = int(rng.integers(2**62)) if attempt else seed
-            arena = self._arena(config.arena, again, config.random_start)
+            arena = self.arena(config.arena, again, config.random_start)
             points, free = arena.reachable
             away = np.hypot(*(points - arena.start[:2]).transpose(2, 0, 1))
             free = free & (arena.clearance(points) >= config.goal_clearance_m)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from enum import IntEnum
-from typing import Any, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import draccus
 import numpy as np
@@ -48,13 +48,16 @@ OUTCOMES = tuple(event.cause for event in Event if event not in (Event.NOTHING, 
 """The events that an episode can end with, by name."""
 
 
-_NEVER: dict[str, tuple[Event, ...]] = {
+NEVER: dict[str, tuple[Event, ...]] = {
     "avoid": (Event.WRONG_OBJECT, Event.DROPPED, Event.UNREACHABLE),
     "navigate": (Event.WRONG_OBJECT, Event.DROPPED),
     "reach": (Event.WRONG_OBJECT, Event.DROPPED, Event.STUCK),
     "pick": (Event.STUCK,),
 }
-"""What cannot happen in a task: a base holds nothing, and only a base gets stuck."""
+"""What cannot happen in a task, by its type: a base holds nothing, and only a base gets stuck.
+
+Tasks of other packages are added when they are registered; an episode of one that is not known may end with anything.
+"""
 
 
 def outcomes_of(task: str | None) -> tuple[str, ...]:
@@ -63,7 +66,7 @@ def outcomes_of(task: str | None) -> tuple[str, ...]:
     Args:
         task: the task's type; None if it is not known.
     """
-    never = {event.cause for event in _NEVER.get(task or "", ())}
+    never = {event.cause for event in NEVER.get(task or "", ())}
     return tuple(name for name in OUTCOMES if name not in never)
 
 
@@ -198,6 +201,9 @@ class ConfiguredTask:
     """
 
     name: str
+    environment_names: tuple[str, ...] = ()
+    never: ClassVar[tuple[Event, ...]] = ()
+    """Events that cannot happen in this task."""
 
     def __init__(self, config: Any, n: int, fps: int, body: Body | None = None) -> None:
         self.config, self.body = config, body
@@ -211,6 +217,10 @@ class ConfiguredTask:
         """Return a time in frames, at least 1."""
         return max(1, round(seconds * self._fps))
 
+    def environment_state(self, truth: Any) -> NDArray[np.float64]:
+        """Report nothing to the brain, shape (n, 0)."""
+        return np.zeros((len(self._sims), 0))
+
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the task."""
         return {"type": self.name, **asdict(self.config)}
@@ -221,7 +231,7 @@ class BaseTask(ConfiguredTask):
 
     robot_kind = "base"
 
-    def _arena(self, name: str, seed: int, random_start: bool = False) -> Arena:
+    def arena(self, name: str, seed: int, random_start: bool = False) -> Arena:
         """Return an arena that this robot can get through."""
         radius = self.body.radius if isinstance(self.body, MobileBase) else BURGER_RADIUS
         return make_arena(name, seed, random_start, robot_radius=radius)

@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from lerobot.robots.config import RobotConfig
 
 import bhd_lerobot as bhd
 
 
-@RobotConfig.register_subclass("rover")
 @dataclass(kw_only=True)
 class RoverConfig(bhd.MobileBaseConfig):
     """Options of the robot type ``rover``."""
@@ -33,9 +31,9 @@ class Rover(bhd.SimulatedBase):
 def corridor(seed: int, robot_radius: float) -> bhd.Arena:
     """Return two walls of 6 m, as far apart as the seed says."""
     half = robot_radius + np.random.default_rng(seed).uniform(0.15, 0.35)
-    walls = [bhd.Shape("box", 0.0, side * (half + 0.05), 0.0, 3.0, 0.05) for side in (-1, 1)]
+    sides = [bhd.Shape("box", 0.0, side * (half + 0.05), 0.0, 3.0, 0.05) for side in (-1, 1)]
     ends = [bhd.Shape("box", side * 3.05, 0.0, 0.0, 0.05, half + 0.1) for side in (-1, 1)]
-    return bhd.Arena("corridor", (*walls, *ends), (-3.0, 3.0, -half, half), (-2.4, 0.0, 0.0))
+    return bhd.Arena("corridor", (*sides, *ends), (-3.0, 3.0, -half, half), (-2.4, 0.0, 0.0))
 
 
 bhd.register_arena("corridor", corridor)
@@ -53,15 +51,13 @@ class CorridorConfig(bhd.TaskConfig):
 class Corridor(bhd.BaseTask):
     """Success: past the goal without a touch. Score: how much of the way was done."""
 
-    environment_names = ()
-
     def __init__(self, config: CorridorConfig, n: int, fps: int, body: bhd.MobileBase | None = None) -> None:
         super().__init__(config, n, fps, body)
         self._x = np.zeros(n)
 
     def sample(self, seed: int) -> bhd.Arena:
         """Return the corridor of an episode."""
-        return self._arena("corridor", seed)
+        return self.arena("corridor", seed)
 
     def instruction(self, scene: bhd.Arena) -> str:
         """Return what a person would ask for."""
@@ -71,56 +67,45 @@ class Corridor(bhd.BaseTask):
         """Start episodes."""
         self._frame[ids], self._x[ids] = 0, [scene.start[0] for scene in scenes]
 
-    def environment_state(self, truth: object) -> np.ndarray:
-        """Report nothing."""
-        return np.zeros((len(self._x), 0))
-
     def judge(self, truth: object, running: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Reward the way forward; a touch, the goal and the time end an episode."""
         x = np.where(running, truth.base_pose_in_world[:, 0], self._x)
         reward, self._x = x - self._x, x
         self._frame[running] += 1
-        event = np.where(self._frame >= self.frames, bhd.Event.TIMEOUT, bhd.Event.NOTHING)
-        event = np.where(x > self.config.goal_m, bhd.Event.SUCCESS, event)
-        event = np.where(truth.touched, bhd.Event.COLLISION, event)
-        return reward, np.where(running, event, bhd.Event.NOTHING)
+        ends = [~running, truth.touched, x > self.config.goal_m, self._frame >= self.frames]
+        events = [bhd.Event.NOTHING, bhd.Event.COLLISION, bhd.Event.SUCCESS, bhd.Event.TIMEOUT]
+        return reward, np.select(ends, events, bhd.Event.NOTHING)
 
     def outcome(self, sim: int, event: bhd.Event) -> bhd.Outcome:
         """Return how an episode ended."""
-        done = (self._x[sim] + 2.4) / (self.config.goal_m + 2.4)
-        return bhd.Outcome(event == bhd.Event.SUCCESS, event, float(np.clip(done, 0, 1)))
+        score = np.clip((self._x[sim] + 2.4) / (self.config.goal_m + 2.4), 0, 1)
+        return bhd.Outcome(event == bhd.Event.SUCCESS, event, float(score))
 
 
 @dataclass
 class WallFollowerConfig(bhd.BrainConfig):
     """Keep `distance_m` from the wall on the right at `speed` [m/s]."""
 
-    distance_m: float = 0.35
+    distance_m: float = 0.28
     speed: float = 0.3
 
 
 @bhd.register_brain("wall_follower", WallFollowerConfig)
 class WallFollower(bhd.ConfiguredBrain):
-    """Turns toward the wall by how far it is, and away from what is ahead."""
+    """Steers by the distance to the wall on the right and by the angle to it, a line through the beams there."""
 
     robot_kind = "base"
 
-    def __init__(self, config: WallFollowerConfig) -> None:
-        self.config = config
-
     def bind(self, robot: bhd.RobotFeatures) -> None:
-        """Find the scan."""
-        self._scan, self._angles = bhd.find_scan(robot.observation_names, self.name)
-
-    def reset(self, ids: np.ndarray, seeds: list[int], n: int, instructions: list[str] = ()) -> None:
-        """Nothing to forget."""
+        """Choose the beams within 45 degrees of the right."""
+        self._scan, angles = bhd.find_scan(robot.observation_names, self.name)
+        self._across = np.where(np.abs(angles + np.pi / 2) < 0.8, -np.sin(angles), 0.0)
+        self._weights = angles + np.pi / 2
 
     def act(self, observation: bhd.Observation) -> np.ndarray:
         """Return the twist of each robot, shape (n, 2)."""
-        ranges = observation.state[:, self._scan]
-        right = np.abs(self._angles + np.pi / 2) < 0.8
-        across = (ranges * -np.sin(self._angles))[:, right]
-        away = self._angles[right] + np.pi / 2
-        slope = (across * away).sum(axis=1) / (away**2).sum()  # the wall is nearer ahead than behind where it is below 0
-        turn = 3.0 * (self.config.distance_m - across.min(axis=1)) - 2.0 * slope
+        across = observation.state[:, self._scan] * self._across
+        beams, square = np.count_nonzero(self._across), (self._weights[self._across > 0] ** 2).sum()
+        distance, slope = across.sum(axis=1) / beams, (across * self._weights).sum(axis=1) / square
+        turn = 3.0 * (self.config.distance_m - distance) - 2.0 * slope / distance
         return np.stack([np.full(len(turn), self.config.speed), np.clip(turn, -1.5, 1.5)], axis=1)
