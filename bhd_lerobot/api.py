@@ -97,7 +97,8 @@ def train(
     if isinstance(config, RlConfig) or "algorithm" in options:
         from bhd_lerobot.training.rl.train import train as run_rl
 
-        return run_rl(_configured(RlConfig, config, options), console)
+        rl: RlConfig = _configured(RlConfig, config, options)  # type: ignore[arg-type]  # refused if it is another
+        return run_rl(rl, console)
     from bhd_lerobot.training.arguments import Request, request_of
     from bhd_lerobot.training.train import train as run_train
 

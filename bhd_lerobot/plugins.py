@@ -8,6 +8,7 @@ one with an entry point of the group `ENTRY_POINTS`, or a module that a command 
 import importlib
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import metadata
 from typing import Any
 
@@ -95,7 +96,7 @@ def _installed() -> list[tuple[str, Callable[[], Any]]]:
     for distribution in metadata.distributions():
         name = str(distribution.metadata["Name"] or "")
         if name.startswith(PREFIXES):
-            found[name] = lambda name=name: importlib.import_module(name)
+            found[name] = partial(importlib.import_module, name)
     for entry in metadata.entry_points(group=ENTRY_POINTS):
         found.setdefault(entry.value, entry.load)
     return sorted(found.items(), key=lambda item: item[0])

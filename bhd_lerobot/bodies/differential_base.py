@@ -123,9 +123,9 @@ def differential_base(
     mjcf = _MJCF.format(
         name=name, r=wheel_radius, tyre=_TYRE, half_x=length / 2, half_y=width / 2, half_z=height / 2, x=0.0,
         z=ground + height / 2, mass=mass, colour=" ".join(map(str, colour)), nose=length / 2 - 0.012, caster=_CASTER,
-        caster_x=length / 2 - _CASTER, caster_z=_CASTER + _CASTER_CLEARANCE, lidar_z=top + _LIDAR_OVER, front=length / 2 + 0.002,
-        camera_z=ground + 0.7 * height, half_track=half_track, wheel=_WHEEL_KG, i_x=inertia / 4, i_y=inertia / 2,
-        gain=_SERVO_GAIN * scale, torque=_SERVO_TORQUE * scale,
+        caster_x=length / 2 - _CASTER, caster_z=_CASTER + _CASTER_CLEARANCE, lidar_z=top + _LIDAR_OVER,
+        front=length / 2 + 0.002, camera_z=ground + 0.7 * height, half_track=half_track, wheel=_WHEEL_KG,
+        i_x=inertia / 4, i_y=inertia / 2, gain=_SERVO_GAIN * scale, torque=_SERVO_TORQUE * scale,
     )  # fmt: skip
     rim = max(max_velocity[0], max_velocity[1] * half_track)
     return MobileBase(

@@ -148,8 +148,10 @@ class DisagreementWatch(_FrameCounter):
                 f"{', '.join(robot.action_names)}. Leave it out, or drive a simulated base, or an arm with "
                 "--robot.action_space=joint."
             )
-        is_arm = isinstance(limits, PositionLimits)
-        self._range = np.array(limits.upper) - np.array(limits.lower) if is_arm else 2 * np.array(limits.velocity)
+        if isinstance(limits, PositionLimits):
+            self._range = np.array(limits.upper) - np.array(limits.lower)
+        else:
+            self._range = 2 * np.array(limits.velocity)
 
     def check(self, seen: Observation, wanted: Array, advised: Array | None) -> Mask:
         """Count the frames of disagreement."""
