@@ -126,7 +126,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     if first is not None and preview is not None:
         states = first.columns[PHYSICS_STATE]
         preview.write(first.scene, states, config.dataset.fps, output_dir / "episode.mp4")
-        preview.write_strip(first.scene, states, output_dir / "episode.png")
+        preview.write_strip(first.scene, states, config.dataset.fps, output_dir / "episode.png")
         preview.close()
     print_summary(console, config, result, preview is not None and first is not None)
     if config.dataset.push_to_hub:

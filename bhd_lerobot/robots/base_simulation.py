@@ -29,6 +29,7 @@ class BaseSimulation(Simulation):
     """
 
     robot_kind = "base"
+    view = "follow"
     action_names = ("x.vel", "theta.vel")
     video_speed = 4
 

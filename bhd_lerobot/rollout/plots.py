@@ -91,6 +91,7 @@ def draw_trajectories(trajectories: Sequence[Trajectory], path: Path, heading: s
                 axes.set_axis_off()
             else:
                 _draw_panel(axes, trajectory)
+        figure.supxlabel("circle: start, square: end, cross: failure", fontsize=7.5)
         file = path if count == 1 else path.with_stem(f"{path.stem}_{page + 1:02d}")
         figure.savefig(file, dpi=110)
         pages.append(file)
@@ -110,9 +111,19 @@ def _draw_panel(axes: Axes, trajectory: Trajectory) -> None:
     color = _GOOD if trajectory.success else _BAD
     axes.plot(trajectory.xy[:, 0], trajectory.xy[:, 1], color=color, linewidth=1.1)
     axes.plot(*trajectory.xy[0], marker="o", color=color, markersize=4)
-    if not trajectory.success:
-        axes.plot(*trajectory.xy[-1], marker="x", color=color, markersize=7, markeredgewidth=2)
+    end = {"marker": "s", "markersize": 4} if trajectory.success else {"marker": "x", "markersize": 7}
+    axes.plot(*trajectory.xy[-1], color=color, markeredgewidth=2, **end)
     axes.set_title(trajectory.title, fontsize=7.5, color=color)
+    _draw_scale(axes)
+
+
+def _draw_scale(axes: Axes) -> None:
+    """Draw a bar of 1 m under the panel, of 0.1 m under one of less than 3 m."""
+    left, right = axes.get_xlim()
+    length = 1.0 if right - left > 3 else 0.1
+    across = axes.get_xaxis_transform()  # x in metres, y in parts of the panel
+    axes.plot([left, left + length], [-0.03, -0.03], color="black", linewidth=1.5, transform=across, clip_on=False)
+    axes.text(left + length, -0.03, f"  {length:g} m", fontsize=6.5, va="center", transform=across)
 
 
 def draw_scene(axes: Axes, scene: Arena | TableScene) -> None:
@@ -160,22 +171,19 @@ def draw_arena(axes: Axes, arena: Arena) -> None:
     """Draw the obstacles of an arena from above, to scale."""
     x_min, x_max, y_min, y_max = arena.extent
     axes.set_facecolor(_FREE)
+    room = axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, visible=False))
     for shape in arena.shapes:
+        patch: Circle | Rectangle
         if shape.kind == "cylinder":
-            axes.add_patch(Circle((shape.x, shape.y), shape.size_x, color=_WALL, linewidth=0))
+            patch = Circle((shape.x, shape.y), shape.size_x, color=_WALL, linewidth=0)
         else:
             corner = (shape.x - shape.size_x, shape.y - shape.size_y)
-            axes.add_patch(
-                Rectangle(
-                    corner,
-                    2 * shape.size_x,
-                    2 * shape.size_y,
-                    angle=math.degrees(shape.yaw),
-                    rotation_point="center",
-                    color=_WALL,
-                    linewidth=0,
-                )
-            )
+            angle = math.degrees(shape.yaw)
+            size = (2 * shape.size_x, 2 * shape.size_y)
+            patch = Rectangle(corner, *size, angle=angle, rotation_point="center", color=_WALL, linewidth=0)
+        axes.add_patch(patch)
+        if x_min < shape.x < x_max and y_min < shape.y < y_max:  # what stands in a wall does not stick out behind it
+            patch.set_clip_path(room)
     if arena.goal is not None:
         x, y, yaw = arena.goal
         axes.plot(x, y, marker="+", color="black", markersize=8, markeredgewidth=1.5)

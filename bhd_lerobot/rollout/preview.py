@@ -58,23 +58,28 @@ class Preview:
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
             container.mux(stream.encode())
 
-    def write_strip(self, scene: Any, states: NDArray[np.float64], path: Path) -> None:
-        """Write an image of an episode: some of its frames, evenly spaced, in rows.
+    def write_strip(self, scene: Any, states: NDArray[np.float64], fps: int, path: Path) -> None:
+        """Write an image of an episode: some of its frames, evenly spaced, in rows, each with its time.
 
         Args:
             scene: where it was.
             states: recorded physics states, shape (frames, nq + nv).
+            fps: recorded frames a second [Hz].
             path: the PNG file.
         """
-        from matplotlib.image import imsave
+        from PIL import Image, ImageDraw
 
         self._simulation.place(np.zeros(1, np.intp), [scene])
         images = []
         for index in np.linspace(0, len(states) - 1, STRIP[0] * STRIP[1]).round().astype(int):
             self._show(states[index])
-            images.append(self._camera.render(0, self._simulation.view))
-        rows = [np.concatenate(images[row : row + STRIP[1]], axis=1) for row in range(0, len(images), STRIP[1])]
-        imsave(path, np.concatenate(rows))
+            image = Image.fromarray(self._camera.render(0, self._simulation.view))
+            ImageDraw.Draw(image).text((12, 8), f"{index / fps:.1f} s", fill="black", font_size=26)
+            images.append(image)
+        strip = Image.new("RGB", (WIDTH * STRIP[1], HEIGHT * STRIP[0]))
+        for number, image in enumerate(images):
+            strip.paste(image, (number % STRIP[1] * WIDTH, number // STRIP[1] * HEIGHT))
+        strip.save(path)
 
     def _show(self, state: NDArray[np.float64]) -> None:
         world = self._simulation.world

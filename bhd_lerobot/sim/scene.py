@@ -67,6 +67,11 @@ def _add_arena_stage(spec: mujoco.MjSpec, body: MobileBase, pool_size: int) -> N
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     _add_stage(spec)
     _add_pool(spec, pool_size)
+    # Behind and above, as far as a room's walls are still seen; it moves with the robot and does not turn.
+    spec.body(body.root).add_camera(
+        name="follow", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK, pos=[0, -1.3, 1.9], xyaxes=[1, 0, 0, 0, 0.82, 0.57],
+        fovy=46,
+    )  # fmt: skip
     spec.add_sensor(
         name=body.touch_sensor,
         type=mujoco.mjtSensor.mjSENS_CONTACT,
