@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-import bhd_lerobot
 from tests.cases import each_case
 
 PACKAGE = "bhd_lerobot"
@@ -31,6 +30,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "renames": (),
     "command_line": ("renames",),
     "bodies": (),
+    "plugins": ("bodies",),
     "sim": ("bodies.body", "bodies.tabletop"),
     "control": ("bodies.body",),
     "control.geometry": ("bodies.body", "control"),
@@ -41,11 +41,11 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "tasks": _TASKS,
     "robots.host": ("bodies.body", "sim", "control.*", "realtime"),
     "robots": ("tasks", "bodies", "sim", "control.*", "robots.host"),
-    "registry": ("tasks", "robots.*", "policies.*"),
+    "registry": ("plugins", "bodies.body", "tasks", "robots.*", "policies.*"),
     "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "rollout.configuration"),
     "policies": _TASKS,
     "policies.mlp": ("control.geometry",),
-    "policies.learned": ("__version__", "control", "datasets.storage", "policies", "policies.mlp"),
+    "policies.learned": ("__version__", "plugins", "control", "datasets.storage", "policies", "policies.mlp"),
     "policies.navigation": ("bodies", "policies"),
     "policies.manipulation": (*_TASKS, "policies"),
     "policies.language": (*_TASKS, "policies", "policies.manipulation"),
@@ -53,7 +53,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "datasets.storage": (),
     "datasets.format": ("renames", "datasets.storage"),
     "datasets.assembly": _DATASETS,
-    "datasets.edit": (*_DATASETS, "datasets.assembly", "tasks"),
+    "datasets.edit": (*_DATASETS, "datasets.assembly", "plugins", "tasks"),
     "datasets.validate": (*_DATASETS, "control.geometry"),
     "datasets.recovery": (*_DATASETS, "datasets.assembly", "datasets.validate", "tasks"),
     "datasets.writer": (*_DATASETS, "datasets.assembly", "datasets.recovery"),
@@ -65,10 +65,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "rosbag.exporter": (*_DATASETS, "datasets.edit", "rosbag.messages", "rosbag.storage"),
     "rosbag.importer": ("tasks", "bodies", "control", "datasets.format", "datasets.writer", "rosbag.*"),
     "rollout": (
-        *("__version__", "command_line", "renames", "registry"),
+        *("__version__", "command_line", "renames", "plugins", "registry"),
         *("tasks", "bodies", "sim", "control", "robots.*", "policies.*", "datasets.format"),
     ),
-    "hub": (*_DATASETS, "datasets.remote", "rollout"),
+    "hub": ("plugins", "bodies.body", *_DATASETS, "datasets.remote", "rollout"),
     "cluster": ("registry", "tasks", "control", "robots.host", "policies.*", "datasets.format", "rollout"),
     "recording": (
         *("registry", "tasks", "bodies", "control", "robots.host", "policies", *_DATASETS, "datasets.writer"),
@@ -85,10 +85,22 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("registry", "rollout", "hub"),
     ),
     "training.rl": ("registry", "plugin", "tasks", "envs", "policies.*", "datasets.format", "rollout", "training"),
-    "apps.view": ("tasks", "bodies", "control", "control.geometry", *_DATASETS, "datasets.assembly", "datasets.edit"),
+    "apps.view": (
+        "plugins",
+        "tasks",
+        "bodies",
+        "control",
+        "control.geometry",
+        *_DATASETS,
+        "datasets.assembly",
+        "datasets.edit",
+    ),
     "apps.monitor": ("command_line", "control", "control.motion", "realtime"),
-    "apps.doctor": ("command_line", "bodies", "sim", "realtime", "datasets.format"),
+    "apps.doctor": ("command_line", "plugins", "bodies", "sim", "realtime", "datasets.format"),
     "apps.demo": ("command_line", "rollout", "recording", "evaluation", "training"),
+    "api": (
+        *("plugins", "registry", "tasks", "policies", "rollout", "recording", "evaluation", "training", "training.rl"),
+    ),
     "cli": EVERYTHING,
     "cli.data": EVERYTHING,
 }
@@ -266,12 +278,6 @@ def test_a_folder_is_read_at_a_glance() -> None:
 def test_init_files_are_empty() -> None:
     filled = [p for p in SOURCE.rglob("__init__.py") if p.parent != SOURCE and p.read_bytes().strip()]
     assert filled == []
-
-
-def test_the_top_init_holds_a_docstring_and_the_version() -> None:
-    tree = ast.parse((SOURCE / "__init__.py").read_text(encoding="utf-8"))
-    assert ast.get_docstring(tree)
-    assert [ast.unparse(node) for node in tree.body[1:]] == [f"__version__ = {bhd_lerobot.__version__!r}"]
 
 
 def test_the_plugin_module_is_one_import() -> None:

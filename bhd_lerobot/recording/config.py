@@ -8,6 +8,7 @@ from lerobot.robots.config import RobotConfig
 from bhd_lerobot.cluster.config import RayConfig, check_engine
 from bhd_lerobot.control.estop import estop_signal
 from bhd_lerobot.control.tolerance import TimingTolerance
+from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.recording.live_view import check_options
@@ -20,7 +21,7 @@ class DatasetConfig:
     """What is recorded and where. The names are those of `lerobot-record`.
 
     Attributes:
-        repo_id: name of the dataset on the Hub, `user/name`.
+        repo_id: name of the dataset on the Hub, `user/name`; `local/` and the folder's name if only `root` is given.
         root: folder of the dataset; LeRobot's default place if nothing.
         fps: frames a second [Hz]; the robot's own if 0.
         num_episodes: number of episodes that the dataset holds in the end.
@@ -33,7 +34,7 @@ class DatasetConfig:
         tags: tags of the uploaded dataset.
     """
 
-    repo_id: str
+    repo_id: str = ""
     root: str | None = None
     fps: int = 0
     num_episodes: int = 50
@@ -105,6 +106,10 @@ class RecordConfig:
         Raises:
             ConfigError: names the value and the valid ones.
         """
+        if not self.dataset.repo_id:
+            if self.dataset.push_to_hub:
+                raise ConfigError("dataset.push_to_hub is true: set --dataset.repo_id=user/name, or leave it out.")
+            self.dataset.repo_id = local_name(self.dataset.root)
         check_robot_and_task(self.robot, self.task, "bhd-record")
         check_brain("brain", self.brain, self.robot.type)
         for name, value in (

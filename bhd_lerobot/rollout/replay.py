@@ -99,6 +99,10 @@ class Divergence:
         """Whether states and observations are the recorded ones, bit for bit."""
         return not self.state.any() and not self.observation.any()
 
+    def __repr__(self) -> str:
+        worst = "identical" if self.identical else f"position up to {self.position_m.max():.3g} m apart"
+        return f"Divergence(mode={self.mode!r}, {len(self.state)} frames, {worst})"
+
 
 class Replay:
     """One recorded episode and a simulation of its robot.

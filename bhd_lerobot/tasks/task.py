@@ -60,13 +60,15 @@ Tasks of other packages are added when they are registered; an episode of one th
 """
 
 
-def outcomes_of(task: str | None) -> tuple[str, ...]:
+def outcomes_of(task: str | None, body: Body | None = None) -> tuple[str, ...]:
     """Return what an episode can end with, by name, whoever says so.
 
     Args:
         task: the task's type; None if it is not known.
+        body: the robot's hardware; None if it is not known.
     """
-    never = {event.cause for event in NEVER.get(task or "", ())}
+    grasping = (Event.WRONG_OBJECT, Event.DROPPED) if isinstance(body, MobileBase) else ()
+    never = {event.cause for event in (*NEVER.get(task or "", ()), *grasping)}
     return tuple(name for name in OUTCOMES if name not in never)
 
 

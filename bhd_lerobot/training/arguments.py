@@ -17,6 +17,7 @@ from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot.utils.device_utils import auto_select_torch_device
 
+from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.contract import find_checkpoint
 from bhd_lerobot.rollout import configuration
@@ -117,6 +118,9 @@ def _read_checkpoint(checkpoint: Path) -> dict[str, Any]:
 
 def _decoded(values: dict[str, Any], checkpoint: Path | None) -> Request:
     values.pop("checkpoint_path", None)
+    dataset = values.get("dataset")
+    if isinstance(dataset, dict) and dataset.get("root") and not dataset.get("repo_id"):
+        values["dataset"] = {**dataset, "repo_id": local_name(dataset["root"])}
     contract = _start_from(values, resume=checkpoint is not None)
     selection = values.get("selection")
     if isinstance(selection, dict) and isinstance(selection.get("outcome"), str):

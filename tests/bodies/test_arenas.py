@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 
 from bhd_lerobot.bodies.arenas import (
     ARENAS,
+    BURGER_RADIUS,
     CLEARANCE,
     RESOLUTION,
-    ROBOT_RADIUS,
     START_CLEARANCE,
     WALL,
     Arena,
@@ -119,7 +119,7 @@ def test_all_free_space_is_connected(name: str, seed: int) -> None:
     offset = grid[..., None, :] - corners
     inside = (edges[:, 0] * offset[..., 1] - edges[:, 1] * offset[..., 0] > 0).all(-1)
     # A little more room than the generator asks for, because its grid may see a gap that is as wide as that exactly.
-    free = inside & (outlines.query(grid)[0] > ROBOT_RADIUS + CLEARANCE + RESOLUTION / 2)
+    free = inside & (outlines.query(grid)[0] > BURGER_RADIUS + CLEARANCE + RESOLUTION / 2)
     labels, _ = ndimage.label(free, np.ones((3, 3)))
     points, reachable = arena.reachable
     tree = cKDTree(points[reachable])
@@ -174,7 +174,7 @@ def test_free_cells_are_cells_of_the_grid(name: str, seed: int, size: float) -> 
     for cell in free:
         x, y = x_min + cell % columns * size, y_min + cell // columns * size
         inside = np.stack(np.meshgrid(np.linspace(x, x + size, 30), np.linspace(y, y + size, 30)), -1)
-        assert arena.clearance(inside).max() > ROBOT_RADIUS + CLEARANCE - 0.01
+        assert arena.clearance(inside).max() > BURGER_RADIUS + CLEARANCE - 0.01
 
 
 def test_cells_are_numbered_row_by_row_and_those_outside_are_clipped() -> None:

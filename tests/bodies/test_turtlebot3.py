@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from bhd_lerobot.bodies.arenas import ROBOT_RADIUS
+from bhd_lerobot.bodies.arenas import BURGER_RADIUS
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ConfigError
 from tests.cases import each_case
@@ -67,7 +67,7 @@ def test_the_bounding_cylinder_holds_the_whole_robot_and_little_more(
 ) -> None:
     reach = np.hypot(*surface_points(model, data)[:, :2].T).max()
     assert reach <= BODY.radius <= reach + 0.005
-    assert BODY.radius == ROBOT_RADIUS
+    assert BODY.radius == BURGER_RADIUS
 
 
 def test_wheels_are_where_and_as_large_as_published(model: mujoco.MjModel, data: mujoco.MjData) -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.arenas import CLEARANCE, ROBOT_RADIUS, Arena, make_arena, random_arena
+from bhd_lerobot.bodies.arenas import BURGER_RADIUS, CLEARANCE, Arena, make_arena, random_arena
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.rollout.provenance import scene_from_json, scene_to_json
@@ -312,7 +312,7 @@ def test_a_way_around_a_wall_has_the_length_of_its_geometry() -> None:
     task = NavigateTask(NavigateConfig(), 1, FPS)
     task.begin(np.array([0]), [arena])
     # Straight to a circle around the wall's corner, around it, along the wall's end, and the same again.
-    around, apart = ROBOT_RADIUS + CLEARANCE, math.hypot(0.97, 2.0)
+    around, apart = BURGER_RADIUS + CLEARANCE, math.hypot(0.97, 2.0)
     turned = math.atan2(2.0, 0.97) + math.asin(around / apart)
     geometry = 2 * (math.sqrt(apart**2 - around**2) + turned * around) + 0.06
     assert task.outcome(0, Event.NOTHING).details["shortest_m"] == pytest.approx(geometry, rel=0.04)

@@ -15,6 +15,7 @@ from bhd_lerobot.datasets.format.schema import as_numpy
 from bhd_lerobot.datasets.format.state import DatasetState, Row, ordered_slots, read_frames, slot_of
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
+from bhd_lerobot.plugins import body_of
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
 
 _REASON = "marked afterwards"
@@ -89,7 +90,7 @@ def mark(
 
 def possible_outcomes(state: DatasetState, row: Row) -> tuple[str, ...]:
     """Return what an episode can have ended with, by its task and its robot; all outcomes if these are unknown."""
-    return outcomes_of(_task_of(state, row))
+    return outcomes_of(_task_of(state, row), body_of(state.info.get("robot_type")))
 
 
 def _task_of(state: DatasetState, row: Row) -> str | None:

@@ -1,6 +1,7 @@
 """The identity of a recording, which decides whether it can be continued."""
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,18 @@ def differences(prefix: str, recorded: Any, requested: Any) -> Iterator[str]:
 def _short(value: Any) -> str:
     text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 120 else f"{text[:80]} ... ({len(text)} characters)"
+
+
+def local_name(root: str | Path | None) -> str:
+    """Return the `repo_id` of a dataset that was given a folder and no name: ``local/`` and the folder's name.
+
+    Raises:
+        ConfigError: no folder either.
+    """
+    if not root:
+        raise ConfigError("Neither dataset.root nor dataset.repo_id is given: name a folder, or user/name on the Hub.")
+    name = re.sub(r"[^\w.-]", "_", Path(root).expanduser().resolve().name).strip("-.") or "dataset"
+    return f"local/{name}"
 
 
 def default_root(repo_id: str) -> Path:

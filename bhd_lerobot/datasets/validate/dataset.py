@@ -54,6 +54,11 @@ class DatasetCheck:
         """The worst finding's severity."""
         return max((finding.severity for finding in self.findings), default=Severity.NOTE)
 
+    @property
+    def is_valid(self) -> bool:
+        """Whether nothing worse than warnings was found."""
+        return self.worst < Severity.ERROR
+
     def count(self, severity: Severity) -> int:
         """Return how many findings are of a severity."""
         return sum(finding.severity == severity for finding in self.findings)

@@ -13,6 +13,7 @@ from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
+from bhd_lerobot.plugins import body_of
 from bhd_lerobot.tasks.task import OUTCOMES, Event, outcomes_of
 from tests.cases import each_case
 from tests.datasets import support
@@ -169,7 +170,7 @@ def test_an_impossible_outcome_of_a_task_or_robot_is_refused(tmp_path, robot, ta
         with pytest.raises(ConfigError, match=f"cannot have ended with '{outcome}'.*Valid: success, ") as error:
             mark(tmp_path / "d", [0], outcome=outcome)
         valid = str(error.value).partition("Valid: ")[2].rstrip(".").split(", ")
-        assert set(valid) == set(outcomes_of(task, robot))
+        assert set(valid) == set(outcomes_of(task, body_of(robot)))
         assert set(possible) <= set(valid)
     assert (tmp_path / "d/meta/info.json").stat().st_mtime_ns == before
     mark(tmp_path / "d", [0], outcome=possible[0])
@@ -191,4 +192,4 @@ def test_no_task_has_an_event_outside_its_possible_outcomes() -> None:
     for path in Path(tasks.__path__[0]).glob("*.py"):
         named = {Event[name].cause for name in re.findall(r"\bEvent\.([A-Z_]+)\b", path.read_text())}
         if path.stem in ("avoid", "navigate", "reach", "pick"):
-            assert named - {"nothing"} <= set(outcomes_of(path.stem, None))
+            assert named - {"nothing"} <= set(outcomes_of(path.stem))

@@ -1,0 +1,82 @@
+"""`import bhd_lerobot`: light, complete, and what it does is what the commands do."""
+
+import importlib
+import subprocess
+import sys
+
+import pytest
+
+import bhd_lerobot as bhd
+
+
+def test_importing_it_imports_nothing_else() -> None:
+    code = "import sys; before = set(sys.modules); import bhd_lerobot; print(*(set(sys.modules) - before))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    imported = {name.partition(".")[0] for name in done.stdout.split()}
+    assert imported - set(sys.stdlib_module_names) <= {"bhd_lerobot"}
+    assert [name for name in done.stdout.split() if name.startswith("bhd_lerobot.")] == []
+
+
+def test_every_name_is_there_and_documented() -> None:
+    assert 30 <= len(bhd.__all__) <= 55
+    assert dir(bhd) == sorted(bhd.__all__)
+    for name in set(bhd.__all__) - {"__version__"}:
+        assert getattr(bhd, name).__doc__, name
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'recrod'"):
+        _ = bhd.recrod
+    assert importlib.import_module("bhd_lerobot.errors").BhdError is bhd.BhdError
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory):
+    """Return a dataset that was recorded by keyword arguments, and the result."""
+    folder = tmp_path_factory.mktemp("api")
+    result = bhd.record(
+        robot={"type": "turtlebot3", "beams": 36},
+        brain="gap_follower",
+        task="avoid",
+        dataset={"root": folder / "d", "num_episodes": 2, "episode_time_s": 3},
+        output_dir=folder / "run",
+        preview_video=False,
+    )
+    return folder, result
+
+
+def test_the_workflow(recorded) -> None:
+    folder, result = recorded
+    assert (result.recorded, result.root) == (2, folder / "d")
+    assert bhd.check_dataset(result.root).is_valid
+    assert all(divergence.identical for divergence in bhd.replay(dataset={"root": result.root, "episode": 1}))
+    trained = bhd.train(
+        policy={"type": "bhd_mlp", "push_to_hub": False},
+        dataset={"root": str(result.root)},
+        output_dir=folder / "train",
+        steps=4,
+        batch_size=8,
+    )
+    evaluated = bhd.evaluate(
+        robot={"type": "turtlebot3", "beams": 36},
+        task={"type": "avoid", "duration_s": 2},
+        brains={"rule": "gap_follower", "learned": {"type": "learned", "path": trained.checkpoint}},
+        n_episodes=2,
+        output_dir=folder / "eval",
+    )
+    assert set(evaluated.brains) == {"rule", "learned"}
+
+
+@pytest.mark.parametrize(
+    ("call", "options", "message"),
+    [
+        (bhd.record, {"brian": "noop"}, "brian.*brain"),
+        (bhd.record, {"brain": "gap_folower", "task": "avoid", "robot": "turtlebot3"}, "gap_folower.*gap_follower"),
+        (bhd.evaluate, {"n_episode": 3}, "n_episode.*n_episodes"),
+        (bhd.train, {"stepz": 3, "dataset": {"repo_id": "a/b"}}, "stepz.*steps"),
+        (bhd.replay, {"dataset": {"rot": "x"}}, "rot.*root"),
+    ],
+)
+def test_misspelt_keywords_name_the_near_miss(call, options, message) -> None:
+    with pytest.raises(bhd.BhdError, match=message):
+        call(**options)
