@@ -27,6 +27,7 @@ from bhd_lerobot.datasets.recovery.repair import repair as repair
 from bhd_lerobot.datasets.validate.dataset import check_dataset as check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder as DatasetRecorder
 from bhd_lerobot.envs.gym_env import BhdEnv as BhdEnv
+from bhd_lerobot.envs.register import register_environment as register_environment
 from bhd_lerobot.envs.vector import BhdVectorEnv as BhdVectorEnv
 from bhd_lerobot.errors import BhdError as BhdError
 from bhd_lerobot.evaluation.config import EvalConfig as EvalConfig

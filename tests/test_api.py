@@ -64,7 +64,7 @@ def test_the_workflow(recorded) -> None:
         n_episodes=2,
         output_dir=folder / "eval",
     )
-    assert set(evaluated.brains) == {"rule", "learned"}
+    assert set(evaluated.results.brains) == {"rule", "learned"}
 
 
 @pytest.mark.parametrize(

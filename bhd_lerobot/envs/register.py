@@ -4,8 +4,10 @@ Importing this module registers them, also as the part of an id before its colon
 ``gymnasium.make("bhd_lerobot.envs.register:bhd_lerobot/UR5Reach-v0")``. It imports nothing heavy.
 """
 
-from gymnasium.envs.registration import register as register_environment
+from gymnasium.envs.registration import register as gymnasium_register
 from gymnasium.envs.registration import registry
+
+from bhd_lerobot.errors import ConfigError
 
 NAMESPACE = "bhd_lerobot"
 
@@ -19,18 +21,34 @@ ENVIRONMENTS: dict[str, tuple[str, str]] = {
 """Robot and task of each environment, by its name."""
 
 
+def register_environment(name: str, robot: str, task: str) -> None:
+    """Register an environment with Gymnasium, as `bhd_lerobot/<name>`; one that is there already stays.
+
+    Args:
+        name: its name, such as ``RoverCorridor-v0``.
+        robot: type of the robot.
+        task: type of the task.
+
+    Raises:
+        ConfigError: there is an environment of this name with another robot or task.
+    """
+    if ENVIRONMENTS.setdefault(name, (robot, task)) != (robot, task):
+        raise ConfigError(f"There is an environment {name!r} already, of {' and '.join(ENVIRONMENTS[name])}.")
+    full = f"{NAMESPACE}/{name}"
+    if full not in registry:
+        # No time limit here: the task knows when an episode's time is over.
+        gymnasium_register(
+            id=full,
+            entry_point="bhd_lerobot.envs.gym_env:BhdEnv",
+            vector_entry_point="bhd_lerobot.envs.vector:BhdVectorEnv",
+            kwargs={"environment": name},
+        )
+
+
 def register() -> None:
     """Register every environment with Gymnasium, as `bhd_lerobot/<name>`; those that are there already stay."""
-    for name in ENVIRONMENTS:
-        full = f"{NAMESPACE}/{name}"
-        if full not in registry:
-            # No time limit here: the task knows when an episode's time is over.
-            register_environment(
-                id=full,
-                entry_point="bhd_lerobot.envs.gym_env:BhdEnv",
-                vector_entry_point="bhd_lerobot.envs.vector:BhdVectorEnv",
-                kwargs={"environment": name},
-            )
+    for name, (robot, task) in ENVIRONMENTS.items():
+        register_environment(name, robot, task)
 
 
 register()

@@ -17,8 +17,6 @@ from bhd_lerobot.tasks.task import Event, Outcome
 EVENT_NAMES = np.array([event.cause for event in Event], object)
 """Names of the events, by their numbers."""
 
-# Tasks whose success is to have lasted until the time was over: nothing ends then but the time.
-_LASTING = ("avoid",)
 _VIEW_WIDTH, _VIEW_HEIGHT = 320, 240
 
 
@@ -87,7 +85,6 @@ class Stage:
         self.seeds = np.zeros(n, np.int64)
         self.scenes: list[Any] = [None] * n
         self._truth: Any = None
-        self._lasts = self.task.name in _LASTING
         self._eyes: Camera | None = None
         self._view: Camera | None = None
         self.simulation.stop(np.arange(n))
@@ -148,7 +145,7 @@ class Stage:
         reward, event = self.task.judge(self._truth, simulation.running)
         event = add_faults(event, report.mode, simulation.running)
         truncated = event == Event.TIMEOUT
-        if self._lasts:
+        if self.task.lasts:
             truncated |= event == Event.SUCCESS
         return Stepped(reward, event, (event != Event.NOTHING) & ~truncated, truncated)
 

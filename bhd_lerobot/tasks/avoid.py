@@ -70,7 +70,7 @@ class AvoidTask(BaseTask):
     """
 
     name = "avoid"
-    environment_names: tuple[str, ...]
+    lasts = True
 
     def __init__(self, config: AvoidConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)

@@ -154,12 +154,14 @@ class Task(Protocol):
         robot_kind: the kind of robot that it is for: ``"base"`` or ``"arm"``.
         duration_s: longest duration of an episode [s].
         environment_names: names of what the task reports to the brain, in order; empty if nothing.
+        lasts: whether success is to have lasted until the time is over; an episode is then truncated, not terminated.
     """
 
     name: str
     robot_kind: str
     duration_s: float
     environment_names: tuple[str, ...]
+    lasts: bool
 
     def sample(self, seed: int) -> Any:
         """Return the scene of the episode with this seed: an `Arena` or a `TableScene`."""
@@ -204,6 +206,7 @@ class ConfiguredTask:
 
     name: str
     environment_names: tuple[str, ...] = ()
+    lasts = False
     never: ClassVar[tuple[Event, ...]] = ()
     """Events that cannot happen in this task."""
 
