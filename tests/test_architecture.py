@@ -60,7 +60,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "datasets.remote": (*_DATASETS, "datasets.assembly", "datasets.edit"),
     "datasets.loader": (*_DATASETS, "datasets.remote", "tasks"),
     "datasets.timing": (*_DATASETS, "control"),
-    "rosbag.messages": ("bodies.body", "datasets.format"),
+    "rosbag.messages": ("plugins", "bodies.body", "datasets.format"),
     "rosbag.storage": ("datasets.storage", "rosbag.messages"),
     "rosbag.exporter": (*_DATASETS, "datasets.edit", "rosbag.messages", "rosbag.storage"),
     "rosbag.importer": ("tasks", "bodies", "control", "datasets.format", "datasets.writer", "rosbag.*"),

@@ -119,6 +119,13 @@ ROWS: dict[str, Finding] = {
         "LeRobot did not find {missing}: `lerobot_robot_bhd` is not installed, or its import failed. {error}",
         _REINSTALL,
     ),
+    "plugins.failed": Finding(
+        "plug-ins",
+        _W,
+        "what the plug-in has is an invalid choice for every command",
+        "{error}",
+        "Mend the plug-in, or uninstall it: `uv pip uninstall NAME`.",
+    ),
     "opengl.missing": Finding(
         "OpenGL",
         _W,
@@ -367,7 +374,11 @@ def check_plugins(outcome: Outcome) -> list[Finding]:
     missing += [f"the teleoperator {name}" for name in TELEOPERATORS if name not in known["teleoperators"]]
     if missing:
         return [wrong("plugins.missing", outcome.output, missing=", ".join(missing), error=outcome.output)]
-    return [fine("plug-ins", f"LeRobot knows {', '.join((*ROBOTS, *TELEOPERATORS))}")]
+    others = [name for name in known["bodies"] if name not in ROBOTS]
+    return [
+        fine("plug-ins", f"LeRobot knows {', '.join((*ROBOTS, *others, *TELEOPERATORS))}"),
+        *(wrong("plugins.failed", text, error=text) for text in known["failed"]),
+    ]
 
 
 def check_opengl(outcome: Outcome) -> list[Finding]:

@@ -153,8 +153,14 @@ def list_plugins() -> dict[str, list[str]]:
     from lerobot.teleoperators.config import TeleoperatorConfig
     from lerobot.utils.import_utils import register_third_party_plugins
 
+    from bhd_lerobot.plugins import BODIES, load_plugins
+
+    failed: list[str] = []
+    load_plugins(failed.append)
     register_third_party_plugins()
     return {
+        "failed": failed,
+        "bodies": list(BODIES),
         "robots": sorted(RobotConfig.get_known_choices()),
         "teleoperators": sorted(TeleoperatorConfig.get_known_choices()),
     }

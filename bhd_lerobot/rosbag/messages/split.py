@@ -7,6 +7,7 @@ from typing import Any
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import UnsupportedDatasetError
+from bhd_lerobot.plugins import body_of
 from bhd_lerobot.rosbag.messages.arm import TOOL, JointsPart, PosePart
 from bhd_lerobot.rosbag.messages.base import (
     GYRO,
@@ -32,8 +33,6 @@ PARTS: Mapping[str, type[Part]] = {
 _SCAN = re.compile(r"scan_\d+\.pos")
 _OBSERVED, _ASKED, _APPLIED = keys.OBSERVATION_STATE, keys.ACTION, keys.APPLIED_ACTION
 _SUFFIX = {_ASKED: "", _APPLIED: "_applied"}
-ROBOTS = ("turtlebot3", "ur5")
-"""Robots whose names and units are known: m, rad and s."""
 
 
 def parts_of(
@@ -50,7 +49,7 @@ def parts_of(
     Args:
         key: the feature.
         names: of its numbers.
-        robot_type: of any but our robots' nothing is known about units, and `Numbers` carry everything.
+        robot_type: of a robot whose body is not known, units are not known either, and `Numbers` carry everything.
         lidar: of the robot, if it has one.
         noise: of what it measures of its own motion, if it is known; only needed to write.
         bare_twist: commands of a base without stamps.
@@ -63,7 +62,7 @@ def parts_of(
             parts.append(kind(topic, tuple(wanted), **options))
             left[:] = [name for name in left if name not in wanted]
 
-    if robot_type in ROBOTS and len(set(names)) == len(names):
+    if body_of(robot_type) is not None and len(set(names)) == len(names):
         if key == _OBSERVED:
             take(OdometryPart, "/odom", (*TWIST, *ODOMETRY), noise=noise)
             take(OdometryPart, "/odom", TWIST, noise=noise)

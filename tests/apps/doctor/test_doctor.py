@@ -51,7 +51,14 @@ def latency(p99: float) -> Outcome:
     return value({**numbers, **bins, "grants": grants().value})
 
 
-PLUGINS = value({"robots": ["so101", "turtlebot3", "ur5"], "teleoperators": ["bhd_brain"]})
+PLUGINS = value(
+    {
+        "robots": ["so101", "turtlebot3", "ur5"],
+        "teleoperators": ["bhd_brain"],
+        "bodies": ["turtlebot3", "ur5"],
+        "failed": [],
+    }
+)
 IMAGE = value({"spread": 70, "driver": "llvmpipe"})
 VIDEO = value({"bytes": 3000, "pyav": "15.1.0", "libavcodec": "61.19.101", "shared": None})
 
@@ -260,6 +267,10 @@ BROKEN: dict[str, tuple[Callable[[Path], list[Finding]], str]] = {
         lambda _: checks.check_plugins(value({"robots": ["ur5"], "teleoperators": []}, "ImportError: pin")),
         "the robot turtlebot3, the teleoperator bhd_brain: `lerobot_robot_bhd` is not installed, or its import failed. "
         "ImportError: pin",
+    ),
+    "plugins.failed": (
+        lambda _: checks.check_plugins(value({**PLUGINS.value, "failed": ["The plug-in x cannot be imported."]})),
+        "The plug-in x cannot be imported.",
     ),
     "opengl.missing": (lambda _: checks.check_opengl(failed("error", "Tried egl: no display")), "Tried egl"),
     "opengl.crash": (

@@ -1,0 +1,105 @@
+"""The plug-in of `examples/plugin`, installed into an environment of its own and used in every program."""
+
+import json
+import os
+import subprocess
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+from hatchling import build
+
+ROOT = Path(__file__).resolve().parents[2]
+PLUGIN = ROOT / "examples" / "plugin"
+USED = r"""
+import json, sys
+from pathlib import Path
+
+from lerobot.scripts import lerobot_teleoperate
+from bhd_lerobot.apps.view.dataset import ViewedDataset
+from bhd_lerobot.apps.view.packing import unpack
+from bhd_lerobot.cli.data import main as data
+from bhd_lerobot.evaluation import evaluate
+from bhd_lerobot.recording import record
+from bhd_lerobot.rollout import replay
+from bhd_lerobot.rollout.configuration import parse
+
+folder = Path(sys.argv[1])
+chosen = ["--robot.type=rover", "--robot.beams=36", "--task.type=corridor"]
+
+assert "lerobot_robot_corridor" not in sys.modules
+assert record.main(
+    [*chosen, "--brain.type=wall_follower", "--dataset.repo_id=me/corridor", f"--dataset.root={folder / 'd'}",
+     "--dataset.num_episodes=3", f"--output_dir={folder / 'run'}", "--n_envs=3", "--preview_video=false"]
+) == 0
+replayed = replay.replay(
+    parse(replay.ReplayConfig, [f"--dataset.root={folder / 'd'}", "--dataset.episode=1",
+                                f"--output_dir={folder / 'replay'}"])
+)
+assert replayed and all(one.identical for one in replayed)
+assert evaluate.main(
+    [*chosen, "--brains.mine.type=wall_follower", "--brains.gaps.type=gap_follower", "--n_episodes=2", "--n_envs=2",
+     f"--output_dir={folder / 'eval'}"]
+) == 0
+for command in (["check"], ["info"], ["export", "--output", str(folder / "bag"), "--episodes=0"]):
+    assert data.main([command[0], str(folder / "d"), *command[1:]]) == 0, command
+about, arrays = unpack(ViewedDataset(folder / "d").packed(0))
+found = {"about": about, "base": arrays["view.base"].tolist()}
+sys.argv = ["lerobot-teleoperate", "--robot.type=rover", "--teleop.type=bhd_brain",
+            "--teleop.brain.type=wall_follower", "--teleop_time_s=0.5"]
+lerobot_teleoperate.main()
+(folder / "found.json").write_text(json.dumps(found))
+"""
+
+
+def install(environment: Path, wheel: Path) -> Path:
+    """Make a virtual environment that has what this one has, and a wheel; return its interpreter."""
+    venv.create(environment, symlinks=True)
+    python = environment / "bin" / "python"
+    base = {"base": str(environment), "platbase": str(environment)}
+    site = Path(sysconfig.get_path("purelib", "posix_prefix", vars=base))
+    here = sysconfig.get_path("purelib")
+    (site / "parent.pth").write_text(f"import site; site.addsitedir({here!r})\n", encoding="utf-8")
+    with zipfile.ZipFile(wheel) as file:
+        file.extractall(site)
+    return python
+
+
+@pytest.fixture(scope="module")
+def used(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder in which every program has used the plug-in."""
+    folder = tmp_path_factory.mktemp("plugin")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(PLUGIN)
+        wheel = build.build_wheel(str(folder))
+    python = install(folder / "environment", folder / wheel)
+    command = [str(python), "-c", USED, str(folder)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def test_it_is_at_most_120_lines() -> None:
+    files = [path for path in PLUGIN.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    assert sum(len(path.read_text(encoding="utf-8").splitlines()) for path in files) <= 120
+
+
+def test_it_is_recorded_replayed_bit_for_bit_and_evaluated(used: Path) -> None:
+    results = json.loads((used / "eval" / "results.json").read_text())
+    assert set(results["brains"]) == {"mine", "gaps"}
+    assert results["brains"]["mine"]["successes"] == 2
+
+
+def test_the_viewer_draws_its_outline_and_knows_its_units(used: Path) -> None:
+    found = json.loads((used / "found.json").read_text())
+    about = found["about"]
+    assert about["scene"]["kind"] == "arena"
+    assert about["views"]["base"]["radius"] == pytest.approx(0.16, abs=0.03)
+    assert about["views"]["scan"]["beams"] == 36
+    assert "m/s" in json.dumps(about["sections"])
+    x = [pose[0] for pose in found["base"]]
+    assert x[0] == pytest.approx(-2.4, abs=0.01)
+    assert x[-1] > 1.9
