@@ -7,7 +7,6 @@ python scripts/make_reference.py --check  exit with 1 if the file is not what wo
 import ast
 import dataclasses
 import inspect
-import re
 import sys
 import textwrap
 import typing
@@ -29,6 +28,7 @@ from bhd_lerobot.robots.base_simulation import observation_names
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, OBSERVED
+from bhd_lerobot.rollout.options_help import meanings_of, summary_of
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.tasks import avoid, navigate, pick, reach
 from bhd_lerobot.tasks.task import Event
@@ -37,12 +37,6 @@ from bhd_lerobot.training.config import BhdTrainConfig, own_fields
 from bhd_lerobot.training.rl.config import RlConfig
 
 FILE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
-
-# What LeRobot's own base classes add to ours; their docstrings do not describe it.
-_INHERITED = {
-    "id": "name of this robot or teleoperator; LeRobot's own field",
-    "calibration_dir": "where LeRobot keeps calibration files; nothing here is calibrated",
-}
 
 _INTRODUCTION = """\
 # Reference
@@ -103,7 +97,7 @@ def _options(
     config_class: type, prefix: str, *, choices: bool = True, only: Sequence[str] | None = None
 ) -> Iterator[str]:
     """Yield the table of a class's plain options, and then those of the classes inside it."""
-    described, hints = _descriptions(config_class), typing.get_type_hints(config_class)
+    described, hints = meanings_of(config_class), typing.get_type_hints(config_class)
     rows, inner = [], []
     for field in dataclasses.fields(config_class):
         if only is not None and field.name not in only:
@@ -124,33 +118,12 @@ def _options(
             default = _default(field)
             shown = "*required*" if default is dataclasses.MISSING else f"`{_plain(default)}`"
             rows.append((f"`{key}`", _type_name(kind), shown, meaning))
-    yield _summary(config_class) + "\n"
+    yield summary_of(config_class) + "\n"
     if rows:
         yield _table(("option", "type", "default", "meaning"), rows)
     for title, one, inner_prefix in inner:
         yield f"### {title}\n"
         yield from _options(one, inner_prefix)
-
-
-def _descriptions(config_class: type) -> dict[str, str]:
-    """Return the attribute descriptions of a class's docstring, and of its bases in this package."""
-    result = dict(_INHERITED)
-    for one in reversed(config_class.__mro__):
-        section = re.search(r"^Attributes:\n((?:[ ]+.*\n?|\n)*)", inspect.cleandoc(one.__doc__ or ""), re.MULTILINE)
-        if one.__module__.startswith("bhd_lerobot.") and section:
-            name = ""
-            for line in textwrap.dedent(section[1]).splitlines():
-                start = re.match(r"(\w+): (.*)", line)
-                if start:
-                    name = start[1]
-                    result[name] = start[2]
-                elif line.strip():
-                    result[name] += f" {line.strip()}"
-    return {name: text.replace("``", "`") for name, text in result.items()}
-
-
-def _summary(config_class: type) -> str:
-    return inspect.cleandoc(config_class.__doc__ or "").partition("\n\n")[0].replace("``", "`")
 
 
 def _choices(kind: Any) -> dict[str, type]:

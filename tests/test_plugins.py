@@ -88,9 +88,7 @@ def test_a_name_that_is_taken_is_refused_and_the_first_stays(installer) -> None:
     plugins.load_plugins(reported.append)
     [text] = reported
     assert "lerobot_robot_second" in text
-    assert (
-        "There is a brain 'twice' already, of lerobot_robot_first; that of lerobot_robot_second needs" in text
-    )
+    assert "There is a brain 'twice' already, of lerobot_robot_first; that of lerobot_robot_second needs" in text
     assert BrainConfig.get_choice_class("twice").__module__ == "lerobot_robot_first"
 
 

@@ -8,6 +8,7 @@ key, the nearest one that exists, and the valid ones on that level. Both read th
 import dataclasses
 import json
 import keyword
+import logging
 import re
 import sys
 import types
@@ -110,48 +111,27 @@ def run(
         read: returns what `main` gets; `parse` if None.
         interrupted: what is printed after Ctrl-C.
     """
+    from bhd_lerobot.rollout.options_help import help_of
+
     given = sys.argv[1:] if arguments is None else arguments
+    # LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 
     def program() -> int | None:
         load_plugins()
         left = load_named(given)
         if asks_for_help(left):
-            print(describe(config_class))
+            print(help_of(config_class, _chosen_types(left)))
             return 0
         return main(read(left) if read else parse(config_class, left))
 
     return exit_status(program, interrupted)
 
 
-def describe(config_class: type, prefix: str = "", within: tuple[type, ...] = ()) -> str:
-    """Return the options of a configuration class, a line each, with their types and defaults.
-
-    Args:
-        config_class: a dataclass.
-        prefix: what stands before the options' names.
-        within: the classes that this one is an option of: a choice that holds one of its own kind is not listed again.
-    """
-    within = (*within, config_class)
-    lines = (
-        [] if prefix else [(config_class.__doc__ or "").strip(), "", "Options (also in a file: --config_path=FILE):"]
-    )
-    for name, kind, default in options_of(config_class):
-        key = f"{prefix}{name}"
-        if _entries(kind) is not None:
-            lines.append(f"  --{key}.NAME.type  {{{','.join(sorted(choices_of(_entries(kind))))}}}, for every NAME")
-        elif choices_of(kind):
-            lines.append(f"  --{key}.type  {{{','.join(sorted(choices_of(kind)))}}}")
-            if set(within) & set(choices_of(kind).values()):
-                continue
-            for choice, subclass in sorted(choices_of(kind).items()):
-                listed = describe(subclass, f"{key}.", within).splitlines()
-                lines += [f"    {choice}:", *("  " + line for line in listed)]
-        elif dataclasses.is_dataclass(kind):
-            lines.append(describe(typing.cast(type, kind), f"{key}.", within))
-        else:
-            shown = "required" if default is dataclasses.MISSING else f"default {default!r}"
-            lines.append(f"  --{key}  {getattr(kind, '__name__', str(kind))}, {shown}")
-    return "\n".join(line for line in lines)
+def _chosen_types(arguments: Sequence[str]) -> dict[str, str]:
+    """Return the options of a command line that choose a type; all others may still be missing or wrong."""
+    written = "\n".join(arguments)
+    return dict(re.findall(r"^--([\w.]+\.type)[=\n](\S+)$", written, re.MULTILINE))
 
 
 def read_overrides(arguments: Sequence[str]) -> dict[str, Any]:
@@ -233,7 +213,7 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None
 
 def _checked(key: str, value: Any, kind: Any) -> Any:
     """Return the value of an option whose keys, if it has any, all exist."""
-    choices, entries = choices_of(kind), _entries(kind)
+    choices, entries = choices_of(kind), entries_of(kind)
     if choices and isinstance(value, str):  # in Python; a command line has --robot.type
         value = {"type": value}
     if entries is not None and isinstance(value, dict):
@@ -308,7 +288,7 @@ def options_of(config_class: type) -> list[tuple[str, Any, Any]]:
     return result
 
 
-def _entries(kind: Any) -> Any:
+def entries_of(kind: Any) -> Any:
     """Return the choice type of the entries of a mapping from names to choices, or None if it is none."""
     arguments = typing.get_args(kind) if typing.get_origin(kind) is dict else ()
     return arguments[1] if len(arguments) == 2 and choices_of(arguments[1]) else None

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from bhd_lerobot.cli.start import leaving_on_interrupt
 from bhd_lerobot.command_line import Parser, exit_status
 from bhd_lerobot.datasets.storage.atomic import noting_what_is_done
+from bhd_lerobot.plugins import load_named
 
 # Modules, in the order of the help. What takes long to import, such as torch, is imported by a command when it runs.
 COMMANDS = (
@@ -40,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> int:
         nonlocal stopped
-        options = parser.parse(arguments)
+        options = parser.parse(load_named(sys.argv[1:] if arguments is None else arguments))
         try:
             return int(options.run(options))
         finally:

@@ -1,0 +1,172 @@
+"""What the options of a configuration class mean, from docstrings and comments: for `--help` and the reference."""
+
+import dataclasses
+import inspect
+import re
+import shutil
+import textwrap
+import typing
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from bhd_lerobot.rollout.configuration import choices_of, entries_of, options_of
+
+_INDENT = 26  # [characters] where meanings begin
+# What LeRobot's own classes say nowhere; where a class says it, that counts.
+_OF_LEROBOT = {
+    "id": "name of this robot or teleoperator; LeRobot's own field",
+    "calibration_dir": "where LeRobot keeps calibration files; nothing here is calibrated",
+    "episodes": "numbers of the episodes to use; all if nothing",
+    "tfs": "random changes of images, by name",
+    "revision": "branch, tag or commit on the Hub; LeRobot's version tag if nothing",
+    "use_imagenet_stats": "normalise images by ImageNet's statistics",
+    "video_backend": "which library decodes videos",
+    "streaming": "read frames from the Hub while training, without a download",
+    "env": "the environment in which the policy is evaluated while it is trained.",
+    "policy": "the policy.",
+    "reward_model": "a reward model to train instead of a policy",
+    "job_name": "name of the run in reports; made of the policy's type if nothing",
+    "batch_size": "frames, or chunks of them, a step",
+    "prefetch_factor": "batches that each worker of the loader prepares",
+    "persistent_workers": "keep the loader's workers between epochs",
+    "steps": "steps of training, in all",
+    "log_freq": "steps from one line of the log to the next",
+    "tolerance_s": "by how much timestamps may differ from frame_index / fps [s]",
+    "save_checkpoint": "write checkpoints",
+    "use_policy_training_preset": "optimizer and scheduler are those that the policy asks for",
+    "optimizer": "the optimizer.",
+    "scheduler": "the schedule of the learning rate.",
+    "n_episodes": "episodes of an evaluation",
+    "enable": "report to Weights & Biases",
+    "project": "its project",
+    "entity": "its user or team",
+    "notes": "text beside the run",
+    "run_id": "continue the run with this id",
+    "peft": "parameter-efficient fine-tuning, LoRA for example; nothing trains all parameters",
+    "checkpoint_path": "set by resuming",
+}
+_TYPES = {"str": "TEXT", "Path": "PATH", "bool": "true|false", "int": "N", "float": "X", "dict": "{…}", "list": "[…]"}
+
+
+def summary_of(config_class: type) -> str:
+    """Return the first paragraph of a class's docstring."""
+    return inspect.cleandoc(config_class.__doc__ or "").partition("\n\n")[0].replace("``", "`")
+
+
+def meanings_of(config_class: type) -> dict[str, str]:
+    """Return what each field means, by name, as far as the class or one of its bases says so.
+
+    This package describes fields in docstrings, LeRobot in docstrings or in comments above or beside the field.
+    """
+    result = dict(_OF_LEROBOT)
+    for one in reversed(config_class.__mro__):
+        if not dataclasses.is_dataclass(one):
+            continue
+        is_ours = one.__module__.startswith("bhd_lerobot.")
+        result |= ({} if is_ours else _comments(one)) | _described(inspect.cleandoc(one.__doc__ or ""))
+    return {name: " ".join(text.replace("``", "`").split()) for name, text in result.items()}
+
+
+def _described(docstring: str) -> dict[str, str]:
+    result: dict[str, str] = {}
+    section = re.search(r"^(?:Attributes|Args|Arguments):\n((?:[ ]+.*\n?|\n)*)", docstring, re.MULTILINE)
+    name = ""
+    for line in textwrap.dedent(section[1]).splitlines() if section else ():
+        if start := re.match(r"(\w+)(?: \(.*\))?: (.*)", line):
+            name = start[1]
+            result[name] = start[2]
+        elif line.strip() and name:
+            result[name] += f" {line.strip()}"
+    return result
+
+
+def _comments(config_class: type) -> dict[str, str]:
+    result: dict[str, str] = {}
+    above: list[str] = []
+    try:
+        lines = inspect.getsource(config_class).splitlines()
+    except (OSError, TypeError):  # made without a file
+        return result
+    for line in lines:
+        if comment := re.fullmatch(r"    #\s?(.*)", line):
+            above.append(comment[1])
+        elif found := re.match(r"    (\w+)\s*:[^#]*(?:#\s*(.*))?$", line):
+            text = " ".join([*above, found[2] or ""]).strip()
+            if text:
+                result[found[1]] = f"{re.split(r'[.] (?=[A-Z])', text)[0].rstrip('.')}."  # the rest is for developers
+            above = []
+        else:
+            above = []
+    return result
+
+
+def type_word(kind: Any) -> str:
+    """Return what stands for a value of a type in the help."""
+    arguments = [one for one in typing.get_args(kind) if one is not type(None)]
+    origin = typing.get_origin(kind)
+    if origin in (list, tuple, dict):
+        return _TYPES["dict" if origin is dict else "list"]
+    if arguments:
+        return "|".join(dict.fromkeys(repr(one) if isinstance(one, str) else type_word(one) for one in arguments))
+    return _TYPES.get(getattr(kind, "__name__", ""), "VALUE")
+
+
+def help_of(config_class: type, chosen: Mapping[str, str]) -> str:
+    """Return the help of a program: its options in groups, each with its meaning and its default.
+
+    Args:
+        config_class: the program's configuration.
+        chosen: types that were chosen on the command line, by option; only the options of these are listed.
+    """
+    width = max(60, min(120, shutil.get_terminal_size((120, 24)).columns))
+    lines = textwrap.wrap(summary_of(config_class), width)
+    lines += ["", "Options are written --key=value, or nested in a YAML file: --config_path=FILE.", ""]
+    return "\n".join([*lines, *_lines(config_class, "", "", chosen, width)])
+
+
+def _lines(config_class: type, prefix: str, title: str, chosen: Mapping[str, str], width: int) -> Iterator[str]:
+    meanings = meanings_of(config_class)
+    inner: list[tuple[type, str, str]] = []
+    if title:
+        yield from ("", *textwrap.wrap(title, width))
+    for name, kind, default in options_of(config_class):
+        key, meaning = f"{prefix}{name}", meanings.get(name, "")
+        entry = entries_of(kind)
+        if choices := choices_of(entry or kind):
+            option = f"{key}.NAME.type" if entry else f"{key}.type"
+            picked = {given: type_name for given, type_name in chosen.items() if _is(given, option)}
+            valid = ", ".join(sorted(choices))
+            known = {given: type_name for given, type_name in picked.items() if type_name in choices}
+            more = "" if known else f" Its options: --{option}=TYPE --help"
+            yield from _entry(f"--{option}=TYPE", f"{meaning} Valid: {valid}.{more}".strip(), width)
+            for given, type_name in known.items():
+                group = choices[type_name]
+                inner.append((group, f"{given.removesuffix('type')}", f"{given}={type_name}: {summary_of(group)}"))
+        elif dataclasses.is_dataclass(kind):
+            inner.append((typing.cast(type, kind), f"{key}.", f"{key}: {meaning or summary_of(kind)}"))
+        else:
+            shown = "required" if default is dataclasses.MISSING else f"default: {_short(default)}"
+            yield from _entry(f"--{key}={type_word(kind)}", f"{meaning} ({shown})".strip(), width)
+    for group, inner_prefix, heading in inner:
+        yield from _lines(group, inner_prefix, heading, chosen, width)
+
+
+def _is(given: str, option: str) -> bool:
+    return re.fullmatch(re.escape(option).replace("NAME", r"\w+"), given) is not None
+
+
+def _short(value: Any) -> str:
+    plain = {None: "nothing", True: "true", False: "false", "": "nothing"}
+    text = plain.get(value, str(value)) if isinstance(value, str | bool | None) else str(value)
+    return text if len(text) <= 40 else f"{text[:37]}…"
+
+
+def _entry(option: str, meaning: str, width: int) -> Iterator[str]:
+    left = f"  {option}"
+    wrapped = textwrap.wrap(meaning, width - _INDENT)
+    if len(left) >= _INDENT:
+        yield left
+        left = ""
+    for line in wrapped or [""]:
+        yield f"{left:<{_INDENT}}{line}".rstrip()
+        left = ""
