@@ -134,3 +134,8 @@ def install_extra(extra: str) -> str:
 def quoted(value: object) -> str:
     """Return a value as a shell reads it back, for a command in a message: a path may hold spaces."""
     return shlex.quote(str(value))
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: ``1 episode``, ``2 episodes``."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"

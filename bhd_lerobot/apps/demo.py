@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from bhd_lerobot.command_line import Parser, exit_status
-from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.errors import BhdError, ConfigError, counted
 from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.text import sentences
@@ -246,9 +246,9 @@ class Demo:
 
     def _record(self, lesson: Lesson) -> None:
         folder = self.folder / lesson.name
-        with self._step(lesson, f"records {lesson.episodes} episodes") as lines:
+        with self._step(lesson, f"records {counted(lesson.episodes, 'episode')}") as lines:
             result = record.record(parse(RecordConfig, lesson.record_options(folder)), self._log)
-            counts = f"{result.recorded} episodes, {result.frames:,} frames, {result.successes} successes"
+            counts = f"{counted(result.recorded, 'episode')}, {result.frames:,} frames, {result.successes} successes"
             lines.append(f"{lesson.what}; {counts}")
             _check(result.exit_status)
             if lesson.video and not (folder / "record/episode.mp4").exists():

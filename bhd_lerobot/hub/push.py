@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bhd_lerobot.datasets.remote.listing import check_repo_id, counted, is_url, listed, megabytes
-from bhd_lerobot.errors import BhdError, ConfigError
+from bhd_lerobot.datasets.remote.listing import check_repo_id, is_url, listed, megabytes
+from bhd_lerobot.errors import BhdError, ConfigError, counted
 from bhd_lerobot.hub.transfer import command_line, quiet_bars, remote_of
 
 if TYPE_CHECKING:
@@ -91,9 +91,12 @@ def check_pushable(repo_id: str) -> None:
 
 def format_push_report(report: "PushReport") -> str:
     """Return a report for a terminal."""
-    lines = [f"{report.name}: {report.episodes} episodes"]
+    lines = [f"{report.name}: {counted(report.episodes, 'episode')}"]
     if report.sent:
-        lines.append(f"  sent {counted(report.sent)}, {megabytes(report.sent_bytes)}; {report.kept} were there already")
+        lines.append(
+            f"  sent {counted(len(report.sent), 'file')}, {megabytes(report.sent_bytes)}; "
+            f"{report.kept} were there already"
+        )
     elif not report.deleted:
         lines.append(f"  nothing to send: all {report.kept} files are there")
     if report.deleted:

@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -10,6 +11,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from bhd_lerobot.errors import counted
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.signals import StopRequest
@@ -98,10 +100,13 @@ def print_refusals(simulation: Simulation, console: Console) -> None:
 
 def print_summary(console: Console, config: RecordConfig, result: RecordResult, video: bool) -> None:
     """Print what the run did; `video` says whether it left a video."""
+    robot: Any = config.robot
     table = Table(title="Recorded", show_header=False, title_justify="left")
-    table.add_row("dataset", f"{result.root} ({result.episodes} episodes)")
+    table.add_row("dataset", f"{result.root} ({counted(result.episodes, 'episode')})")
     table.add_row(
-        "this run", f"{result.recorded} episodes, {result.frames} frames, {result.simulated_s:.0f} s simulated"
+        "this run",
+        f"{counted(result.recorded, 'episode')}, {counted(result.frames, 'frame')}, {result.simulated_s:.0f} s"
+        f"{' simulated' if robot.clock == 'lockstep' else ''}",
     )
     if result.recorded:
         table.add_row("success", f"{result.successes} of {result.recorded}")

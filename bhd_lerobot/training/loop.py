@@ -14,6 +14,7 @@ from bhd_lerobot.training.log import Row
 from bhd_lerobot.training.step import Learner, NonFiniteLossError, StepResult
 
 Batch = dict[str, Any]
+_EARLY = (10, 20, 50, 100)  # steps with a row of metrics although `log_freq` is more: it shows soon that it learns
 
 
 class DivergedError(BhdError):
@@ -28,7 +29,7 @@ class LoopOptions:
         steps: when it is over.
         batch_size: samples in a step, of all processes.
         frames: samples in an epoch.
-        log_freq: steps from one row of metrics to the next.
+        log_freq: steps from one row of metrics to the next; the first come earlier, after 10, 20, 50 and 100 steps.
         eval_freq: steps from one held-out loss to the next; there is one after the last step, too.
         save_freq: steps from one checkpoint to the next; there is one after the last step, too.
         env_eval_freq: steps from one evaluation in an environment to the next.
@@ -190,7 +191,8 @@ class TrainingLoop:
         step, options, hooks = self.step, self.options, self.hooks
         is_last = step == options.steps
         self.interrupted = hooks.should_stop(step)
-        is_log, is_saving = _is_due(step, options.log_freq), _is_due(step, options.save_freq) or is_last
+        is_log = _is_due(step, options.log_freq) or (step in _EARLY and step < options.log_freq)
+        is_saving = _is_due(step, options.save_freq) or is_last
         is_eval = hooks.held_out is not None and options.eval_freq > 0 and (_is_due(step, options.eval_freq) or is_last)
         row: Row = {"step": step, "epoch": step * options.batch_size / options.frames}
         if is_log:

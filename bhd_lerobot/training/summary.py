@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bhd_lerobot.errors import quoted
+from bhd_lerobot.errors import counted, quoted
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.registry import robot_configs, tasks_for
 from bhd_lerobot.robots.host.simulation import describe
@@ -35,7 +35,7 @@ def print_start(console: Console, config: BhdTrainConfig, policy: Any, data: Tra
     table.add_row(
         "policy", escape(f"{policy.config.type}, {learnable:,} parameters{frozen}, on {policy.config.device}")
     )
-    table.add_row("data", f"{data.episodes} episodes{held_out}, {data.frames:,} samples in an epoch")
+    table.add_row("data", f"{counted(data.episodes, 'episode')}{held_out}, {data.frames:,} samples in an epoch")
     table.add_row("loader", escape(data.how))
     epochs = config.steps * config.batch_size / data.frames
     table.add_row("steps", f"{config.steps:,} of {config.batch_size} samples: {epochs:.3g} epochs")

@@ -18,7 +18,7 @@ from bhd_lerobot.datasets.format.summary import is_being_written
 from bhd_lerobot.datasets.recovery.fix import fix
 from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.datasets.validate.values import Limits
-from bhd_lerobot.errors import DatasetLockedError
+from bhd_lerobot.errors import DatasetLockedError, counted
 from bhd_lerobot.plugins import body_of
 
 # No option of a robot changes its limits, and its configuration takes seconds to import.
@@ -99,7 +99,7 @@ def _print(found: DatasetCheck, console: Console, is_valid: bool) -> None:
         console.print(table)
     errors, warnings = found.count(Severity.ERROR), found.count(Severity.WARNING)
     console.print(
-        f"{found.root}: {found.episodes} episodes, {found.frames} frames: "
+        f"{found.root}: {counted(found.episodes, 'episode')}, {counted(found.frames, 'frame')}: "
         f"{'valid' if is_valid else 'not valid'}, {_some(errors, 'error')}, {_some(warnings, 'warning')}.",
         soft_wrap=True,
         highlight=False,

@@ -17,7 +17,7 @@ from bhd_lerobot.cli.data.command import Commands, add_command, root_of
 from bhd_lerobot.cli.data.episode_list import parse_episodes
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, counted
 from bhd_lerobot.plugins import body_of
 from bhd_lerobot.rosbag.exporter.episode import START_S, ExportOptions
 from bhd_lerobot.rosbag.exporter.export import export_bags
@@ -73,8 +73,8 @@ def _run(options: argparse.Namespace) -> int:
             start_s=options.start_time,
         ),
     )
-    what = "1 episode" if report.episodes == 1 else f"{report.episodes} episodes"
-    bags = "1 bag" if len(report.bags) == 1 else f"{len(report.bags)} bags"
+    what = counted(report.episodes, "episode")
+    bags = counted(len(report.bags), "bag")
     print(f"{options.output}: {what}, {report.messages} messages, in {bags}. Play one: ros2 bag play {report.bags[0]}")
     return 0
 

@@ -10,7 +10,7 @@ from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.identity import default_root
-from bhd_lerobot.errors import ConfigError, quoted, unknown_name
+from bhd_lerobot.errors import ConfigError, counted, quoted, unknown_name
 from bhd_lerobot.rosbag.importer.convert import ImportReport, import_bags
 from bhd_lerobot.rosbag.importer.exported import (
     ExportedEpisode,
@@ -228,7 +228,7 @@ def _print(report: ImportReport, bags: list[Bag]) -> None:
         print(f"damaged: {problem}", file=sys.stderr)
     for note in report.notes:
         print(f"note: {note}", file=sys.stderr)
-    episodes = "1 episode" if report.episodes == 1 else f"{report.episodes} episodes"
+    episodes = counted(report.episodes, "episode")
     source = "1 bag" if len(bags) == 1 else f"{len(bags)} bags"
     print(
         f"{report.root}: {episodes}, {report.frames} frames, of {source}. Is it valid? "

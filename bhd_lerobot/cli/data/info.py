@@ -19,7 +19,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info, is_being_written
 from bhd_lerobot.datasets.timing.report import timing_of
 from bhd_lerobot.datasets.timing.tables import fitting, ms
-from bhd_lerobot.errors import DatasetError
+from bhd_lerobot.errors import DatasetError, counted
 
 
 def add_to(commands: Commands) -> None:
@@ -78,7 +78,7 @@ def _amount(summary: DatasetSummary) -> list[str]:
     if not summary.episodes:
         return ["empty: no episodes"]
     seconds = summary.frames / summary.fps
-    return [f"{len(summary.episodes)} episodes", f"{summary.frames} frames", f"{seconds:.0f} s"]
+    return [counted(len(summary.episodes), "episode"), counted(summary.frames, "frame"), f"{seconds:.0f} s"]
 
 
 def _outcomes(summary: DatasetSummary) -> str:

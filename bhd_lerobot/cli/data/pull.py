@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.cli.data.episode_list import parse_episodes, short
 from bhd_lerobot.datasets.format.identity import default_root
-from bhd_lerobot.datasets.remote.listing import check_repo_id, counted, is_url, megabytes
+from bhd_lerobot.datasets.remote.listing import check_repo_id, is_url, megabytes
 from bhd_lerobot.datasets.remote.url import shown
-from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetWriteError, TransferError
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetWriteError, TransferError, counted
 from bhd_lerobot.hub.transfer import (
     folder_of,
     for_urls,
@@ -67,10 +67,11 @@ def _run(options: argparse.Namespace) -> int:
 
 def format_report(report: "PullReport", source: str) -> str:
     """Return a report for a terminal."""
-    lines = [f"{report.root}: {report.total_episodes} episodes"]
+    lines = [f"{report.root}: {counted(report.total_episodes, 'episode')}"]
     if report.fetched:
         lines.append(
-            f"  fetched {counted(report.fetched)}, {megabytes(report.fetched_bytes)}; {report.kept} were there already"
+            f"  fetched {counted(len(report.fetched), 'file')}, {megabytes(report.fetched_bytes)}; "
+            f"{report.kept} were there already"
         )
     else:
         lines.append(f"  nothing to fetch: all {report.kept} files are there")
@@ -81,7 +82,7 @@ def format_report(report: "PullReport", source: str) -> str:
             "contents"
         )
     if report.episodes is not None:
-        count = "1 episode" if len(report.episodes) == 1 else f"{len(report.episodes)} episodes"
+        count = counted(len(report.episodes), "episode")
         lines[0] = f"{report.root}: {count} of {report.total_episodes}: {short(report.episodes)}"
         others = f"all {report.total_episodes}" if report.is_whole else "others, too"
         label = source if not is_url(source) else report.root.name

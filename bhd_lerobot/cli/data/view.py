@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, counted
 
 PORT = 8766
 
@@ -57,7 +57,7 @@ def view(root: Path, console: Console, *, port: int = PORT, open_browser: bool =
 
     def ready(address: str) -> None:
         episodes = dataset.state.num_episodes
-        told = f"{episodes} episodes" if episodes else "empty, no episodes yet,"
+        told = counted(episodes, "episode") if episodes else "empty, no episodes yet,"
         console.print(f"{escape(str(root))}: {told} at {address}", soft_wrap=True, highlight=False)
         console.print("Ctrl-C ends it.")
         if open_browser and _has_display():

@@ -28,7 +28,7 @@ from bhd_lerobot.datasets.storage.atomic import (
     uninterrupted,
 )
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
-from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, quoted
+from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, counted, quoted
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class EditReport:
     def __str__(self) -> str:
         """Return the report for a terminal."""
         note = "; the same edit was interrupted before, after it had been completed: nothing was changed now"
-        return f"{self.root}: {self.episodes} episodes, {self.frames} frames{note if self.is_repeated else ''}"
+        size = f"{counted(self.episodes, 'episode')}, {counted(self.frames, 'frame')}"
+        return f"{self.root}: {size}{note if self.is_repeated else ''}"
 
 
 type OnDone = Callable[[EditReport], object]
@@ -323,12 +324,17 @@ def _edited(state: DatasetState, edit: Mapping[str, Any]) -> dict[str, Any] | No
 
 
 def _common(recordings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what all recordings share."""
-    return {
-        name: value
-        for name, value in recordings[0].items()
-        if all(recording.get(name) == value for recording in recordings[1:])
-    }
+    """Return what all recordings share; of a robot or a task of one type, the options that are the same."""
+    shared: dict[str, Any] = {}
+    for name, value in recordings[0].items():
+        others = [recording.get(name) for recording in recordings[1:]]
+        if all(other == value for other in others):
+            shared[name] = value
+        elif isinstance(value, dict) and all(isinstance(other, dict) for other in others):
+            options = _common([value, *(other for other in others if isinstance(other, dict))])
+            if "type" in options:
+                shared[name] = options
+    return shared
 
 
 def _timed(edit: Mapping[str, Any]) -> dict[str, Any]:

@@ -35,7 +35,7 @@ from bhd_lerobot.datasets.storage.atomic import WORK, Workspace, link_others
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
 from bhd_lerobot.datasets.storage.places import check_links
 from bhd_lerobot.datasets.validate.findings import Finding, Findings, Severity, few
-from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError, UnsupportedDatasetError
+from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError, UnsupportedDatasetError, counted
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class RepairReport:
     def __str__(self) -> str:
         """Return the report for a terminal."""
         empty = "" if self.episodes else ": it is empty"
-        lines = [f"{self.root}: {self.episodes} episodes, {self.frames} frames{empty}"]
+        lines = [f"{self.root}: {counted(self.episodes, 'episode')}, {counted(self.frames, 'frame')}{empty}"]
         lines += [f"  completed: {item}" for item in self.completed]
         lines += [f"  dropped: {item}" for item in self.dropped]
         lines += [f"  lost: {item}" for item in self.lost or ("nothing",) * (self.aside is not None)]

@@ -218,11 +218,6 @@ def megabytes(size: int) -> str:
     return f"{size / 1e6:.1f} MB" if size < 1e9 else f"{size / 1e9:.2f} GB"
 
 
-def counted(names: Sequence[str] | Mapping[str, Any]) -> str:
-    """Return how many files there are, in words."""
-    return "1 file" if len(names) == 1 else f"{len(names)} files"
-
-
 def listed(names: Iterable[str], at_most: int = 3) -> str:
     """Return some names in words, and how many more there are."""
     names = sorted(names)
