@@ -224,7 +224,8 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
     if choices and isinstance(value, dict):
         chosen = value.get("type")
         if chosen is None:
-            raise ConfigError(f"{key}.type is missing. Valid: {', '.join(sorted(choices))}.")
+            given = f"; given: {', '.join(f'{key}.{name}' for name in value)}" if value else ""
+            raise ConfigError(f"{key}.type is missing{given}. Valid: {', '.join(sorted(choices))}.")
         if chosen not in choices:
             raise ConfigError(unknown_name(f"{key}.type", chosen, choices))
         fields = {k: v for k, v in value.items() if k != "type"}
@@ -262,9 +263,12 @@ def _checked_value(key: str, value: Any, kind: Any) -> Any:
 def _named(kind: Any) -> str:
     if typing.get_origin(kind) is list:
         return f"a list of {_named(typing.get_args(kind)[0])} in brackets, such as [a, b]"
-    return "nothing" if kind is type(None) else str(getattr(kind, "__name__", kind))
+    return _WORDS.get(kind) or str(getattr(kind, "__name__", kind))
 
 
+_WORDS = {int: "a whole number", float: "a number", str: "text", Path: "a path", bool: "true or false"} | {
+    type(None): "nothing"
+}
 _EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
 _PLAIN: dict[Any, tuple[type, ...]] = {
     float: (int, float),

@@ -110,7 +110,7 @@ def test_it_renders_in_its_render_mode() -> None:
     [
         ({"environment": "TurtleBot3Avoyd-v0"}, "Did you mean 'TurtleBot3Avoid-v0'"),
         ({"robot": {"beems": 36}}, "robot.beems"),
-        ({"robot": {"beams": "many"}}, "robot.beams is 'many'; it must be int"),
+        ({"robot": {"beams": "many"}}, "robot.beams is 'many'; it must be a whole number"),
         ({"robot": {"beams": 36.0}}, "robot.beams is 36.0"),
         ({"robot": {"fps": 7}}, "fps is 7"),
         ({"robot": {"fps": 0}}, "fps is 0"),

@@ -275,8 +275,8 @@ def test_episodes_come_in_order_and_are_dropped_at_a_stop_request(tmp_path):
         ({"robot__type": "turtlebot4"}, "Did you mean 'turtlebot3'"),
         ({"robot__beems": 3}, "Did you mean 'robot.beams'"),
         ({"dataset__num_episode": 3}, "Did you mean 'dataset.num_episodes'"),
-        ({"task__duration_s": "long"}, "must be float"),
-        ({"resume": 3}, "must be bool"),
+        ({"task__duration_s": "long"}, "must be a number"),
+        ({"resume": 3}, "must be true or false"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(tmp_path, change, message):
