@@ -33,10 +33,11 @@ class Rates:
             ("fps", self.fps, "control_hz", self.control_hz),
         ):
             if fast % slow:
-                valid = ", ".join(str(rate) for rate in range(1, fast + 1) if fast % rate == 0)
+                near = sorted((rate for rate in range(1, fast + 1) if fast % rate == 0), key=lambda r: abs(r - slow))
                 raise ConfigError(
-                    f"{slow_name} is {slow} Hz, which does not divide {fast_name} = {fast} Hz. "
-                    f"In lockstep every rate divides the one above it; valid values of {slow_name}: {valid}."
+                    f"{slow_name} is {slow} Hz, which does not divide {fast_name} = {fast} Hz. In lockstep every rate "
+                    f"divides the one above it; the nearest valid values of {slow_name}: "
+                    f"{', '.join(map(str, sorted(near[:4])))}."
                 )
 
     @property

@@ -122,7 +122,7 @@ def test_emergency_stop_is_latched_until_reset_and_activate(robot):
 @each_case(
     ("options", "message"),
     [
-        ({"fps": 7}, "valid values of fps: 1, 2, 4, 5"),
+        ({"fps": 7}, "valid values of fps: 4, 5, 8, 10"),
         ({"fps": 0}, "positive whole number"),
         ({"physics_hz": 300}, "control_hz"),
         ({"beams": 7}, "must divide 360"),
