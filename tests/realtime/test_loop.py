@@ -181,7 +181,7 @@ def test_a_fault_of_misses_stops_a_moving_robot_and_latches():
 @pytest.mark.parametrize(
     ("word", "watchdog"), [(Word.BRAIN_ALIVE, Watchdog.BRAIN), (Word.RECORDER_ALIVE, Watchdog.RECORDER)]
 )
-@settings(max_examples=15)
+@settings(max_examples=30)
 @given(timeout_ms=st.integers(1, 400), dies=st.integers(1, 60), phase=st.integers(0, TICK_NS - 1))
 def test_silence_stops_the_robot_at_its_time_out(word, watchdog, timeout_ms, dies, phase):
     """Counted in ticks: the first that starts more than the time-out after the last sign of life, and no other."""
