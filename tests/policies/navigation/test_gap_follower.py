@@ -20,7 +20,7 @@ from bhd_lerobot.tasks.task import Outcome, episode_seed
 from tests.cases import each_case
 
 ACTIONS = ("x.vel", "theta.vel")
-BEAMS = (36, 40, 45, 60, 72, 90, 120, 180, 360)
+BEAMS = (36, 90, 360)
 
 
 def names_of(beams: int) -> tuple[str, ...]:
@@ -295,7 +295,7 @@ def test_it_gets_out_of_a_dead_end(beams: int) -> None:
     assert outside.all()
 
 
-@pytest.mark.parametrize("beams", [36, 60, 180])
+@pytest.mark.parametrize("beams", [36, 180])
 def test_it_roams_without_contact_with_any_scanner(beams: int) -> None:
     outcomes = run(GapFollowerBrain(), [episode_seed(5, e, "train") for e in range(4)], 4, beams, seconds=25)
     assert all(outcome.success for outcome in outcomes)
@@ -303,7 +303,7 @@ def test_it_roams_without_contact_with_any_scanner(beams: int) -> None:
 
 
 def test_it_sees_more_than_avoidance_and_fails_no_more() -> None:
-    seeds = [episode_seed(7, episode, "train") for episode in range(16)]
-    old, new = run(AvoidanceBrain(), seeds, 16), run(GapFollowerBrain(), seeds, 16)
+    seeds = [episode_seed(7, episode, "train") for episode in range(8)]
+    old, new = run(AvoidanceBrain(), seeds, 8), run(GapFollowerBrain(), seeds, 8)
     assert sum(not outcome.success for outcome in new) <= sum(not outcome.success for outcome in old)
     assert np.mean([outcome.score for outcome in new]) > 1.2 * np.mean([outcome.score for outcome in old])
