@@ -254,7 +254,7 @@ def test_many_robots_decide_like_each_alone_to_the_last_bit() -> None:
         assert drive([sim])[:, 0].tobytes() == together[:, sim].tobytes()
 
 
-def run(brain: Brain, seeds: list[int], n: int, beams: int = 120, seconds: float = 60.0) -> list[Outcome]:
+def run(brain: Brain, seeds: list[int], n: int, beams: int = 120, seconds: float = 40.0) -> list[Outcome]:
     simulation = TurtleBot3Simulation(TurtleBot3Config(beams=beams), n)
     loop = EpisodeLoop(simulation, AvoidTask(AvoidConfig(duration_s=seconds, min_path_m=0.0), n, 10), brain)
     return [e.outcome for e in loop.run([EpisodeSpec(index, seed) for index, seed in enumerate(seeds)])]
