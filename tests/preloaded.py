@@ -14,16 +14,20 @@ from lerobot.datasets import lerobot_dataset
 from lerobot.scripts import lerobot_record, lerobot_replay
 
 from bhd_lerobot.cli.data import main
+from bhd_lerobot.datasets.remote import hub, local, store
 from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.hub import transfer
 from bhd_lerobot.recording import record
 from bhd_lerobot.rosbag.messages.types import type_store
 from bhd_lerobot.training import train
 from bhd_lerobot.training.rl import train as rl
+from tests.datasets import corruption_jobs, kill_jobs
+from tests.datasets.sweeps import faults
 
 __all__ = [
-    "av", "evaluate", "lerobot_dataset", "lerobot_record", "lerobot_replay", "mcap", "pd", "pyarrow", "record", "rl",
-    "rosbags", "stable_baselines3", "torch", "train", "transfer",
+    "av", "corruption_jobs", "evaluate", "faults", "hub", "kill_jobs", "lerobot_dataset", "lerobot_record",
+    "lerobot_replay", "local", "mcap", "pd", "pyarrow", "record", "rl", "rosbags", "stable_baselines3", "store",
+    "torch", "train", "transfer",
 ]  # fmt: skip
 
 type_store()

@@ -6,8 +6,6 @@ import os
 import pickle
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
 from importlib import metadata
@@ -18,24 +16,25 @@ import pytest
 from rich.console import Console
 
 from bhd_lerobot.cluster import loop
+from bhd_lerobot.cluster.cluster import describe_crowding
 from bhd_lerobot.cluster.config import RayConfig
 from bhd_lerobot.cluster.job import Job
 from bhd_lerobot.cluster.loop import open_pool
-from bhd_lerobot.cluster.pool import WorkerPool
 from bhd_lerobot.cluster.task import Task
 from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.video import count_frames
 from bhd_lerobot.errors import ActionError, ClusterError
 from bhd_lerobot.evaluation import evaluate as evaluate_module
 from bhd_lerobot.recording import record as record_module
+from bhd_lerobot.recording.record import main
 from tests.cluster import fakes
 from tests.evaluation.test_brains import checkpoint  # noqa: F401  (a fixture)
 from tests.evaluation.test_evaluate import FAILING, run_eval
+from tests.forks import Fork
 from tests.recording.support import options, run_record
 from tests.waiting import until
 
 STORE = 100 * 2**20
-ROOT = Path(__file__).parents[2]
 ARM = {
     "robot__type": "ur5",
     "brain__type": "reach",
@@ -75,6 +74,7 @@ def cluster(ray_folder):
             "num_gpus": 0,
             "object_store_memory": STORE,
             "include_dashboard": False,
+            "_system_config": {"health_check_period_ms": 300},  # a machine's end is noticed after five of them
         },
     )
     try:
@@ -91,6 +91,13 @@ def add_machine(cluster):
 
 def on(cluster, **more) -> dict[str, object]:
     return {"engine": "ray", "ray__address": cluster.address, **more}
+
+
+def run_alone(root: Path, **overrides: object) -> None:
+    """Record on this machine what a cluster's recording is compared with; its picture, which costs a second, is not."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record_module.TrajectoryAlbum, "draw", lambda *_: None)
+        run_record(root, **overrides)
 
 
 def files_of(root: Path) -> dict[str, bytes]:
@@ -125,45 +132,6 @@ def gone(pid: int) -> bool:
 # --- recordings -------------------------------------------------------------------------------------------------------
 
 
-def test_a_recording_is_the_same_although_a_worker_and_a_machine_die(cluster, tmp_path, monkeypatch):
-    pools: list[WorkerPool] = []
-
-    class Seen(WorkerPool):
-        def __init__(self, *arguments):
-            super().__init__(*arguments)
-            pools.append(self)
-
-    killed: list[int] = []
-
-    def a_worker() -> int:
-        # The pool may not have missed yet the one that was killed just now.
-        pids = [int(worker.host.rpartition(" ")[2]) for worker in pools[0]._workers if worker.is_ready]
-        return next(pid for pid in pids if pid not in killed)
-
-    def kill_a_worker() -> None:
-        killed.append(a_worker())
-        os.kill(killed[0], signal.SIGKILL)
-
-    def kill_its_machine() -> None:
-        raylet = parent_of(a_worker())
-        machine = next(one for one in cluster.spare if one.all_processes["raylet"][0].process.pid == raylet)
-        cluster.spare.remove(machine)
-        cluster.remove_node(machine, allow_graceful=False)
-
-    # When the eighth is saved, 42 are missing, and no more than 16 of them can be on their way or waiting to be saved.
-    monkeypatch.setattr(loop, "WorkerPool", Seen)
-    after_saves(monkeypatch, {3: kill_a_worker, 8: kill_its_machine})
-    many = {"dataset__num_episodes": 50, "n_envs": 2, "dataset__episode_time_s": 5}
-    result, printed = run_record(tmp_path / "ray", **on(cluster, ray__episodes_per_task=2), **many)
-    cluster.spare.append(add_machine(cluster))
-    monkeypatch.undo()
-    assert (result.exit_status, result.recorded) == (0, 50)
-    assert printed.count("A worker was lost") >= 2
-    assert "will be run again" in printed
-    run_record(tmp_path / "local", **many)
-    assert files_of(tmp_path / "ray") == files_of(tmp_path / "local")
-
-
 def workers_of(raylets: set[int]) -> list[int]:
     """Return the processes of our workers on these machines."""
     found = []
@@ -179,34 +147,26 @@ def workers_of(raylets: set[int]) -> list[int]:
 
 def test_a_killed_driver_leaves_good_episodes_and_no_processes(ray_folder, tmp_path):
     pytest.importorskip("ray")
-    many = {"dataset__num_episodes": 400, "dataset__episode_time_s": 5}
+    many = {"dataset__num_episodes": 400, "dataset__episode_time_s": 2}
     arguments = options(tmp_path / "ray", engine="ray", ray__num_workers=1, **many)
-    driver = subprocess.Popen(
-        [sys.executable, "-m", "bhd_lerobot.recording.record", *arguments],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        stdin=subprocess.DEVNULL,
-    )
+    driver = Fork(main, arguments, output=tmp_path / "log")
     family: set[int] = set()
     try:
-        until(lambda: len(list((tmp_path / "ray" / "data").rglob("*.parquet"))) >= 3)
+        until(lambda: len(list((tmp_path / "ray" / "data").rglob("*.parquet"))) >= 2)
         family = descendants(driver.pid)
         assert any(b"RemoteWorker" in Path(f"/proc/{pid}/cmdline").read_bytes() for pid in family)
         driver.kill()
-        driver.wait()
         # Ray's two agents try for a minute to report that the rest has gone.
         until(lambda: not any(working(pid) for pid in family))
     finally:
         for pid in {driver.pid, *family}:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        driver.wait()
     saved = len(list((tmp_path / "ray" / "data").rglob("*.parquet")))
     result, _ = run_record(tmp_path / "ray", **{**many, "dataset__num_episodes": saved}, resume="true")
     assert result.episodes == saved
     assert result.recorded <= 1
-    run_record(tmp_path / "local", **{**many, "dataset__num_episodes": saved})
+    run_alone(tmp_path / "local", **{**many, "dataset__num_episodes": saved})
     for part in ("data", "meta/episodes"):
         ours, theirs = table(tmp_path / "ray" / part), table(tmp_path / "local" / part)
         assert ours == theirs
@@ -242,27 +202,62 @@ def descendants(pid: int) -> set[int]:
     return found
 
 
-class TestOneWorker:
-    """Runs one after the other on the same worker, as an evaluation of several brains uses it."""
+class TestOnePool:
+    """Runs one after the other with the same workers, as an evaluation of several brains uses them."""
 
     @pytest.fixture(scope="class")
     @classmethod
     def pool(cls, cluster):
-        with open_pool(RayConfig(address=cluster.address, num_workers=1), Console(file=io.StringIO())) as pool:
+        with open_pool(RayConfig(address=cluster.address), Console(file=io.StringIO(), width=400)) as pool:
             yield pool
+        while len(cluster.spare) < 2:
+            cluster.spare.append(add_machine(cluster))
 
     @pytest.fixture
     def shared(self, pool, monkeypatch):
         for module in (record_module, evaluate_module):
             monkeypatch.setattr(module, "open_pool", lambda *_: contextlib.nullcontext(pool))
 
+    def test_a_recording_is_the_same_although_a_worker_and_a_machine_die(
+        self, cluster, pool, shared, tmp_path, monkeypatch
+    ):
+        """The first of this class: what comes after it runs on the worker that is left."""
+        killed: list[int] = []
+
+        def a_worker() -> int:
+            # The pool may not have missed yet the one that was killed just now.
+            pids = [int(worker.host.rpartition(" ")[2]) for worker in pool._workers if worker.is_ready]
+            return next(pid for pid in pids if pid not in killed)
+
+        def kill_a_worker() -> None:
+            killed.append(a_worker())
+            os.kill(killed[0], signal.SIGKILL)
+
+        def kill_its_machine() -> None:
+            raylet = parent_of(a_worker())
+            machine = next(one for one in cluster.spare if one.all_processes["raylet"][0].process.pid == raylet)
+            cluster.spare.remove(machine)
+            cluster.remove_node(machine, allow_graceful=False)
+
+        # When the sixth is saved, 22 are missing, and no more than 16 of them can be on their way or waiting to be
+        # saved.
+        with monkeypatch.context() as once:
+            after_saves(once, {2: kill_a_worker, 6: kill_its_machine})
+            many = {"dataset__num_episodes": 28, "n_envs": 2, "dataset__episode_time_s": 2}
+            result, _ = run_record(tmp_path / "ray", **on(cluster, ray__episodes_per_task=2), **many)
+        printed = pool._console.file.getvalue()
+        assert (result.exit_status, result.recorded) == (0, 28)
+        assert printed.count("A worker was lost") >= 2
+        assert "will be run again" in printed
+        run_alone(tmp_path / "local", **many)
+        assert files_of(tmp_path / "ray") == files_of(tmp_path / "local")
+
     def test_a_cluster_goes_on_with_what_one_machine_began_images_too(self, cluster, shared, tmp_path):
-        several = {**ARM, "dataset__num_episodes": 4, "dataset__episode_time_s": 3, "n_envs": 2}
-        run_record(tmp_path / "local", **{**several, "dataset__num_episodes": 2})
+        several = {**ARM, "dataset__num_episodes": 4, "dataset__episode_time_s": 1, "n_envs": 2}
+        run_alone(tmp_path / "local", **{**several, "dataset__num_episodes": 2})
         shutil.copytree(tmp_path / "local", tmp_path / "ray")
-        run_record(tmp_path / "local", **several, resume="true")
-        more = on(cluster)
-        result, _ = run_record(tmp_path / "ray", **several, resume="true", **more)
+        run_alone(tmp_path / "local", **several, resume="true")
+        result, _ = run_record(tmp_path / "ray", **several, resume="true", **on(cluster))
         assert result.recorded == 2
         ours, theirs = files_of(tmp_path / "ray"), files_of(tmp_path / "local")
         assert ours.keys() == theirs.keys()
@@ -284,7 +279,9 @@ class TestOneWorker:
         shutil.copytree(checkpoint, policy)
         brains = {"only": "[old,net]", "brains__net__type": "learned", "brains__net__path": policy}
         same = {**brains, "brains__net__exact": "true", "n_episodes": 4, "n_envs": 2, **FAILING}
-        run_eval(tmp_path / "local", **same)
+        with monkeypatch.context() as once:
+            once.setattr(evaluate_module, "write_report", lambda *_: None)  # only the numbers are compared
+            run_eval(tmp_path / "local", **same)
 
         def read_and_hide(brain):
             found = read(brain)
@@ -316,14 +313,14 @@ class TestOneWorker:
         safetensors.numpy.save_file(weights, policy / "model.safetensors")
         brain = {"brain__type": "learned", "brain__path": policy, "dataset__num_episodes": 1}
         with pytest.raises(ActionError) as alone:
-            run_record(tmp_path / "local", **brain)
+            run_alone(tmp_path / "local", **brain)
         with pytest.raises(ActionError) as spread:
             run_record(tmp_path / "ray", **brain, **on(cluster))
         assert str(spread.value) == str(alone.value)
         assert files_of(tmp_path / "ray") == files_of(tmp_path / "local")
 
     def test_ctrl_c_ends_it_in_order_and_one_machine_goes_on(self, cluster, shared, tmp_path, monkeypatch):
-        many = {"dataset__num_episodes": 30, "dataset__episode_time_s": 5}
+        many = {"dataset__num_episodes": 30, "dataset__episode_time_s": 3}
         with monkeypatch.context() as once:
             after_saves(once, {2: lambda: os.kill(os.getpid(), signal.SIGINT)})
             result, printed = run_record(tmp_path / "ray", **on(cluster), **many)
@@ -332,8 +329,8 @@ class TestOneWorker:
         assert "Stopped by SIGINT" in printed
         shorter = {**many, "dataset__num_episodes": result.recorded + 1}
         assert run_record(tmp_path / "ray", **shorter, resume="true")[0].exit_status == 0
-        run_record(tmp_path / "local", **{**shorter, "dataset__num_episodes": result.recorded})
-        run_record(tmp_path / "local", **shorter, resume="true")
+        run_alone(tmp_path / "local", **{**shorter, "dataset__num_episodes": result.recorded})
+        run_alone(tmp_path / "local", **shorter, resume="true")
         assert files_of(tmp_path / "ray") == files_of(tmp_path / "local")
 
 
@@ -410,9 +407,11 @@ def test_how_many_workers_run_at_a_time_is_told_if_more_were_asked_for(cluster):
     assert (got, error) == (list(range(6)), None)
     assert "ray.num_workers is 5, and the cluster has room for 2 of 1 CPU: 2 run at a time." in printed
     assert printed.count("1 CPUs and 0 GPUs") == 2  # the machines that have room, by name
-    # No message about workers without a task.
-    assert "at a time" not in run_pool(cluster, [fakes.ECHO] * 2, num_workers=5)[1]
-    assert "at a time" not in run_pool(cluster, [fakes.ECHO] * 6)[1]
+    with open_pool(RayConfig(address=cluster.address), Console(file=io.StringIO())) as pool:
+        # No message about workers without a task, nor where no number was asked for.
+        for config, tasks in ((RayConfig(num_workers=5), 2), (RayConfig(), 6)):
+            pool._config = config
+            assert describe_crowding(config, pool.workers_for(tasks)) == ""
 
 
 def test_workers_that_others_leave_no_room_for_are_not_waited_for_without_end(cluster):

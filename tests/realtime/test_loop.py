@@ -228,6 +228,7 @@ def test_absent_processes_are_not_watched():
     assert set(loop.modes) == {Mode.TRACKING}
 
 
+@settings(max_examples=30)
 @given(timeout_ms=st.integers(1, 100))
 def test_a_silent_plant_is_a_fault_at_its_time_out(timeout_ms):
     loop = VirtualLoop(LoopLimits(plant_timeout_s=timeout_ms / 1e3), alive=(Word.PLANT_ALIVE,))
@@ -239,11 +240,11 @@ def test_a_silent_plant_is_a_fault_at_its_time_out(timeout_ms):
     assert set(loop.modes[fault:]) == {Mode.FAULT}
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(tick=st.integers(1, 60), delays=LATE)
 def test_the_stop_word_takes_effect_at_the_next_executed_tick(tick, delays):
     loop = VirtualLoop(delays=delays)
-    loop.drive(0, 150)
+    loop.drive(0, 100)
     driving = loop.script[tick]
 
     def press() -> None:
@@ -251,7 +252,7 @@ def test_the_stop_word_takes_effect_at_the_next_executed_tick(tick, delays):
         loop.words[Word.ESTOP] = 1
 
     loop.script[tick] = press
-    loop.run(150)
+    loop.run(100)
     assert Mode.ESTOP not in loop.modes[:tick]
     assert set(loop.modes[tick:]) == {Mode.ESTOP}
     # The command is a braking one with that tick already, and stays so.

@@ -353,7 +353,7 @@ others = st.tuples(st.just("cancel"), st.integers(0, 8)) | st.tuples(st.just("st
 actions = st.tuples(st.one_of(goals, goals, others), st.integers(0, 5) | st.integers(0, 400))
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.lists(actions, min_size=1, max_size=7), st.lists(st.integers(0, 300), max_size=10), st.integers(MIN_LEAD, 40))
 def test_whatever_happens_while_another_process_plans(script: list, latencies: list[int], lead: int) -> None:
     world = World(script, latencies, lead / HZ)

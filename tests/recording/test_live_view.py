@@ -21,9 +21,11 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.recording import live_view as module
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.live_view import PACKAGES, LiveView, check_options, live_view, points
+from bhd_lerobot.recording.record import main
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.configuration import parse
+from tests.forks import Fork
 from tests.recording.support import data_columns, options, run_record
 
 
@@ -180,24 +182,25 @@ def test_a_viewer_that_cannot_be_reached_is_an_error_before_the_run(robot: Simul
         LiveView(display(display_mode="rerun", display_ip="127.0.0.1", display_port=port), robot)
 
 
+def record_while_the_viewer_goes(root: Path) -> int:
+    """Record with a viewer that goes as soon as it has been connected to; in a process of its own."""
+    server = socket.create_server(("127.0.0.1", 0))
+    start = module.RerunExtras.__init__
+
+    def start_and_go(*arguments: Any) -> None:
+        start(*arguments)
+        server.close()
+
+    module.RerunExtras.__init__ = start_and_go
+    module._END_S = 0.5
+    where = ["--display_data=true", "--display_ip=127.0.0.1", f"--display_port={server.getsockname()[1]}"]
+    return main([*options(root, dataset__num_episodes=1, dataset__episode_time_s=1), *where])
+
+
 def test_a_viewer_that_disappears_does_not_delay_the_end_of_the_run(tmp_path: Path) -> None:
-    program = (
-        "import socket\n"
-        "from bhd_lerobot.recording import live_view\n"
-        "from bhd_lerobot.recording.record import main\n"
-        "live_view._END_S = 0.5\n"
-        "server = socket.create_server(('127.0.0.1', 0))\n"
-        "start = live_view.RerunExtras.__init__\n"
-        "def start_and_go(*arguments):\n"
-        "    start(*arguments)\n"
-        "    server.close()\n"
-        "live_view.RerunExtras.__init__ = start_and_go\n"
-        "where = ['--display_data=true', '--display_ip=127.0.0.1', f'--display_port={server.getsockname()[1]}']\n"
-        f"assert main({options(tmp_path / 'd', dataset__num_episodes=1, dataset__episode_time_s=1)!r} + where) == 0\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "Live view: ended after" in done.stderr
+    log = tmp_path / "log"
+    assert Fork(record_while_the_viewer_goes, tmp_path / "d", output=log).wait() == 0, log.read_text()
+    assert "Live view: ended after" in log.read_text()
     assert len(data_columns(tmp_path / "d")["index"]) == 10
 
 

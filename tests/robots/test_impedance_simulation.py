@@ -1,6 +1,6 @@
 """Impedance in closed loop: against a rigid wall, under known forces, and in free motion. Truth is the engine's."""
 
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -19,28 +19,14 @@ EFFORT = np.array(ARM.limits.effort[:6])
 PUSH = (10.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def pushing() -> Rig:
-    """Return a rig that has been pushing on the wall with 10 N for a second and a half."""
+def pushing(speed: float = 0.02, peak: float = 25.0) -> Rig:
+    """Return a rig that came to the wall at a speed, has been pushing on it with 10 N, and did so as it should."""
     rig = Rig(wall=True)
     rig.move((0.07, 0, 0), 0.1)
-    rig.approach(0.02)
-    rig.controller.set_wrench(PUSH)
-    rig.keep(1.5)
-    assert abs(rig.log["force"][-1][0] + 10) < 1
-    return rig
-
-
-# --- contact ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("speed", "peak"), [(0.02, 25.0), (0.05, 60.0)])
-def test_a_push_on_a_rigid_wall(speed: float, peak: float) -> None:
-    rig = Rig(wall=True)
-    rig.move((0.05, 0, 0), 0.1)
-    rig.keep(0.3)
+    rig.keep(0.2)
     rig.approach(speed)
     rig.controller.set_wrench(PUSH)
-    rig.keep(1.5)
+    rig.keep(1.2)
     force, estimate = rig.logged("force"), rig.logged("estimate")
     onset = int(np.flatnonzero(force[:, 0])[0])
     assert -force.min() < peak
@@ -50,10 +36,27 @@ def test_a_push_on_a_rigid_wall(speed: float, peak: float) -> None:
     assert (force[onset:, 0] < 0).all()  # it does not bounce
     assert np.linalg.norm(estimate[:onset, :3], axis=1).max() < 0.2
     assert (np.abs(rig.logged("torque")) <= EFFORT).all()
+    return rig
 
 
-def test_it_lets_go_cleanly() -> None:
+# --- contact ---------------------------------------------------------------------------------------------------------
+
+
+def test_it_pushes_on_a_rigid_wall_until_no_commands_come_and_lets_go_cleanly() -> None:
     rig = pushing()
+    rig.cerebellum.take_flags()
+    commanded = rig.controller.command.copy()
+    rig.wait(0.5)
+    assert rig.mode == Mode.HOLD
+    assert rig.cerebellum.take_flags()[1][0] == Watchdog.COMMAND_AGE
+    assert not rig.controller.wrench.any()
+    rig.wait(0.4)
+    assert abs(rig.log["force"][-1][0]) < 1.0
+    np.testing.assert_allclose(rig.controller.command, commanded, atol=1e-6)
+
+    rig.controller.set_wrench(PUSH)
+    rig.keep(0.6)
+    assert abs(rig.log["force"][-1][0] + 10) < 1
     since = rig.ticks
     rig.controller.set_wrench(np.zeros(6))
     rig.move((-0.03, 0, 0), 0.05)
@@ -72,7 +75,7 @@ def test_a_push_by_the_spring_alone() -> None:
     rig.move((0.07, 0, 0), 0.1)
     rig.approach(0.02)
     rig.target[:, 0] = rig.log["tool"][-1][0] + 10 / 500
-    rig.keep(2.0)
+    rig.keep(1.2)
     assert abs(rig.log["force"][-1][0] + 10) < 0.5
 
 
@@ -82,7 +85,7 @@ def test_a_wall_in_the_way_of_a_far_target_is_pushed_no_harder_than_allowed() ->
     rig.approach(0.02)
     since = rig.ticks
     rig.target[:, 0] += 0.3
-    rig.keep(3.0)
+    rig.keep(2.2)
     assert abs(rig.log["force"][-1][0] + 30) < 1.0
     # On its way in the equilibrium is 250 mm/s faster than the tool, which the damper feels.
     assert rig.logged("force", since)[:, 0].min() > -80
@@ -93,10 +96,10 @@ def test_a_wall_in_the_way_of_a_far_target_is_pushed_no_harder_than_allowed() ->
 
 
 def test_an_emergency_stop_in_contact_presses_no_more_and_stays() -> None:
-    rig = pushing()
+    rig = pushing(speed=0.05, peak=60.0)
     since = rig.ticks
     rig.bridge.estop()
-    rig.wait(2.0)
+    rig.wait(1.2)
     force, tool = rig.logged("force", since)[:, 0], rig.logged("tool", since)
     assert rig.mode == Mode.ESTOP
     assert force.min() > -10.5
@@ -116,7 +119,7 @@ def test_an_emergency_stop_in_contact_presses_no_more_and_stays() -> None:
 
 def test_an_emergency_stop_in_motion_ends_where_it_was_pressed() -> None:
     rig = Rig()
-    rig.move((0, -0.2, 0), 0.25)
+    rig.move((0, -0.15, 0), 0.25)
     pressed = rig.log["tool"][-1]
     rig.bridge.estop()
     rig.wait(0.02)
@@ -128,23 +131,11 @@ def test_an_emergency_stop_in_motion_ends_where_it_was_pressed() -> None:
     assert rig.bridge.reset().accepted.all()
 
 
-def test_without_commands_the_push_ends_and_the_arm_holds() -> None:
-    rig = pushing()
-    commanded = rig.controller.command.copy()
-    rig.wait(0.5)
-    assert rig.mode == Mode.HOLD
-    assert rig.cerebellum.take_flags()[1][0] == Watchdog.COMMAND_AGE
-    assert not rig.controller.wrench.any()
-    rig.wait(0.5)
-    assert abs(rig.log["force"][-1][0]) < 1.0
-    np.testing.assert_allclose(rig.controller.command, commanded, atol=1e-6)
-
-
 def test_a_stop_in_motion_brakes_the_equilibrium_and_holds_it_where_it_stops() -> None:
     rig = Rig()
-    rig.move((0, -0.2, 0), 0.25)
+    rig.move((0, -0.15, 0), 0.25)
     since = rig.ticks
-    rig.wait(1.5)
+    rig.wait(1.2)
     command = rig.logged("command", since)[:, :3]
     speed = np.linalg.norm(np.diff(command, axis=0), axis=1) * 500
     assert rig.mode == Mode.HOLD
@@ -158,17 +149,17 @@ def test_a_stop_in_motion_brakes_the_equilibrium_and_holds_it_where_it_stops() -
 
 def test_it_holds_still() -> None:
     rig = Rig()
-    rig.wait(2.0)
+    rig.wait(1.0)
     assert np.linalg.norm(rig.logged("tool") - START, axis=1).max() < 1e-6
     assert rig.mode == Mode.HOLD
 
 
-@pytest.mark.parametrize("force", [(20.0, 0.0, 0.0), (0.0, -20.0, 0.0), (-5.0, 8.0, -12.0)])
+@pytest.mark.parametrize("force", [(20.0, 0.0, 0.0), (-5.0, 8.0, -12.0)])
 def test_a_force_moves_the_tool_by_force_over_stiffness_and_is_felt(force: tuple[float, float, float]) -> None:
     stiffness = np.diag([400.0, 800.0, 600.0, 40.0, 40.0, 40.0])
     rig = Rig(compliance=Compliance(stiffness))
     rig.push[:3] = force
-    rig.wait(2.0)
+    rig.wait(1.4)
     size = np.linalg.norm(force)
     moved = stiffness[:3, :3] @ (rig.log["tool"][-1] - START)
     assert np.linalg.norm(moved - force) < 0.05 * size
@@ -180,7 +171,7 @@ def test_a_force_moves_the_tool_by_force_over_stiffness_and_is_felt(force: tuple
 def test_a_moment_is_felt() -> None:
     rig = Rig()
     rig.push[3:] = (1.0, 0.5, -1.0)
-    rig.wait(1.0)
+    rig.wait(0.5)
     np.testing.assert_allclose(rig.log["estimate"][-1], (0, 0, 0, 1.0, 0.5, -1.0), atol=0.05)
 
 
@@ -207,7 +198,7 @@ def test_a_far_target_causes_no_jump() -> None:
     rig = Rig()
     rig.target[:, :3] += (0.05, -0.3, -0.05)
     rig.target[:, 3:7] = (0.0, 0.0, 1.0, 0.0)  # the tool points down
-    rig.keep(4.0)
+    rig.keep(2.6)
     command, torque = rig.logged("command"), rig.logged("torque")
     velocity = np.diff(command[:, :3], axis=0) * 500
     assert np.linalg.norm(velocity, axis=1).max() <= 0.25 + 1e-9
@@ -220,9 +211,9 @@ def test_a_far_target_causes_no_jump() -> None:
 
 def test_no_contact_is_felt_in_free_motion_at_full_speed() -> None:
     rig = Rig()
-    rig.move((0, -0.4, 0), 0.25)
+    rig.move((0, -0.25, 0), 0.25)
     rig.keep(0.3)
-    rig.move((-0.1, 0, 0.2), 0.25)
+    rig.move((-0.06, 0, 0.12), 0.25)
     rig.keep(0.3)
     estimate = rig.logged("estimate")
     assert np.linalg.norm(np.diff(rig.logged("tool"), axis=0), axis=1).max() * 500 > 0.24
@@ -239,19 +230,19 @@ def test_a_stretched_arm_stays_calm() -> None:
     assert speed.max() < 0.01
     assert (np.abs(rig.logged("torque")) < EFFORT).all()
     rig.move((-0.6, 0, -0.2), 0.25)
-    rig.keep(1.5)
+    rig.keep(1.0)
     np.testing.assert_allclose(rig.log["tool"][-1], START, atol=2e-3)
 
 
-def test_two_arms_do_bit_for_bit_what_one_does() -> None:
+def test_one_of_several_arms_does_bit_for_bit_what_one_does() -> None:
     logs = []
-    for n in (1, 2, 3):
+    for n in (1, 3):
         rig = Rig(n=n)
         rig.target[1:, :3] += 0.05
         rig.move((0.02, 0.03, -0.04), 0.1)
         rig.keep(0.2)
         logs.append(np.concatenate([rig.logged(name) for name in ("tool", "estimate", "torque", "command")], axis=1))
-    assert logs[0].tobytes() == logs[1].tobytes() == logs[2].tobytes()
+    assert logs[0].tobytes() == logs[1].tobytes()
 
 
 # --- around it -------------------------------------------------------------------------------------------------------
@@ -268,16 +259,11 @@ def test_a_posture_at_the_start_points_forward() -> None:
     assert np.isfinite(forward_posture()).all()
 
 
-def test_the_example_settles_at_the_force_that_is_asked_for() -> None:
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / "push_wall.py"), "--force", "15", "--hold", "1"],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=ROOT,
-        stdin=subprocess.DEVNULL,
-    )
-    assert done.returncode == 0, done.stderr
-    last = done.stdout.splitlines()[-1]
+def test_the_example_settles_at_the_force_that_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["push_wall.py", "--force", "15", "--speed", "0.05", "--hold", "1"])
+    runpy.run_path(str(ROOT / "examples" / "push_wall.py"), run_name="__main__")
+    last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("settled at 1")
     assert abs(float(last.split()[2]) - 15) < 1

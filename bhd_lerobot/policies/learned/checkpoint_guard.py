@@ -6,6 +6,8 @@ calls it with arguments from the same file, `subprocess.Popen` as readily as a n
 
 import importlib
 import json
+from collections.abc import Callable
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -68,6 +70,7 @@ def check_checkpoint(folder: Path) -> None:
         _register_steps(PreTrainedConfig.get_choice_class(kind))
     if kind in _POLICIES_WITH_CODE:
         _check_models(folder / CONFIG_FILE, config)
+    allowed = cache(plugin_packages)  # reads about every installed distribution
     for file in (folder / name for name in PROCESSOR_FILES):
         if not file.exists() and not file.is_symlink():
             continue
@@ -75,7 +78,7 @@ def check_checkpoint(folder: Path) -> None:
         if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
             raise ConfigError(f"{file} has no list of processor steps. Copy the checkpoint again.")
         for step in steps:
-            _check_step(file, step)
+            _check_step(file, step, allowed)
 
 
 def _register_steps(config_class: type) -> None:
@@ -87,16 +90,16 @@ def _register_steps(config_class: type) -> None:
         return
 
 
-def _check_step(file: Path, step: dict[str, Any]) -> None:
+def _check_step(file: Path, step: dict[str, Any], allowed: Callable[[], set[str]]) -> None:
     # As in LeRobot, where "registry_name" is there "class" is not looked at.
     is_registered = "registry_name" in step
     name = step.get("registry_name" if is_registered else "class")
-    found = _registered(name) if is_registered else _class(name)
+    found = _registered(name) if is_registered else _class(name, allowed)
     if not (isinstance(found, type) and issubclass(found, ProcessorStep)):
-        allowed = ", ".join(sorted(plugin_packages()))
+        packages = ", ".join(sorted(allowed()))
         raise ConfigError(
             f"{file} asks for the processor step {name!r}, which is not loaded: it would run code of the checkpoint's "
-            f"choice. Allowed are registered steps, and processor steps of {allowed}. {_BEWARE} A step of your own "
+            f"choice. Allowed are registered steps, and processor steps of {packages}. {_BEWARE} A step of your own "
             "belongs into an installed package lerobot_policy_…, decorated with ProcessorStepRegistry.register()."
         )
     state = step.get("state_file")
@@ -117,20 +120,19 @@ def _registered(name: Any) -> Any:
     return ProcessorStepRegistry.get(name) if name in ProcessorStepRegistry.list() else None
 
 
-def _class(path: Any) -> Any:
+def _class(path: Any, allowed: Callable[[], set[str]]) -> Any:
     """Return the class of a dotted name; None if it is not of an allowed package.
 
     A module of an allowed package may have imported the class from elsewhere, so it is the class that is asked.
     """
     parts = path.split(".") if isinstance(path, str) else []
-    allowed = plugin_packages()
-    if len(parts) < 2 or parts[0] not in allowed or not all(part.isidentifier() for part in parts):
+    if len(parts) < 2 or parts[0] not in allowed() or not all(part.isidentifier() for part in parts):
         return None
     try:
         found = getattr(importlib.import_module(".".join(parts[:-1])), parts[-1], None)
     except Exception:  # whatever that module needs and does not find
         return None
-    return found if getattr(found, "__module__", "").partition(".")[0] in allowed else None
+    return found if getattr(found, "__module__", "").partition(".")[0] in allowed() else None
 
 
 def _check_models(file: Path, options: dict[str, Any]) -> None:

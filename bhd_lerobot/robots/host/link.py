@@ -32,6 +32,7 @@ _START_S = 120.0  # that a process may take to import, build its model and warm 
 _ANSWER_S = 30.0  # that it may take to place a scene
 _HEAD_START_S = 0.02  # from the order to run to the first tick
 _SILENCE_S = 2.0  # so long without a sign of life a plant is stopped, or gets no processor time
+_END_S = 5.0  # that a process has to end in order before it is killed
 _FIFO = 256
 
 
@@ -228,7 +229,7 @@ class LiveLink:
                 pipe.send(("end",))
         for process in self._processes.values():
             try:
-                process.wait(5.0)
+                process.wait(_END_S)
             except subprocess.TimeoutExpired:
                 process.kill()  # stopped, or stuck: nothing it holds survives it
                 process.wait()

@@ -66,7 +66,7 @@ def follow(rig: Rig, sim: int, script: list) -> Counter:
     return due
 
 
-@settings(max_examples=500)
+@settings(max_examples=200)
 @given(st.lists(actions, min_size=1, max_size=6))
 @example([(("goal", {"joint_target": tuple(HOME[:6] + 0.3), "preempt": False}), 3), (("goal", {"gripper": 0.0}), 0)])
 def test_limits_hold_and_every_goal_has_one_result(script: list) -> None:

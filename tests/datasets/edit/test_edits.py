@@ -159,7 +159,7 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new(tmp_path: Path) -> None:
     new = [old[0], old[2], old[3]]
     steps = steps_of(lambda: delete(shutil.copytree(origin, tmp_path / "count"), [1]))
     seen = set()
-    for step in range(steps):
+    for step in range(0, steps, 6):  # all of them: `delete` in tests/datasets/sweeps
         root = shutil.copytree(origin, tmp_path / f"d{step}")
         assert Fork(kill_jobs.delete, root, [1], step).wait() == -signal.SIGKILL
         repair(root)

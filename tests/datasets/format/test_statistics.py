@@ -46,7 +46,7 @@ def test_sampled_frames_are_lerobots(length: int) -> None:
     assert statistics.sampled_frames(length).tolist() == sample_indices(length)
 
 
-@pytest.mark.parametrize("size", [(48, 64), (240, 320), (400, 150)])
+@pytest.mark.parametrize("size", [(48, 64), (40, 320), (400, 25)])
 def test_images_against_numpy(size: tuple[int, int]) -> None:
     from lerobot.datasets.compute_stats import auto_downsample_height_width
 

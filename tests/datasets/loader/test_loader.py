@@ -26,13 +26,13 @@ B_FRAMES = VideoSettings(g=30, extra_options={"bf": 2})
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Without cameras, by our recorder."""
-    return support.record_ours(tmp_path_factory.mktemp("plain") / "d")
+    return support.record_light(tmp_path_factory.mktemp("plain") / "d")
 
 
 @pytest.fixture(scope="module")
 def video_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With two cameras."""
-    return support.record_ours(tmp_path_factory.mktemp("video_dataset") / "d", 4, (FRONT, WRIST))
+    return support.record_light(tmp_path_factory.mktemp("video_dataset") / "d", 4, (FRONT, WRIST))
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +57,10 @@ def assert_equal_datasets(root: Path, **options: Any) -> TableDataset:
     return ours
 
 
-@each_case("episodes", [None, [0], [4, 1], [2, 3, 4]])
+@each_case("episodes", [None, [0], [4, 1]])
 @each_case(
     "deltas",
-    [None, {"action": CHUNK}, {"action": CHUNK, "observation.state": WINDOW, "event": WINDOW}, {"action": [0.0]}],
+    [None, {"action": CHUNK, "observation.state": WINDOW, "event": WINDOW}, {"action": [0.0]}],
 )
 def test_tables_are_those_of_lerobot(plain: Path, episodes: list[int] | None, deltas: dict[str, list[float]]) -> None:
     assert_equal_datasets(plain, episodes=episodes, delta_timestamps=deltas)
@@ -79,7 +79,7 @@ def test_frames_of_our_recorder_are_those_of_lerobot(
 def test_frames_of_other_codecs_are_those_of_lerobot_with_any_number_of_threads(
     tmp_path: Path, video: VideoSettings, cores: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root = support.record_ours(tmp_path / "d", 3, (FRONT,), video)
+    root = support.record_light(tmp_path / "d", 3, (FRONT,), video)
     monkeypatch.setattr(frame_cache.os, "cpu_count", lambda: cores)
     assert_equal_datasets(root, delta_timestamps={"action": CHUNK}, return_uint8=True)
 
@@ -114,7 +114,7 @@ def test_other_decoders_run_through_lerobot(video_dataset: Path) -> None:
 
 
 def test_a_language_column_is_in_samples_and_left_out_of_batches_as_in_lerobot(tmp_path: Path) -> None:
-    root = support.record_ours(tmp_path / "d", 2, language=True)
+    root = support.record_light(tmp_path / "d", 2, language=True)
     ours = assert_equal_datasets(root, delta_timestamps={"action": CHUNK})
     assert ours[0]["language_persistent"][0]["content"] == "pick it up"
     assert "language_persistent" not in ours.batch(torch.tensor([0]))

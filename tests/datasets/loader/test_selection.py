@@ -34,12 +34,12 @@ from tests.datasets.loader.support import FPS, FRONT, WRIST
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Five episodes: success, success, collision, timeout, success."""
-    return support.record_ours(tmp_path_factory.mktemp("plain") / "d")
+    return support.record_light(tmp_path_factory.mktemp("plain") / "d")
 
 
 @pytest.fixture(scope="module")
 def video_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return support.record_ours(tmp_path_factory.mktemp("video_dataset") / "d", 2, (FRONT, WRIST))
+    return support.record_light(tmp_path_factory.mktemp("video_dataset") / "d", 2, (FRONT, WRIST))
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +178,7 @@ def test_a_policy_can_learn_from_a_valid_dataset(plain: Path, video_dataset: Pat
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_value_that_is_not_finite_is_named(tmp_path: Path, plain: Path, value: float) -> None:
-    root = support.record_ours(tmp_path / "d")
+    root = support.record_light(tmp_path / "d")
     path = root / "data/chunk-000/file-000.parquet"
     table = pq.read_table(path)
     rows = [list(row) for row in table["action"].to_pylist()]
@@ -309,8 +309,8 @@ def test_available_memory_respects_the_control_group(tmp_path: Path, monkeypatch
 
 
 def test_a_video_that_lacks_frames_is_named(tmp_path: Path) -> None:
-    root = support.record_ours(tmp_path / "d", 2, (FRONT,))
-    other = support.record_ours(tmp_path / "other", 1, (FRONT,))
+    root = support.record_light(tmp_path / "d", 2, (FRONT,))
+    other = support.record_light(tmp_path / "other", 1, (FRONT,))
     name = f"videos/{FRONT}/chunk-000/file-000.mp4"
     (root / name).write_bytes((other / name).read_bytes())
     with pytest.raises(DatasetError, match=f"no image of '{FRONT}' for episode 1, frame 0"):
@@ -321,7 +321,7 @@ def test_a_video_that_lacks_frames_is_named(tmp_path: Path) -> None:
 
 
 def test_a_data_file_that_does_not_fit_the_metadata(tmp_path: Path) -> None:
-    root = support.record_ours(tmp_path / "d")
+    root = support.record_light(tmp_path / "d")
     path = root / "data/chunk-000/file-000.parquet"
     table = pq.read_table(path)
     pq.write_table(table.slice(0, len(table) - 1), path)

@@ -26,17 +26,33 @@ def few_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def s3_url() -> Iterator[str]:
     """An S3-compatible store with one bucket; yields its address."""
+    from moto import backends
     from moto.server import ThreadedMotoServer
 
+    services = list(backends.list_of_moto_modules())
     server = ThreadedMotoServer(port=0)
-    server.start()
-    host, port = server.get_host_and_port()
-    yield f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"
-    server.stop()
+    with pytest.MonkeyPatch.context() as patch:
+        # It would look for all of them on the disk at every request, which takes longer than the request.
+        patch.setattr(backends, "list_of_moto_modules", lambda: services)
+        server.start()
+        host, port = server.get_host_and_port()
+        yield f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"
+        server.stop()
 
 
 @pytest.fixture(params=["memory", "file", "s3"])
 def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A place of each kind."""
+    return _place(request, tmp_path, monkeypatch)
+
+
+@pytest.fixture(params=["memory", "file"])
+def near_url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A place that needs no server: for what happens on our side of the store."""
+    return _place(request, tmp_path, monkeypatch)
+
+
+def _place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     if request.param == "file":
         return f"file://{tmp_path}/there/d"
     if request.param == "memory":

@@ -35,32 +35,30 @@ def flip(url: str, path: str) -> None:
     fs.pipe_file(f"{folder}/{path}", bytes(broken))
 
 
-@pytest.mark.parametrize("path", [DATA, layout.STATS, layout.INFO])
-def test_a_byte_that_is_another_is_repaired_by_a_push_that_verifies(
-    root: Path, url: str, tmp_path: Path, path: str
-) -> None:
+def test_a_byte_that_is_another_is_repaired_by_a_push_that_verifies(root: Path, url: str, tmp_path: Path) -> None:
     push(root, StoreDataset(url))
-    flip(url, path)
-    assert push(root, StoreDataset(url)).sent == []  # by the list all is well
-    report = push(root, StoreDataset(url), verify=True)
-    assert report.sent == [path]
-    assert stored(url) == content(root)
+    for path in (DATA, layout.STATS, layout.INFO):
+        flip(url, path)
+        assert push(root, StoreDataset(url)).sent == []  # by the list all is well
+        report = push(root, StoreDataset(url), verify=True)
+        assert report.sent == [path]
+        assert stored(url) == content(root)
     assert push(root, StoreDataset(url), verify=True).sent == []
     pull(StoreDataset(url), tmp_path / "e")
     assert content(tmp_path / "e") == content(root)
 
 
-def test_verifying_finds_what_is_there_without_a_list_and_writes_one(root: Path, url: str) -> None:
-    push(root, StoreDataset(url))
-    fs, folder = fsspec.core.url_to_fs(url)
+def test_verifying_finds_what_is_there_without_a_list_and_writes_one(root: Path, near_url: str) -> None:
+    push(root, StoreDataset(near_url))
+    fs, folder = fsspec.core.url_to_fs(near_url)
     fs.rm_file(f"{folder}/{MANIFEST}")
-    flip(url, DATA)
-    assert push(root, StoreDataset(url), verify=True).sent == [DATA]
-    assert push(root, StoreDataset(url)).sent == []
-    assert stored(url) == content(root)
+    flip(near_url, DATA)
+    assert push(root, StoreDataset(near_url), verify=True).sent == [DATA]
+    assert push(root, StoreDataset(near_url)).sent == []
+    assert stored(near_url) == content(root)
     fs.rm_file(f"{folder}/{MANIFEST}")
-    assert push(root, StoreDataset(url), verify=True).sent == []
-    assert push(root, StoreDataset(url)).sent == []  # what was read is noted, and not sent for want of a note
+    assert push(root, StoreDataset(near_url), verify=True).sent == []
+    assert push(root, StoreDataset(near_url)).sent == []  # what was read is noted, and not sent for want of a note
 
 
 def test_a_pull_that_verifies_reports_a_damaged_place(root: Path, url: str, tmp_path: Path) -> None:
@@ -76,31 +74,31 @@ def test_a_pull_that_verifies_reports_a_damaged_place(root: Path, url: str, tmp_
     assert (report.fetched, report.by_size) == ([], 0)
 
 
-def test_without_a_list_sizes_are_compared_and_that_is_reported(root: Path, url: str, tmp_path: Path) -> None:
-    push(root, StoreDataset(url))
-    fs, folder = fsspec.core.url_to_fs(url)
+def test_without_a_list_sizes_are_compared_and_that_is_reported(root: Path, near_url: str, tmp_path: Path) -> None:
+    push(root, StoreDataset(near_url))
+    fs, folder = fsspec.core.url_to_fs(near_url)
     fs.rm_file(f"{folder}/{MANIFEST}")
     target = tmp_path / "e"
-    assert pull(StoreDataset(url), target).by_size == 0  # all of it was fetched
+    assert pull(StoreDataset(near_url), target).by_size == 0  # all of it was fetched
     before = content(target)
-    flip(url, layout.STATS)
-    report = pull(StoreDataset(url), target)
+    flip(near_url, layout.STATS)
+    report = pull(StoreDataset(near_url), target)
     assert (report.fetched, report.by_size) == ([], len(content(root)))
     with pytest.raises(DatasetExistsError, match=layout.STATS):
-        pull(StoreDataset(url), target, verify=True)
+        pull(StoreDataset(near_url), target, verify=True)
     assert content(target) == before
-    report = pull(StoreDataset(url), target, verify=True, replace=True)
+    report = pull(StoreDataset(near_url), target, verify=True, replace=True)
     assert (report.fetched, report.by_size) == ([layout.STATS], 0)
-    assert content(target) == stored(url) != before
+    assert content(target) == stored(near_url) != before
 
 
-def test_an_info_that_was_damaged_is_not_put_back(root: Path, url: str) -> None:
+def test_an_info_that_was_damaged_is_not_put_back(root: Path, near_url: str) -> None:
     """A push that takes it away for a while puts its own there, also where that is unchanged."""
-    push(root, StoreDataset(url))
-    flip(url, layout.INFO)
+    push(root, StoreDataset(near_url))
+    flip(near_url, layout.INFO)
     (root / layout.STATS).write_bytes((root / layout.STATS).read_bytes() + b"\n")
-    push(root, StoreDataset(url))
-    assert stored(url) == content(root)
+    push(root, StoreDataset(near_url))
+    assert stored(near_url) == content(root)
 
 
 @pytest.mark.parametrize("place", ["", "there/d/"])

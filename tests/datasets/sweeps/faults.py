@@ -16,6 +16,7 @@ from bhd_lerobot.datasets.remote import staging
 from bhd_lerobot.datasets.storage import atomic, disk
 from tests.datasets import support
 
+IS_FULL = os.environ.get("BHD_SWEEP") == "full"  # `make sweep`
 REMOVALS = ("os.remove", "os.rmdir")
 CHANGES = ("os.mkdir", "os.rename", "os.link", "os.symlink", "os.truncate", *REMOVALS)
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC

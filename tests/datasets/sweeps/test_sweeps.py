@@ -5,7 +5,6 @@ the file system. Here some of them are tried; ``make sweep`` tries all.
 """
 
 import json
-import os
 import re
 import shutil
 import signal
@@ -16,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from tests.datasets.sweeps import faults
+from tests.datasets.sweeps.faults import IS_FULL
 from tests.datasets.sweeps.operations import NOTES, OPERATIONS, REFUSED, Operation, content, leftovers
 from tests.forks import Fork
 
-IS_FULL = os.environ.get("BHD_SWEEP") == "full"
 FAULTS = ("kill", "interrupt", "full")
 
 # What messages say of the state in which a command leaves what it works on.
@@ -62,11 +61,17 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
     return Runner(tmp_path_factory.mktemp("runner"))
 
 
-def chosen(steps: int, offset: int) -> list[int]:
-    """Return the changes before which something happens: all, or one early and some of the last, which decide."""
+def chosen(steps: int, offset: int, place: str) -> list[int]:
+    """Return the changes before which something happens: all, or one early and one of the last, which decide.
+
+    Which ones is another choice for each offset. At a place where the content is moved in file by file, between the
+    decision and the end, it is every fourth of the last.
+    """
     if IS_FULL:
         return list(range(1, steps + 1))
-    return sorted({1 + (steps * (offset + 1)) // 5, *range(max(1, steps - 8 + offset), steps + 1, 4)})
+    early = 1 + offset * 5 % (2 * steps // 3)
+    late = [steps - offset % 8] if place == "plain" else range(steps - 8 + offset % 4, steps + 1, 4)
+    return sorted({early, *(max(1, step) for step in late)})
 
 
 CASES = [
@@ -101,7 +106,7 @@ def test_nothing_is_lost_and_messages_are_true(
     assert leftovers(folder) == []
     assert steps > 5
     for number, fault in enumerate(FAULTS):
-        for step in chosen(steps, number):
+        for step in chosen(steps, len(FAULTS) * CASES.index((operation, place)) + number, place):
             target = fresh()
             status, output, _ = runner.run(argv, folder, place=place, target=target, fault=fault, step=step)
             where = f"{fault} before change {step} of {steps}: status {status}, {output!r}"

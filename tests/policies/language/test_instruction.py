@@ -134,8 +134,9 @@ def test_every_generated_instruction_means_its_target(scene: list[SceneObject], 
     made = instructions_for(scene, target)
     assert len(set(made)) == len(made)
     for instruction in made:
-        assert plan(instruction, scene).target == target
-        assert plan(instruction, shuffled) == plan(instruction, scene)
+        made_of_it = plan(instruction, scene)
+        assert made_of_it.target == target
+        assert plan(instruction, shuffled) == made_of_it
     assert instructions_for(shuffled, target) == made
 
 

@@ -21,7 +21,7 @@ from tests.cases import each_case
 
 BURGER = turtlebot3_burger()
 ACTIONS = ("x.vel", "theta.vel")
-BEAMS = (36, 40, 45, 60, 72, 90, 120, 180, 360)
+BEAMS = (36, 90, 360)
 
 
 def names_of(beams: int) -> tuple[str, ...]:
@@ -257,7 +257,7 @@ def test_many_robots_decide_like_each_alone_to_the_last_bit() -> None:
         assert drive([sim])[:, 0].tobytes() == together[:, sim].tobytes()
 
 
-def run(brain: Brain, seeds: list[int], n: int, beams: int = 120, seconds: float = 60.0) -> list[Outcome]:
+def run(brain: Brain, seeds: list[int], n: int, beams: int = 120, seconds: float = 40.0) -> list[Outcome]:
     simulation = BaseSimulation(TurtleBot3Config(beams=beams), n)
     loop = EpisodeLoop(simulation, AvoidTask(AvoidConfig(duration_s=seconds, min_path_m=0.0), n, 10), brain)
     return [e.outcome for e in loop.run([EpisodeSpec(index, seed) for index, seed in enumerate(seeds)])]
@@ -298,7 +298,7 @@ def test_it_gets_out_of_a_dead_end(beams: int) -> None:
     assert outside.all()
 
 
-@pytest.mark.parametrize("beams", [36, 60, 180])
+@pytest.mark.parametrize("beams", [36, 180])
 def test_it_roams_without_contact_with_any_scanner(beams: int) -> None:
     outcomes = run(GapFollowerBrain(), [episode_seed(5, e, "train") for e in range(4)], 4, beams, seconds=25)
     assert all(outcome.success for outcome in outcomes)
@@ -306,7 +306,7 @@ def test_it_roams_without_contact_with_any_scanner(beams: int) -> None:
 
 
 def test_it_sees_more_than_avoidance_and_fails_no_more() -> None:
-    seeds = [episode_seed(7, episode, "train") for episode in range(16)]
-    old, new = run(AvoidanceBrain(), seeds, 16), run(GapFollowerBrain(), seeds, 16)
+    seeds = [episode_seed(7, episode, "train") for episode in range(8)]
+    old, new = run(AvoidanceBrain(), seeds, 8), run(GapFollowerBrain(), seeds, 8)
     assert sum(not outcome.success for outcome in new) <= sum(not outcome.success for outcome in old)
     assert np.mean([outcome.score for outcome in new]) > 1.2 * np.mean([outcome.score for outcome in old])

@@ -492,7 +492,7 @@ def test_killing_the_cerebellum_stops_the_robot(kind: str) -> None:
     assert block_name not in names()
 
 
-def test_a_cerebellum_that_was_stopped_finds_a_fault_and_goes_on_after_a_reset() -> None:
+def test_a_stopped_cerebellum_goes_on_after_a_reset_and_a_stopped_or_killed_plant_is_a_fault_and_an_error() -> None:
     with moving("turtlebot3") as (robot, link):
         pid = robot.simulation.link.pids["cerebellum"]
         os.kill(pid, signal.SIGSTOP)
@@ -508,14 +508,12 @@ def test_a_cerebellum_that_was_stopped_finds_a_fault_and_goes_on_after_a_reset()
         robot.send_action({"x.vel": 0.1, "theta.vel": 0.0})
         assert link.states.latest()["stops"] == 1  # type: ignore[index]
 
-
-def test_a_stopped_or_killed_plant_is_a_fault_and_an_error() -> None:
-    with moving("turtlebot3") as (robot, _):
-        live_link = robot.simulation.link
+        live_link, seen = robot.simulation.link, WATCHDOGS.index(Watchdog.PLANT)
+        until(lambda: robot.simulation.modes[0] == Mode.TRACKING)
+        before = int(bridge.latest["watchdogs"][seen])
         os.kill(live_link.pids["plant"], signal.SIGSTOP)
         until(lambda: robot.simulation.modes[0] == Mode.FAULT)
-        seen = WATCHDOGS.index(Watchdog.PLANT)
-        until(lambda: robot.simulation.live_bridge.latest["watchdogs"][seen] > 0)
+        until(lambda: bridge.latest["watchdogs"][seen] > before)
         with pytest.raises(RealtimeError, match=r"plant's process \(\d+\) has shown no sign of life for 2\.\d s"):
             until(live_link.check)  # it says nothing until then
         os.kill(live_link.pids["plant"], signal.SIGKILL)
