@@ -1,8 +1,11 @@
 """`import bhd_lerobot`: light, complete, and what it does is what the commands do."""
 
 import importlib
+import re
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -80,3 +83,17 @@ def test_the_workflow(recorded) -> None:
 def test_misspelt_keywords_name_the_near_miss(call, options, message) -> None:
     with pytest.raises(bhd.BhdError, match=message):
         call(**options)
+
+
+def test_the_python_of_the_readme_runs(tmp_path, monkeypatch) -> None:
+    text = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+    first, second, *_ = re.findall(r"```python\n(.*?)```", text.partition("## From Python")[2], re.DOTALL)
+    assert len(first.strip().splitlines()) <= 20
+    shorter = first.replace("steps=200", "steps=20").replace("n_episodes=8", "n_episodes=2")
+    shorter = shorter.replace('"num_episodes": 4}', '"num_episodes": 2, "episode_time_s": 3}')
+    shorter = shorter.replace('task="avoid", brains', 'task={"type": "avoid", "duration_s": 2}, brains')
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(shorter, names)
+    exec(second.replace("range(100)", "range(5)"), names)
+    assert [row["step"] for row in names["trained"].rows] == [10, 20]
