@@ -137,9 +137,11 @@ class BhdBrain(Teleoperator):
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
             if not is_for(robot_of_brain(self.config.brain), robot.name):
+                is_arm = isinstance(robot.simulation.body, Arm)
+                example = " For example: --teleop.brain.type=reach --robot.scene=reach." if is_arm else ""
                 raise ConfigError(
                     f"The brain {self._brain_name!r} does not drive a {robot.name}. Choose one that does by "
-                    f"--teleop.brain.type: {', '.join(brains_for(robot.name))}."
+                    f"--teleop.brain.type: {', '.join(brains_for(robot.name))}.{example}"
                 )
             self._brain = make_brain(self.config.brain)
             names, _ = robot.environment

@@ -8,7 +8,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
-from bhd_lerobot.rollout.configuration import describe, encode, parse
+from bhd_lerobot.rollout.configuration import encode, parse
 from tests.cases import each_case
 
 SHIPPED = sorted((Path(__file__).parents[2] / "configs" / "eval").glob("*.yaml"))
@@ -93,10 +93,6 @@ def test_what_cannot_be_honoured_is_refused_by_name(arguments, message):
     with pytest.raises(ConfigError) as caught:
         parse(EvalConfig, arguments)
     assert message in str(caught.value)
-
-
-def test_help_names_how_brains_are_given():
-    assert "--brains.NAME.type" in describe(EvalConfig)
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

@@ -4,7 +4,8 @@ import pytest
 
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.configuration import describe, encode, parse, run
+from bhd_lerobot.rollout.configuration import encode, parse, run
+from bhd_lerobot.rollout.options_help import help_of
 from tests.cases import each_case
 
 REQUIRED = ["--robot.type=turtlebot3", "--dataset.repo_id=a/b", "--brain.type=avoidance", "--task.type=avoid"]
@@ -81,7 +82,8 @@ def test_errors_of_this_package_are_messages_and_others_keep_their_traceback(cap
 
 
 def test_help_lists_every_option():
-    text = describe(RecordConfig)
+    chosen = {"robot.type": "turtlebot3", "brain.type": "avoidance", "task.type": "avoid"}
+    text = help_of(RecordConfig, chosen)
     for option in ("--robot.beams", "--dataset.episode_time_s", "--brain.safe_distance_m", "--task.arena", "--resume"):
         assert option in text
 

@@ -1,0 +1,61 @@
+"""The help of the programs: every option with a meaning, short until a type is chosen."""
+
+import dataclasses
+
+import pytest
+
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout.configuration import choices_of, options_of
+from bhd_lerobot.rollout.options_help import help_of, meanings_of
+from bhd_lerobot.rollout.replay import ReplayConfig
+from bhd_lerobot.training.config import BhdTrainConfig
+from bhd_lerobot.training.rl.config import RlConfig
+
+PROGRAMS = (RecordConfig, ReplayConfig, EvalConfig, BhdTrainConfig, RlConfig)
+
+
+@pytest.fixture(autouse=True)
+def wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_option_has_a_meaning(program: type) -> None:
+    def without(config_class: type, prefix: str) -> list[str]:
+        meanings, found = meanings_of(config_class), []
+        for name, kind, _ in options_of(config_class):
+            if dataclasses.is_dataclass(kind) and not choices_of(kind):
+                found += without(kind, f"{prefix}{name}.")
+            elif not meanings.get(name):
+                found.append(f"{prefix}{name}")
+        return found
+
+    assert without(program, "") == []
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_it_is_short_until_a_type_is_chosen(program: type) -> None:
+    lines = help_of(program, {}).splitlines()
+    assert len(lines) <= 200
+    assert max(map(len, lines)) <= 120
+
+
+def test_a_chosen_type_lists_its_options_with_units_and_defaults() -> None:
+    text = help_of(RecordConfig, {"robot.type": "turtlebot3", "brain.type": "gap_follower"})
+    assert "robot.type=turtlebot3: " in text
+    assert "--robot.beams=N" in text
+    assert "[m]" in text
+    assert "(default: 0.05)" in text
+    assert "Its options: --task.type=TYPE --help" in text
+    assert "--robot.beams" not in help_of(RecordConfig, {})
+    assert "--policy.chunk_size=N" in help_of(BhdTrainConfig, {"policy.type": "act"})
+
+
+def test_brains_by_name() -> None:
+    assert "--brains.NAME.type=TYPE" in help_of(EvalConfig, {})
+    assert "--brains.mine.margin_m=X" in help_of(EvalConfig, {"brains.mine.type": "gap_follower"})
+
+
+def test_a_type_that_is_not_there_is_left_to_the_parser() -> None:
+    assert help_of(RecordConfig, {"robot.type": "nobody"}) == help_of(RecordConfig, {})
