@@ -2,9 +2,8 @@
 .PHONY: help demo test sweep lint format bench bench-realtime results lock clean venv
 
 PYTHON_IN_VENV := .venv/bin/python
-# Test processes: more than two processors, because tests of processes mostly wait. `make test WORKERS=0` runs
-# everything in one, for a debugger.
-WORKERS ?= 3
+# Two test processes by default; `make test WORKERS=0` runs everything in one, for a debugger.
+WORKERS ?= 2
 PYTEST_ARGS ?=
 BENCH ?=
 RESULTS ?=
