@@ -79,9 +79,9 @@ class RecordConfig:
     """
 
     robot: RobotConfig
-    dataset: DatasetConfig
     brain: BrainConfig
     task: TaskConfig
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
     timing: TimingTolerance = field(default_factory=TimingTolerance)
     seed: int = 0
     split: str = "train"

@@ -214,7 +214,7 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str) -> None
 def _checked(key: str, value: Any, kind: Any) -> Any:
     """Return the value of an option whose keys, if it has any, all exist."""
     choices, entries = choices_of(kind), entries_of(kind)
-    if choices and isinstance(value, str):  # in Python; a command line has --robot.type
+    if choices and isinstance(value, str):  # short for its type: robot="ur5"
         value = {"type": value}
     if entries is not None and isinstance(value, dict):
         # Nothing in the place of an entry takes it out: a command line can drop what a file names.
@@ -262,13 +262,15 @@ def _checked_value(key: str, value: Any, kind: Any) -> Any:
 
 def _named(kind: Any) -> str:
     if typing.get_origin(kind) is list:
-        return f"a list of {_named(typing.get_args(kind)[0])} in brackets, such as [a, b]"
+        inner = typing.get_args(kind)[0]
+        return f"a list of {_PLURALS.get(inner) or _named(inner)} in brackets, such as [a, b]"
     return _WORDS.get(kind) or str(getattr(kind, "__name__", kind))
 
 
 _WORDS = {int: "a whole number", float: "a number", str: "text", Path: "a path", bool: "true or false"} | {
     type(None): "nothing"
 }
+_PLURALS = {int: "whole numbers", float: "numbers", str: "texts", Path: "paths"}
 _EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
 _PLAIN: dict[Any, tuple[type, ...]] = {
     float: (int, float),

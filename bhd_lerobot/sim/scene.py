@@ -68,7 +68,10 @@ def _add_arena_stage(spec: mujoco.MjSpec, body: MobileBase, pool_size: int) -> N
     _add_stage(spec)
     _add_pool(spec, pool_size)
     # Behind and above, as far as a room's walls are still seen; it moves with the robot and does not turn.
-    spec.body(body.root).add_camera(
+    root = spec.body(body.root)
+    if root is None:
+        raise ConfigError(f"The model of {body.name!r} has no body {body.root!r}.")
+    root.add_camera(
         name="follow", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK, pos=[0, -1.3, 1.9], xyaxes=[1, 0, 0, 0, 0.82, 0.57],
         fovy=46,
     )  # fmt: skip

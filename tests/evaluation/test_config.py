@@ -44,6 +44,7 @@ def test_a_command_line_adds_takes_out_and_chooses_brains(tmp_path):
     at = f"--config_path={path}"
     assert list(parse(EvalConfig, [at, "--brains.c.type=gap_follower"]).brains) == ["a", "b", "c"]
     assert list(parse(EvalConfig, [at, "--brains.a=null"]).brains) == ["b"]
+    assert parse(EvalConfig, [at, "--brains.c=gap_follower"]) == parse(EvalConfig, [at, "--brains.c.type=gap_follower"])
     chosen = parse(EvalConfig, [at, "--baseline=a", "--only=[b]"])
     assert list(chosen.chosen) == ["b"]
     assert chosen.reference == "b"
@@ -63,16 +64,15 @@ def test_one_brain_has_a_short_form():
         ([*BASE, "--brains.a.type=avoidence"], "Did you mean 'avoidance'"),
         ([*BASE, "--brains.a.type=avoidance", "--brains.a.speed=1"], "brains.a.speed"),
         ([*BASE, "--brains.a.forward_speed=1"], "brains.a.type is missing"),
-        ([*BASE, "--brains.a=avoidance"], "such as brains.a.type"),
         ([*BASE, "--brains=avoidance"], "such as brains.NAME.type"),
         ([*BASE, "--brains.my-brain.type=avoidance"], "'my-brain' is no name"),
-        ([*BASE, "--brains.a.type=reach"], "brains.a.type is 'reach', which drives a ur5"),
+        ([*BASE, "--brains.a.type=reach"], "brains.a.type is 'reach', which drives an arm"),
         (["--robot.type=ur5", "--task.type=avoid", "--brains.a.type=avoidance"], "which is for robot.type"),
         ([*TWO, "--baseline=older"], "Did you mean 'old'"),
         ([*TWO, "--only=[never]"], "Unknown brain in only 'never'"),
         ([*TWO, "--only=[]"], "only is empty"),
-        ([*TWO, "--only=old"], "only is 'old'; it must be a list of str"),
-        ([*TWO, "--episodes=3"], "episodes is 3; it must be a list of int"),
+        ([*TWO, "--only=old"], "only is 'old'; it must be a list of texts"),
+        ([*TWO, "--episodes=3"], "episodes is 3; it must be a list of whole numbers"),
         ([*TWO, "--episodes=[a]"], "must be a whole number"),
         ([*TWO, "--episodes=[1.5]"], "is 1.5; it must be a whole number"),
         ([*TWO, "--n_episodes=0"], "n_episodes is 0"),

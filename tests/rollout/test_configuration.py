@@ -49,7 +49,7 @@ def test_numbers_may_have_an_exponent(text):
         (["--seed=1.5"], "must be a whole number"),
         (["--seed=true"], "must be a whole number"),
         (["--resume=1"], "must be true or false"),
-        (["--dataset.tags=x"], r"dataset.tags is 'x'; it must be a list of str in brackets, such as \[a, b\]"),
+        (["--dataset.tags=x"], r"dataset.tags is 'x'; it must be a list of texts in brackets, such as \[a, b\]"),
         (["--dataset=x"], r"has keys of its own, such as dataset\.repo_id"),
         (["--dataset.fps.x=1"], "fps"),
         (["--seed=[1"], "cannot be read"),

@@ -42,7 +42,7 @@ def test_it_is_short_until_a_type_is_chosen(program: type) -> None:
 
 
 def test_a_chosen_type_lists_its_options_with_units_and_defaults() -> None:
-    text = help_of(RecordConfig, {"robot.type": "turtlebot3", "brain.type": "gap_follower"})
+    text = " ".join(help_of(RecordConfig, {"robot.type": "turtlebot3", "brain.type": "gap_follower"}).split())
     assert "robot.type=turtlebot3: " in text
     assert "--robot.beams=N" in text
     assert "[m]" in text

@@ -151,7 +151,7 @@ def test_the_image_obeys_the_pinhole_and_nothing_casts_a_shadow(world: World, ca
 
 
 def test_an_unknown_camera_is_an_error_with_the_near_miss(camera: Camera) -> None:
-    with pytest.raises(RenderingError, match=r"Did you mean 'front'\? Valid: front, overview"):
+    with pytest.raises(RenderingError, match=r"Did you mean 'front'\? Valid: follow, front, overview"):
         camera.render(0, "frnt")
 
 

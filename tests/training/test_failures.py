@@ -308,7 +308,7 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
         ({"policy.push_to_hub": "true"}, "--policy.repo_id"),
         ({"optimizer.type": "sgd"}, "use_policy_training_preset"),
         ({"eval_steps": 5}, "eval_steps > 0 requires dataset.eval_split"),
-        ({"policy.type": None}, "policy.type is missing. Valid: .*act"),
+        ({"policy.type": None}, "policy.type is missing.*Valid: .*act"),
         ({"policy.n_heads": "[1]"}, r"policy.n_heads is \[1\]"),
         ({"policy.device": "tpu"}, r"(?i)cannot be used: .*tpu"),
         ({"dataset.eval_split": ".nan"}, r"cannot be used: .*eval_split.*nan"),

@@ -53,7 +53,7 @@ def test_info_of_several_datasets(recorded, tmp_path, capsys):
     first, second = capsys.readouterr().out.splitlines()
     assert first.startswith(f"{recorded}: turtlebot3, 3 episodes, 90 frames, 9 s, ")
     assert first.endswith(" MB, timeout 3")
-    assert second.startswith(f"{other}: turtlebot3, 1 episodes, 30 frames, 3 s, ")
+    assert second.startswith(f"{other}: turtlebot3, 1 episode, 30 frames, 3 s, ")
     # One that is none does not hide the others.
     assert main.main(["info", str(tmp_path / "none"), str(recorded), "--short"]) == 2
     captured = capsys.readouterr()

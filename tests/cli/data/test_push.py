@@ -238,7 +238,7 @@ def test_recording_uploads_by_the_same_code(hub: HubServer, tmp_path: Path, caps
     root = tmp_path / "d"
     short = {"dataset__repo_id": "me/avoid", "dataset__push_to_hub": "true", "dataset__num_episodes": 1}
     _, output = run_record(root, **short, dataset__private="true", dataset__tags="[avoid]")
-    assert "me/avoid: 1 episodes" in output
+    assert "me/avoid: 1 episode" in output
     assert hub.dataset("me/avoid").private
     assert is_generated(text_of(hub, "me/avoid").encode())
     hub.faults = [Fault("/preupload/", times=-1, status=403)]

@@ -267,7 +267,7 @@ WRONG: list[tuple[dict[str, object], str]] = [
     ({"algorithm": "sac"}, "Valid: ppo"),
     ({"validation__seed": 0}, "judged on the episodes"),
     ({"critic_warmup": 10}, "needs --start_from"),
-    ({"robot__type": "ur5", "robot__beams": None}, "this task is for 'turtlebot3'"),
+    ({"robot__type": "ur5", "robot__beams": None}, "this task is for turtlebot3"),
     ({"ppo__gamma": 1.5}, "between 0 and 1"),
     ({"ppo__learning_rate": 1.0}, "Unknown option 'ppo.learning_rate'"),
     ({"resume": "true"}, "resume needs --output_dir"),
