@@ -5,7 +5,7 @@ dictionaries, and where an option has a ``type``, its name alone is enough.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from lerobot.robots.config import RobotConfig
 from lerobot.robots.robot import Robot
@@ -97,8 +97,7 @@ def train(
     if isinstance(config, RlConfig) or "algorithm" in options:
         from bhd_lerobot.training.rl.train import train as run_rl
 
-        rl: RlConfig = _configured(RlConfig, config, options)  # type: ignore[arg-type]  # refused if it is another
-        return run_rl(rl, console)
+        return run_rl(_configured(RlConfig, cast("RlConfig | None", config), options), console)  # refuses another
     from bhd_lerobot.training.arguments import Request, request_of
     from bhd_lerobot.training.train import train as run_train
 

@@ -257,7 +257,8 @@ def _checked_value(key: str, value: Any, kind: Any) -> Any:
             return value  # enumerations and other lists: the decoder checks them
         if isinstance(value, _PLAIN[one]) and (one is bool or not isinstance(value, bool)):
             return value
-    raise ConfigError(f"{key} is {value!r}; it must be {' or '.join(map(_named, allowed))}.")
+    separator = ", or " if any(typing.get_origin(one) is list for one in allowed) else " or "
+    raise ConfigError(f"{key} is {value!r}; it must be {separator.join(map(_named, allowed))}.")
 
 
 def _named(kind: Any) -> str:

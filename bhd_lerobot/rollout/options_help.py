@@ -143,7 +143,8 @@ def _lines(config_class: type, prefix: str, title: str, chosen: Mapping[str, str
                 group = choices[type_name]
                 inner.append((group, f"{given.removesuffix('type')}", f"{given}={type_name}: {summary_of(group)}"))
         elif dataclasses.is_dataclass(kind):
-            inner.append((typing.cast(type, kind), f"{key}.", f"{key}: {meaning or summary_of(kind)}"))
+            group = typing.cast(type, kind)
+            inner.append((group, f"{key}.", f"{key}: {meaning or summary_of(group)}"))
         else:
             shown = "required" if default is dataclasses.MISSING else f"default: {_short(default)}"
             yield from _entry(f"--{key}={type_word(kind)}", f"{meaning} ({shown})".strip(), width)

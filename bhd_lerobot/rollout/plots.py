@@ -111,8 +111,8 @@ def _draw_panel(axes: Axes, trajectory: Trajectory) -> None:
     color = _GOOD if trajectory.success else _BAD
     axes.plot(trajectory.xy[:, 0], trajectory.xy[:, 1], color=color, linewidth=1.1)
     axes.plot(*trajectory.xy[0], marker="o", color=color, markersize=4)
-    end = {"marker": "s", "markersize": 4} if trajectory.success else {"marker": "x", "markersize": 7}
-    axes.plot(*trajectory.xy[-1], color=color, markeredgewidth=2, **end)
+    marker, size = ("s", 4) if trajectory.success else ("x", 7)
+    axes.plot(*trajectory.xy[-1], color=color, markeredgewidth=2, marker=marker, markersize=size)
     axes.set_title(trajectory.title, fontsize=7.5, color=color)
     _draw_scale(axes)
 

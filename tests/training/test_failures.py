@@ -312,7 +312,7 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
         ({"policy.n_heads": "[1]"}, r"policy.n_heads is \[1\]"),
         ({"policy.device": "tpu"}, r"(?i)cannot be used: .*tpu"),
         ({"dataset.eval_split": ".nan"}, r"cannot be used: .*eval_split.*nan"),
-        ({"dataset.episodes": 3}, "dataset.episodes is 3; it must be a list of int"),
+        ({"dataset.episodes": 3}, "dataset.episodes is 3; it must be a list of whole numbers"),
         ({"log_freq": -1}, "log_freq is -1; it must be at least 0"),
         ({"tolerance_s": ".nan"}, "tolerance_s is nan"),
         ({"selection.intervention_weight": ".inf"}, "is inf; it must be 0 or more, and finite"),
