@@ -12,6 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from bhd_lerobot.apps.view.download import to_csv, to_video
 from bhd_lerobot.apps.view.episode import packed_episode
 from bhd_lerobot.apps.view.marking import mark_episode
 from bhd_lerobot.datasets.edit.mark import possible_outcomes
@@ -146,6 +147,26 @@ class ViewedDataset:
             return None
         path = check_inside(self.root, self.root / layout.video_file(key, slot))
         return path if path.is_file() else None
+
+    def download(self, index: int, key: str | None) -> bytes | None:
+        """Return an episode's numbers as CSV, or a camera's video of it as MP4; None if there is no such video.
+
+        Raises:
+            DatasetError: there is no such episode, or the dataset has changed on disk.
+            DatasetCorruptError: its file cannot be read.
+            UnsupportedDatasetError: the video cannot be cut without encoding it again.
+        """
+        state = self.state
+        row = _row(state, index)
+        with self._lock:
+            self._check_unchanged()
+            if key is None:
+                return to_csv(state, _table(state, row))
+            path = self.video(key, slot_of(row, f"videos/{key}")) if key in state.video_keys else None
+            if path is None:
+                return None
+            span = row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"]
+            return to_video(path, span, row["length"], state.info["fps"])
 
     def image(self, index: int, key: str, frame: int) -> bytes | None:
         """Return the image of a camera whose images lie in the data files, or None if there is no such image.

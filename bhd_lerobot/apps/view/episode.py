@@ -9,7 +9,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from bhd_lerobot.apps.view.geometry import scene_of, views_of
-from bhd_lerobot.apps.view.groups import names_of, sections
+from bhd_lerobot.apps.view.groups import names_of, numbers, sections
 from bhd_lerobot.apps.view.marking import marks_of
 from bhd_lerobot.apps.view.packing import pack
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
@@ -41,7 +41,7 @@ def packed_episode(state: DatasetState, row: Row, table: pa.Table) -> bytes:
         table: its columns.
     """
     features = state.info["features"]
-    columns = {key: values for key in table.column_names if (values := _numbers(table[key], len(table))) is not None}
+    columns = {key: values for key in table.column_names if (values := numbers(table[key], len(table))) is not None}
     widths = {key: values.shape[1] for key, values in columns.items()}
     robot = state.info.get("robot_type")
     views, places = views_of(robot, features, columns)
@@ -70,27 +70,6 @@ def packed_episode(state: DatasetState, row: Row, table: pa.Table) -> bytes:
         "videos": [_video(row, key) for key, feature in features.items() if feature["dtype"] in ("video", "image")],
     }
     return pack(header, {**columns, **{f"view.{name}": values for name, values in places.items()}})
-
-
-def _numbers(column: pa.ChunkedArray, frames: int) -> NDArray | None:
-    """Return a column of numbers, of shape (frames, numbers); None if it holds something else."""
-    array: Any = column.combine_chunks()
-    while True:
-        if isinstance(array.type, pa.BaseExtensionType):  # LeRobot's matrices
-            array = array.storage
-        elif pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type):
-            array = array.flatten()
-        else:
-            break
-    kind = array.type
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
-        return None
-    values = np.asarray(array.to_numpy(zero_copy_only=False))
-    if values.dtype == object:  # a column with gaps
-        values = values.astype(np.float64)
-    if frames == 0 or values.size % frames:
-        return None
-    return values.reshape(frames, -1)
 
 
 def _not_finite(values: NDArray) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.apps.view.groups import names_of, scan_of
-from bhd_lerobot.bodies.body import Arm, MobileBase
+from bhd_lerobot.bodies.body import Arm, Body, MobileBase
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.datasets.format import features as keys
@@ -73,14 +73,21 @@ def views_of(
         if physics is not None and physics.shape[1] > _arm_state(body):
             arrays["objects"] = _objects(body, physics)
     elif isinstance(body, MobileBase) and physics is not None and physics.shape[1] > _BASE_STATE:
-        about["base"] = {"from": "simulator", "radius": body.radius}
+        about["base"] = {"from": "simulator", **_shape(body)}
         w, x, y, z = physics[:, 3:7].T
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         arrays["base"] = np.column_stack([physics[:, :2], yaw]).astype(np.float32)
     elif observed is not None and {"x.pos", "y.pos", "theta.pos"} <= set(names):
-        about["base"] = {"from": "odometry", "radius": body.radius if isinstance(body, MobileBase) else 0.1}
+        about["base"] = {"from": "odometry", **_shape(body)}
         arrays["base"] = observed[:, [names.index(name) for name in ("x.pos", "y.pos", "theta.pos")]]
     return about, arrays
+
+
+def _shape(body: Body | None) -> dict[str, Any]:
+    """Return how a base is drawn [m]; one that is not known is a box of 0.2 m."""
+    if not isinstance(body, MobileBase):
+        return {"radius": 0.1, "height": 0.2, "outline": [(-0.1, 0.1, 0.07)]}
+    return {"radius": body.radius, "height": body.height, "outline": body.outline}
 
 
 def _arm_state(body: Arm) -> int:

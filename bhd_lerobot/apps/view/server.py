@@ -33,6 +33,8 @@ def application(dataset: ViewedDataset) -> web.Application:
     app.router.add_get("/api/stamp", _stamp)
     app.router.add_get("/api/episodes/{index}", _episode)
     app.router.add_post("/api/episodes/{index}/mark", _mark)
+    app.router.add_get("/api/episodes/{index}/episode.csv", _download)
+    app.router.add_get("/api/episodes/{index}/videos/{key}.mp4", _download)
     app.router.add_get("/api/episodes/{index}/images/{key}/{frame}", _image)
     app.router.add_get("/videos/{key}/{chunk}/{file}.mp4", _video)
     app.router.add_static("/static", STATIC)
@@ -127,6 +129,15 @@ async def _video(request: web.Request) -> web.StreamResponse:
     if path is None:
         raise web.HTTPNotFound(text="There is no such video.\n")
     return web.FileResponse(path, headers={"Content-Type": "video/mp4"})  # it knows ranges and conditions
+
+
+async def _download(request: web.Request) -> web.Response:
+    dataset, index, key = request.app[_DATASET], _number(request, "index"), request.match_info.get("key")
+    content = await asyncio.to_thread(dataset.download, index, key)
+    if content is None:
+        raise web.HTTPNotFound(text="There is no such video.\n")
+    kind = "text/csv" if key is None else "video/mp4"
+    return web.Response(body=content, content_type=kind, headers={"Content-Disposition": "attachment"})
 
 
 async def _image(request: web.Request) -> web.Response:

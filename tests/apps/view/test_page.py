@@ -20,19 +20,24 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 ARGUMENTS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    "--enable-unsafe-swiftshader",  # WebGL without a GPU
 )
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
+    api = pytest.importorskip("playwright.sync_api", reason="NOT TESTED: pip install playwright to test the page.")
+    with api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=found_browser(), args=list(ARGUMENTS))
+        yield chromium
+        chromium.close()
+
+
+def found_browser() -> str:
     found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if found is None:
         pytest.skip(f"NOT TESTED: no browser is installed. Install one of {', '.join(BROWSERS)} to test the page.")
-    api = pytest.importorskip("playwright.sync_api", reason="NOT TESTED: pip install playwright to test the page.")
-    with api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=found, args=list(ARGUMENTS))
-        yield chromium
-        chromium.close()
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +55,7 @@ def opened(
     page = context.new_page()
     wrong: list[str] = []
     requested: list[str] = []
-    page.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
+    page.on("console", lambda message: wrong.append(message.text) if is_wrong(message) else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on("request", lambda request: requested.append(request.url))
     page.goto(server.url + place)
@@ -61,6 +66,11 @@ def opened(
     assert requested
     assert wrong == []
     context.close()
+
+
+def is_wrong(message: Any) -> bool:
+    """Return whether a line of the console is about our page; drawing without a GPU makes the browser report stalls."""
+    return message.type in ("error", "warning") and "GPU stall" not in message.text
 
 
 def shown_frames(page: Any) -> dict[str, set[int]]:
@@ -102,7 +112,7 @@ def test_everything_moves_together(browser, base) -> None:
         assert page.title().startswith("base")
         assert numbers(page) == [0, 1, 2]
         kinds = page.eval_on_selector_all(".view", "views => views.map((one) => one.dataset.view)")
-        assert kinds == ["video", "scan", "top"]
+        assert kinds == ["video", "scan", "top", "scene"]
         wait_for_plots(page, 7)
         assert shown_frames(page) == {"video": {0}, "drawing": {0}, "timeline": {0}, "plot": {0}}
         scrub(page, 0.525)
@@ -246,7 +256,7 @@ def server_videos(server: Served) -> list[float]:
 def test_an_arm_its_plan_and_the_requested_action(browser, arm) -> None:
     with served(arm) as server, opened(browser, server, scheme="dark") as page:
         kinds = page.eval_on_selector_all(".view", "views => views.map((one) => one.dataset.view)")
-        assert kinds == ["arm-above", "arm-side"]
+        assert kinds == ["arm-above", "arm-side", "scene"]
         assert page.locator("[data-lane=subtask] .run").count() >= 4
         assert page.text_content("#now").startswith("move the gripper")
         page.keyboard.press("End")
@@ -348,6 +358,73 @@ def test_nothing_is_wider_than_the_window(browser, base, width, height) -> None:
         boxes = [page.locator(".view").nth(number).bounding_box() for number in range(4)]
         assert all(box["width"] > 150 and box["height"] > 150 for box in boxes)
         assert boxes[-1]["x"] + boxes[-1]["width"] <= width
+
+
+def test_three_dimensions(browser, base, arm) -> None:
+    """What is seen follows the time and the mouse; a browser without WebGL says so."""
+    flat = browser.browser_type.launch(executable_path=found_browser(), args=[*ARGUMENTS, "--disable-3d-apis"])
+    with served(base) as server, opened(flat, server) as page:
+        assert "has no WebGL" in page.text_content("[data-view=scene]")
+    flat.close()
+    for root in (base, arm):
+        with served(root) as server, opened(browser, server) as page:
+            canvas = page.locator("[data-view=scene] canvas")
+            at = "(frame) => document.querySelector('[data-view=scene] canvas').dataset.frame === frame"
+            wait_until(page, at, "0")
+            seen = [canvas.screenshot()]
+            page.keyboard.press("End")
+            wait_until(page, at, str(page.evaluate("document.querySelector('#track').dataset.frame")))
+            seen.append(canvas.screenshot())
+            box = canvas.bounding_box()
+            page.mouse.move(box["x"] + 50, box["y"] + 50)
+            page.mouse.down()
+            page.mouse.move(box["x"] + 90, box["y"] + 60)
+            page.mouse.up()
+            seen.append(canvas.screenshot())
+            page.mouse.wheel(0, -300)
+            page.mouse.dblclick(box["x"] + 50, box["y"] + 50)
+            assert canvas.screenshot() == seen[1]  # as it was
+            assert len(set(seen)) == 3
+
+
+def test_a_phone(browser, base) -> None:
+    with served(base) as server, opened(browser, server, "#episode=1", width=390, height=844, scheme="dark") as page:
+        assert not page.locator("#list").is_visible()
+        page.click("#episodes-button")
+        assert numbers(page) == [0, 1, 2]
+        assert not page.locator("main").is_visible()
+        select(page, 2)
+        assert not page.locator("#list").is_visible()
+        wait_for_plots(page, 7)
+        assert page.evaluate("document.documentElement.scrollWidth") == 390
+        boxes = page.eval_on_selector_all(".view, .plot", "all => all.map((one) => one.getBoundingClientRect().width)")
+        assert min(boxes) > 300
+        assert max(boxes) <= 390
+
+
+def test_an_address_that_names_no_episode_says_so(browser, base) -> None:
+    for place, message in (
+        ("#episode=7", "There is no episode 7: the dataset has 3, from 0 to 2."),
+        ("#episode=0&compare=9", "There is no episode 9"),
+        ("#episode=last", "The address names episode last, which is no number"),
+    ):
+        with served(base) as server, opened(browser, server, place) as page:
+            assert message in page.text_content("#toast")
+            assert page.get_attribute(".card-a", "data-episode") == "0"
+    with served(base) as server, opened(browser, server) as page:  # an address that is changed by hand
+        page.evaluate("location.hash = '#episode=2'")
+        page.wait_for_selector(".card-a[data-episode='2']")
+
+
+def test_an_episode_is_downloaded(browser, base) -> None:
+    with served(base) as server, opened(browser, server, "#episode=1") as page:
+        page.click(".card-a button:has-text('download')")
+        names = page.eval_on_selector_all("dialog a", "links => links.map((one) => one.download)")
+        assert names == ["base-episode-1.csv", "base-episode-1-front.mp4"]
+        with page.expect_download() as started:
+            page.click("dialog a:has-text('csv')")
+        assert started.value.suggested_filename == names[0]
+        assert Path(started.value.path()).read_text().startswith('"frame","time_s","')
 
 
 def test_a_dataset_of_stock_lerobot_and_odd_ones(browser, tmp_path) -> None:

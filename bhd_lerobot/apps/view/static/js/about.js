@@ -21,6 +21,7 @@ function card(name, episode, onCompareEnd) {
     make("span", { class: "badge", style: { "--colour": outcomeColour(outcome) } }, make("span", { class: "dot" }), outcomeWords(outcome)),
     make("span", { class: "instruction" }, episode.instruction),
     make("button", { class: "quiet", title: "Everything that was stored about the episode", onclick: () => showAll(episode) }, "more"),
+    make("button", { class: "quiet", title: "Download the episode", onclick: () => showDownloads(episode) }, "download"),
     name === "b" ? make("button", { class: "quiet", title: "End the comparison (c)", onclick: onCompareEnd }, "✕") : null,
     make("span", { class: "facts", title: stored(episode) }, facts(episode).join("  ·  ")));
 }
@@ -41,6 +42,21 @@ function facts(episode) {
 
 function stored(episode) {
   return Object.entries(episode.metadata).map(([key, value]) => `${key}: ${value}`).join("\n");
+}
+
+function showDownloads(episode) {
+  const dialog = byId("dialog"), path = `/api/episodes/${episode.index}`;
+  const name = `${state.dataset.name}-episode-${episode.index}`;
+  const link = (href, file, what) => make("p", {}, make("a", { href, download: file }, file), ` ${what}`);
+  const videos = episode.videos.filter(({ kind }) => kind === "video").map(({ key }) => {
+    const { label } = state.dataset.cameras.find((camera) => camera.key === key);
+    return link(`${path}/videos/${encodeURIComponent(key)}.mp4`, `${name}-${label.replaceAll(/[^\w-]/g, "_")}.mp4`, "the video, not encoded again");
+  });
+  dialog.replaceChildren(
+    make("h2", { tabindex: "-1", autofocus: true }, `Download episode ${episode.index}`),
+    link(`${path}/episode.csv`, `${name}.csv`, "all numbers, one line a frame"), ...videos,
+    make("div", { class: "end" }, make("button", { onclick: () => dialog.close() }, "Close")));
+  dialog.showModal();
 }
 
 function showAll(episode) {

@@ -57,7 +57,14 @@ function preload(stamp) {
   if (next !== undefined && next !== state.aimed) loadEpisode(next, stamp).catch(() => {});
 }
 
+// On a narrow screen the list covers the episode, until one is chosen.
+function showList(isShown) {
+  document.body.classList.toggle("listed", isShown);
+  byId("episodes-button").setAttribute("aria-expanded", `${isShown}`);
+}
+
 function choose(index, isCompared) {
+  showList(false);
   if (isCompared && state.a && state.a.index !== index) select(state.a.index, { compare: index, time: state.time });
   else select(index);
 }
@@ -85,7 +92,13 @@ function told() {
   const parts = new URLSearchParams(location.hash.slice(1));
   const number = (name) => (/^\d+$/.test(parts.get(name) ?? "") ? Number(parts.get(name)) : null);
   const count = state.dataset.episodes.frames.length;
-  const inside = (value) => (value !== null && value < count ? value : null);
+  const inside = (value) => {
+    if (value !== null && value >= count) toast(`There is no episode ${value}: the dataset has ${count}, from 0 to ${count - 1}.`, true);
+    return value !== null && value < count ? value : null;
+  };
+  for (const name of ["episode", "compare"]) {
+    if (parts.has(name) && number(name) === null) toast(`The address names ${name} ${parts.get(name)}, which is no number of an episode.`, true);
+  }
   const time = Number.parseFloat(parts.get("t") ?? "0");
   return { episode: inside(number("episode")) ?? 0, compare: inside(number("compare")), time: Number.isFinite(time) ? time : 0 };
 }
@@ -144,6 +157,11 @@ async function start() {
   startViews();
   startTimeline();
   startPlots();
+  byId("episodes-button").addEventListener("click", () => showList(document.body.classList.contains("listed") === false));
+  addEventListener("hashchange", () => {
+    const { episode, compare, time } = told();
+    if (state.dataset.episodes.frames.length && (episode !== state.a?.index || compare !== (state.b?.index ?? null))) select(episode, { compare, time });
+  });
   startKeys({ move: (rows) => select(neighbour(rows)), compare: toggleCompare });
   byId("banner").querySelector("button").addEventListener("click", reload);
   on("marked", reload);

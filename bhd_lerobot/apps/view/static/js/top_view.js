@@ -4,6 +4,8 @@ import { colour, disc, fit, polyline, prepare } from "./canvas.js";
 import { beams, reach } from "./scan_view.js";
 import { frameAt } from "./store.js";
 
+export const WALL = 0.1; // [m] thickness of the outer walls
+
 // Draw one or two episodes in one arena. `together` are pairs of a colour's name and an episode.
 export function drawTop(canvas, together) {
   const { context, width, height } = prepare(canvas);
@@ -46,11 +48,16 @@ function drawArena(context, arena, scale, point) {
   context.fillStyle = colour("--floor");
   context.fillRect(left, top, (x1 - x0) * scale, (y1 - y0) * scale);
   context.fillStyle = colour("--wall");
+  context.save();
+  context.beginPath(); // what is built beyond the outer walls is not seen from within
+  context.rect(left - WALL * scale, top - WALL * scale, (x1 - x0 + 2 * WALL) * scale, (y1 - y0 + 2 * WALL) * scale);
+  context.clip();
   for (const [kind, x, y, yaw, sizeX, sizeY] of arena.shapes) {
     if (kind === "cylinder") disc(context, point(x, y), sizeX * scale);
     else corners(context, x, y, yaw, sizeX, sizeY, point);
     context.fill();
   }
+  context.restore();
   if (arena.goal) drawGoal(context, arena.goal, point);
 }
 

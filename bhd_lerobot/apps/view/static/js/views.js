@@ -4,6 +4,7 @@ import { drawArm } from "./arm_view.js";
 import { byId, make } from "./dom.js";
 import { cameraView } from "./videos.js";
 import { drawScan } from "./scan_view.js";
+import { sceneView } from "./scene_view.js";
 import { on, shown, state } from "./store.js";
 import { drawTop, sameScene } from "./top_view.js";
 
@@ -26,7 +27,7 @@ function arrange() {
 const follow = () => followers.forEach((show) => show());
 
 function build() {
-  const cards = [...cameras(), ...scans(), ...tops(), ...arms()];
+  const cards = [...cameras(), ...scans(), ...tops(), ...arms(), ...scenes()];
   followers = cards.flatMap((card) => card.follow);
   byId("views").replaceChildren(...cards.map((card) => card.element));
   byId("views").hidden = cards.length === 0;
@@ -108,4 +109,11 @@ function arms() {
     drawing("arm-above", `from above${numbers(together)}`, "the arm from above", (canvas) => drawArm(canvas, "above", together)),
     drawing("arm-side", `from the side${numbers(together)}`, "the arm from the side", (canvas) => drawArm(canvas, "side", together)),
   ]);
+}
+
+function scenes() {
+  return groups((episode) => episode.views.arm || episode.views.base).map((together, place) => {
+    const { elements, show } = sceneView(together, place);
+    return card("scene", `in three dimensions${numbers(together)}`, { follow: [show] }, ...elements);
+  });
 }
