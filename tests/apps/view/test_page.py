@@ -273,7 +273,7 @@ def test_an_arm_its_plan_and_the_requested_action(browser, arm) -> None:
         page.wait_for_selector("[data-section='Simulator state'][open] .uplot")
         # Something is drawn in each view, and not the same.
         inks = page.eval_on_selector_all(
-            ".view canvas",
+            ".view:not([data-view=scene]) canvas",
             """all => all.map((one) => {
               const pixels = one.getContext('2d').getImageData(0, 0, one.width, one.height).data;
               return new Set(new Uint32Array(pixels.buffer)).size;
