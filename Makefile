@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help demo test sweep lint format bench bench-realtime results lock clean venv
+.PHONY: help demo test sweep docs lint format bench bench-realtime results lock clean venv
 
 PYTHON_IN_VENV := .venv/bin/python
 # Two test processes by default; `make test WORKERS=0` runs everything in one, for a debugger.
@@ -21,6 +21,9 @@ test: venv ## run the tests; PYTEST_ARGS='-k name' narrows them down
 sweep: venv ## disturb every command that writes at each of its steps (half an hour), of which `make test` tries some
 	BHD_SWEEP=full $(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal tests/datasets/sweeps $(PYTEST_ARGS)
 
+docs: venv ## build the documentation site into site/, without a network
+	$(PYTHON_IN_VENV) -m mkdocs build --strict --quiet
+
 lint: venv ## check style, docstrings and types
 	$(PYTHON_IN_VENV) -m ruff check
 	$(PYTHON_IN_VENV) -m ruff format --check
@@ -36,7 +39,7 @@ bench: venv ## run the benchmarks; BENCH='name' picks some
 bench-realtime: venv ## measure how punctual the control loop is; BENCH='--quick' for a short run
 	$(PYTHON_IN_VENV) -m benchmarks.realtime $(BENCH)
 
-results: venv ## record, train and evaluate everything that is claimed about learning (hours), into docs/results.md
+results: venv ## record, train and evaluate everything that is claimed about learning (hours), into docs/reference/results.md
 	$(PYTHON_IN_VENV) -m benchmarks.results $(RESULTS)
 
 lock: ## rewrite constraints.txt; LOCK_ARGS=--upgrade takes the newest versions
@@ -45,7 +48,7 @@ lock: ## rewrite constraints.txt; LOCK_ARGS=--upgrade takes the newest versions
 		--only-binary :all: $(LOCK_ARGS) --output-file constraints.txt pyproject.toml - >/dev/null
 
 clean: ## remove .venv, .uv and every cache
-	rm -rf .venv .uv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
+	rm -rf site .venv .uv .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist
 	find bhd_lerobot tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
 venv:

@@ -4,6 +4,7 @@ Each takes its configuration, or keyword arguments that are named like the optio
 dictionaries, and where an option has a ``type``, its name alone is enough.
 """
 
+import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
     from bhd_lerobot.training.rl.config import RlConfig
     from bhd_lerobot.training.rl.train import RlResult
     from bhd_lerobot.training.train import TrainResult
+
+
+# LeRobot looks for torchcodec as soon as there is a dataset's configuration, and prints 80 lines if it is broken.
+logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 
 
 def record(config: RecordConfig | None = None, *, console: Console | None = None, **options: Any) -> RecordResult:

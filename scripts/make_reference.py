@@ -1,4 +1,4 @@
-"""Write docs/reference.md: every configuration option and every dataset column, from the code that defines them.
+"""Write docs/reference/options.md: every option and every dataset column, from the code that defines them.
 
 python scripts/make_reference.py          write the file
 python scripts/make_reference.py --check  exit with 1 if the file is not what would be written
@@ -36,7 +36,7 @@ from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 from bhd_lerobot.training.config import BhdTrainConfig, own_fields
 from bhd_lerobot.training.rl.config import RlConfig
 
-FILE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
+FILE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "options.md"
 
 _INTRODUCTION = """\
 # Reference

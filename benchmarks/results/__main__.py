@@ -1,4 +1,4 @@
-"""`make results`: everything that is claimed about learning, made again, into `docs/results.md`.
+"""`make results`: everything that is claimed about learning, made again, into `docs/reference/results.md`.
 
 It takes hours. What was done is not done again: `outputs/results` keeps it, `--fresh` begins anew.
 """
@@ -32,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="make results", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=names, default=names, help="sections to make")
     parser.add_argument("--folder", type=Path, default=Path("outputs/results"), help="where everything goes")
-    parser.add_argument("--page", type=Path, default=Path("docs/results.md"))
+    parser.add_argument("--page", type=Path, default=Path("docs/reference/results.md"))
     parser.add_argument("--short", action="store_true", help="a short run, to try the commands")
     parser.add_argument("--fresh", action="store_true", help="begin anew")
     options = parser.parse_args(arguments)

@@ -160,7 +160,7 @@ AVOID = Lesson(
         "--policy.chunk_size=1",
         "--policy.hidden_dims=[256,256]",
         "--policy.scan.transform=inverse",
-        "--policy.ignore=['*.vel']",  # docs/policies.md says what happens otherwise
+        "--policy.ignore=['*.vel']",  # docs/reference/policies.md says what happens otherwise
     ),
     steps=3000,
     yardstick="random",
@@ -295,7 +295,7 @@ class Demo:
             result = evaluate.evaluate(parse(EvalConfig, options), self._log)
             _check(result.exit_status)
             lines += [f"{lesson.what}, on {lesson.trials} held-out episodes", *sentences(result.results)]
-            lines.append(f"score: {lesson.score}. Training in full: {lesson.recipe}, docs/training.md")
+            lines.append(f"score: {lesson.score}. Training in full: {lesson.recipe}, docs/how_to/training.md")
         return result.report
 
     def _head(self, text: str) -> None:

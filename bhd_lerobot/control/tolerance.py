@@ -133,8 +133,8 @@ def verdict(summary: TimingSummary, tolerance: TimingTolerance) -> str | None:
     if not found:
         found.append("observations came at uneven intervals")
     return (
-        f"{summary.late_frames} of {summary.frames} frames ({summary.late_frames / summary.frames:.1%}) are out of the "
-        f"timing tolerance; timing.max_late_frames = {tolerance.max_late_frames:g} allows {allowed}. "
+        f"{summary.late_frames} of {summary.frames} frames ({100 * summary.late_frames / summary.frames:.1f} %) are "
+        f"out of the timing tolerance; timing.max_late_frames = {tolerance.max_late_frames:g} allows {allowed}. "
         f"Worst: {'; '.join(found)}. Give the control loop its real-time rights (`bhd-doctor --realtime` says which "
         "are missing), take other work off this machine, lower robot.control_hz or robot.fps, or widen --timing.* if "
         "the task can bear it."

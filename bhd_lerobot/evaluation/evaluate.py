@@ -45,9 +45,13 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
         title=f"{len(config.indices)} {config.split} episodes, seed {config.seed}",
         title_justify="left",
         box=SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
     )
+    # What is too wide for the terminal is folded, never cut off.
     for heading in ("brain", "success, 95 %", "score, 95 %", f"success beside\n{baseline}", "failures"):
-        table.add_column(escape(heading), no_wrap=True)
+        is_text = heading in ("brain", "failures")
+        table.add_column(escape(heading), no_wrap=not is_text, overflow="fold")
     for label, one in results.brains.items():
         failures = [f"{name} {count}" for name, count in one.outcomes.items() if name != "success"]
         pair = results.paired.get(label)
@@ -65,8 +69,8 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
         by = f" by {result.stopped_by.name}" if result.stopped_by else ""
         console.print(f"Stopped{by}: the results are partial, and hold every episode that was finished.")
     for label in result.missed:
-        low = results.brains[label].success.low
-        console.print(f"[bold]{escape(label)} missed fail_below:[/bold] {low:.1%} is below {config.fail_below:.1%}.")
+        low, wanted = 100 * results.brains[label].success.low, 100 * (config.fail_below or 0.0)
+        console.print(f"[bold]{escape(label)} missed fail_below:[/bold] {low:.1f} % is below {wanted:.1f} %.")
     console.print(f"Report: {escape(str(result.report))}", soft_wrap=True)
 
 

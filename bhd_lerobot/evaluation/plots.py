@@ -54,7 +54,7 @@ _STYLE: Any = {
 def forest(brains: Mapping[str, BrainSummary], baseline: str) -> str:
     """Return success rates and mean scores with their intervals, a row for each brain; dashed: the baseline's."""
     columns = [
-        ("success rate", {label: one.success for label, one in brains.items()}, baseline, _rate_limits(brains)),
+        ("success rate", {label: one.success for label, one in brains.items()}, baseline, (-0.03, 1.03)),
         ("mean score", {label: one.means["score"] for label, one in brains.items()}, baseline, None),
     ]
 
@@ -66,6 +66,8 @@ def forest(brains: Mapping[str, BrainSummary], baseline: str) -> str:
             if limits:
                 axes.set_xlim(*limits)
                 axes.xaxis.set_major_formatter(lambda x, _: f"{100 * x:.0f} %")
+            else:
+                _include(axes, 0.0)
 
     return _svg(draw, (10.0, 0.9 + 0.5 * len(brains)))
 
@@ -74,14 +76,17 @@ def paired_forest(paired: Mapping[str, PairedSummary]) -> str:
     """Return differences from the baseline with their intervals, a row for each other brain; dashed: no difference."""
     points = {label: _scaled(one.success, 100) for label, one in paired.items()}
     columns = [
-        ("success rate, difference [points]", points, 0.0),
-        ("mean score, difference", {label: one.score for label, one in paired.items()}, 0.0),
-        ("mean score, ratio", {label: one.ratio for label, one in paired.items()}, 1.0),
+        ("success rate, difference [points]", points, 0.0, (-10.0, 10.0)),
+        ("mean score, difference", {label: one.score for label, one in paired.items()}, 0.0, (0.0,)),
+        ("mean score, ratio", {label: one.ratio for label, one in paired.items()}, 1.0, (0.0, 1.2)),
     ]
 
     def draw(figure: Figure) -> None:
-        for axes, (title, estimates, reference) in zip(figure.subplots(1, 3, sharey=True), columns, strict=True):
+        for axes, (title, estimates, reference, always) in zip(
+            figure.subplots(1, 3, sharey=True), columns, strict=True
+        ):
             _draw_rows(axes, estimates, title, reference)
+            _include(axes, *always)
 
     return _svg(draw, (10.0, 0.9 + 0.5 * len(paired)))
 
@@ -218,11 +223,10 @@ def _draw_spread(axes: Axes, row: int, values: np.ndarray, success: Sequence[boo
         axes.scatter(values[picked], height[picked], s=13, color=colour, marker=marker, alpha=0.55, zorder=3, **edge)
 
 
-def _rate_limits(brains: Mapping[str, BrainSummary]) -> tuple[float, float]:
-    """Return what part of 0 to 1 shows the success rates: all of it, unless all lie in its upper half."""
-    lowest = min((brain.success.low for brain in brains.values()), default=0.0)
-    start = 0.0 if lowest < 0.5 else math.floor(10 * lowest) / 10
-    return start - 0.03 * (1 - start), 1 + 0.03 * (1 - start)
+def _include(axes: Axes, *values: float) -> None:
+    """Widen an axis to hold some values, so that a small difference does not look like a large one."""
+    low, high = axes.get_xlim()
+    axes.set_xlim(min(low, *values), max(high, *values))
 
 
 def _scaled(one: Estimate, factor: float) -> Estimate:

@@ -341,7 +341,7 @@ def _listed(names: list[str]) -> str:
 
 def share(count: int, one: BrainSummary) -> str:
     """Return a number of a brain's frames as a share of all of them."""
-    return f"{count / one.frames:.2%}" if one.frames and count else "0"
+    return f"{100 * count / one.frames:.1f} %" if one.frames else "–"
 
 
 def significant(estimate: Estimate) -> str:
@@ -371,4 +371,4 @@ def table(head: list[str], rows: list[tuple[str, list[str]]], baseline: str | No
 
 def chart(source: str, text: str) -> str:
     """Return an image with words for those who do not see it."""
-    return f'<img class="chart" src="{source}" alt="{escape(text)}">'
+    return f'<div class="scroll"><img class="chart" src="{source}" alt="{escape(text)}"></div>'

@@ -116,7 +116,7 @@ def _outcomes(summary: DatasetSummary) -> str:
     )
     if not counts:
         return ""
-    rows = [(name, str(count), f"{count / len(summary.episodes):.0%}") for name, count in counts.items()]
+    rows = [(name, str(count), f"{100 * count / len(summary.episodes):.0f} %") for name, count in counts.items()]
     return "\n\n".join(filter(None, ["## Outcomes", _table(("outcome", "episodes", "share"), rows), _success(summary)]))
 
 
@@ -130,8 +130,8 @@ def _success(summary: DatasetSummary) -> str:
 
     low, high = binomtest(sum(known), len(known)).proportion_ci(method="wilson")
     return (
-        f"{sum(known)} of {len(known)} episodes succeeded: {sum(known) / len(known):.1%}; 95 % interval of the share "
-        f"(Wilson): {low:.1%} to {high:.1%}."
+        f"{sum(known)} of {len(known)} episodes succeeded: {100 * sum(known) / len(known):.1f} %; 95 % interval of the "
+        f"share (Wilson): {100 * low:.1f} to {100 * high:.1f} %."
     )
 
 

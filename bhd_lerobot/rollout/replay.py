@@ -242,7 +242,7 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
         )
     results = []
     table = Table(title=f"Replay of episode {config.dataset.episode} of {root}", title_justify="left")
-    for heading in ("largest difference", "frames", "position", "angle", "state", "observed", ""):
+    for heading in ("largest difference", "frames", "position [m]", "angle [rad]", "state", "observed", ""):
         table.add_column(heading, justify="left" if heading in ("largest difference", "") else "right")
     for mode in ("open_loop", "state") if config.mode == "both" else (config.mode,):
         result = episode.open_loop() if mode == "open_loop" else episode.state_exact()

@@ -527,7 +527,7 @@ def check_latency(outcome: Outcome, robots: dict[str, int]) -> list[Finding]:
     findings = []
     for robot, rate in robots.items():
         share = p99 * rate
-        found = f"{robot}, {rate} Hz: p99 {p99 * 1e6:.0f} µs is {share:.1%} of {1e3 / rate:g} ms"
+        found = f"{robot}, {rate} Hz: p99 {p99 * 1e6:.0f} µs is {100 * share:.1f} % of {1e3 / rate:g} ms"
         if share < FINE_SHARE:
             findings.append(fine("latency test", found))
         else:

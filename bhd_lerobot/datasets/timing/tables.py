@@ -142,8 +142,8 @@ def _three(summary: TimingSummary, kind: str, separator: str, *, names: bool = T
 def _share(summary: TimingSummary) -> str:
     share = summary.late_frames / summary.frames if summary.frames else 0.0
     allowed = summary.tolerated.get("late_frames")
-    return f"{summary.late_frames} of {summary.frames} ({share:.1%})" + (
-        f", tolerated {allowed:.1%} of an episode" if allowed is not None else ""
+    return f"{summary.late_frames} of {summary.frames} ({100 * share:.1f} %)" + (
+        f", tolerated {100 * allowed:.1f} % of an episode" if allowed is not None else ""
     )
 
 

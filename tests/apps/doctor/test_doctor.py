@@ -377,7 +377,7 @@ Provides-Extra: test
 
 
 def test_the_documentation_has_the_same_table() -> None:
-    text = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "how_to" / "troubleshooting.md").read_text(encoding="utf-8")
     begin, end = text.index("<!-- doctor: begin"), text.index("<!-- doctor: end -->")
     table = text[text.index("\n", begin) + 1 : end]
     assert table == markdown_table(), "paste what bhd_lerobot.apps.doctor.checks.markdown_table() returns"
@@ -385,7 +385,7 @@ def test_the_documentation_has_the_same_table() -> None:
 
 
 def test_the_documentation_names_the_shares_and_rates() -> None:
-    text = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "how_to" / "troubleshooting.md").read_text(encoding="utf-8")
     for share in (checks.FINE_SHARE, checks.LATE_SHARE):
         assert f"| {share:.0%}".replace("%", " %") in text
     assert doctor.robot_rates() == {"turtlebot3": 200, "ur5": 500}
@@ -449,8 +449,8 @@ def test_the_measurement_is_compared_with_every_robot(capsys: pytest.CaptureFixt
     status, report = run(capsys, tmp_path, "--realtime", answers={"latency test": latency(1.2e-3)})
     found = [(one["status"], one["found"]) for one in report["findings"] if one["check"] == "latency test"]
     assert found == [
-        ("warning", "turtlebot3, 200 Hz: p99 1200 µs is 24.0% of 5 ms"),
-        ("problem", "ur5, 500 Hz: p99 1200 µs is 60.0% of 2 ms"),
+        ("warning", "turtlebot3, 200 Hz: p99 1200 µs is 24.0 % of 5 ms"),
+        ("problem", "ur5, 500 Hz: p99 1200 µs is 60.0 % of 2 ms"),
     ]
     assert status == 1
     assert report["latency_test"]["p99"] == 1.2e-3

@@ -96,8 +96,8 @@ def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) ->
         assert f"| {outcome} | {outcomes.count(outcome)} | {outcomes.count(outcome) / 4:.0%} |" in card
     successes = sum(bool(episode.metadata["success"]) for episode in summary.episodes)
     share = wilson(successes, 4)
-    assert f"{successes} of 4 episodes succeeded: {share.value:.1%}" in card
-    assert f"{share.low:.1%} to {share.high:.1%}" in card
+    assert f"{successes} of 4 episodes succeeded: {100 * share.value:.1f} %" in card
+    assert f"{100 * share.low:.1f} to {100 * share.high:.1f} %" in card
     folded = re.search(r"<details>.*```json\n(.*)\n```\n\n</details>", card, re.DOTALL)
     assert folded is not None
     assert json.loads(folded[1]) == json.loads((recorded / "meta/bhd.json").read_text())

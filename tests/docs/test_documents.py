@@ -1,0 +1,236 @@
+"""The documents are true: generated parts are up to date, links and files exist, commands parse, messages are real."""
+
+import ast
+import contextlib
+import io
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from bhd_lerobot.apps.monitor import monitor
+from bhd_lerobot.cli.data import main
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.recording.record import record
+from bhd_lerobot.rollout.configuration import parse
+from bhd_lerobot.rollout.replay import ReplayConfig
+from bhd_lerobot.training.arguments import parse_train
+from bhd_lerobot.training.rl.config import is_rl, parse_rl
+from tests.cases import each_case
+from tests.docs.support import ROOT, load_script
+
+DOCUMENTS = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+CONFIGURATIONS = sorted((ROOT / "configs").rglob("*.yaml"))
+FOLDERS = ("benchmarks", "bhd_lerobot", "configs", "docs", "scripts", "tests")
+
+
+def by_name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def test_the_reference_is_up_to_date() -> None:
+    script = load_script("make_reference")
+    assert script.FILE.read_text(encoding="utf-8") == script.reference(), "run: python scripts/make_reference.py"
+
+
+def test_an_option_without_a_description_is_found() -> None:
+    script = load_script("make_reference")
+
+    @dataclass
+    class Undocumented:
+        """It has a docstring, and the docstring describes nothing."""
+
+        mode: str = "both"
+
+    with pytest.raises(SystemExit, match="does not describe 'mode'"):
+        list(script._options(Undocumented, ""))
+
+
+# --- links and files -------------------------------------------------------------------------------------------------
+
+
+def without_code(text: str) -> str:
+    return re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+
+
+def anchors(text: str) -> set[str]:
+    """Return the anchors of a document's headings, as the usual renderers make them."""
+    headings = re.findall(r"^#+ (.*)$", without_code(text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+def broken_references(document: Path) -> list[str]:
+    """Return every relative link, image and file name in a document that leads nowhere."""
+    text = document.read_text(encoding="utf-8")
+    prose = without_code(text)
+    broken = []
+    targets = re.findall(r"\]\(([^)\s]+)\)", prose) + re.findall(r"(?:src|href)=\"([^\"]+)\"", prose)
+    for target in targets:
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        path = (document.parent / name).resolve() if name else document
+        if not path.exists() or (anchor and anchor not in anchors(path.read_text(encoding="utf-8"))):
+            broken.append(target)
+    for name in re.findall(r"`([\w./-]+)`", prose):
+        if name.startswith(tuple(f"{folder}/" for folder in FOLDERS)) and not (ROOT / name).exists():
+            broken.append(name)
+    targets_of_make = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    for name in re.findall(r"`make ([a-z-]+)", prose) + re.findall(r"^make ([a-z-]+)", text, re.MULTILINE):
+        if name not in targets_of_make:
+            broken.append(f"make {name}")
+    return broken
+
+
+def test_every_link_and_every_file_exists() -> None:
+    assert [(by_name(path), target) for path in DOCUMENTS for target in broken_references(path)] == []
+
+
+@each_case(
+    "planted",
+    ["[x](no.md)", "[x](README.md#no-such-heading)", '<img src="no.png">', "`docs/no.md`", "`make nothing`"],
+)
+def test_a_planted_broken_reference_is_found(tmp_path: Path, planted: str) -> None:
+    (tmp_path / "README.md").write_text("# Heading\n")
+    document = tmp_path / "notes.md"
+    document.write_text(f"{planted}\n[fine](README.md#heading) `docs/reference/options.md`\n")
+    assert len(broken_references(document)) == 1
+
+
+# --- commands --------------------------------------------------------------------------------------------------------
+
+
+def quoted_commands(path: Path) -> Iterator[str]:
+    """Yield every command line of ours in a document's code blocks and code spans, or in a file's comments."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".yaml":
+        comments = "\n".join(line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
+        lines = comments.replace("\\\n", " ").splitlines()
+    else:
+        blocks = "\n".join(re.findall(r"```(?:bash|sh)\n(.*?)```", text, re.DOTALL))
+        lines = blocks.replace("\\\n", " ").splitlines()
+        lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", without_code(text)) if " " in span]
+    # "…" stands for the options of an earlier command.
+    yield from (line for line in lines if re.match(r"bhd-\w+ ", line) and "…" not in line)
+
+
+def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parse a command line as its program would, and run nothing."""
+    monkeypatch.chdir(ROOT)
+    program, *arguments = shlex.split(line, comments=True)
+    if arguments == ["--help"]:
+        return
+    if program == "bhd-train":
+        parse_training(arguments)
+    elif program == "bhd-eval":
+        parse(EvalConfig, arguments)
+    elif program == "bhd-record":
+        parse(RecordConfig, arguments)
+    elif program == "bhd-replay":
+        parse(ReplayConfig, arguments)
+    elif program == "bhd-data":
+        # In running text a command is named without its arguments.
+        named = ["--help"] if len(arguments) == 1 else []
+        with contextlib.redirect_stdout(io.StringIO()):
+            try:
+                main._parser().parse_args([*arguments, *named])
+            except SystemExit as end:
+                if end.code:
+                    raise
+    elif program == "bhd-monitor":
+        monitor._parser().parse_args(arguments)
+    else:
+        raise AssertionError(f"Unknown program {program}.")
+
+
+def parse_training(arguments: list[str]) -> None:
+    """Parse the arguments of `bhd-train`; checkpoints of earlier commands need not be there."""
+    if is_rl(arguments):
+        parse_rl(arguments)
+        return
+    try:
+        parse_train(arguments)
+    except ConfigError as error:
+        if not re.search("outputs/(train|results)/", str(error)):
+            raise
+
+
+def test_every_quoted_command_parses(monkeypatch: pytest.MonkeyPatch) -> None:
+    programs, wrong = set(), []
+    for path in [*DOCUMENTS, *CONFIGURATIONS]:
+        for line in quoted_commands(path):
+            programs.add(line.split()[0])
+            try:
+                parse_command(line, monkeypatch)
+            except (Exception, SystemExit) as error:
+                wrong.append(f"{by_name(path)}: {line}: {error}")
+    assert wrong == []
+    assert programs == {"bhd-record", "bhd-replay", "bhd-data", "bhd-monitor", "bhd-train", "bhd-eval"}
+
+
+def test_a_wrong_command_does_not_parse(monkeypatch: pytest.MonkeyPatch) -> None:
+    for line in (
+        *("bhd-record --seed=1", "bhd-replay --mode=sideways", "bhd-data inform x", "bhd-fly x"),
+        *("bhd-train --policy.type=none", "bhd-eval --robot.type=ur5"),
+    ):
+        with pytest.raises((Exception, SystemExit)):
+            parse_command(line, monkeypatch)
+
+
+# --- messages --------------------------------------------------------------------------------------------------------
+
+
+def texts_in_code() -> str:
+    """Return every piece of text in the package's code; what stands between two pieces of a message is not one."""
+    pieces = []
+    for path in sorted((ROOT / "bhd_lerobot").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                pieces.append(node.value)
+    return "\0".join(pieces)
+
+
+def quoted_messages() -> list[str]:
+    """Return the messages of the tables in troubleshooting.md whose first column is headed "message"."""
+    text = (ROOT / "docs" / "how_to" / "troubleshooting.md").read_text(encoding="utf-8")
+    tables = re.findall(r"^\| message \|.*\n((?:\|.*\n)+)", text, re.MULTILINE)
+    rows = [line for table in tables for line in table.splitlines() if not line.startswith("|---")]
+    return [re.split(r"(?<!\\)\|", row)[1].strip().strip("`") for row in rows]
+
+
+def test_every_quoted_message_is_in_the_code() -> None:
+    code, messages = texts_in_code(), quoted_messages()
+    assert len(messages) > 20
+    # "…" stands for a value.
+    unknown = [
+        (m, part) for m in messages for part in re.split("…", m) if part.strip(" .") and part.strip() not in code
+    ]
+    assert unknown == []
+
+
+# --- columns ---------------------------------------------------------------------------------------------------------
+
+
+def test_every_column_is_described(tmp_path: Path) -> None:
+    arguments = ["--robot.type=turtlebot3", "--robot.odometry=true", "--robot.imu=true", "--brain.type=avoidance"]
+    arguments += ["--task.type=avoid", "--dataset.repo_id=bhd/test", f"--dataset.root={tmp_path / 'data'}"]
+    arguments += ["--dataset.num_episodes=1", "--dataset.episode_time_s=0.5", "--preview_video=false"]
+    record(parse(RecordConfig, [*arguments, f"--output_dir={tmp_path}"]))
+    summary = dataset_info(tmp_path / "data")
+    text = (ROOT / "docs" / "reference" / "dataset.md").read_text(encoding="utf-8")
+    wanted = [f"`{key}`" for key in summary.features] + [f"`bhd/{key}`" for key in summary.episodes[0].metadata]
+    assert [key for key in wanted if key not in text] == []
+    robots = (ROOT / "docs" / "reference" / "robots.md").read_text(encoding="utf-8")
+    names = [name for name in summary.features["observation.state"]["names"] if not name.startswith("scan_")]
+    assert [name for name in names if f"`{name}`" not in robots] == []
