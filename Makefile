@@ -21,8 +21,8 @@ test: venv ## run the tests; PYTEST_ARGS='-k name' narrows them down
 sweep: venv ## disturb every command that writes at each of its steps (half an hour), of which `make test` tries some
 	BHD_SWEEP=full $(PYTHON_IN_VENV) -m pytest --numprocesses=$(WORKERS) --dist=worksteal tests/datasets/sweeps $(PYTEST_ARGS)
 
-docs: venv ## build the documentation site into site/, without a network
-	$(PYTHON_IN_VENV) -m mkdocs build --strict --quiet
+docs: venv ## build the documentation into site/; to read it: python -m http.server -d site
+	NO_MKDOCS_2_WARNING=1 $(PYTHON_IN_VENV) -m mkdocs build --strict --quiet
 
 lint: venv ## check style, docstrings and types
 	$(PYTHON_IN_VENV) -m ruff check

@@ -1,0 +1,34 @@
+"""The documentation site: it is built without a warning, loads nothing from elsewhere, and names all that is public."""
+
+import re
+from pathlib import Path
+
+import pytest
+from mkdocs.commands.build import build
+from mkdocs.config import load_config
+
+import bhd_lerobot as bhd
+from tests.docs.support import ROOT
+
+REFERENCE = ROOT / "docs" / "reference" / "api.md"
+
+
+def test_it_is_built_and_loads_nothing_from_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
+    monkeypatch.chdir(ROOT)
+    build(load_config(str(ROOT / "mkdocs.yml"), strict=True, site_dir=str(tmp_path)))
+    pages = sorted(tmp_path.rglob("*.html"))
+    sources = sorted((ROOT / "docs").rglob("*.md"))
+    assert {path.stem for path in sources if path.parent.name != "diagrams"} <= {path.stem for path in pages}
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        loaded = re.findall(r"<(?:script|link|img|iframe)\b[^>]*?(?:src|href)=[\"']?(https?:[^\"' >]+)", text)
+        assert loaded == [], page
+    reference = (tmp_path / "reference" / "api.html").read_text(encoding="utf-8")
+    for name in set(bhd.__all__) - {"__version__"}:
+        assert re.search(rf'id="bhd_lerobot\.[\w.]*\b{name}"', reference), name
+
+
+def test_the_reference_of_python_is_what_is_public() -> None:
+    listed = re.findall(r"^::: [\w.]+\.(\w+)$", REFERENCE.read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(listed) == sorted(set(bhd.__all__) - {"__version__"})
