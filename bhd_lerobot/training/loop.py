@@ -29,7 +29,8 @@ class LoopOptions:
         steps: when it is over.
         batch_size: samples in a step, of all processes.
         frames: samples in an epoch.
-        log_freq: steps from one row of metrics to the next; the first come earlier, after 10, 20, 50 and 100 steps.
+        log_freq: steps from one row of metrics to the next; the first come earlier, after 10, 20, 50
+            and 100 steps, and the last step has one.
         eval_freq: steps from one held-out loss to the next; there is one after the last step, too.
         save_freq: steps from one checkpoint to the next; there is one after the last step, too.
         env_eval_freq: steps from one evaluation in an environment to the next.
@@ -191,7 +192,8 @@ class TrainingLoop:
         step, options, hooks = self.step, self.options, self.hooks
         is_last = step == options.steps
         self.interrupted = hooks.should_stop(step)
-        is_log = _is_due(step, options.log_freq) or (step in _EARLY and step < options.log_freq)
+        is_extra = (options.log_freq > 0 and is_last) or (step in _EARLY and step < options.log_freq)
+        is_log = _is_due(step, options.log_freq) or is_extra
         is_saving = _is_due(step, options.save_freq) or is_last
         is_eval = hooks.held_out is not None and options.eval_freq > 0 and (_is_due(step, options.eval_freq) or is_last)
         row: Row = {"step": step, "epoch": step * options.batch_size / options.frames}

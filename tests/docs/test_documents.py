@@ -133,8 +133,7 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Parse a command line as its program would, and run nothing."""
     monkeypatch.chdir(ROOT)
     program, *arguments = shlex.split(line, comments=True)
-    arguments = [argument for argument in arguments if argument != "--help"]
-    if not arguments:
+    if "--help" in arguments:
         return
     if program == "bhd-train":
         parse_training(arguments)
