@@ -1,15 +1,22 @@
 """`import bhd_lerobot`: light, complete, and what it does is what the commands do."""
 
 import importlib
+import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import bhd_lerobot as bhd
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.conformance import ConformanceError
+from tests.forks import Fork
+from tests.waiting import until
 
 
 def test_importing_it_imports_nothing_else() -> None:
@@ -83,6 +90,50 @@ def test_the_workflow(recorded) -> None:
 def test_misspelt_keywords_name_the_near_miss(call, options, message) -> None:
     with pytest.raises(bhd.BhdError, match=message):
         call(**options)
+
+
+def interrupted_as_in_a_notebook(folder: Path) -> None:
+    """Record in the main thread, get a SIGINT as Jupyter's stop button sends it, and go on."""
+    options: dict[str, Any] = {
+        "robot": {"type": "turtlebot3", "beams": 36}, "brain": "gap_follower", "task": "avoid", "seed": 3,
+        "dataset": {"root": folder / "d", "num_episodes": 3, "episode_time_s": 30}, "preview_video": False,
+    }  # fmt: skip
+    before = signal.getsignal(signal.SIGINT)
+
+    def interrupt() -> None:
+        until(lambda: (folder / "d" / "meta" / "episodes").exists() or list((folder / "d").rglob("*.parquet")))
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    result = bhd.record(**options, output_dir=folder / "first")
+    assert result.stopped_by is not None
+    assert result.stopped_by.name == "SIGINT"
+    assert result.recorded < 3
+    assert signal.getsignal(signal.SIGINT) is before
+    again = bhd.record(**options, output_dir=folder / "second", resume=True)
+    assert again.recorded == 3 - result.recorded
+    assert bhd.check_dataset(folder / "d").is_valid
+
+
+def test_a_notebook_may_interrupt_a_recording_and_go_on(tmp_path) -> None:
+    fork = Fork(interrupted_as_in_a_notebook, tmp_path, output=tmp_path / "out")
+    assert fork.wait() == 0, (tmp_path / "out").read_text()
+
+
+class Forgetful(bhd.SimulatedBase):
+    """A plug-in's robot whose author forgot what `send_action` has to return."""
+
+    config_class = TurtleBot3Config
+    name = "forgetful"
+
+    def send_action(self, action: Any) -> Any:
+        super().send_action(action)
+
+
+def test_a_robot_that_breaks_the_contract_is_told_how() -> None:
+    with pytest.raises(ConformanceError, match="send_action") as caught:
+        bhd.check_robot(lambda: Forgetful(TurtleBot3Config()))
+    assert "NoneType" in str(caught.value) or "None" in str(caught.value)
 
 
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch) -> None:

@@ -1,6 +1,7 @@
 """Ending a run from outside, without losing what it has."""
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -38,9 +39,13 @@ class StopRequest:
 def stop_on_signals() -> Iterator[StopRequest]:
     """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request that the run's loop reads between two frames.
 
-    A second one acts as it would without us: the loop might hang. The former handlers come back at the end.
+    A second one acts as it would without us: the loop might hang. The former handlers come back at the end. Python
+    gives signals to its main thread only; a run in another one is not ended by them.
     """
     request = StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield request
+        return
     former: dict[signal.Signals, Any] = {}
 
     def handle(number: int, frame: FrameType | None) -> None:

@@ -1,0 +1,30 @@
+"""Ending a run by a signal: the first is a request, the handlers come back, and another thread is left alone."""
+
+import os
+import signal
+import threading
+
+from bhd_lerobot.rollout.signals import stop_on_signals
+
+
+def test_the_first_signal_is_a_request_and_the_handlers_come_back() -> None:
+    former = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        with stop_on_signals() as request:
+            assert not request
+            os.kill(os.getpid(), number)
+            assert (request.name, request.exit_status) == (number.name, 128 + number)
+        assert [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == former
+
+
+def test_a_run_in_another_thread_changes_no_handler() -> None:
+    former, seen = signal.getsignal(signal.SIGINT), []
+
+    def run() -> None:
+        with stop_on_signals() as request:
+            seen.append((bool(request), signal.getsignal(signal.SIGINT)))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert seen == [(False, former)]
