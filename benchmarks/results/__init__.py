@@ -1,0 +1,1 @@
+"""What is claimed about learning, recorded, trained and evaluated again: `make results`."""

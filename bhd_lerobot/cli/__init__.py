@@ -1,0 +1,3 @@
+"""The command lines; nothing imports them."""
+
+__all__ = ["data", "start", "train"]

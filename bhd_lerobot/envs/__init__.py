@@ -1,0 +1,3 @@
+"""The tasks as Gymnasium and LeRobot see them."""
+
+__all__ = ["config_env", "course", "gym_env", "register", "settings", "spaces", "stage", "vector", "vector_member"]

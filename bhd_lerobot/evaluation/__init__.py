@@ -1,0 +1,3 @@
+"""`bhd-eval`: brains on the same episodes, with intervals and a report."""
+
+__all__ = ["config", "evaluate", "metrics", "plots", "report", "results", "run", "statistics", "text"]

@@ -1,0 +1,17 @@
+"""The tick on the wall clock: privileges, shared memory and the links between processes."""
+
+__all__ = [
+    "block",
+    "bridge",
+    "frame_log",
+    "grid",
+    "loop",
+    "mailbox",
+    "plan_link",
+    "plant_link",
+    "privileges",
+    "recorder_process",
+    "requests",
+    "sections",
+    "shared_memory",
+]

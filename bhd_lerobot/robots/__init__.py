@@ -1,0 +1,17 @@
+"""LeRobot's view of the hand, and a check of its contract."""
+
+__all__ = [
+    "base",
+    "base_simulation",
+    "config",
+    "config_turtlebot3",
+    "config_ur5",
+    "conformance",
+    "faults",
+    "host",
+    "latency",
+    "simulated_robot",
+    "turtlebot3",
+    "ur5",
+    "ur5_simulation",
+]

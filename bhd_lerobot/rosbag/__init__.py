@@ -1,0 +1,3 @@
+"""ROS 2 bags, without ROS."""
+
+__all__ = ["exporter", "importer", "messages", "storage"]

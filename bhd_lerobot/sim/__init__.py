@@ -1,0 +1,14 @@
+"""MuJoCo, which no other package imports."""
+
+__all__ = [
+    "backdrop",
+    "camera",
+    "engine",
+    "lidar",
+    "plant",
+    "render_thread",
+    "scene",
+    "table_stage",
+    "tabletop",
+    "world",
+]

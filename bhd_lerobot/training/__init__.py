@@ -1,0 +1,17 @@
+"""`bhd-train`: LeRobot's training with our loader and loop."""
+
+__all__ = [
+    "arguments",
+    "checkpoint",
+    "config",
+    "data",
+    "env",
+    "log",
+    "loop",
+    "output",
+    "rl",
+    "setup",
+    "step",
+    "summary",
+    "train",
+]

@@ -1,0 +1,3 @@
+"""The controllers of an arm."""
+
+__all__ = ["compliance", "controller", "equilibrium", "impedance", "rotations", "setpoints", "wrench"]

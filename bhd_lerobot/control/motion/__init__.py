@@ -1,0 +1,14 @@
+"""Trajectories, the planner and goals."""
+
+__all__ = [
+    "command_check",
+    "goal_book",
+    "goal_codec",
+    "goals",
+    "line",
+    "planner",
+    "planning",
+    "player",
+    "supervision",
+    "trajectory",
+]

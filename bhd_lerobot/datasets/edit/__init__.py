@@ -1,0 +1,3 @@
+"""Delete, keep, split, merge and mark."""
+
+__all__ = ["edits", "mark"]

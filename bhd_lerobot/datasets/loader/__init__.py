@@ -1,0 +1,15 @@
+"""Batches for training, from memory."""
+
+__all__ = [
+    "batches",
+    "check",
+    "config",
+    "frame_cache",
+    "gather",
+    "loader",
+    "order",
+    "selection",
+    "source",
+    "table",
+    "table_dataset",
+]

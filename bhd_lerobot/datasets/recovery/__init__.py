@@ -1,0 +1,3 @@
+"""Damaged and unfinished datasets."""
+
+__all__ = ["columns", "evidence", "fix", "info", "outcomes", "repair", "rows", "salvage", "statistics", "videos"]

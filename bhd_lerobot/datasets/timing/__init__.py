@@ -1,0 +1,3 @@
+"""How punctual the frames of a dataset are."""
+
+__all__ = ["plots", "report", "tables"]

@@ -1,0 +1,3 @@
+"""`bhd_mlp`, a small policy that needs no GPU."""
+
+__all__ = ["configuration_mlp", "modeling_mlp", "processor_mlp", "scan_mlp", "yaw_mlp"]

@@ -1,0 +1,14 @@
+"""n simulations of one kind under one cerebellum, in this process or in others."""
+
+__all__ = [
+    "config",
+    "link",
+    "plant_loop",
+    "plant_process",
+    "plant_stop",
+    "process",
+    "realtime",
+    "remote_plant",
+    "simulation",
+    "state",
+]

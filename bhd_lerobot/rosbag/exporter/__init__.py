@@ -1,0 +1,3 @@
+"""Episodes into bags."""
+
+__all__ = ["episode", "export"]

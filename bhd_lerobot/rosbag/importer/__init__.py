@@ -1,0 +1,16 @@
+"""Bags into a dataset."""
+
+__all__ = [
+    "columns",
+    "convert",
+    "diagnostics",
+    "exported",
+    "frames",
+    "options",
+    "resample",
+    "scan",
+    "segments",
+    "topics",
+    "tracks",
+    "video",
+]

@@ -1,0 +1,3 @@
+"""Reinforcement learning."""
+
+__all__ = ["checkpoint", "config", "environment", "features", "learner", "log", "parts", "train", "validation"]
