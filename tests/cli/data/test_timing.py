@@ -127,7 +127,14 @@ def test_the_tables_hold_what_was_measured(measured, tmp_path, capsys, monkeypat
     image = tmp_path / "new" / "t.png"
     assert main.main(["timing", str(measured), "--output", str(image)]) == 0
     text = capsys.readouterr().out
-    for part in ("wall clock", "3600 run", "6 of 180 (3.3%)", "max 1.50 ms", "tolerated 1.00 ms", "9 frames or states"):
+    for part in (
+        "wall clock",
+        "3600 run",
+        "6 of 180 (3.3 %)",
+        "max 1.50 ms",
+        "tolerated 1.00 ms",
+        "9 frames or states",
+    ):
         assert part in text
     for part in ("granted, episodes 0-1", "granted, episode 2", "raise memlock [KiB]", "lateness [ms]", "rate"):
         assert part in text
