@@ -122,7 +122,7 @@ def open_data(
         rank=rank,
         world_size=world_size,
     )
-    loaders = make_loader(dataset.repo_id, loading, root=meta.root, revision=dataset.revision, report=report)
+    loaders = make_loader(dataset.repo_id, loading, meta=meta, report=report)
     check(loaders.dataset, keep)
     if loaders.held_out is not None:
         check(loaders.held_out.dataset, keep)

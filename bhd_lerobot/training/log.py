@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -77,7 +77,8 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
         path: where the image goes.
         heading: what stands above it.
     """
-    figure = Figure(figsize=(8.5, 5.2), layout="constrained")
+    figure = Figure(figsize=(8.5, 5.2))
+    figure.subplots_adjust(left=0.1, right=0.98, top=0.92, bottom=0.1, hspace=0.13)  # a layout engine takes as long again
     figure.suptitle(heading, fontsize=11)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
     smallest = []
@@ -116,6 +117,7 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
     below.set_ylabel("learning rate")
     below.ticklabel_format(axis="y", style="sci", scilimits=(-2, 3))
     below.set_xlabel("step")
+    below.xaxis.set_major_locator(MaxNLocator(integer=True))
     below.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
 

@@ -52,6 +52,7 @@ class RunOutput:
         self._config, self._parts, self._processes = config, parts, processes
         self._metrics = self._open(step) if is_main else None
         self._wandb = self._make_wandb() if is_main else None
+        self._drawn = (0, 0)  # the step and the number of rows of the curve as it was drawn last
 
     @property
     def rows(self) -> list[Row]:
@@ -97,12 +98,13 @@ class RunOutput:
 
     def draw(self, step: int) -> None:
         """Draw the curve. Where that fails, what was learned is worth more than its image: the run goes on."""
-        if self._metrics is None:
+        if self._metrics is None or self._drawn == (step, len(self._metrics.rows)):
             return
         config = self._config
         heading = f"{config.job_name} on {config.dataset.repo_id}, step {step} of {config.steps}"
         try:
             draw_loss(self._metrics.rows, self.folder / PLOT_NAME, heading)
+            self._drawn = (step, len(self._metrics.rows))
         except OSError:
             (self.folder / PLOT_NAME).unlink(missing_ok=True)  # half of an image
 

@@ -63,6 +63,7 @@ def make_loader(
     *,
     root: Path | str | None = None,
     revision: str | None = None,
+    meta: "LeRobotDatasetMetadata | None" = None,
     report: Callable[[str], None] = _log.warning,
 ) -> Loaders:
     """Return the batches of a training and of what it holds out.
@@ -76,13 +77,16 @@ def make_loader(
         config: which samples, in which order and form.
         root: folder of the dataset; None means LeRobot's folder for `repo_id`.
         revision: version of the dataset on the Hub.
+        meta: the dataset's metadata where it is open already, with the wanted files on this machine; `root` and
+            `revision` are not used then.
         report: gets the message once.
 
     Raises:
         ConfigError: `drop_n_last_frames` or the weights leave no sample.
         DatasetError: no such dataset, episode or feature; the message names what there is.
     """
-    meta = local_metadata(repo_id, root, revision, config.episodes)
+    if meta is None:
+        meta = local_metadata(repo_id, root, revision, config.episodes)
     selection, episodes = config.selection, config.episodes
     chosen = checked_episodes(meta, episodes) if selection is None else selection.select(meta, episodes)
     train, held_out = split_episodes(meta, chosen, config.eval_split, config.hold_out)
