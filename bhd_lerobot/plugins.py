@@ -27,6 +27,8 @@ BODIES: dict[str, Callable[[], MobileBase | Arm]] = {"turtlebot3": turtlebot3_bu
 """What makes the body of a robot with the options that it has by default, by the robot's type."""
 
 _OPTION = "discover_packages_path"
+# This distribution, for LeRobot's commands. Ours register what they need; our environments take seconds to import.
+_OURS = "lerobot_robot_bhd"
 _imported: set[str] = set()
 
 
@@ -95,7 +97,7 @@ def _installed() -> list[tuple[str, Callable[[], Any]]]:
     found: dict[str, Callable[[], Any]] = {}
     for distribution in metadata.distributions():
         name = str(distribution.metadata["Name"] or "")
-        if name.startswith(PREFIXES):
+        if name.startswith(PREFIXES) and name != _OURS:
             found[name] = partial(importlib.import_module, name)
     for entry in metadata.entry_points(group=ENTRY_POINTS):
         found.setdefault(entry.value, entry.load)

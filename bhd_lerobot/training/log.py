@@ -78,7 +78,9 @@ def draw_loss(rows: Sequence[Row], path: Path, heading: str) -> None:
         heading: what stands above it.
     """
     figure = Figure(figsize=(8.5, 5.2))
-    figure.subplots_adjust(left=0.1, right=0.98, top=0.92, bottom=0.1, hspace=0.13)  # a layout engine takes as long again
+    figure.subplots_adjust(
+        left=0.1, right=0.98, top=0.92, bottom=0.1, hspace=0.13
+    )  # a layout engine takes as long again
     figure.suptitle(heading, fontsize=11)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
     smallest = []

@@ -19,6 +19,8 @@ from bhd_lerobot.rollout.signals import StopRequest
 from bhd_lerobot.training.arguments import parse_train
 from tests.cases import each_case
 
+pytestmark = pytest.mark.figures
+
 SMALL = {"episodes": 2, "steps": 4, "trials": 2, "video": False}  # videos are the slowest part, and tested elsewhere
 AVOID = replace(
     demo.AVOID,

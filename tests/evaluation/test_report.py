@@ -23,6 +23,8 @@ from bhd_lerobot.rollout.plots import Trajectory
 from bhd_lerobot.tasks.task import Event
 from tests.evaluation.test_evaluate import FAILING, run_eval
 
+pytestmark = pytest.mark.figures
+
 
 def metrics(brain: str, episode: int, score: float, outcome: str = "success") -> EpisodeMetrics:
     return EpisodeMetrics(

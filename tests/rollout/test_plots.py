@@ -7,6 +7,8 @@ from PIL import Image
 from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.rollout import plots
 
+pytestmark = pytest.mark.figures
+
 
 @pytest.mark.parametrize(("count", "pages"), [(1, 1), (2, 1), (7, 1), (9, 3)])
 def test_every_trajectory_has_a_panel(tmp_path, monkeypatch, count, pages):

@@ -64,6 +64,7 @@ def test_a_quaternion_and_its_negative_are_the_same_orientation(recorded):
     assert replay.open_loop().angle_rad.max() == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.figures
 def test_the_command_draws_and_reports(recorded, tmp_path, capsys):
     status = module.main([f"--dataset.root={recorded}", f"--output_dir={tmp_path}", "--tolerance_m=0"])
     text = capsys.readouterr().err

@@ -1,9 +1,12 @@
 from pathlib import Path
 
+import pytest
 from matplotlib.figure import Figure
 
 from bhd_lerobot.training import log
 from bhd_lerobot.training.log import MetricsFile, draw_loss, read_metrics
+
+pytestmark = pytest.mark.figures
 
 ROWS = [{"step": step, "loss": 1 / step, "lr": 1e-3, "held_out_loss": 2 / step} for step in (10, 20, 30)]
 

@@ -26,6 +26,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset(tmp_path_factory.mktemp("data") / "set")
 
 
+@pytest.mark.figures
 def test_a_run_leaves_metrics_a_curve_its_configuration_and_checkpoints(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     result, printed = run_train(options(data, run, eval_steps=10, dataset__eval_split=0.3))

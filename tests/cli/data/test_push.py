@@ -78,6 +78,7 @@ def test_there_and_back(hub: HubServer, recorded: Path, tmp_path: Path, capsys) 
     assert "nothing to send" in capsys.readouterr().out
 
 
+@pytest.mark.figures
 def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) -> None:
     assert main.main(["push", str(recorded), "me/avoid", "--tags=roaming,small", "--licence=mit"]) == 0
     card = text_of(hub, "me/avoid")
@@ -112,6 +113,7 @@ def test_the_card_says_what_is_in_the_dataset(hub: HubServer, recorded: Path) ->
     assert image[..., :3].std() > 0.05
 
 
+@pytest.mark.figures
 def test_images_of_cameras_and_of_curves(hub: HubServer, lesson: Path, tmp_path: Path) -> None:
     videos = make_dataset(tmp_path / "videos", episodes=2, camera=True)
     for root, caption in (

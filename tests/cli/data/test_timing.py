@@ -21,6 +21,8 @@ from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetError
 from tests.recording.support import data_columns, run_record
 
+pytestmark = pytest.mark.figures
+
 RATES = Rates(500, 500, 25)
 FRAMES, LATE = 60, (17, 42)
 FEATURES = {key: {"dtype": dtype, "shape": (1,), "names": None} for key, (dtype, _) in keys.SCALARS.items()}

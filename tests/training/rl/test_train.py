@@ -29,6 +29,7 @@ from bhd_lerobot.training.rl.config import RlConfig, is_rl, parse_rl
 from bhd_lerobot.training.rl.environment import RlVecEnv
 from bhd_lerobot.training.rl.features import in_units
 from bhd_lerobot.training.rl.learner import make_learner
+from bhd_lerobot.training.rl.log import draw_curve
 from bhd_lerobot.training.rl.parts import make_parts, single_action
 from bhd_lerobot.training.rl.train import RlResult, main, train
 from tests.forks import Fork
@@ -97,10 +98,11 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RlResult:
     return run(tmp_path_factory.mktemp("rl") / "run", validation__rule="{type: gap_follower}")
 
 
-def test_a_run_leaves_checkpoints_metrics_a_curve_and_its_configuration(finished: RlResult) -> None:
+@pytest.mark.figures
+def test_a_run_leaves_checkpoints_metrics_a_curve_and_its_configuration(finished: RlResult, tmp_path: Path) -> None:
     folder = finished.output_dir
     assert finished.step == 96
-    assert (folder / "learning_curve.png").stat().st_size > 10_000
+    assert (folder / "learning_curve.png").is_file()
     names = {one.name for one in (folder / "checkpoints").iterdir()}
     assert {"000000000", "000000064", "000000096", "last", "best"} == names
     found = rows(folder)
@@ -109,6 +111,8 @@ def test_a_run_leaves_checkpoints_metrics_a_curve_and_its_configuration(finished
     assert any("return" in row for row in found)
     assert finished.rule is not None
     assert finished.rule.episodes == 2
+    draw_curve(found, tmp_path / "curve.png", "PPO", ("gap_follower", finished.rule.row()))
+    assert (tmp_path / "curve.png").stat().st_size > 10_000
     again = parse_rl([f"--config_path={folder}", "--resume=true"])
     assert again.ppo.n_steps == 8
     assert again.output_dir == str(folder)
