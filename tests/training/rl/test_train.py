@@ -111,7 +111,7 @@ def test_a_run_leaves_checkpoints_metrics_a_curve_and_its_configuration(finished
     assert any("return" in row for row in found)
     assert finished.rule is not None
     assert finished.rule.episodes == 2
-    draw_curve(found, tmp_path / "curve.png", "PPO", ("gap_follower", finished.rule.row()))
+    draw_curve(finished.rows, tmp_path / "curve.png", "PPO", ("gap_follower", finished.rule.row()))
     assert (tmp_path / "curve.png").stat().st_size > 10_000
     again = parse_rl([f"--config_path={folder}", "--resume=true"])
     assert again.ppo.n_steps == 8
