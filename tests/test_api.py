@@ -140,9 +140,15 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch) -> None:
     text = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
     first, second, *_ = re.findall(r"```python\n(.*?)```", text.partition("## From Python")[2], re.DOTALL)
     assert len(first.strip().splitlines()) <= 20
-    shorter = first.replace("steps=200", "steps=20").replace("n_episodes=8", "n_episodes=2")
-    shorter = shorter.replace('"num_episodes": 4}', '"num_episodes": 2, "episode_time_s": 3}')
-    shorter = shorter.replace('task="avoid", brains', 'task={"type": "avoid", "duration_s": 2}, brains')
+    shorter = first
+    for long, short in (
+        ("steps=200", "steps=20"),
+        ("n_episodes=8", "n_episodes=2"),
+        ('"num_episodes": 4}', '"num_episodes": 2, "episode_time_s": 3}'),
+        ('task="avoid",\n', 'task={"type": "avoid", "duration_s": 2},\n'),
+    ):
+        assert long in shorter
+        shorter = shorter.replace(long, short)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     exec(shorter, names)

@@ -2,7 +2,6 @@
 
 import io
 import socket
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -290,16 +289,16 @@ def test_a_recording_is_the_same_with_and_without_a_view(sent: Helpers, tmp_path
     assert data_columns(tmp_path / "a") == data_columns(tmp_path / "b")
 
 
+def record_and_list_viewers(arguments: list[str]) -> int:
+    status = main(arguments)
+    print(sorted({"rerun", "foxglove"} & set(sys.modules)))
+    return status
+
+
 def test_rerun_is_not_imported_unless_it_is_wanted(tmp_path: Path) -> None:
-    program = (
-        "import sys\n"
-        "from bhd_lerobot.recording.record import main\n"
-        f"assert main({options(tmp_path / 'd', dataset__num_episodes=1, dataset__episode_time_s=1)!r}) == 0\n"
-        "print(sorted({'rerun', 'foxglove'} & set(sys.modules)))\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "[]"
+    arguments = options(tmp_path / "d", dataset__num_episodes=1, dataset__episode_time_s=1)
+    assert Fork(record_and_list_viewers, arguments, output=tmp_path / "log").wait() == 0
+    assert (tmp_path / "log").read_text().splitlines()[-1] == "[]"
 
 
 def test_rerun_itself_takes_it(robot: Simulation, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

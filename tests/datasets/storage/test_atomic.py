@@ -6,7 +6,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from bhd_lerobot.errors import DatasetError, DatasetExistsError, DatasetLockedEr
 from tests.datasets import support
 from tests.datasets.edit_support import content, record
 from tests.datasets.sweeps.operations import leftovers
+from tests.forks import Fork
 
 
 @pytest.fixture(scope="module")
@@ -135,70 +135,70 @@ def test_a_link_to_an_empty_folder_and_one_to_a_dataset_stay_links(root: Path, t
         keep(root, [0], tmp_path / "dangling")
 
 
+def use_a_mount_point(root: Path, place: Path) -> None:
+    """In a process of its own, whose mounts end with it."""
+    user, group = os.getuid(), os.getgid()
+    try:
+        os.unshare(os.CLONE_NEWNS)
+    except PermissionError:  # root's rights, in a namespace of its own
+        os.unshare(os.CLONE_NEWUSER | os.CLONE_NEWNS)
+        for name, line in (("setgroups", "deny"), ("uid_map", f"0 {user} 1"), ("gid_map", f"0 {group} 1")):
+            Path("/proc/self", name).write_text(line)
+    assert os.system("mount --make-rprivate /") == 0
+
+    def empty() -> Path:
+        os.system(f"umount --lazy {place} 2>/dev/null")
+        assert os.system(f"mount -t tmpfs tmpfs {place}") == 0
+        (place / "lost+found").mkdir()
+        return place
+
+    with support.create(empty()) as recorder:
+        support.record(recorder), support.record(recorder)
+    with support.resume(place) as recorder:
+        support.record(recorder)
+    assert support.read_back(place) == 3
+    delete(place, [1])
+    assert sorted(os.listdir(place)) == ["data", "lost+found", "meta"], os.listdir(place)
+    keep(root, [0, 2], empty())
+    assert main.main(["mark", str(place), "--episodes=0", "--outcome=failure"]) == 0
+    split(root, {"a": [0], "b": [1]}, empty())
+    assert sorted(os.listdir(place)) == ["a", "b", "lost+found"]
+    assert main.main(["export", str(root), "--output", str(empty())]) == 0
+    again = root.parent / "again"
+    assert main.main(["import", str(place), "--repo_id=t/t", "--root", str(again)]) == 0
+    assert main.main(["pull", f"file://{root}", "--root", str(empty())]) == 0
+    delete(place, [0])
+    assert main.main(["pull", f"file://{root}", "--root", str(place), "--replace", "--verify"]) == 0
+    assert support.read_back(place) == 3
+    assert sorted(os.listdir(place)) == ["data", "lost+found", "meta"], os.listdir(place)
+    assert os.system(f"umount --lazy {place} && mount --bind {again} {place}") == 0
+    delete(place, [1])
+    assert support.read_back(root) == 3
+    assert len(os.listdir(place / "meta")) > 3
+    other = root.parent / "bound"
+    other.mkdir()
+    assert os.system(f"mount --bind {root} {other}") == 0
+    delete(root, [2])  # from outside of the container
+    assert support.read_back(other) == 2
+    assert os.system(f"umount --lazy {other} && mkdir {root}/kept && mount -t tmpfs tmpfs {root}/kept") == 0
+    assert os.system(f"mount --bind {root}/data {root}/data") == 0
+    before = sorted(os.listdir(root / "data/chunk-000"))
+    assert main.main(["delete", str(root), "--episodes=0"]) == 2
+    assert sorted(os.listdir(root / "data/chunk-000")) == before
+    assert not (root / ".bhd").exists()
+    assert support.read_back(root) == 2
+
+
 def test_all_commands_work_at_a_mount_point(root: Path, tmp_path: Path) -> None:
     """Of a container, for example, whose volume is the dataset."""
-    folder = Path(__file__).parents[3]
-    program = f"""
-import os, sys
-from pathlib import Path
-sys.path[:0] = [{str(folder)!r}]
-from tests.datasets import support
-from bhd_lerobot.datasets.edit.edits import delete, keep, split
-from bhd_lerobot.cli.data import main as data
-root, place = Path({str(root)!r}), Path({str(tmp_path / "volume")!r})
-def empty():
-    os.system(f"umount --lazy {{place}} 2>/dev/null")
-    assert os.system(f"mount -t tmpfs tmpfs {{place}}") == 0
-    (place / "lost+found").mkdir()
-    return place
-with support.create(empty()) as recorder:
-    support.record(recorder), support.record(recorder)
-with support.resume(place) as recorder:
-    support.record(recorder)
-assert support.read_back(place) == 3
-delete(place, [1])
-assert sorted(os.listdir(place)) == ["data", "lost+found", "meta"], os.listdir(place)
-keep(root, [0, 2], empty())
-assert data.main(["mark", str(place), "--episodes=0", "--outcome=failure"]) == 0
-split(root, {{"a": [0], "b": [1]}}, empty())
-assert sorted(os.listdir(place)) == ["a", "b", "lost+found"]
-assert data.main(["export", str(root), "--output", str(empty())]) == 0
-assert data.main(["import", str(place), "--repo_id=t/t", "--root", str(root.parent / "again")]) == 0
-assert data.main(["pull", f"file://{{root}}", "--root", str(empty())]) == 0
-delete(place, [0])
-assert data.main(["pull", f"file://{{root}}", "--root", str(place), "--replace", "--verify"]) == 0
-assert support.read_back(place) == 3
-assert sorted(os.listdir(place)) == ["data", "lost+found", "meta"], os.listdir(place)
-assert os.system(f"umount --lazy {{place}} && mount --bind {{root.parent / 'again'}} {{place}}") == 0
-delete(place, [1])
-assert support.read_back(root) == 3 and len(os.listdir(place / "meta")) > 3
-other = root.parent / "bound"
-other.mkdir()
-assert os.system(f"mount --bind {{root}} {{other}}") == 0
-delete(root, [2])  # from outside of the container
-assert support.read_back(other) == 2
-assert os.system(f"umount --lazy {{other}} && mkdir {{root}}/kept && mount -t tmpfs tmpfs {{root}}/kept") == 0
-assert os.system(f"mount --bind {{root}}/data {{root}}/data") == 0
-before = sorted(os.listdir(root / "data/chunk-000"))
-assert data.main(["delete", str(root), "--episodes=0"]) == 2
-assert sorted(os.listdir(root / "data/chunk-000")) == before and not (root / ".bhd").exists()
-assert support.read_back(root) == 2
-print("all of it")
-"""
-    (tmp_path / "volume").mkdir()
     for options in (["--mount"], ["--mount", "--map-root-user"]):
         if subprocess.run(["unshare", *options, "true"], capture_output=True, check=False).returncode == 0:
             break
     else:
         pytest.skip("this system permits no mounts")
-    done = subprocess.run(
-        ["unshare", *options, sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(folder.parents[1])},
-    )
-    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["all of it"]), done.stderr
+    (tmp_path / "volume").mkdir()
+    process = Fork(use_a_mount_point, root, tmp_path / "volume", output=tmp_path / "log")
+    assert process.wait() == 0, (tmp_path / "log").read_text()
 
 
 def test_without_an_atomic_swap_the_content_is_moved_in(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
