@@ -12,14 +12,15 @@ from bhd_lerobot.bodies.body import Arm as Arm
 from bhd_lerobot.bodies.body import MobileBase as MobileBase
 from bhd_lerobot.bodies.body import Shape as Shape
 from bhd_lerobot.bodies.differential_base import differential_base as differential_base
+from bhd_lerobot.bodies.tabletop import TableObject as TableObject
+from bhd_lerobot.bodies.tabletop import TableScene as TableScene
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger as turtlebot3_burger
 from bhd_lerobot.bodies.ur5 import ur5 as ur5
+from bhd_lerobot.control.commands import BrainCommand as BrainCommand
 from bhd_lerobot.control.commands import Chunk as Chunk
 from bhd_lerobot.control.commands import Goals as Goals
 from bhd_lerobot.control.commands import Mixed as Mixed
-from bhd_lerobot.datasets.edit.edits import delete as delete
-from bhd_lerobot.datasets.edit.edits import keep as keep
-from bhd_lerobot.datasets.edit.edits import merge as merge
+from bhd_lerobot.control.commands import Pose as Pose
 from bhd_lerobot.datasets.format.summary import dataset_info as dataset_info
 from bhd_lerobot.datasets.loader.config import LoaderConfig as LoaderConfig
 from bhd_lerobot.datasets.loader.loader import make_loader as make_loader
@@ -36,6 +37,7 @@ from bhd_lerobot.policies.brain import ConfiguredBrain as ConfiguredBrain
 from bhd_lerobot.policies.brain import Observation as Observation
 from bhd_lerobot.policies.brain import RobotFeatures as RobotFeatures
 from bhd_lerobot.policies.brain import find_scan as find_scan
+from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain as GoalBrain
 from bhd_lerobot.recording.config import RecordConfig as RecordConfig
 from bhd_lerobot.registry import register_brain as register_brain
 from bhd_lerobot.registry import register_robot as register_robot
@@ -44,6 +46,7 @@ from bhd_lerobot.robots.base import SimulatedBase as SimulatedBase
 from bhd_lerobot.robots.config import MobileBaseConfig as MobileBaseConfig
 from bhd_lerobot.robots.conformance import check_robot as check_robot
 from bhd_lerobot.rollout.replay import ReplayConfig as ReplayConfig
+from bhd_lerobot.tasks.task import ArmTask as ArmTask
 from bhd_lerobot.tasks.task import BaseTask as BaseTask
 from bhd_lerobot.tasks.task import Event as Event
 from bhd_lerobot.tasks.task import Outcome as Outcome

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.bodies.body import Arm, MobileBase
@@ -73,10 +74,13 @@ def load_named(arguments: Sequence[str]) -> list[str]:
             importlib.import_module(name)
         except Exception as error:  # whatever a module raises while it is imported, also a name that is none
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise ConfigError(
-                f"{option} names {name!r}, which cannot be imported: {reason}. Give a module that Python finds here, "
-                "installed or in PYTHONPATH."
-            ) from error
+            here = Path(f"{name}.py").is_file() or Path(name, "__init__.py").is_file()
+            remedy = (
+                "Give a module that Python finds: one that is installed, or in a folder of PYTHONPATH."
+                if not (isinstance(error, ModuleNotFoundError) and error.name == name and here)
+                else "It is in this folder, where Python does not look: write PYTHONPATH=. before the command."
+            )
+            raise ConfigError(f"{option} names {name!r}, which cannot be imported: {reason}. {remedy}") from error
     return left
 
 

@@ -110,7 +110,7 @@ def test_a_configuration_without_its_class_is_refused(installer, tmp_path) -> No
         parse(RecordConfig, options(tmp_path / "d", brain__type="half"))
 
 
-def test_a_module_that_an_option_names_is_imported_or_refused(installer) -> None:
+def test_a_module_that_an_option_names_is_imported_or_refused(installer, tmp_path, monkeypatch) -> None:
     (installer.folder / "my_brains.py").write_text(BRAIN.format(name="named"), encoding="utf-8")
     importlib.invalidate_caches()
     left = plugins.load_named(["--n=1", "--robot.discover_packages_path=my_brains", "--brain.type=named"])
@@ -118,3 +118,9 @@ def test_a_module_that_an_option_names_is_imported_or_refused(installer) -> None
     assert "named" in registry.brains_for("turtlebot3")
     with pytest.raises(ConfigError, match=r"--brain\.discover_packages_path names 'no_brains', which cannot be"):
         plugins.load_named(["--brain.discover_packages_path", "no_brains"])
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder])  # as of an installed command
+    Path("in_this_folder.py").write_text("", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"write PYTHONPATH=\. before the command"):
+        plugins.load_named(["--task.discover_packages_path=in_this_folder"])

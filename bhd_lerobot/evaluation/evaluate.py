@@ -42,14 +42,14 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
     results = result.results
     baseline = config.reference
     table = Table(
-        title=f"{len(config.indices)} {config.split} episodes, seed {config.seed}",
+        title=f"{len(config.indices)} {config.split.replace('_', '-')} episodes, seed {config.seed}",
         title_justify="left",
         box=SIMPLE_HEAD,
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
     # What is too wide for the terminal is folded, never cut off.
-    for heading in ("brain", "success, 95 %", "score, 95 %", f"success beside\n{baseline}", "failures"):
+    for heading in ("brain", "success, 95 %", "score, 95 %", f"success minus\n{baseline}'s, 95 %", "failures"):
         is_text = heading in ("brain", "failures")
         table.add_column(escape(heading), no_wrap=not is_text, overflow="fold")
     for label, one in results.brains.items():

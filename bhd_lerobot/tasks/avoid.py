@@ -75,7 +75,7 @@ class AvoidTask(BaseTask):
     def __init__(self, config: AvoidConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)
         self.environment_names = TRAIL if config.trail else ()
-        self._window = self._in_frames(config.stuck_time_s)
+        self._window = self.in_frames(config.stuck_time_s)
         # Cells by number, a row for each simulation; the rows grow with the largest arena seen.
         self._free: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
         self._visited: NDArray[np.bool_] = np.zeros((n, 0), np.bool_)
@@ -119,22 +119,22 @@ class AvoidTask(BaseTask):
         started[ids] = True
         self._count_cells(started)
         self._path.begin(ids)
-        self._frame[ids] = 0
+        self.frame[ids] = 0
 
     def judge(self, truth: BaseTruth, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return reward and event of the frame that just ended, each of shape (n,)."""
         event = np.full(len(running), int(Event.NOTHING))
         position = truth.base_pose_in_world[:, :2]
-        recent = self._path.add(np.where(running, np.hypot(*(position - self._pose).T), 0.0), self._frame)
+        recent = self._path.add(np.where(running, np.hypot(*(position - self._pose).T), 0.0), self.frame)
         self._pose[running] = position[running]
-        self._frame[running] += 1
+        self.frame[running] += 1
         clean = running & ~truth.touched
         reward = self._count_cells(clean)
-        over = clean & (self._frame >= self.frames)
+        over = clean & (self.frame >= self.max_frames)
         far = self._path.total >= self.config.min_path_m
         event[over & far] = Event.SUCCESS
         event[over & ~far] = Event.TIMEOUT
-        stuck = clean & ~over & (self._frame >= self._window) & (recent < self.config.stuck_path_m)
+        stuck = clean & ~over & (self.frame >= self._window) & (recent < self.config.stuck_path_m)
         event[stuck] = Event.STUCK
         event[running & truth.touched] = Event.COLLISION
         return reward, event

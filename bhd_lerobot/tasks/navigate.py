@@ -106,7 +106,7 @@ class NavigateTask(BaseTask):
 
     def __init__(self, config: NavigateConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)
-        self._hold, self._window = self._in_frames(config.hold_s), self._in_frames(config.stuck_time_s)
+        self._hold, self._window = self.in_frames(config.hold_s), self.in_frames(config.stuck_time_s)
         # Lengths of ways, a grid for each simulation; the grids grow with the largest arena seen.
         self._ways: NDArray[np.float64] = np.zeros((n, 2, 2))
         self._origin = np.zeros((n, 2))
@@ -182,7 +182,7 @@ class NavigateTask(BaseTask):
             self._goal[sim], self._pose[sim] = goal, arena.start
         self._path.begin(ids)
         self._sum[ids] = 0.0
-        self._within[ids] = self._frame[ids] = 0
+        self._within[ids] = self.frame[ids] = 0
         self._shortest[ids] = interpolate(self._ways, self._origin, self._pose[:, :2])[ids]
         self._first[ids] = self._left[ids] = np.maximum(self._way_left(), self.config.tolerance_m)[ids]
 
@@ -199,17 +199,17 @@ class NavigateTask(BaseTask):
         pose = np.where(running[:, None], truth.base_pose_in_world, self._pose)
         step, turn = np.hypot(*(pose - self._pose)[:, :2].T), np.abs(_wrap(pose[:, 2] - self._pose[:, 2]))
         self._pose = pose
-        recent = self._path.add(step, self._frame)
-        self._frame[running] += 1
+        recent = self._path.add(step, self.frame)
+        self.frame[running] += 1
         distance, angle = self._errors()
         there = (distance <= config.tolerance_m) & (angle <= math.radians(config.tolerance_deg))
-        there &= (step * self._fps <= config.rest_speed) & (turn * self._fps <= config.rest_turn_speed)
+        there &= (step * self.fps <= config.rest_speed) & (turn * self.fps <= config.rest_turn_speed)
         self._within[running] = np.where(there, self._within + 1, 0)[running]
         hit = running & truth.touched
         clean = running & ~truth.touched
-        over = clean & (self._frame >= self.frames)
+        over = clean & (self.frame >= self.max_frames)
         event = np.full(len(running), int(Event.NOTHING))
-        event[clean & (self._frame >= self._window) & (recent < config.stuck_path_m)] = Event.STUCK
+        event[clean & (self.frame >= self._window) & (recent < config.stuck_path_m)] = Event.STUCK
         event[over] = Event.TIMEOUT
         event[clean & (self._within >= self._hold)] = Event.SUCCESS
         event[hit] = Event.COLLISION
@@ -234,7 +234,7 @@ class NavigateTask(BaseTask):
             details={
                 "path_m": path,
                 "shortest_m": shortest,
-                "time_s": float(self._frame[sim]) / self._fps,
+                "time_s": float(self.frame[sim]) / self.fps,
                 "error_m": float(distance[sim]),
                 "error_rad": float(angle[sim]),
             },

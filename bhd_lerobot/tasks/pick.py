@@ -11,7 +11,7 @@ from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
-from bhd_lerobot.tasks.task import ArmTruth, ConfiguredTask, Event, Outcome, TaskConfig
+from bhd_lerobot.tasks.task import ArmTask, ArmTruth, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
 
 # Where objects stand, in the base frame [m]: what a tool that points down reaches with room to spare.
@@ -70,7 +70,7 @@ class PickConfig(TaskConfig):
             raise ConfigError(unknown_name("task.language", self.language, (*INSTRUCTIONS, "any")))
 
 
-class PickTask(ConfiguredTask):
+class PickTask(ArmTask):
     """The pick task for n simulations.
 
     Success: the object that the instruction names, and no other, lifted by `lift_m` and held for `hold_s`. Failures:
@@ -87,12 +87,11 @@ class PickTask(ConfiguredTask):
     """
 
     name = "pick"
-    robot_kind = "arm"
     environment_names = ENVIRONMENT
 
     def __init__(self, config: PickConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)
-        self._hold = self._in_frames(config.hold_s)
+        self._hold = self.in_frames(config.hold_s)
         self._target = np.zeros(n, np.int64)
         self._present = np.zeros((n, MAX_OBJECTS), np.bool_)
         self._start = np.zeros((n, MAX_OBJECTS))  # height of the objects' centres at the start [m]
@@ -151,7 +150,7 @@ class PickTask(ConfiguredTask):
                 self._fixed[sim, number, :3] = 1.0, is_target, is_box
                 self._fixed[sim, number, 10:] = 2 * one.size_x, 2 * one.size_y, one.height, *colour
         self._best[ids] = self._height[ids] = 0.0
-        self._held[ids] = self._frame[ids] = 0
+        self._held[ids] = self.frame[ids] = 0
 
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
         """Return what is on the table, as a camera sees it: 16 numbers for each place of an object, shape (n, 80).
@@ -178,7 +177,7 @@ class PickTask(ConfiguredTask):
         gripped = truth.fingers_on_object[sims, target]
         up = (height >= config.lift_m) & gripped
         np.copyto(self._held, (self._held + 1) * up, where=running)
-        self._frame += running
+        self.frame += running
         np.copyto(self._height, height, where=running)
         best = np.maximum(self._best, height)
         reward = (self._share(best) - self._share(self._best)) * running
@@ -188,7 +187,7 @@ class PickTask(ConfiguredTask):
         event = np.zeros(len(running), np.int64)
         # What must not happen counts also in the last frame of a success: the later of these takes the earlier's place.
         for name, happened in (
-            (Event.TIMEOUT, self._frame >= self.frames),
+            (Event.TIMEOUT, self.frame >= self.max_frames),
             (Event.UNREACHABLE, np.hypot(at[:, 0], at[:, 1]) > _REACH),
             (Event.DROPPED, (self._best >= _LIFTED) & (height < _FALLEN) & ~gripped),
             (Event.SUCCESS, self._held >= self._hold),

@@ -15,7 +15,7 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError, check_positive
-from bhd_lerobot.tasks.task import ArmTruth, ConfiguredTask, Event, Outcome, TaskConfig
+from bhd_lerobot.tasks.task import ArmTask, ArmTruth, Event, Outcome, TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig, draw_variation
 
 # Where targets are, in the base frame [m]: before the arm, over the table.
@@ -55,7 +55,7 @@ class ReachConfig(TaskConfig):
             raise ConfigError(f"task.start_spread_rad is {self.start_spread_rad}; it must be between 0 and 1.")
 
 
-class ReachTask(ConfiguredTask):
+class ReachTask(ArmTask):
     """The reach task for n simulations.
 
     Success: the tool within the tolerances of the target for `hold_s`. Failures: `collision` (the arm touches the table
@@ -70,12 +70,11 @@ class ReachTask(ConfiguredTask):
     """
 
     name = "reach"
-    robot_kind = "arm"
     environment_names = ENVIRONMENT
 
     def __init__(self, config: ReachConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)
-        self._hold = self._in_frames(config.hold_s)
+        self._hold = self.in_frames(config.hold_s)
         self._target = np.zeros((n, 7))
         self._camera_error = np.zeros((n, 3))
         self._first, self._last = np.ones(n), np.ones(n)
@@ -107,7 +106,7 @@ class ReachTask(ConfiguredTask):
                 raise ConfigError(f"The scene {scene.name!r} has no target pose to reach.")
             self._target[sim] = scene.target_pose
             self._camera_error[sim] = scene.variation.camera_error
-        self._within[ids] = self._frame[ids] = 0
+        self._within[ids] = self.frame[ids] = 0
         self._started[ids] = False
 
     def environment_state(self, truth: ArmTruth) -> NDArray[np.float64]:
@@ -129,9 +128,9 @@ class ReachTask(ConfiguredTask):
         self._last[running], self._angle[running] = distance[running], angle[running]
         there = (distance <= config.tolerance_m) & (angle <= math.radians(config.tolerance_deg))
         self._within[running] = np.where(there, self._within + 1, 0)[running]
-        self._frame[running] += 1
+        self.frame[running] += 1
         event = np.full(len(running), int(Event.NOTHING))
-        event[running & (self._frame >= self.frames)] = Event.TIMEOUT
+        event[running & (self.frame >= self.max_frames)] = Event.TIMEOUT
         event[running & (self._within >= self._hold)] = Event.SUCCESS
         event[running & (truth.arm_on_table | truth.self_contact)] = Event.COLLISION
         return reward, event

@@ -189,13 +189,15 @@ class Task(Protocol):
 
 
 class ConfiguredTask:
-    """What the tasks have in common: parameters, and the number of frames so far.
+    """What the tasks have in common: parameters, rate, and the number of frames so far.
 
     Attributes:
         config: the parameters.
-        duration_s: longest duration of an episode [s].
-        frames: the same [frames].
         body: the robot's hardware; None if it is not known.
+        fps: frames a second [Hz].
+        duration_s: longest duration of an episode [s].
+        max_frames: the same [frames].
+        frame: frames of each episode so far, shape (n,); `begin` sets them to 0, `judge` counts.
 
     Args:
         config: the parameters, with a `duration_s`.
@@ -213,14 +215,14 @@ class ConfiguredTask:
     def __init__(self, config: Any, n: int, fps: int, body: Body | None = None) -> None:
         self.config, self.body = config, body
         self.duration_s: float = config.duration_s
-        self._fps = fps
-        self.frames = self._in_frames(config.duration_s)
+        self.fps = fps
+        self.max_frames = self.in_frames(config.duration_s)
         self._sims = np.arange(n)
-        self._frame: NDArray[np.int64] = np.zeros(n, np.int64)  # of each episode
+        self.frame: NDArray[np.int64] = np.zeros(n, np.int64)
 
-    def _in_frames(self, seconds: float) -> int:
+    def in_frames(self, seconds: float) -> int:
         """Return a time in frames, at least 1."""
-        return max(1, round(seconds * self._fps))
+        return max(1, round(seconds * self.fps))
 
     def environment_state(self, truth: Any) -> NDArray[np.float64]:
         """Report nothing to the brain, shape (n, 0)."""
@@ -240,6 +242,12 @@ class BaseTask(ConfiguredTask):
         """Return an arena that this robot can get through."""
         radius = self.body.radius if isinstance(self.body, MobileBase) else BURGER_RADIUS
         return make_arena(name, seed, random_start, robot_radius=radius)
+
+
+class ArmTask(ConfiguredTask):
+    """What the tasks of arms have in common; their scenes are `TableScene`."""
+
+    robot_kind = "arm"
 
 
 class PathLengths:

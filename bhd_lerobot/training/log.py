@@ -178,7 +178,10 @@ class RunProgress:
 
 def format_numbers(row: Mapping[str, Any], labels: Sequence[tuple[str, str]]) -> str:
     """Return the numbers of a row that have a label, as pairs of key and label, to 4 digits."""
-    return "  ".join(f"{label} {row[key]:.4g}" for key, label in labels if row.get(key) is not None)
+    shown = ((label, row[key]) for key, label in labels if row.get(key) is not None)
+    return "  ".join(
+        f"{label} {value:,.0f}" if 1e4 <= value < 1e15 else f"{label} {value:.4g}" for label, value in shown
+    )
 
 
 SHOWN = (

@@ -87,19 +87,24 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
     """
     path = f"{checkpoint}/{PRETRAINED_MODEL_DIR}"
     kinds = robot_configs()
-    task = (contract.task or {}).get("type")
+    task, found, module = (contract.task or {}).get("type"), contract.task or {}, ""
     if contract.robot_type not in kinds:
         rollout = f"lerobot-rollout --robot.type={contract.robot_type} --policy.path={quoted(path)} --duration=60"
         return ["Let it drive the robot for a minute with:", f"  {rollout}"]
-    if task not in TaskConfig.get_known_choices():
-        task = tasks_for(contract.robot_type)[0]
+    text, usual = "Evaluate it with:", {}
+    if task is None:
+        task, found = tasks_for(contract.robot_type)[0], {}
         text = f"The dataset does not say its task. Evaluate it in simulation at {task!r}, for example, with:"
+    elif task in TaskConfig.get_known_choices():
+        usual = asdict(TaskConfig.get_choice_class(task)())
     else:
-        text = "Evaluate it with:"
+        text = f"Its task {task!r} is of a plug-in that is not installed. Evaluate it, with the plug-in's module, with:"
+        usual = dict.fromkeys(key for key in found if key != "type")
+        module = " --task.discover_packages_path=MODULE"
     options = _options("robot", contract.robot or {}, describe(kinds[contract.robot_type]()))
-    chosen = _options("task", contract.task or {}, asdict(TaskConfig.get_choice_class(task)()))
     command = (
-        f"bhd-eval --robot.type={contract.robot_type}{options} --task.type={task}{chosen} --brain.path={quoted(path)}"
+        f"bhd-eval{module} --robot.type={contract.robot_type}{options} --task.type={task}"
+        f"{_options('task', found, usual)} --brain.path={quoted(path)}"
     )
     return [text, f"  {command}"]
 

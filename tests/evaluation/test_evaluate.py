@@ -123,7 +123,7 @@ def test_counts_and_files_agree(whole):
     new, old = (written["brains"][label]["means"]["score"]["value"] for label in ("new", "old"))
     assert pair["score"]["value"] == pytest.approx(new - old)
     assert set(written["brains"]["old"]["outcomes"]) | set(written["brains"]["new"]["outcomes"]) > {"success"}
-    assert "9 held_out episodes" in printed
+    assert "9 held-out episodes" in printed
     timing = json.loads((folder / "timing.json").read_text())
     assert timing["brains"]["old"]["act"]["calls"] >= 9 * 20
     assert 0 < timing["brains"]["old"]["act"]["p50_s"] <= timing["brains"]["old"]["act"]["p99_s"]

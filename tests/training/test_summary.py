@@ -59,6 +59,16 @@ def test_a_robot_that_is_not_simulated_is_driven_by_lerobot() -> None:
     assert command == "  lerobot-rollout --robot.type=so101_follower --policy.path=c/pretrained_model --duration=60"
 
 
+def test_a_task_of_a_plug_in_that_is_not_installed_is_named_with_its_options() -> None:
+    contract = PolicyContract(robot_type="ur5", task={"type": "hover", "hold_s": 0.4})
+    said, command = how_to_evaluate(contract, "c")
+    assert "'hover' is of a plug-in that is not installed" in said
+    assert command == (
+        "  bhd-eval --task.discover_packages_path=MODULE --robot.type=ur5 --task.type=hover --task.hold_s=0.4 "
+        "--brain.path=c/pretrained_model"
+    )
+
+
 @pytest.mark.parametrize("robot", [TurtleBot3Config(), UR5Config()])
 def test_of_a_simulated_robot_without_a_task_one_of_its_tasks_is_an_example(robot) -> None:
     said, command = how_to_evaluate(PolicyContract(robot_type=robot.type), "c")

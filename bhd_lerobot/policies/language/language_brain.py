@@ -39,10 +39,11 @@ class LanguageBrain(PickBrain):
         super().__init__(config or LanguageBrainConfig())
         self._planner = planner or RulePlanner()
 
-    def _begin(self, sim: int, seed: int, instruction: str) -> None:
+    def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
+        """Take the instruction of the episode, or that of the configuration."""
         config = self.config
         own = config.instruction if isinstance(config, LanguageBrainConfig) else ""
-        super()._begin(sim, seed, own or instruction)
+        super().begin_episode(sim, seed, own or instruction)
 
     def _make_plan(self, work: _Work, objects: Sequence[SeenObject]) -> Plan:
         return self._planner.plan(work.instruction, [scene_object(item) for item in objects])

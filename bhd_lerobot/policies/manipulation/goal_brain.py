@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,24 +49,31 @@ class GoalBrainConfig(BrainConfig):
 class GoalBrain(ConfiguredBrain, ABC):
     """A brain that gives each simulation one goal after the other.
 
-    A subclass decides in `_decide` what comes next; it is called at the start and whenever a goal has ended.
+    A subclass returns the next goal in `decide`, which is called at the start and whenever a goal has ended.
+
+    Attributes:
+        config: the parameters.
+        doing: what each simulation's brain is doing, in words; recorded as the column `subtask`.
+
+    Args:
+        config: the parameters.
     """
 
     robot_kind = "arm"
     has_plan = True
 
-    def __init__(self) -> None:
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
         self._pending: list[str | None] = []
         self._numbers: list[int] = []
-        self._doing: list[str] = []
+        self.doing: list[str] = []
         self._done: list[bool] = []
 
-    @abstractmethod
-    def _begin(self, sim: int, seed: int, instruction: str) -> None:
+    def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
         """Start an episode in one simulation."""
 
     @abstractmethod
-    def _decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
+    def decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
         """Return the next goal of one simulation; None for none any more.
 
         Args:
@@ -79,10 +86,10 @@ class GoalBrain(ConfiguredBrain, ABC):
         """Start episodes in some simulations."""
         if len(self._pending) != n:
             self._pending, self._numbers = [None] * n, [0] * n
-            self._doing, self._done = [""] * n, [False] * n
+            self.doing, self._done = [""] * n, [False] * n
         for place, sim in enumerate(np.asarray(ids).tolist()):
-            self._pending[sim], self._numbers[sim], self._doing[sim], self._done[sim] = None, 0, "", False
-            self._begin(sim, seeds[place], instructions[place] if instructions else "")
+            self._pending[sim], self._numbers[sim], self.doing[sim], self._done[sim] = None, 0, "", False
+            self.begin_episode(sim, seeds[place], instructions[place] if instructions else "")
 
     def act(self, observation: Observation) -> Goals:
         """Return the goals that come next."""
@@ -97,7 +104,7 @@ class GoalBrain(ConfiguredBrain, ABC):
                 if not ends:
                     continue
                 result = ends[-1]
-            command = self._decide(sim, observation, result)
+            command = self.decide(sim, observation, result)
             self._pending[sim] = None if command is None else command.task_id
             self._done[sim] = command is None
             if command is not None:
@@ -106,9 +113,9 @@ class GoalBrain(ConfiguredBrain, ABC):
 
     def subtasks(self) -> Sequence[str]:
         """Return what each simulation's brain is doing, in words."""
-        return self._doing
+        return self.doing
 
-    def _name(self, sim: int, step: str) -> str:
-        """Return a new name for a goal."""
+    def new_id(self, sim: int, step: str) -> str:
+        """Return a new `task_id` for a goal."""
         self._numbers[sim] += 1
         return f"{self._numbers[sim]}-{step}"

@@ -73,8 +73,7 @@ class PickBrain(GoalBrain):
     name = "pick"
 
     def __init__(self, config: PickBrainConfig | None = None) -> None:
-        super().__init__()
-        self.config = config or PickBrainConfig()
+        super().__init__(config or PickBrainConfig())
         self._work: dict[int, _Work] = {}
         self._columns: NDArray[np.intp] = np.zeros(0, np.intp)
         self._opening = 0
@@ -112,10 +111,12 @@ class PickBrain(GoalBrain):
 
     # --- from one goal to the next -----------------------------------------------------------------------------------
 
-    def _begin(self, sim: int, seed: int, instruction: str) -> None:
+    def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
+        """Take the instruction."""
         self._work[sim] = _Work(instruction)
 
-    def _decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
+    def decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
+        """Return the next goal of the plan."""
         work = self._work[sim]
         objects = self._objects(sim, seen)
         if work.plan is None:
@@ -145,12 +146,12 @@ class PickBrain(GoalBrain):
         if work.stage in _LAST_STAGE.get(steps[work.step].skill, ()):
             work.step += 1
             if work.step == len(steps):
-                self._doing[sim] = "done"
+                self.doing[sim] = "done"
                 return None
         if steps[work.step].skill == Skill.HOLD and work.step + 1 < len(steps):
             work.step += 1  # between two goals nothing moves: it was held
         step = steps[work.step]
-        self._doing[sim] = step.text
+        self.doing[sim] = step.text
         if step.skill == Skill.APPROACH and work.stage != "above":
             return self._approach(sim, target, objects)
         if work.grasp is None:
@@ -175,13 +176,13 @@ class PickBrain(GoalBrain):
             command = self._line(sim, "down", grasp, grasp.z)
         elif skill == Skill.GRASP:
             work.stage = "close"
-            command = BrainCommand(self._name(sim, "close"), gripper=max(0.0, grasp.width - _SQUEEZE))
+            command = BrainCommand(self.new_id(sim, "close"), gripper=max(0.0, grasp.width - _SQUEEZE))
         elif skill == Skill.LIFT:
             command = self._line(sim, "lift", grasp, grasp.z + config.lift_m)
         elif skill == Skill.HAND_OVER:
             work.stage = "hand_over"
             command = BrainCommand(
-                self._name(sim, "hand_over"),
+                self.new_id(sim, "hand_over"),
                 target_pose=pointing_down(*_HAND_OVER, yaw=neutral_yaw(*_HAND_OVER[:2])),
                 max_velocity=config.max_velocity / 2,
                 max_acceleration=config.max_acceleration / 2,
@@ -190,7 +191,7 @@ class PickBrain(GoalBrain):
             command = self._line(sim, "put", grasp, grasp.z)
         elif skill == Skill.PLACE:
             work.stage = "release"
-            command = BrainCommand(self._name(sim, "release"), gripper=grasp.opening)
+            command = BrainCommand(self.new_id(sim, "release"), gripper=grasp.opening)
         return command
 
     def _retry(self, sim: int, target: SeenObject, objects: Sequence[SeenObject], problem: str) -> BrainCommand | None:
@@ -205,7 +206,7 @@ class PickBrain(GoalBrain):
         if work.grasp is None:
             return self._next(sim, target, objects)
         work.stage = "back"
-        self._doing[sim] = "let go and try again"
+        self.doing[sim] = "let go and try again"
         # Up first, with the fingers open, from wherever the tool is.
         return self._free(sim, "back", work.grasp, opening=MAX_OPENING)
 
@@ -223,14 +224,14 @@ class PickBrain(GoalBrain):
 
     def _give_up(self, sim: int, problem: str) -> BrainCommand | None:
         self._work[sim].problem = problem
-        self._doing[sim] = f"cannot: {problem}"
+        self.doing[sim] = f"cannot: {problem}"
         return None
 
     def _free(self, sim: int, stage: str, grasp: Grasp, opening: float) -> BrainCommand:
         work, config = self._work[sim], self.config
         work.stage = stage
         return BrainCommand(
-            self._name(sim, stage),
+            self.new_id(sim, stage),
             target_pose=grasp.pose(_TRAVEL),
             gripper=opening,
             max_velocity=config.max_velocity,
@@ -241,7 +242,7 @@ class PickBrain(GoalBrain):
         config = self.config
         self._work[sim].stage = stage
         return BrainCommand(
-            self._name(sim, stage),
+            self.new_id(sim, stage),
             target_pose=grasp.pose(height),
             motion="line",
             max_velocity=config.line_velocity,

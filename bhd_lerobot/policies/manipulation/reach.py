@@ -31,8 +31,7 @@ class ReachBrain(GoalBrain):
     name = "reach"
 
     def __init__(self, config: ReachBrainConfig | None = None) -> None:
-        super().__init__()
-        self.config = config or ReachBrainConfig()
+        super().__init__(config or ReachBrainConfig())
         self._columns: NDArray[np.intp] = np.zeros(0, np.intp)
         self._tries: dict[int, int] = {}
         self._home = ur5().home
@@ -41,19 +40,21 @@ class ReachBrain(GoalBrain):
         """Find the target."""
         self._columns = find_columns(robot.environment_names, _TARGET, self.name, "environment")
 
-    def _begin(self, sim: int, seed: int, instruction: str) -> None:
+    def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
+        """Count attempts from 0."""
         self._tries[sim] = 0
 
-    def _decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
-        if result is not None and result.success and self._doing[sim] != "go home":
-            self._doing[sim] = "hold"
+    def decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
+        """Return the target, or home between two attempts."""
+        if result is not None and result.success and self.doing[sim] != "go home":
+            self.doing[sim] = "hold"
             return None
         if result is not None and not result.success:
             if self._tries[sim] >= self.config.attempts:
-                self._doing[sim] = f"give up: {result.message}"
+                self.doing[sim] = f"give up: {result.message}"
                 return None
-            if self._doing[sim] != "go home":
-                self._doing[sim] = "go home"
+            if self.doing[sim] != "go home":
+                self.doing[sim] = "go home"
                 return self._goal(sim, "home", joint_target=self._home[:-1])
         if seen.environment_state is None:
             raise AssertionError("The brain was bound to a target.")
@@ -61,14 +62,14 @@ class ReachBrain(GoalBrain):
         # Observations are rounded to single precision, and so is the quaternion's length.
         length = math.sqrt(sum(value * value for value in quaternion))
         if not (0.5 < length < 2 and math.isfinite(x + y + z)):
-            self._doing[sim] = "give up: there is no target pose"
+            self.doing[sim] = "give up: there is no target pose"
             return None
         self._tries[sim] += 1
-        self._doing[sim] = "move the tool to the target"
+        self.doing[sim] = "move the tool to the target"
         dx, dy, dz = self.config.camera_error_m
         w, i, j, k = (value / length for value in quaternion)
         return self._goal(sim, "reach", target_pose=Pose((x - dx, y - dy, z - dz), (w, i, j, k)))
 
     def _goal(self, sim: int, step: str, **target: Any) -> BrainCommand:
         speed, acceleration = self.config.max_velocity, self.config.max_acceleration
-        return BrainCommand(self._name(sim, step), max_velocity=speed, max_acceleration=acceleration, **target)
+        return BrainCommand(self.new_id(sim, step), max_velocity=speed, max_acceleration=acceleration, **target)
