@@ -306,7 +306,7 @@ def test_it_roams_without_contact_with_any_scanner(beams: int) -> None:
 
 
 def test_it_sees_more_than_avoidance_and_fails_no_more() -> None:
-    seeds = [episode_seed(7, episode, "train") for episode in range(8)]
-    old, new = run(AvoidanceBrain(), seeds, 8), run(GapFollowerBrain(), seeds, 8)
+    seeds = [episode_seed(7, episode, "train") for episode in range(5)]
+    old, new = (run(brain, seeds, len(seeds), seconds=30) for brain in (AvoidanceBrain(), GapFollowerBrain()))
     assert sum(not outcome.success for outcome in new) <= sum(not outcome.success for outcome in old)
     assert np.mean([outcome.score for outcome in new]) > 1.2 * np.mean([outcome.score for outcome in old])
