@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
-from bhd_lerobot.control.messages import NANOSECONDS, CerebellumState, Request, SendResult, Setpoint
+from bhd_lerobot.control.messages import HORIZON_NS, NANOSECONDS, CerebellumState, Reason, Request, SendResult, Setpoint
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError
 
@@ -92,8 +92,10 @@ class LockstepBridge(ModeRequests):
             due_ns: when it takes effect [ns]; now if None.
             replaces: whether it takes the place of what was sent before and is not due yet.
         """
-        self._sequence += 1
         due = self.now_ns if due_ns is None else due_ns
+        if due - self.now_ns > HORIZON_NS:
+            return self.cerebellum.refuse(Reason.BEYOND_HORIZON, mask)
+        self._sequence += 1
         return self.cerebellum.offer(Setpoint(self._sequence, due, values, replaces), mask)
 
     def send_chunk(self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None) -> list[SendResult]:
@@ -159,13 +161,13 @@ class LockstepBridge(ModeRequests):
         return self.cerebellum.state(self.now_ns)
 
     def estop(self, ids: NDArray[np.intp] | None = None) -> None:
-        """Set the emergency-stop word; the next tick latches it."""
-        self.cerebellum.estop_word[slice(None) if ids is None else ids] = 1
+        """Press the emergency stop; the next tick latches it."""
+        self.cerebellum.estop.press(ids)
 
     @property
     def estop_pressed(self) -> bool:
-        """Whether the emergency-stop word of any simulation is set, be it latched already or not."""
-        return bool(np.any(self.cerebellum.estop_word))
+        """Whether the emergency stop of any simulation is pressed, be it latched already or not."""
+        return bool(np.any(self.cerebellum.estop.pressed))
 
     def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Request a change of mode; it happens before the next tick or is refused with a reason."""

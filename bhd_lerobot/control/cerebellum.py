@@ -6,8 +6,11 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.controller import Controller
+from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo
+from bhd_lerobot.control.guard import Guard, WireLimits
 from bhd_lerobot.control.messages import (
+    HORIZON_NS,
     NANOSECONDS,
     CerebellumState,
     Mode,
@@ -21,6 +24,7 @@ from bhd_lerobot.control.messages import (
 from bhd_lerobot.control.plant import Plant, PlantReading
 
 _TRACKING = int(Mode.TRACKING)  # numpy compares plain numbers faster
+_OLDEST_PERIODS = 3  # a reading that is older than so many is no measurement of the present
 MOVING = 0.01  # [rad/s] a joint faster than this moves: the articles' `is_moving`
 
 # Requests and the modes that they apply in; resets lead to INACTIVE only, motion needs a separate activation.
@@ -44,9 +48,12 @@ class Cerebellum:
         control_hz: ticks a second [Hz].
         controller: what turns commands into actuator commands.
         fifo: where commands come from; a new one if None.
-        estop_word: n 64-bit integers that any process may set to something else than 0; new memory if None.
+        estop: the word of the emergency stop, which any process may press; a new one if None.
 
     Attributes:
+        guard: the last check of what is written to the plant.
+        stamp_origin_ns: time 0 of the ticks, on the clock of the plant's stamps [ns].
+        oldest_ns: a reading that is older than this is a fault [ns]: three periods, if nothing else is set.
         requested: the setpoint that was last taken, before all limits, shape (n, width).
         setpoints_taken: how many have been taken.
 
@@ -60,7 +67,7 @@ class Cerebellum:
         controller: Controller,
         *,
         fifo: CommandFifo | None = None,
-        estop_word: NDArray[np.int64] | None = None,
+        estop: EstopWord | None = None,
     ) -> None:
         self.body, self.plant, self.control_hz = body, plant, control_hz
         self.n = n = plant.n
@@ -68,14 +75,17 @@ class Cerebellum:
         self.width = width = self.controller.width
         self.command = self.controller.command
         self.fifo = CommandFifo(n, width) if fifo is None else fifo
-        self.estop_word = np.zeros(n, np.int64) if estop_word is None else estop_word
+        self.estop = EstopWord(n) if estop is None else estop
         self.mode = np.full(n, Mode.UNCONFIGURED, np.int8)
+        self.guard = Guard(WireLimits.of(body, control_hz), n)
+        self.guard.restart(np.arange(n), controller.actuators)
         self.refusals = np.zeros((len(Reason), n), np.int64)
         self.reading = PlantReading(n, self.controller.joints)
         self.requested = np.zeros((n, width))
         self.setpoints_taken = 0
         self.ticks = 0
 
+        self.stamp_origin_ns, self.oldest_ns = 0, _OLDEST_PERIODS * NANOSECONDS // control_hz
         self._timeout_ns = round(body.limits.command_timeout_s * NANOSECONDS)
         self._last_position = np.zeros_like(self.reading.position)
         # The sum of 0 * x is 0 if and only if every x is finite; unlike a plain sum it neither overflows nor warns.
@@ -83,7 +93,7 @@ class Cerebellum:
         self._zeros = np.zeros_like(self._flat_reading)
         self._configured = np.zeros(n, np.bool_)
         self._last_due = np.zeros(n, np.int64)
-        self._sent_sequence = np.full(n, -1, np.int64)
+        self._sent_sequence, self._taken_sequence = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
         self._sent_due = np.full(n, np.iinfo(np.int64).min, np.int64)
         self._deactivating = np.zeros(n, np.bool_)
         self._deadline: int | None = None  # when the first command of a moving robot becomes too old [ns]
@@ -95,38 +105,45 @@ class Cerebellum:
 
     # --- one tick ----------------------------------------------------------------------------------------------------
 
-    def tick(self, now_ns: int, ticks: int = 1) -> None:
+    def tick(self, now_ns: int) -> None:
         """Run one tick.
+
+        The reference advances by one period, also after ticks that were skipped: it is late then, and what is written
+        to the plant does not jump to where it would be by now.
 
         Args:
             now_ns: the time that the tick is for [ns].
-            ticks: how many periods have passed since the last tick: more than 1 after ticks that were skipped. The
-                reference advances by all of them, each within the limits, so that it stays in step with time.
         """
         self.plant.read(self.reading)
         self._supervise(now_ns)
         self._take_commands(now_ns)
-        for _ in range(ticks):
-            self.controller.run(self.reading)
-            self._follow_controller()
-        self.plant.write(self.controller.actuators)
+        self.controller.run(self.reading)
+        self._follow_controller()
+        unsafe = self.guard.check(self.controller.actuators)
+        if unsafe is not None:
+            self._refuse_to_write(unsafe)
+        self.plant.write(self.guard.written)
         self._last_position[:] = self.reading.position
         self.ticks += 1
 
     def _supervise(self, now_ns: int) -> None:
         """Emergency stop, plant faults and watchdogs: changes of mode that were not requested."""
         # This runs several times a tick: counting is several times cheaper than `any`.
-        if np.count_nonzero(self.estop_word):
-            hit = (self.estop_word != 0) & (self.mode != Mode.ESTOP)
+        pressed = self.estop.see()
+        if np.count_nonzero(pressed):
+            hit = pressed & (self.mode != Mode.ESTOP)
             if hit.any():
                 self._set_mode(hit, Mode.ESTOP)
                 self.estop_latched |= hit
         if self._flat_reading.dot(self._zeros) != 0.0 or np.count_nonzero(self.reading.fault):
             self._handle_fault()
+        if self.reading.stamp_ns.min() < now_ns + self.stamp_origin_ns - self.oldest_ns:
+            self._handle_old_reading(now_ns)
         if self._deadline is not None and now_ns > self._deadline:
             old = (self.mode == Mode.TRACKING) & ~self._by_goal & (now_ns - self._last_due > self._timeout_ns)
             if old.any():
                 self._watchdog[old] |= Watchdog.COMMAND_AGE
+                self.fifo.drop(np.flatnonzero(old))  # what a brain left behind that fell silent moves nothing later
                 self._set_mode(old, Mode.STOPPING)
             self._update_deadline()
         if self._stopping:
@@ -145,16 +162,39 @@ class Cerebellum:
         reading.position[bad] = self._last_position[bad]
         self._set_mode((bad | reading.fault) & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT), Mode.FAULT)
 
+    def _handle_old_reading(self, now_ns: int) -> None:
+        old = self.reading.stamp_ns < now_ns + self.stamp_origin_ns - self.oldest_ns
+        old &= (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT) & (self.mode != Mode.UNCONFIGURED)
+        self._watchdog[old] |= Watchdog.PLANT
+        self._set_mode(old, Mode.FAULT)
+
+    def _refuse_to_write(self, unsafe: NDArray[np.bool_]) -> None:
+        """Stop robots whose actuator commands are not safe: as hard as possible, from the last that were."""
+        self._watchdog[unsafe] |= Watchdog.GUARD
+        self.controller.go_back(unsafe, self.guard.written, self.reading)
+        latched = (self.mode == Mode.ESTOP) | (self.mode == Mode.FAULT)
+        self.controller.stop(unsafe & latched, Mode.FAULT)  # the present stop is not safe either
+        self._set_mode(unsafe & ~latched, Mode.FAULT)
+
     def _take_commands(self, now_ns: int) -> None:
-        """Take what is due from the queue, in order; the newest that is due wins."""
+        """Take what is due from the queue; the newest that is due wins, and at most one for each robot counts."""
         due = self.fifo.next_due()
+        if due is not None and due - now_ns > HORIZON_NS:
+            self.fifo.drop(np.arange(self.n))  # by a sender whose clock is another one
+            return
+        popped = None
         while due is not None and due <= now_ns:
-            popped = self.fifo.pop(self._popped, self._popped_mask)
             if popped is not None:
-                # What was sent before and is due later belongs to an action chunk that a newer one took the place of.
-                self.fifo.drop_older(popped[0], self._popped_mask)
-            # Modes may have changed since the command was sent.
+                self.fifo.keep_newest(now_ns)  # however many are due, a tick takes its time for one
+            popped = self.fifo.pop(self._popped, self._popped_mask)
+            if popped is None:
+                return
+            # What was sent before and is due later belongs to an action chunk that a newer one took the place of.
+            self.fifo.drop_older(popped[0], self._popped_mask)
             take: NDArray[np.bool_] = self._popped_mask
+            take &= self._taken_sequence < popped[0]  # none is taken twice, whatever became of the queue
+            self._taken_sequence[take] = popped[0]
+            # Modes may have changed since the command was sent.
             if now_ns - due > self._timeout_ns or not self._all_track:
                 take = self._sift(take, now_ns - due)
                 self._last_due[take] = due
@@ -172,7 +212,7 @@ class Cerebellum:
         """Whether every robot follows commands, and none is to stop."""
         if np.count_nonzero(self.mode == _TRACKING) < self.n:
             return False
-        return not (np.count_nonzero(self.estop_word) or np.count_nonzero(self._deactivating))
+        return not (np.count_nonzero(self.estop.pressed) or np.count_nonzero(self._deactivating))
 
     def _sift(self, mask: NDArray[np.bool_], age_ns: int) -> NDArray[np.bool_]:
         """Count the robots that refuse a command of this age; return those that take it."""
@@ -278,11 +318,20 @@ class Cerebellum:
         self._count_refusals(reasons)
         return SendResult(reasons)
 
+    def refuse(self, reason: Reason, mask: NDArray[np.bool_] | None = None) -> SendResult:
+        """Count a setpoint that is refused before it gets here; `mask` as for `offer`."""
+        reasons = np.full(self.n, reason, np.int8)
+        if mask is not None:
+            reasons[~mask] = Reason.ACCEPTED
+        self._count_refusals(reasons)
+        return SendResult(reasons)
+
     def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Ask for a change of mode; it happens before the next tick or is refused with a reason.
 
-        `RESET` also clears the emergency-stop word of a latched emergency stop, because only the cerebellum clears its
-        own latch. `ACTIVATE` drops what still waits in the queue: no command from before it can start motion.
+        `RESET` of a latched emergency stop also acknowledges the presses that a tick has seen; the next tick latches
+        those that came later. `ACTIVATE` drops what still waits in the queue: no command from before it can start
+        motion.
         """
         if request == Request.CONFIGURE:
             self.plant.read(self.reading)
@@ -293,7 +342,7 @@ class Cerebellum:
         sources, result = _TRANSITIONS[request]
         allowed = wanted & np.isin(self.mode, [int(source) for source in sources])
         reasons = np.where(wanted & ~allowed, Reason.WRONG_MODE, Reason.ACCEPTED).astype(np.int8)
-        reasons[wanted & ~allowed & ((self.mode == Mode.ESTOP) | (self.estop_word != 0))] = Reason.ESTOP
+        reasons[wanted & ~allowed & ((self.mode == Mode.ESTOP) | self.estop.pressed)] = Reason.ESTOP
         reasons[wanted & ~allowed & (self.mode == Mode.FAULT)] = Reason.FAULT
         if request == Request.RESET:
             # A stop that is not over yet must not become a gentler one.
@@ -307,8 +356,8 @@ class Cerebellum:
             self.refusals[Reason.NOT_ACTIVE, active] += self.fifo.drop(active)
             self._sent_due[active] = np.iinfo(np.int64).min
         if request == Request.RESET:
-            # A word that was set after another latch has not been seen yet: the next tick will.
-            self.estop_word[allowed & (self.mode == Mode.ESTOP)] = 0
+            # A press after another latch has not been seen yet: the next tick will.
+            self.estop.acknowledge(allowed & (self.mode == Mode.ESTOP))
             self.estop_latched &= ~allowed
             self._configure(allowed & ~self._configured)
         self._set_mode(allowed, result)
@@ -323,11 +372,14 @@ class Cerebellum:
         All but an emergency stop that no tick has seen yet: the next one will.
         """
         self.fifo.drop(ids)
-        self.estop_word[ids[self.mode[ids] == Mode.ESTOP]] = 0
+        chosen = np.zeros(self.n, np.bool_)
+        chosen[ids] = True
+        self.estop.acknowledge(chosen & (self.mode == Mode.ESTOP))
         self.mode[ids] = Mode.UNCONFIGURED
         self.controller.restart(ids)
+        self.guard.restart(ids, self.controller.actuators)
         self._configured[ids] = False
-        self._sent_sequence[ids] = -1
+        self._sent_sequence[ids] = self._taken_sequence[ids] = -1
         self._sent_due[ids] = np.iinfo(np.int64).min
         self._last_due[ids] = 0
         self._deactivating[ids] = False
@@ -409,7 +461,7 @@ class Cerebellum:
         reasons = _MODE_REASON[self.mode]
         reasons[self._deactivating] = Reason.NOT_ACTIVE
         # The word counts from the moment that it is set, the mode from the next tick.
-        reasons[self.estop_word != 0] = Reason.ESTOP
+        reasons[self.estop.pressed] = Reason.ESTOP
         return reasons
 
     def _count_refusals(self, reasons: NDArray) -> None:
@@ -424,7 +476,9 @@ class Cerebellum:
             self._deadline = None
 
     def _configure(self, mask: NDArray[np.bool_]) -> None:
-        self.controller.configure(np.flatnonzero(mask), self.reading)
+        ids = np.flatnonzero(mask)
+        self.controller.configure(ids, self.reading)
+        self.guard.restart(ids, self.controller.actuators)
         self._configured |= mask
         np.copyto(self.requested, self.command, where=mask[:, None])
 

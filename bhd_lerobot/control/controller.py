@@ -58,6 +58,16 @@ class Controller(ABC):
         """Advance by one tick."""
 
     @abstractmethod
+    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], reading: PlantReading) -> None:
+        """Make the reference again what is really written to the actuators, whatever it has become; a stop follows.
+
+        Args:
+            mask: the robots, shape (n,).
+            actuators: the last commands that were written, shape (n, joints).
+            reading: the joints now.
+        """
+
+    @abstractmethod
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each robot is commanded to be at rest, shape (n,)."""
 

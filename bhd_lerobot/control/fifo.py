@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
 
+_MOST_READS = 100  # a writer overwrites what is being read once in a great while, and never so many times in a row
+
 
 class CommandFifo:
     """A queue of commands for n simulations.
@@ -119,8 +121,7 @@ class CommandFifo:
     def drop(self, ids: NDArray[np.intp]) -> NDArray[np.int64]:
         """Drop what waits for some simulations, and return how many commands of each that were. For the reader."""
         dropped = np.zeros(len(ids), np.int64)
-        for entry in range(int(self._tail[0]), int(self._head[0])):
-            slot = entry % self.capacity
+        for slot in self._slots():
             dropped += self._mask[slot, ids]
             self._mask[slot, ids] = False
         self._update()
@@ -135,15 +136,40 @@ class CommandFifo:
         """
         if int(self._tail[0]) == int(self._head[0]):
             return
-        slots = np.arange(int(self._tail[0]), int(self._head[0])) % self.capacity
+        slots = self._slots()
         older = slots[self._sequence[slots] < sequence]
         if len(older):
             self._mask[np.ix_(older, np.flatnonzero(mask))] = False
             self._update()
 
+    def keep_newest(self, now_ns: int) -> None:
+        """Drop every command that is due and that a later one, which is due too, takes the place of. For the reader.
+
+        Args:
+            now_ns: what is due by then is due [ns].
+        """
+        slots = self._slots()
+        due = slots[self._due[slots] <= now_ns]
+        # From the newest to the oldest: which simulations have had a newer one.
+        newer = np.logical_or.accumulate(self._mask[due][::-1], axis=0)[::-1]
+        self._mask[due[:-1]] &= ~newer[1:]
+        self._update()
+
+    def _slots(self) -> NDArray[np.intp]:
+        """Return where the entries in use lie, the oldest first."""
+        tail, head = self._ends()
+        return np.arange(tail, head) % self.capacity
+
+    def _ends(self) -> tuple[int, int]:
+        """Return tail and head; a queue that cannot be, because another process wrote garbage, is emptied."""
+        tail, head = int(self._tail[0]), int(self._head[0])
+        if not 0 <= head - tail <= self.capacity:
+            self._tail[0] = tail = head
+        return tail, head
+
     def _update(self) -> None:
         """Find the next entry, and release the oldest entries that are for no simulation any more."""
-        tail, head = int(self._tail[0]), int(self._head[0])
+        tail, head = self._ends()
         self._seen_head = head
         self._next, self._next_due = None, None
         if tail == head:
@@ -212,14 +238,19 @@ class StateRing:
         self._count[0] = count + 1
 
     def latest(self) -> NDArray | None:
-        """Return a copy of the newest state, or None if there is none yet."""
-        while True:
+        """Return a copy of the newest state, or None if there is none yet.
+
+        None also if none could be read whole in many attempts: the reader of a real-time loop does not hang because
+        another process wrote garbage.
+        """
+        for _ in range(_MOST_READS):
             count = len(self)
             if count == 0:
                 return None
             state = self.copy(count - 1)
             if state is not None:
                 return state
+        return None
 
     def copy(self, number: int) -> NDArray | None:
         """Return a copy of one state, or None if it has been overwritten.

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 NANOSECONDS = 1_000_000_000
+HORIZON_NS = 10 * NANOSECONDS
+"""A command that is due later than this is refused [ns]: 100 frames at 10 fps, the action chunks of most policies."""
 
 
 class Mode(IntEnum):
@@ -52,6 +54,7 @@ class Reason(IntEnum):
     WRONG_MODE = 9
     NOT_AT_REST = 10
     NO_POSTURE = 11
+    BEYOND_HORIZON = 12
 
     @property
     def explanation(self) -> str:
@@ -72,6 +75,8 @@ _EXPLANATIONS = {
     "fault, fell silent or was too late; clear the cause, then call reset() and activate()",
     Reason.WRONG_MODE: "the request does not apply in the present mode",
     Reason.NO_POSTURE: "no admissible posture of the arm puts the tool there",
+    Reason.BEYOND_HORIZON: f"the command is due more than {HORIZON_NS // NANOSECONDS} s from now; send shorter action "
+    "chunks, more often",
     Reason.NOT_AT_REST: "the robot is still stopping; ask again when it is at rest",
 }
 
@@ -94,7 +99,7 @@ class Limit(IntFlag):
     ACCELERATION = 4
     """Slowed to the acceleration limit."""
     EFFORT = 8
-    """The commanded effort is above the servo's largest: a wheel's command is clipped, an arm's servo saturates."""
+    """The commanded effort is above the servo's largest: the servo gives its largest, the command stays as it is."""
     POSITION = 16
     """Clipped to the range of the joint."""
 
@@ -112,9 +117,12 @@ class Watchdog(IntFlag):
     RECORDER = 8
     """The recorder's process showed no sign of life for its time-out; the robot decelerates and holds."""
     PLANT = 16
-    """The plant's process showed no sign of life for its time-out: mode FAULT."""
+    """The plant showed no sign of life for its time-out, or its readings were too old: mode FAULT."""
     MISSES = 32
     """So many ticks in a row came too late that the loop is no control loop any more: mode FAULT."""
+    GUARD = 64
+    """What was to be written to an actuator was not finite, out of its range, or too far from the last: mode FAULT, and
+    the last safe command stays until the stop begins."""
 
 
 class Request(IntEnum):

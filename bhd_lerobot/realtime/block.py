@@ -12,6 +12,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.realtime.shared_memory import SharedBlock
 
@@ -32,7 +33,9 @@ class Word(IntEnum):
     END = 4
     """Not 0: the process is to end. Written by the brain's process."""
     ESTOP = 5
-    """Not 0: emergency stop. Any process may set it; the cerebellum clears it on a reset."""
+    """The last press of the emergency stop, monotonic [ns]: see `EstopWord`. Any process may write it."""
+    ESTOP_ACKNOWLEDGED = 6
+    """The press that a reset acknowledged; if it is not the last one: emergency stop. Written by the cerebellum."""
     BRAIN_ALIVE = 8
     """When the brain's process last showed that it lives, monotonic [ns]; 0: it is not watched."""
     CEREBELLUM_ALIVE = 9
@@ -111,6 +114,7 @@ class LiveBlock:
 
     Attributes:
         words: the words, shape (64,).
+        estop: the word of the emergency stop.
         fifo: the commands.
         ring: the states.
 
@@ -124,6 +128,7 @@ class LiveBlock:
         self.name, self.about = block.name, block.about
         self.words: NDArray[np.int64] = np.frombuffer(block.section("words"), np.int64)
         self.state_dtype = npy.descr_to_dtype(_tuples(layout["state"]))
+        self.estop = EstopWord(1, self.words[Word.ESTOP : Word.ESTOP_ACKNOWLEDGED + 1])
         self.fifo = CommandFifo(1, layout["width"], layout["fifo_capacity"], block.section("fifo"))
         self.ring = StateRing(self.state_dtype, layout["ring_capacity"], block.section("ring"))
 
@@ -151,8 +156,8 @@ class LiveBlock:
         return self._block.is_held
 
     def set_estop(self) -> None:
-        """Set the word of the emergency stop of a robot that is watched."""
-        self._block.write("words", 8 * Word.ESTOP, np.int64(1).tobytes())
+        """Press the emergency stop of a robot that is watched."""
+        self._block.write("words", 8 * Word.ESTOP, np.int64(time.monotonic_ns()).tobytes())
 
     def section(self, name: str) -> memoryview:
         """Return the memory of a further section."""
@@ -161,11 +166,6 @@ class LiveBlock:
     def has(self, name: str) -> bool:
         """Return whether there is a section of this name."""
         return self._block.has(name)
-
-    @property
-    def estop_word(self) -> NDArray[np.int64]:
-        """The word of the emergency stop, shape (1,): any process may set it."""
-        return self.words[Word.ESTOP : Word.ESTOP + 1]
 
     def show_life(self, word: Word) -> None:
         """Note that this process lives."""

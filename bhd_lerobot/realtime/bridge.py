@@ -11,6 +11,7 @@ from bhd_lerobot.bodies.body import Rates
 from bhd_lerobot.control.bridge import ModeRequests
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.messages import (
+    HORIZON_NS,
     NANOSECONDS,
     CerebellumState,
     Mode,
@@ -109,13 +110,15 @@ class LiveBridge(ModeRequests):
     def _refusal(self, values: NDArray[np.float64], due_ns: int) -> Reason:
         if np.shape(values) != (1, self._block.fifo.width) or np.asarray(values).dtype.kind not in "fiu":
             return Reason.WRONG_WIDTH
-        if self._block.words[Word.ESTOP]:
+        if self.estop_pressed:
             return Reason.ESTOP
         reason = mode_reason(Mode(int(self.latest["mode"][0])))
         if reason != Reason.ACCEPTED:
             return reason
         if due_ns < self._last_due:
             return Reason.OUT_OF_ORDER
+        if due_ns - self.now_ns > HORIZON_NS:
+            return Reason.BEYOND_HORIZON
         return Reason.ACCEPTED if np.isfinite(values).all() else Reason.NON_FINITE
 
     def send_chunk(self, values: NDArray[np.float64], start_ns: int | None = None) -> list[SendResult]:
@@ -178,13 +181,13 @@ class LiveBridge(ModeRequests):
         return CerebellumState(stamp_ns=int(state["due_ns"]) - start, **{name: state[name].copy() for name in names})
 
     def estop(self, ids: NDArray[np.intp] | None = None) -> None:
-        """Set the emergency-stop word; the next tick latches it."""
-        self._block.words[Word.ESTOP] = 1
+        """Press the emergency stop; the next tick latches it."""
+        self._block.estop.press()
 
     @property
     def estop_pressed(self) -> bool:
-        """Whether the emergency-stop word is set, be it latched already or not."""
-        return bool(self._block.words[Word.ESTOP])
+        """Whether the emergency stop is pressed, be it latched already or not."""
+        return bool(self._block.estop.pressed[0])
 
     def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Request a change of mode, and wait until it is published.

@@ -100,7 +100,7 @@ class RealtimeLoop:
         start = clock() + period if start_ns is None else start_ns
         grid = TickGrid(start, period, self.limits.most_misses)
         words[Word.EXECUTED : Word.CATCH_UP_LOST + 1] = 0
-        words[Word.START] = start
+        words[Word.START] = self.cerebellum.stamp_origin_ns = start
         words[Word.SEGMENT] += 1
         words[Word.PHASE] = Phase.RUNNING
         ended = start
@@ -132,7 +132,7 @@ class RealtimeLoop:
         if slot.skipped:
             ticks += min(slot.skipped, self.limits.most_catch_up)
             self.words[Word.CATCH_UP_LOST] += slot.skipped + 1 - ticks
-        self.cerebellum.tick(now, ticks)
+        self.cerebellum.tick(now)
         self._advance(ticks)
         self._publish(slot, started_ns, ended_ns, grid)
 

@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.fifo import StateRing
+from bhd_lerobot.control.guard import Guard
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.realtime.block import LiveBlock
 
 _COMMANDS = 8  # capacity of the ring; only the newest counts
+_START_TICKS = 4  # a first command may be so many ticks' largest change away from where the robot is
 
 
 class PlantPhase(IntEnum):
@@ -149,7 +151,8 @@ class RemotePlant:
         """Take the newest state, and return it."""
         published = len(self._states)
         if published != self._seen:
-            self._seen, self.state = published, self._states.latest()
+            self._seen, newest = published, self._states.latest()
+            self.state = self.state if newest is None else newest
         return self.state
 
     @property
@@ -167,6 +170,7 @@ class RemotePlant:
         state = self.refresh()
         if state is not None:
             out.position[:], out.velocity[:] = state["position"], state["velocity"]
+            out.stamp_ns[:] = state["stamp_ns"]
         out.fault[:] = self.has_stopped
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
@@ -195,16 +199,18 @@ class CommandGuard:
     Args:
         link: the rings.
         timeout_ns: age at which a command is too old, and so long may the plant itself be away [ns].
+        wire: what may be written to the actuators; a command beyond it stops the plant.
+        period_ns: of a tick [ns].
     """
 
-    def __init__(self, link: PlantLink, timeout_ns: int) -> None:
-        self._commands, self._timeout_ns = link.commands, timeout_ns
+    def __init__(self, link: PlantLink, timeout_ns: int, wire: Guard, period_ns: int) -> None:
+        self._commands, self._timeout_ns, self._wire, self._period_ns = link.commands, timeout_ns, wire, period_ns
         self.phase = PlantPhase.WAITING
         self.stops = self.stopped_ns = self.number = self.stamp_ns = 0
-        self.actuators = np.zeros((1, link.shape.joints))
-        self._begun = self._acknowledged = self._seen = 0
+        self.actuators: NDArray[np.float64] = wire.written  # the same array
+        self._begun = self._acknowledged = self._seen = self._taken_ns = 0
         self._checked_ns: int | None = None
-        self._finite = True
+        self._is_safe = True
 
     def place(self) -> None:
         """Forget a stop: the robot was put somewhere else, at rest."""
@@ -218,16 +224,17 @@ class CommandGuard:
         if self.phase == PlantPhase.DRIVEN:
             self.phase = PlantPhase.WAITING
 
-    def check(self, now_ns: int) -> PlantPhase:
+    def check(self, now_ns: int, position: NDArray[np.float64]) -> PlantPhase:
         """Return who commands the actuators now.
 
         Args:
             now_ns: the time [ns].
+            position: of the joints as they were read last, shape (1, joints).
         """
-        self._take()
+        self._take(now_ns, position)
         before, self._checked_ns = self._checked_ns, now_ns
         away = before is not None and now_ns - before > self._timeout_ns
-        good = self.number > self._begun and self._finite and now_ns - self.stamp_ns <= self._timeout_ns
+        good = self.number > self._begun and self._is_safe and now_ns - self.stamp_ns <= self._timeout_ns
         if self.phase == PlantPhase.DRIVEN:
             if away or not good:
                 self.phase = PlantPhase.STOPPED
@@ -237,14 +244,19 @@ class CommandGuard:
             self.phase = PlantPhase.DRIVEN
         return self.phase
 
-    def _take(self) -> None:
+    def _take(self, now_ns: int, position: NDArray[np.float64]) -> None:
         written = len(self._commands)
         if written == self._seen:
             return
         self._seen = written
         command: Any = self._commands.latest()
+        if command is None:
+            return  # nothing that is whole: the last one grows old
+        # What was sent since the last tick counts, but no more of it than there was time for.
+        ticks = min(int(command["number"]) - self.number, (now_ns - self._taken_ns) // self._period_ns + 1)
+        if self.phase != PlantPhase.DRIVEN:
+            self._wire.start(command["actuators"], position)
+            ticks = _START_TICKS
         self.number, self.stamp_ns = int(command["number"]), int(command["stamp_ns"])
-        self._acknowledged = int(command["acknowledged"])
-        self._finite = bool(np.isfinite(command["actuators"]).all())
-        if self._finite:
-            self.actuators[:] = command["actuators"]
+        self._acknowledged, self._taken_ns = int(command["acknowledged"]), now_ns
+        self._is_safe = self._wire.check(command["actuators"], ticks) is None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.control.messages import NANOSECONDS, Request, SendResult, Setpoint
 from bhd_lerobot.control.plant import PlantReading
@@ -133,8 +134,8 @@ def publish_states(path: Path, count: int) -> None:
 
 
 def set_word(path: Path, _: int) -> None:
-    """Set the emergency-stop word of the second of two simulations."""
-    np.frombuffer(shared_block(path), np.int64, 2)[1] = 1
+    """Press the emergency stop of the second of two simulations."""
+    EstopWord(2, shared_block(path)).press(np.array([1]))
 
 
 if __name__ == "__main__":

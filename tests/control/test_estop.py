@@ -234,7 +234,7 @@ def test_a_closed_file_is_no_input(inputs):
 def test_an_emergency_stop_that_no_tick_has_seen_survives_a_restart():
     """Pressed between two episodes: the next one begins stopped."""
     rig = Rig()
-    rig.cerebellum.estop_word[0] = 1
+    rig.cerebellum.estop.press()
     rig.cerebellum.restart(np.arange(1))
     rig.request(Request.CONFIGURE)
     rig.request(Request.ACTIVATE)

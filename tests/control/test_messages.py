@@ -23,5 +23,5 @@ def test_recorded_enum_values_are_stable() -> None:
         "NON_FINITE": 1, "VELOCITY": 2, "ACCELERATION": 4, "EFFORT": 8, "POSITION": 16,
     }  # fmt: skip
     assert {flag.name: int(flag) for flag in Watchdog} == {
-        "COMMAND_AGE": 1, "BLOCKED": 2, "BRAIN": 4, "RECORDER": 8, "PLANT": 16, "MISSES": 32,
+        "COMMAND_AGE": 1, "BLOCKED": 2, "BRAIN": 4, "RECORDER": 8, "PLANT": 16, "MISSES": 32, "GUARD": 64,
     }  # fmt: skip

@@ -5,7 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Watchdog
 from tests.cases import each_case
 from tests.control import support
@@ -33,7 +36,7 @@ def in_mode(mode: Mode) -> Rig:
         rig.request(Request.DEACTIVATE)
         rig.tick(100)
     elif mode == Mode.ESTOP:
-        rig.cerebellum.estop_word[0] = 1
+        rig.cerebellum.estop.press()
         rig.tick(60)  # to rest
     elif mode == Mode.FAULT:
         rig.plant.fault[0] = True
@@ -97,7 +100,7 @@ def test_a_setpoint_in_every_mode(mode: Mode) -> None:
 @each_case("mode", list(Mode))
 def test_an_emergency_stop_in_every_mode(mode: Mode) -> None:
     rig = in_mode(mode)
-    rig.cerebellum.estop_word[0] = 1
+    rig.cerebellum.estop.press()
     rig.tick()
     assert rig.mode == Mode.ESTOP
     assert rig.cerebellum.state(rig.now).emergency_stop.all()
@@ -282,7 +285,7 @@ def test_an_emergency_stop_ramps_down_from_the_next_tick(twist: tuple[float, flo
         rig.send(*twist)
         rig.tick(90)
     assert rig.command == list(twist)
-    rig.cerebellum.estop_word[0] = 1
+    rig.cerebellum.estop.press()
     ramp = [np.abs(rig.command)]
     for _ in range(60):
         rig.tick()
@@ -305,7 +308,7 @@ def test_commands_after_an_emergency_stop_are_refused_and_counted() -> None:
 
 def test_a_command_is_refused_from_the_moment_that_the_word_is_set() -> None:
     rig = in_mode(Mode.TRACKING)
-    rig.cerebellum.estop_word[0] = 7
+    rig.cerebellum.estop.press()
     assert rig.send(0.1).reasons.tolist() == [Reason.ESTOP]
 
 
@@ -330,7 +333,7 @@ def test_after_a_latch_motion_needs_reset_and_activate(mode: Mode) -> None:
 
 
 def stop_by_word(rig: Rig) -> None:
-    rig.cerebellum.estop_word[0] = 1
+    rig.cerebellum.estop.press()
 
 
 def stop_by_fault(rig: Rig) -> None:
@@ -388,7 +391,7 @@ def test_a_deactivation_is_not_undone_by_a_setpoint() -> None:
 def test_an_unprocessed_emergency_stop_survives_the_reset_of_another_latch() -> None:
     for mode in (Mode.FAULT, Mode.SAFE_OFF):
         rig = in_mode(mode)
-        rig.cerebellum.estop_word[0] = 1
+        rig.cerebellum.estop.press()
         rig.request(Request.RESET)
         rig.tick()
         assert rig.mode == Mode.ESTOP
@@ -396,7 +399,7 @@ def test_an_unprocessed_emergency_stop_survives_the_reset_of_another_latch() -> 
 
 def test_a_reset_waits_until_the_stop_is_over() -> None:
     rig = in_mode(Mode.TRACKING)
-    rig.cerebellum.estop_word[0] = 1
+    rig.cerebellum.estop.press()
     rig.tick(3)
     assert rig.command[0] > 0
     assert rig.request(Request.RESET).reasons.tolist() == [Reason.NOT_AT_REST]
@@ -411,7 +414,7 @@ def test_a_reset_waits_until_the_stop_is_over() -> None:
 def test_a_stop_before_the_configuration_leaves_odometry_at_zero() -> None:
     rig = Rig(active=False)
     rig.plant.position[:] = 12.5
-    rig.cerebellum.estop_word[0] = 1
+    rig.cerebellum.estop.press()
     rig.tick()
     assert rig.request(Request.RESET).accepted.all()
     assert rig.request(Request.ACTIVATE).accepted.all()
@@ -421,19 +424,54 @@ def test_a_stop_before_the_configuration_leaves_odometry_at_zero() -> None:
 
 def test_only_a_reset_clears_the_latch() -> None:
     rig = in_mode(Mode.ESTOP)
-    rig.cerebellum.estop_word[0] = 0
     rig.tick(10)
     assert rig.mode == Mode.ESTOP
-    rig.cerebellum.estop_word[0] = 1
     rig.request(Request.RESET)
-    assert rig.cerebellum.estop_word.tolist() == [0]
+    assert not rig.cerebellum.estop.pressed.any()
     rig.tick()
     assert rig.mode == Mode.INACTIVE
 
 
+@given(st.lists(st.sampled_from(["press", "tick", "reset", "activate", "send"]), min_size=1, max_size=40))
+def test_no_press_is_lost_however_presses_and_resets_meet(history: list[str]) -> None:
+    """A press that no tick has seen yet is never acknowledged: the next tick latches it, whatever came first."""
+    rig = in_mode(Mode.TRACKING)
+    unseen = False
+    for what in history:
+        if what == "press":
+            rig.cerebellum.estop.press()
+            unseen = True
+        elif what == "tick":
+            rig.tick()
+            assert not unseen or rig.mode == Mode.ESTOP
+            unseen = False
+        elif what == "send":
+            taken = rig.send(0.2).accepted[0]
+            assert not (taken and unseen)
+        else:
+            rig.request(Request.RESET if what == "reset" else Request.ACTIVATE)
+
+
+def test_a_press_in_the_middle_of_a_reset_is_not_lost() -> None:
+    rig = in_mode(Mode.ESTOP)
+    word = rig.cerebellum.estop
+    acknowledge = word.acknowledge
+
+    def meanwhile(mask: np.ndarray) -> None:
+        word.press()  # before the store of the acknowledgement
+        acknowledge(mask)
+
+    word.acknowledge = meanwhile  # type: ignore[method-assign]
+    assert rig.request(Request.RESET).accepted.all()
+    assert rig.request(Request.ACTIVATE).accepted.all()
+    assert rig.send(0.2).reasons.tolist() == [Reason.ESTOP]
+    rig.tick()
+    assert rig.mode == Mode.ESTOP
+
+
 def test_another_process_can_stop_one_of_two_robots(tmp_path: Path) -> None:
     path = tmp_path / "word"
-    rig = Rig(2, estop_word=np.frombuffer(support.shared_block(path, 16), np.int64, 2))
+    rig = Rig(2, estop=EstopWord(2, support.shared_block(path, 32)))
     rig.send(0.2)
     rig.tick(20)
     assert (rig.cerebellum.mode == Mode.TRACKING).all()
@@ -451,7 +489,7 @@ def test_a_restart_forgets_the_episode_before_in_the_simulations_named_only() ->
     rig.send(0.2, 0.5)
     rig.send(0.1, due=rig.now + 500 * TICK_NS)
     rig.tick(20)
-    rig.cerebellum.estop_word[:] = 1
+    rig.cerebellum.estop.press()
     rig.tick()
     rig.send(0.2)
     before = rig.cerebellum.command[1].tobytes()
@@ -463,7 +501,7 @@ def test_a_restart_forgets_the_episode_before_in_the_simulations_named_only() ->
     assert state.joint_efforts[0].tolist() == (-state.joint_velocities[0] * support.BODY.drive.servo_gain).tolist()
     assert rig.cerebellum.command[1].tobytes() == before
     assert rig.cerebellum.refusals.sum(axis=0).tolist() == [0, 1]
-    assert rig.cerebellum.estop_word.tolist() == [0, 1]
+    assert rig.cerebellum.estop.pressed.tolist() == [False, True]
     ids = np.array([0])
     rig.request(Request.CONFIGURE, ids)
     rig.request(Request.ACTIVATE, ids)

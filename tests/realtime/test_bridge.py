@@ -41,7 +41,7 @@ class Rig:
         other = LiveBlock.attach(self.block.name)
         self.other = other
         self.cerebellum = Cerebellum(
-            BODY, PerfectPlant(1), HZ, BaseController(BODY, 1, HZ), fifo=other.fifo, estop_word=other.estop_word
+            BODY, PerfectPlant(1), HZ, BaseController(BODY, 1, HZ), fifo=other.fifo, estop=other.estop
         )
         requests, events = (Mailbox(request_dtype(0), buffer=other.section("requests")),
                             Mailbox(EVENT_DTYPE, buffer=other.section("events")))  # fmt: skip
@@ -102,7 +102,7 @@ class Rig:
         first = self.start
         plain = self.cerebellum.tick
         offset = next_due - first
-        self.cerebellum.tick = lambda now, ticks=1: plain(now + offset, ticks)  # type: ignore[method-assign]
+        self.cerebellum.tick = lambda now: plain(now + offset)  # type: ignore[method-assign]
         try:
             self.loop.run(next_due)
         finally:

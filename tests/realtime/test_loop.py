@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, Request, Watchdog
 from bhd_lerobot.realtime.block import WORDS, Phase, Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
@@ -34,7 +35,7 @@ class VirtualLoop:
         self.now = self.begin = 10**15
         self.rig = Rig()
         self.words = np.zeros(WORDS, np.int64)
-        self.rig.cerebellum.estop_word = self.words[Word.ESTOP : Word.ESTOP + 1]
+        self.rig.cerebellum.estop = EstopWord(1, self.words[Word.ESTOP : Word.ESTOP_ACKNOWLEDGED + 1])
         self.delays, self.work, self.alive = delays, work, set(alive)
         self.script: dict[int, Callable[[], object]] = {}
         self.until = 0  # executed ticks after which the loop is to pause
@@ -42,16 +43,16 @@ class VirtualLoop:
         self.starts: list[int] = []
         self.counted: list[tuple[int, int, int, int]] = []
         self.served: list[int] = []
-        self.given: list[tuple[int, int]] = []  # arguments of `tick`: the time, and periods that passed
-        self.advanced = 0
+        self.given: list[int] = []  # the times that `tick` was called with
+        self.passed: list[int] = []  # periods by which the plant went on
         self.modes: list[int] = []
         self.speeds: list[float] = []
         self.watchdogs: list[int] = []
         tick = self.rig.cerebellum.tick
 
-        def spy(now_ns: int, ticks: int = 1) -> None:
-            self.given.append((now_ns, ticks))
-            tick(now_ns, ticks)
+        def spy(now_ns: int) -> None:
+            self.given.append(now_ns)
+            tick(now_ns)
 
         self.rig.cerebellum.tick = spy  # type: ignore[method-assign]
         self.loop = RealtimeLoop(
@@ -80,7 +81,7 @@ class VirtualLoop:
         self.served.append(now_ns)
 
     def _advance(self, ticks: int) -> None:
-        self.advanced += ticks
+        self.passed.append(ticks)
 
     def _publish(self, slot: Slot, started_ns: int, ended_ns: int, grid: TickGrid) -> None:
         tick = len(self.slots)
@@ -127,8 +128,8 @@ def test_the_grid_is_absolute_and_every_period_is_accounted_for(delays, work, ca
     ticks = max(len(delays), len(work)) + 2
     grid = loop.run(ticks)
     last = -1
-    for slot, started, (due, counted_start, ended, skipped), (now, periods) in zip(
-        loop.slots, loop.starts, loop.counted, loop.given, strict=True
+    for slot, started, (due, counted_start, ended, skipped), now, periods in zip(
+        loop.slots, loop.starts, loop.counted, loop.given, loop.passed, strict=True
     ):
         assert due == slot.due_ns == start + slot.index * TICK_NS  # never re-anchored
         assert 0 <= started - due < TICK_NS
@@ -140,8 +141,7 @@ def test_the_grid_is_absolute_and_every_period_is_accounted_for(delays, work, ca
     words = loop.words
     assert words[Word.EXECUTED] == grid.executed == ticks
     assert words[Word.EXECUTED] + words[Word.SKIPPED] == last + 1  # the periods that passed
-    assert loop.advanced == sum(periods for _, periods in loop.given)
-    assert words[Word.CATCH_UP_LOST] == last + 1 - loop.advanced
+    assert words[Word.CATCH_UP_LOST] == last + 1 - sum(loop.passed)
     assert words[Word.CEREBELLUM_ALIVE] == loop.counted[-1][2]
 
 
@@ -149,7 +149,7 @@ def test_ticks_beyond_the_catch_up_are_lost_and_counted():
     loop = VirtualLoop(LoopLimits(most_misses=10, most_catch_up=3), work=(0, 8 * TICK_NS + 1))
     loop.run(4)
     assert [slot.skipped for slot in loop.slots] == [0, 0, 7, 0]
-    assert [periods for _, periods in loop.given] == [1, 1, 4, 1]
+    assert loop.passed == [1, 1, 4, 1]
     assert loop.words[Word.CATCH_UP_LOST] == 4
     assert loop.words[Word.OVERRUNS] == 1
 
@@ -249,7 +249,7 @@ def test_the_stop_word_takes_effect_at_the_next_executed_tick(tick, delays):
 
     def press() -> None:
         driving()
-        loop.words[Word.ESTOP] = 1
+        loop.rig.cerebellum.estop.press()
 
     loop.script[tick] = press
     loop.run(100)
@@ -259,7 +259,7 @@ def test_the_stop_word_takes_effect_at_the_next_executed_tick(tick, delays):
     assert loop.speeds[tick] < loop.speeds[tick - 1] or loop.speeds[tick] == 0.0
     assert np.all(np.diff(loop.speeds[tick - 1 :]) <= 0)
     assert loop.speeds[-1] == 0.0
-    assert loop.words[Word.ESTOP] == 1  # only a reset clears it
+    assert loop.rig.cerebellum.estop.pressed.all()  # only a reset acknowledges it
 
 
 def test_reset_and_activation_lead_out_of_an_emergency_stop_between_late_ticks():
@@ -277,13 +277,13 @@ def test_reset_and_activation_lead_out_of_an_emergency_stop_between_late_ticks()
 
     loop.loop._serve = serve
     loop.drive(0, 30)
-    loop.script[31] = lambda: loop.words.__setitem__(int(Word.ESTOP), 1)
+    loop.script[31] = loop.rig.cerebellum.estop.press
     loop.run(100)
     refusals = answers.count(Reason.NOT_AT_REST)
     assert refusals > 0
     assert answers == [Reason.NOT_AT_REST] * refusals + [Reason.ACCEPTED] * 2
     assert loop.modes[-1] == Mode.HOLD
-    assert loop.words[Word.ESTOP] == 0
+    assert not loop.rig.cerebellum.estop.pressed.any()
 
 
 def test_a_pause_ends_the_segment_and_the_next_starts_at_tick_0():

@@ -11,12 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bhd_lerobot.control.guard import Guard, WireLimits
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, PlantShape, RemotePlant
 
 SHAPE = PlantShape(joints=2, positions=9, velocities=8, features=300, touches=1, capacity=4)
 MS = 1_000_000
 TIMEOUT = 20 * MS
+
+
+def anything() -> Guard:
+    """Return a guard that lets all finite commands through."""
+    far = np.full(2, 1e9)
+    return Guard(WireLimits(-far, far, far, np.full(2, np.nan)), 1)
 
 
 class Rig:
@@ -26,7 +33,7 @@ class Rig:
         self.now = 1000 * MS
         self.link = PlantLink(SHAPE)
         self.remote = RemotePlant(self.link, lambda: self.now)
-        self.guard = CommandGuard(self.link, timeout_ns)
+        self.guard = CommandGuard(self.link, timeout_ns, anything(), MS)
         self.guard.begin()
 
     def send(self, value: float = 1.0) -> None:
@@ -34,7 +41,7 @@ class Rig:
 
     def check(self, after_ms: float = 0.0) -> PlantPhase:
         self.now += round(after_ms * MS)
-        return self.guard.check(self.now)
+        return self.guard.check(self.now, np.zeros((1, 2)))
 
     def publish_state(self) -> PlantReading:
         """Publish the state of the guard, and return the cerebellum's reading of it."""
@@ -225,7 +232,7 @@ def test_another_process_never_shows_half_of_a_command_or_of_a_state(tmp_path: P
     path = tmp_path / "block"
     path.write_bytes(bytes(sum(SHAPE.sections().values()) + 128))
     link = PlantLink(SHAPE, *memory_of(path))
-    guard = CommandGuard(link, 10**12)
+    guard = CommandGuard(link, 10**12, anything(), MS)
     remote = RemotePlant(link)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     process = subprocess.Popen([sys.executable, __file__, str(path)], env=environment)
@@ -233,7 +240,7 @@ def test_another_process_never_shows_half_of_a_command_or_of_a_state(tmp_path: P
         seen, newest = 0, 0
         while guard.number < COUNT or len(link.states) < COUNT:
             assert process.poll() in (None, 0)
-            guard.check(0)
+            guard.check(0, np.zeros((1, 2)))
             assert guard.number >= newest
             newest = guard.number
             assert guard.actuators.tolist() == [[float(newest)] * 2]

@@ -109,7 +109,7 @@ def test_modes() -> None:
     assert pair.client.request(Request.CONFIGURE) == Reason.ACCEPTED
     assert pair.client.request(Request.ACTIVATE) == Reason.ACCEPTED
     assert pair.mode == Mode.HOLD
-    pair.cerebellum.estop_word[0] = 1
+    pair.cerebellum.estop.press()
     pair.tick()
     assert pair.client.request(Request.ACTIVATE) == Reason.ESTOP
     assert pair.client.request(Request.RESET) == Reason.ACCEPTED
@@ -179,7 +179,7 @@ def test_an_emergency_stop_ends_goals_and_refuses_others() -> None:
     pair = Pair()
     pair.client.submit(goal("a", 2.0))
     pair.tick(50)
-    pair.cerebellum.estop_word[0] = 1
+    pair.cerebellum.estop.press()
     refusal = pair.client.submit(goal("b"))
     assert refusal is not None
     assert refusal.code == ResultCode.ESTOP
@@ -313,7 +313,7 @@ def test_every_goal_that_was_answered_has_one_result(script: list, capacity: int
         elif kind == "cancel":
             pair.client.cancel(str(value))
         elif kind == "estop":
-            pair.cerebellum.estop_word[0] = 1
+            pair.cerebellum.estop.press()
         elif kind == "mode":
             assert isinstance(pair.client.request(value), Reason)
         elif kind == "take":

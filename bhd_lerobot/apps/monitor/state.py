@@ -212,7 +212,7 @@ class Sampler:
             phase=phase.name,
             episode=int(words[Word.SEGMENT]),
             episode_time=max(0, now - int(words[Word.START])) / NANOSECONDS if running else None,
-            estop=bool(words[Word.ESTOP]),
+            estop=bool(words[Word.ESTOP] != words[Word.ESTOP_ACKNOWLEDGED]),
             control_rate=rates.get("executed"),
             control_hz=int(about["control_hz"]),
             frame_rate=rates.get("frames"),

@@ -51,6 +51,7 @@ class ArmController(Controller):
         self._off_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
         self._unwatched: NDArray[np.bool_] = np.zeros(n, np.bool_)  # stopped hard, or on the way back already
         self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
+        self._speed = np.asarray(limits.velocity)
         self._most_off_ticks = round(BLOCKED_S * control_hz)
         self._lead = np.asarray(arm.servo_damping) / np.asarray(arm.servo_stiffness)
         self._stiffness, self._damping = np.asarray(arm.servo_stiffness), np.asarray(arm.servo_damping)
@@ -90,6 +91,16 @@ class ArmController(Controller):
             self._unwatched |= mask
         self._leave_setpoints(mask)
         self.goals.stop(mask, _STOP_CODES[cause], hard, self.command, self.velocity, self.acceleration)
+
+    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], reading: PlantReading) -> None:
+        """Make the reference again what the servos have, at the speed that the joints have; play nothing any more."""
+        where = mask[:, None]
+        self.setpoints.drop(mask)
+        self.goals.let_go(mask)
+        np.copyto(self.velocity, np.minimum(np.maximum(reading.velocity, -self._speed), self._speed), where=where)
+        np.copyto(self.acceleration, 0.0, where=where)
+        reference = actuators - self.velocity * self._lead
+        np.copyto(self.command, np.minimum(np.maximum(reference, self._lower), self._upper), where=where)
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""

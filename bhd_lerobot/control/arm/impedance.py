@@ -11,6 +11,7 @@ from bhd_lerobot.control.arm.wrench import OBSERVER_GAIN, ContactObserver
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics, DynamicsTerms, product
 from bhd_lerobot.control.geometry.poses import pose_vectors
+from bhd_lerobot.control.guard import FULL_TORQUE_S
 from bhd_lerobot.control.messages import Limit, Mode
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
@@ -18,7 +19,6 @@ from bhd_lerobot.errors import ConfigError
 Array = NDArray[np.float64]
 
 WIDTH = 8
-_FULL_TORQUE_S = 0.1  # [s] a motor's torque goes from none to its largest in no less: an estimate that spares gears
 _JOINT_DAMPING = 0.01  # [s/rad] share of a joint's largest torque that brakes it at 1 rad/s, in every posture
 _FORCE_RATE, _MOMENT_RATE = 100.0, 20.0  # [N/s, N m/s] of the feed-forward wrench
 _MOBILITY_DAMPING = 1e-3  # [1/kg, 1/(kg m^2)] beside about 0.1 1/kg: no direction weighs more than 1000 kg
@@ -88,7 +88,7 @@ class ImpedanceController(Controller):
         self._ratio, self._is_fixed = np.ones(n), np.zeros(n, np.bool_)
         self._largest = np.zeros((n, 2))
         self._effort = np.asarray(arm.limits.effort[:dof])
-        self._effort_step = self._effort / (_FULL_TORQUE_S * control_hz)
+        self._effort_step = self._effort / (FULL_TORQUE_S * control_hz)
         # An opening and positions beyond what the arm can ever reach; nearer ones are for the spring to find out.
         reach = float(np.abs((*arm.chain.a, *arm.chain.d, *arm.chain.tool)).sum())
         self._lower = np.array([*(-reach,) * 3, arm.limits.lower[-1]])
@@ -164,6 +164,14 @@ class ImpedanceController(Controller):
         if cause in (Mode.ESTOP, Mode.FAULT):
             self._capture |= mask & ~self._held
             self._held |= mask
+
+    def go_back(self, mask: NDArray[np.bool_], actuators: Array, reading: PlantReading) -> None:
+        """Put the equilibrium where the tool is, and go on from the torques that the motors have."""
+        ids = np.flatnonzero(mask)
+        self.actuators[ids] = actuators[ids]
+        self.equilibrium.place_opening(ids, actuators[ids, -1])
+        self.wrench[ids] = 0.0
+        self._capture |= mask
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""

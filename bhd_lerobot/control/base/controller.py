@@ -12,6 +12,9 @@ from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 
 _REST = 1e-9  # a ramp has arrived when the command is this close to zero
+# A wheel that is to turn, and for so long turns less than half as far by its encoder, is blocked, or its encoder is.
+_STALL_S, _STALL_CHECKS = 0.3, 6
+_LEAST_SPEED = 1.0  # [rad/s] a wheel that is to turn slower than this is not judged
 
 
 class BaseController(Controller):
@@ -37,7 +40,7 @@ class BaseController(Controller):
         self.command = np.zeros((n, width))
         self.actuators = np.zeros((n, self.joints))
         self.busy, self.blocked = (np.zeros(n, np.bool_) for _ in range(2))
-        self._servo_gain = drive.servo_gain
+        self._servo_gain, self._torque = drive.servo_gain, drive.max_torque
         self._velocity = np.asarray(limits.velocity)
         self._change = np.asarray(limits.acceleration) / control_hz
         self._stop_change = np.asarray(limits.stop_deceleration) / control_hz
@@ -52,15 +55,24 @@ class BaseController(Controller):
         self._target = np.zeros((n, width))
         self._largest = np.broadcast_to(self._change, (n, width)).copy()
         self._clipped = np.zeros((n, width))
-        self._reference = np.zeros((n, self.joints))
+        self._error, self._beyond = np.zeros((n, self.joints)), np.zeros((n, self.joints), np.bool_)
         self._settled = self._is_clipped = False
         # The sum of 0 * x is 0 if and only if every x is finite; unlike a plain sum it neither overflows nor warns.
         self._flat_target, self._zeros = self._target.reshape(-1), np.zeros(n * width)
         self._limited_velocity = np.zeros((n, width), np.bool_)
         self._limited_change = np.zeros((n, width), np.bool_)
         self._limited_wheels = np.zeros(n, np.bool_)
-        self._limited_effort = np.zeros((n, self.joints), np.bool_)
+        self._limited_effort = np.zeros(n, np.bool_)
         self._limited_finite = np.zeros(n, np.bool_)
+        # Of the wheels since the last look at their progress: how far they were to turn, and where they were.
+        self._look_ticks = max(1, round(_STALL_S / _STALL_CHECKS * control_hz))
+        # Each robot has its own time for it, counted from its start: an episode does not depend on those beside it.
+        self._ticks, self._next_look, self._dt = 0, self._look_ticks, 1 / control_hz
+        self._look_at = np.full(n, self._look_ticks)
+        self._asked, self._position = np.zeros((n, self.joints)), np.zeros((n, self.joints))
+        self._least_turn = _LEAST_SPEED * self._look_ticks / control_hz
+        self._stalls = np.zeros((n, self.joints), np.int64)
+        self._any_blocked = False
         self._wheels = (1.0 / drive.wheel_radius, per_yaw, drive.max_wheel_speed, self._limited_wheels)
 
     def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
@@ -76,14 +88,45 @@ class BaseController(Controller):
         self._largest[mask] = self._stop_change if hard else self._change
         self._settled = self._is_clipped = False
 
+    def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], reading: PlantReading) -> None:
+        """Make the twist again what the wheels have."""
+        np.copyto(self.command, self.drive.twist_from_wheels(actuators), where=mask[:, None])
+
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
         if not self._settled:
             self._filter()
-        # Where nothing changed since the last tick the command stands, and so do the wheel speeds that it means.
-        np.copyto(self.actuators, self._reference)
-        safety.limit_effort(self.actuators, reading.velocity, self._largest_error, self._limited_effort)
+        # A servo beyond its torque gives its largest: that is flagged, and the command stays as it is.
+        error = np.subtract(self.actuators, reading.velocity, out=self._error)
+        np.abs(error, out=error)
+        if np.count_nonzero(np.greater(error, self._largest_error, out=self._beyond)):
+            self._limited_effort |= self._beyond.any(axis=1)
         self.drive.update_odometry(reading.position)
+        if self._any_blocked:
+            self.blocked[:] = self._any_blocked = False
+        self._asked += self.actuators
+        self._ticks += 1
+        if self._ticks == self._next_look:
+            self._look(reading.position)
+
+    def _look(self, position: NDArray[np.float64]) -> None:
+        """Find bases with a wheel that does not turn as it is commanded to: it is blocked, or its encoder lies."""
+        ids = np.flatnonzero(self._look_at == self._ticks)
+        asked, turned = self._asked[ids] * self._dt, position[ids] - self._position[ids]
+        stalled = (np.abs(asked) > self._least_turn) & (turned * np.sign(asked) < 0.5 * np.abs(asked))
+        stalls = (self._stalls[ids] + 1) * stalled
+        self.blocked[ids] = blocked = (stalls >= _STALL_CHECKS).any(axis=1)
+        self._any_blocked = bool(blocked.any())
+        stalls[blocked] = 0
+        self._stalls[ids] = stalls
+        self._look_again(ids, position)
+
+    def _look_again(self, ids: NDArray[np.intp], position: NDArray[np.float64]) -> None:
+        """Begin a new period in which the wheels' progress is looked at; `position` has shape (n, joints)."""
+        self._asked[ids] = 0.0
+        self._position[ids] = position[ids]
+        self._look_at[ids] = self._ticks + self._look_ticks
+        self._next_look = int(self._look_at.min())
 
     def _filter(self) -> None:
         """From the targets to the commands applied in this tick, and the wheel speeds that they mean."""
@@ -94,7 +137,7 @@ class BaseController(Controller):
         # change at different rates.
         limited = safety.limit_wheel_speed(self.command, *self._wheels)
         self._settled = arrived and not limited
-        self.drive.wheels_from_twist(self.command, self._reference)
+        self.drive.wheels_from_twist(self.command, self.actuators)
 
     def _clip(self) -> None:
         """From the targets to targets within the limits; they stand until there are others."""
@@ -113,11 +156,13 @@ class BaseController(Controller):
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start odometry here."""
+        self._stalls[ids] = 0
+        self._look_again(ids, reading.position)
         self.drive.reset_odometry(ids, reading.position[ids])
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about bases that were put somewhere else."""
-        for array in (self.command, self._target, self.actuators, self._reference):
+        for array in (self.command, self._target, self.actuators):
             array[ids] = 0.0
         self._largest[ids] = self._change
         for flags in self._flags():
@@ -130,7 +175,7 @@ class BaseController(Controller):
             self._limited_finite * int(Limit.NON_FINITE)
             + (self._limited_velocity.any(axis=1) | self._limited_wheels) * int(Limit.VELOCITY)
             + self._limited_change.any(axis=1) * int(Limit.ACCELERATION)
-            + self._limited_effort.any(axis=1) * int(Limit.EFFORT)
+            + self._limited_effort * int(Limit.EFFORT)
         )
         for flags in self._flags():
             flags[:] = False
@@ -138,8 +183,9 @@ class BaseController(Controller):
         return limits
 
     def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return the commanded torques of the servos [N m], shape (n, joints)."""
-        return (self.actuators - reading.velocity) * self._servo_gain
+        """Return the torques of the servos [N m], shape (n, joints)."""
+        torque = (self.actuators - reading.velocity) * self._servo_gain
+        return np.minimum(np.maximum(torque, -self._torque), self._torque)
 
     def odometry(self) -> NDArray[np.float64]:
         """Return x [m], y [m] and yaw [rad] since the start, from the encoders, shape (n, 3)."""

@@ -76,19 +76,3 @@ def limit_wheel_speed(twist: Array, per_speed: float, per_yaw: float, limit: flo
     np.maximum(forward, -room, out=forward)
     np.minimum(forward, room, out=forward)
     return True
-
-
-def limit_effort(speeds: Array, measured: Array, largest_error: float, changed: Mask) -> None:
-    """Clip servo speed commands, in place, so that the servo does not ask for more than its largest torque.
-
-    Args:
-        speeds: commanded joint speeds [rad/s], shape (n, joints).
-        measured: measured joint speeds [rad/s], shape (n, joints).
-        largest_error: speed error at which the servo reaches its torque limit [rad/s].
-        changed: set to True where a value was clipped and left alone elsewhere, shape (n, joints).
-    """
-    error = speeds - measured
-    over = np.abs(error) > largest_error
-    if over.any():
-        np.logical_or(changed, over, out=changed)
-        np.copyto(speeds, measured + np.clip(error, -largest_error, largest_error), where=over)

@@ -184,6 +184,12 @@ class GoalManager:
                 self._motion[sim] = _Motion.BRAKE
             self._changed(sim)
 
+    def let_go(self, mask: NDArray[np.bool_]) -> None:
+        """Play nothing any more for some arms; a stop, which ends their goals, follows. `mask` has shape (n,)."""
+        for sim in np.flatnonzero(mask).tolist():
+            self._rest(sim)
+            self._changed(sim)
+
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about arms that were put somewhere else, results included."""
         for sim in np.asarray(ids).tolist():

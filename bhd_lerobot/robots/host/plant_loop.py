@@ -129,7 +129,7 @@ class PlantLoop:
         """
         guard, world, reading = self.guard, self.world, self.reading
         stops = guard.stops
-        phase = guard.check(now_ns)
+        phase = guard.check(now_ns, reading.position)
         if guard.stops != stops:
             self.stop.begin(self._actuators)
         if phase != PlantPhase.WAITING:

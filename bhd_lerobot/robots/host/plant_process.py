@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.fifo import StateRing
+from bhd_lerobot.control.guard import Guard, WireLimits
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import BhdError, RealtimeError
@@ -105,7 +106,10 @@ class PlantProcess:
             raise RealtimeError(f"The block {spec.block!r} has no place for a plant.")
         self._simulation = simulation = spec.make_simulation()
         self._world = SensedWorld(simulation, link.states, link.shape.state_dtype)
-        guard = CommandGuard(link, round(spec.limits.plant_timeout_s * NANOSECONDS))
+        control_hz = spec.rates.control_hz
+        wire = Guard(WireLimits.of(simulation.body, control_hz), 1)
+        timeout_ns = round(spec.limits.plant_timeout_s * NANOSECONDS)
+        guard = CommandGuard(link, timeout_ns, wire, NANOSECONDS // control_hz)
         parent = os.getppid()
         self._loop = PlantLoop(
             self._world,
@@ -113,7 +117,7 @@ class PlantProcess:
             make_stop(simulation.body, link.shape.joints),
             block.words,
             joints=link.shape.joints,
-            control_hz=spec.rates.control_hz,
+            control_hz=control_hz,
             most_catch_up=spec.limits.most_catch_up,
             is_orphan=lambda: os.getppid() != parent,
         )

@@ -97,11 +97,13 @@ class LiveProcess:
         remote = None if link is None else RemoteSimulation(simulation, link)
         self._simulation = simulation = simulation if remote is None else remote
         cerebellum = simulation.cerebellum
-        cerebellum.fifo, cerebellum.estop_word = self._block.fifo, self._block.estop_word
+        cerebellum.fifo, cerebellum.estop = self._block.fifo, self._block.estop
         self._serve_bridge = cerebellum_side(self._block, cerebellum)
         self._publisher = StatePublisher(simulation, self._block.ring)
         if remote is not None:
             self._publisher = StatePublisher(simulation, self._block.ring, remote.sensed_ns)
+            timeout_ns = round(spec.limits.plant_timeout_s * NANOSECONDS)
+            cerebellum.oldest_ns = max(cerebellum.oldest_ns, timeout_ns)
             self._serve_bridge = remote.resuming(self._serve_bridge)
         period = NANOSECONDS // spec.rates.control_hz
         self._statistics = TimingStatistics(period, self._block.section("statistics"))

@@ -142,6 +142,7 @@ class RemoteSimulation(Simulation):
             opening = controller.command[0, -1]  # what is gripped is not let go of
             controller.configure(np.zeros(1, np.intp), self.cerebellum.reading)
             controller.command[0, -1] = controller.actuators[0, -1] = opening
+        self.cerebellum.guard.restart(np.zeros(1, np.intp), controller.actuators)
 
     def close(self) -> None:
         """Free everything. May be called twice."""

@@ -100,7 +100,7 @@ def test_a_hard_stop_ends_a_wrench_at_once() -> None:
     rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
     rig.send(10)
     assert rig.controller.wrench[0, 0] == 10
-    rig.cerebellum.estop_word[0] = 1
+    rig.cerebellum.estop.press()
     rig.tick()
     assert not rig.controller.wrench.any()
 
@@ -195,7 +195,7 @@ def test_a_hard_stop_holds_where_the_tool_is_and_soft_ones_what_was_commanded(ca
     assert rig.mode == Mode.HOLD
     np.testing.assert_allclose(rig.controller.command, commanded, atol=1e-5)
     if cause == Mode.ESTOP:
-        rig.cerebellum.estop_word[0] = 1
+        rig.cerebellum.estop.press()
     else:
         rig.plant.fault = True
     rig.tick()
@@ -212,7 +212,7 @@ def test_a_hard_stop_is_over_when_the_joints_are_still() -> None:
     rig = StuckRig()
     rig.send(5)
     rig.plant.velocity[0] = 0.2
-    rig.cerebellum.estop_word[0] = 1
+    rig.cerebellum.estop.press()
     rig.tick(5)
     assert rig.cerebellum.request(Request.RESET).reasons.tolist() == [Reason.NOT_AT_REST]
     rig.plant.velocity[0] = 0.0

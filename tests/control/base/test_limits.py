@@ -78,22 +78,11 @@ def test_wheel_speed(twist: np.ndarray) -> None:
     assert again.tobytes() == limited.tobytes()
 
 
-@given(speeds=COMMANDS, measured=NEAR, largest=st.floats(0.1, 20))
-def test_effort(speeds: np.ndarray, measured: np.ndarray, largest: float) -> None:
-    limited, changed = speeds.copy(), np.zeros((N, 2), np.bool_)
-    limits.limit_effort(limited, measured, largest, changed)
-    assert (np.abs(limited - measured) <= largest * (1 + 1e-12)).all()
-    np.testing.assert_array_equal(changed, np.abs(speeds - measured) > largest)
-    np.testing.assert_array_equal(limited[~changed], speeds[~changed])
-    assert ((limited - measured) * (speeds - measured) >= 0).all()
-
-
 @given(requested=COMMANDS, limit=LIMITS)
 def test_flags_accumulate_until_taken(requested: np.ndarray, limit: np.ndarray) -> None:
     everything = np.ones((N, 2), np.bool_)
     limits.limit_velocity(requested, limit, np.empty_like(requested), everything)
     limits.limit_change(requested, requested.copy(), np.ones((N, 2)), np.empty_like(requested), everything)
-    limits.limit_effort(requested.copy(), requested, 1.0, everything)
     assert everything.all()
     one = np.ones(N, np.bool_)
     limits.limit_wheel_speed(np.zeros((N, 2)), PER_SPEED, PER_YAW, WHEEL_LIMIT, one)

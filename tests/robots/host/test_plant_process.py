@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.control.guard import Guard, WireLimits
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, RealtimeError
@@ -41,6 +42,7 @@ from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.world import World
+from tests.realtime.test_plant_link import anything
 from tests.waiting import until
 
 HZ = 200
@@ -86,7 +88,7 @@ class LoopRig:
         self.words = np.zeros(64, np.int64)
         self.orphan = False
         self.happens = happens or {}
-        self.guard = CommandGuard(self.link, TIMEOUT)
+        self.guard = CommandGuard(self.link, TIMEOUT, anything(), NANOSECONDS // HZ)
         self.world = world
         self.loop = PlantLoop(
             world,
@@ -255,7 +257,8 @@ class Parts:
         self.remote = RemoteSimulation(own, link)
         self.remote.remote._clock = lambda: self.now
         self.world = SensedWorld(there, link.states, shape.state_dtype, lambda: self.now)
-        self.guard = CommandGuard(link, TIMEOUT)
+        hz = own.rates.control_hz
+        self.guard = CommandGuard(link, TIMEOUT, Guard(WireLimits.of(own.body, hz), 1), NANOSECONDS // hz)
         self.loop = PlantLoop(
             self.world,
             self.guard,

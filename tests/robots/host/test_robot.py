@@ -11,7 +11,7 @@ from lerobot.utils.errors import DeviceNotConnectedError
 from bhd_lerobot.control.estop import EstopInputs
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.errors import CommandRefusedError, ConfigError, RealtimeError
-from bhd_lerobot.realtime.block import LiveBlock, Word
+from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.shared_memory import names
 from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
@@ -116,7 +116,7 @@ def test_estop_from_a_callable(driving):
 
 def test_estop_from_another_process(driving):
     block = LiveBlock.attach(NAME)
-    block.words[Word.ESTOP] = 1
+    block.estop.press()
     block.close()
     expect_stop(driving)
 

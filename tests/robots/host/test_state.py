@@ -39,7 +39,7 @@ class Rig:
         self.now = max(self.now, self.grid.next_due_ns) + late_ns
         slot = self.grid.begin(self.now)
         ticks = 1 + slot.skipped
-        self.simulation.cerebellum.tick(slot.due_ns - self.grid.start_ns, ticks)
+        self.simulation.cerebellum.tick(slot.due_ns - self.grid.start_ns)
         for _ in range(ticks):
             self.simulation.advance()
         self.now += 100_000

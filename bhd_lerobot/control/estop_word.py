@@ -1,0 +1,47 @@
+"""The word of the emergency stop: any process presses, only the cerebellum acknowledges."""
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class EstopWord:
+    """Presses of the emergency stops of n robots, and those that are acknowledged.
+
+    A press is one store of the present time, which no two presses share. An acknowledgement is a store of the press
+    that it is for, in another place: a press that comes while the cerebellum acknowledges an earlier one is not lost.
+
+    Args:
+        n: number of robots.
+        memory: 2 n 64-bit integers, the presses and what is acknowledged; new memory if None.
+    """
+
+    def __init__(self, n: int, memory: Any = None) -> None:
+        words = np.zeros(2 * n, np.int64) if memory is None else np.frombuffer(memory, np.int64, 2 * n)
+        self._pressed, self._acknowledged = words[:n], words[n:]
+        self._seen = self._pressed.copy()
+        self._flags = np.zeros(n, np.bool_)
+
+    def press(self, ids: NDArray[np.intp] | None = None) -> None:
+        """Press the emergency stop of some robots, of all if None. From any process and thread."""
+        self._pressed[slice(None) if ids is None else ids] = time.monotonic_ns()
+
+    @property
+    def pressed(self) -> NDArray[np.bool_]:
+        """Whether there is a press that was not acknowledged, shape (n,); valid until it is asked for again."""
+        return np.not_equal(self._pressed, self._acknowledged, out=self._flags)
+
+    def see(self) -> NDArray[np.bool_]:
+        """Return `pressed`, and take note of those presses: `acknowledge` is about them. For the cerebellum."""
+        np.copyto(self._seen, self._pressed)
+        return np.not_equal(self._seen, self._acknowledged, out=self._flags)
+
+    def acknowledge(self, mask: NDArray[np.bool_]) -> None:
+        """Acknowledge the presses of some robots that were seen, and no later ones. For the cerebellum.
+
+        Args:
+            mask: the robots, shape (n,).
+        """
+        np.copyto(self._acknowledged, self._seen, where=mask)

@@ -1,0 +1,325 @@
+"""What is written to the plant is safe, whatever is sent, and whatever breaks between the brain and the wire.
+
+The limits are stated here anew, from the body's numbers: nothing in this file asks the guard what it thinks.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Rates
+from bhd_lerobot.control.bridge import LockstepBridge
+from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.messages import HORIZON_NS, Mode, Reason, Request, Watchdog
+from bhd_lerobot.control.motion.planner import GoalPlanner
+from bhd_lerobot.realtime.plan_link import PlanLink, PlanServer
+from tests.control import arm_rig, support
+from tests.control.arm.test_impedance import ARM as TORQUE_ARM
+from tests.control.arm.test_impedance import StuckRig
+
+Array = NDArray[np.float64]
+
+WHEEL = support.BODY.drive
+WHEEL_CHANGE = (2.5 + 20.0 * WHEEL.wheel_separation / 2) / WHEEL.wheel_radius / support.HZ
+ARM = arm_rig.ARM
+SERVO_CHANGE = (np.array(ARM.limits.velocity) + 2 * arm_rig.LEAD * arm_rig.STOP) / arm_rig.HZ
+EFFORT = np.array(TORQUE_ARM.limits.effort[:6])
+
+
+class Wire:
+    """A plant that asserts that what is written to it is safe, and remembers it."""
+
+    def __init__(self, plant: Any, lower: Any, upper: Any, change: Any) -> None:
+        self._plant, self.n = plant, plant.n
+        self._lower, self._upper, self._change = (np.asarray(value) for value in (lower, upper, change))
+        self.last: Array | None = None
+        self.count = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._plant, name)
+
+    def write(self, ctrl: Array) -> None:
+        assert np.isfinite(ctrl).all()
+        assert (ctrl >= self._lower - 1e-3).all()
+        assert (ctrl <= self._upper + 1e-3).all()
+        if self.last is not None:
+            assert (np.abs(ctrl - self.last) <= self._change * 1.021 + 1e-12).all(), (ctrl - self.last).tolist()
+        self.last = ctrl.copy()
+        self.count += 1
+        self._plant.write(ctrl)
+
+
+def base_rig(n: int = 1) -> support.Rig:
+    rig = support.Rig(n)
+    most = WHEEL.max_wheel_speed
+    rig.plant = rig.cerebellum.plant = Wire(rig.plant, [-most] * 2, [most] * 2, WHEEL_CHANGE)  # type: ignore[assignment]
+    return rig
+
+
+def arm(n: int = 1, planning: Any = None) -> arm_rig.Rig:
+    rig = arm_rig.Rig(n, planning=planning)
+    lower, upper = ARM.limits.lower, ARM.limits.upper
+    rig.plant = rig.cerebellum.plant = Wire(rig.plant, lower, upper, SERVO_CHANGE)  # type: ignore[assignment]
+    return rig
+
+
+def torque_arm() -> StuckRig:
+    rig = StuckRig()
+    limits = TORQUE_ARM.limits
+    change = [*(EFFORT / 0.1 / 500), limits.velocity[-1] / 500]
+    lower, upper = [*-EFFORT, limits.lower[-1]], [*EFFORT, limits.upper[-1]]
+    rig.plant = rig.cerebellum.plant = Wire(rig.plant, lower, upper, change)  # type: ignore[assignment]
+    return rig
+
+
+BREAK: dict[str, Callable[[Array], None]] = {
+    "not a number": lambda values: values.fill(np.nan),
+    "one infinity": lambda values: values.__setitem__((..., 0), np.inf),
+    "a jump of 1 rad": lambda values: values.__iadd__(1.0),
+    "the other sign": lambda values: values.__imul__(-1.0),
+    "far away": lambda values: values.fill(1e300),
+}
+
+# --- finding 1: rows of a trajectory that another process wrote ------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", BREAK)
+def test_rows_in_shared_memory_that_were_overwritten_stop_the_arm_and_move_nothing(how: str) -> None:
+    block = bytearray(PlanLink.nbytes(6, arm_rig.HZ))
+    link, server = PlanLink(block, 6, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
+    rig = arm(planning=link)
+    assert rig.go(joint_target=arm_rig.posture(j0=1.5)) is None
+    for _ in range(220):
+        rig.tick()
+        server.serve_once()
+    assert rig.mode == Mode.TRACKING
+    assert np.abs(rig.cerebellum.reading.velocity).max() > 0.5  # under way
+    where = rig.plant.position.copy()
+    BREAK[how](link._memory.rows)
+    rig.tick()
+    assert rig.mode == Mode.FAULT
+    assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.GUARD]
+    assert rig.results() == [("1", ResultCode.FAULT)]
+    rig.tick(500)
+    # It has braked as in any other hard stop: no farther than from this speed with the limits of a stop.
+    speed = np.array(ARM.limits.velocity)
+    room = speed**2 / (2 * arm_rig.STOP) + speed * arm_rig.STOP / np.array(ARM.limits.stop_jerk)
+    assert (np.abs(rig.plant.position - where)[0] <= room + 0.02).all()
+    assert np.abs(rig.plant.velocity).max() < 1e-6
+    # and nothing is left of it afterwards
+    assert rig.request(Request.RESET).accepted.all()
+    assert rig.request(Request.ACTIVATE).accepted.all()
+    assert rig.go(joint_target=arm_rig.posture(j0=0.2)) is None
+    for _ in range(1500):
+        rig.tick()
+        server.serve_once()
+    assert rig.results() == [("2", ResultCode.SUCCEEDED)]
+
+
+# --- anything that goes wrong inside ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", BREAK)
+@pytest.mark.parametrize("what", ["command", "actuators"])
+def test_numbers_of_the_controller_that_are_wrong_do_not_reach_the_wire(how: str, what: str) -> None:
+    rigs: dict[str, Any] = {"base": base_rig(2), "arm": arm(2), "torques": torque_arm()}
+    for name, rig in rigs.items():
+        for step in range(30):
+            if name == "base":
+                rig.send(0.2, 0.5)
+                rig.tick(4)
+            elif name == "arm":
+                rig.send(arm_rig.off(j0=0.02 * step))
+                rig.tick(arm_rig.FRAME)
+            else:
+                rig.target[0, 2] += 1e-3
+                rig.send()
+        assert rig.mode == Mode.TRACKING
+        controller = rig.cerebellum.controller
+        run = controller.run
+
+        def broken(reading: Any, run: Any = run, controller: Any = controller) -> None:
+            run(reading)
+            BREAK[how](getattr(controller, what)[:1])
+
+        controller.run = broken
+        for _ in range(20):
+            rig.tick()
+        controller.run = run
+        if rig.mode == Mode.TRACKING:
+            # It did not get as far as the actuators: the command is computed anew, or is a report only.
+            assert what == "command" or (name, how) == ("torques", "a jump of 1 rad"), (name, what, how)
+            continue
+        assert rig.mode == Mode.FAULT
+        assert int(rig.cerebellum.take_flags()[1][0]) & Watchdog.GUARD
+        if rig.cerebellum.n == 2:
+            assert rig.cerebellum.mode[1] == Mode.TRACKING  # the other robot noticed nothing
+        rig.tick(1000)
+        assert rig.cerebellum.controller.at_rest()[0]
+        for request in (Request.RESET, Request.ACTIVATE):
+            assert rig.cerebellum.request(request, np.array([0])).accepted[0]
+        rig.tick(50)
+        assert rig.mode == Mode.HOLD
+
+
+# --- finding 7: ticks that were skipped ------------------------------------------------------------------------------
+
+
+def test_what_was_missed_is_not_caught_up_at_the_wire() -> None:
+    rig = arm()
+    assert rig.go(joint_target=arm_rig.posture(j0=1.5)) is None
+    rig.tick(200)
+    before = rig.plant.count
+    for skipped in (1, 3, 10, 45):
+        rig.now += skipped * arm_rig.TICK_NS
+        rig.tick()
+    assert rig.plant.count == before + 4
+    rig.until(Mode.HOLD)
+    assert rig.results() == [("1", ResultCode.SUCCEEDED)]
+
+
+# --- finding 6: readings that are old, and encoders that stand still --------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [base_rig, arm])
+def test_a_reading_older_than_three_periods_is_a_fault(make: Callable[[], Any]) -> None:
+    rig = make()
+    hz = rig.cerebellum.control_hz
+    period = 1_000_000_000 // hz
+    rig.cerebellum.stamp_origin_ns = origin = 10**15
+    ages = [0]
+    read = rig.plant.read
+
+    def stamped(out: Any) -> None:
+        read(out)
+        out.stamp_ns[:] = origin + rig.now - ages[0]
+
+    rig.plant.read = stamped
+    for age in (0, 1, 3):  # periods
+        ages[0] = age * period
+        rig.tick(5)
+        assert rig.mode == Mode.HOLD
+    ages[0] = 3 * period + 1
+    rig.tick()
+    assert rig.mode == Mode.FAULT
+    assert int(rig.cerebellum.take_flags()[1][0]) == Watchdog.PLANT
+    ages[0] = 0
+    rig.tick(5)
+    assert rig.mode == Mode.FAULT  # it latches
+    for request in (Request.RESET, Request.ACTIVATE):
+        assert rig.request(request).accepted.all()
+    rig.tick(5)
+    assert rig.mode == Mode.HOLD
+
+
+@pytest.mark.parametrize("what", ["frozen", "one wheel", "the other way"])
+def test_wheels_that_do_not_turn_as_commanded_are_a_fault(what: str) -> None:
+    rig = base_rig(2)
+    read, fault_at = rig.plant.read, None
+    frozen = np.zeros(2)
+
+    def lie(out: Any) -> None:
+        read(out)
+        if what == "the other way":
+            out.position[0] *= -1.0
+        elif rig.now > support.NANOSECONDS:
+            out.position[0, : 1 if what == "one wheel" else 2] = frozen[: 1 if what == "one wheel" else 2]
+        else:
+            frozen[:] = out.position[0]
+
+    rig.plant.read = lie  # type: ignore[method-assign]
+    driven = 0.0
+    for tick in range(600):
+        rig.send(0.2)
+        rig.tick()
+        if fault_at is None and rig.mode == Mode.FAULT:
+            fault_at, driven = tick, float(rig.plant.position[0, 0])
+    begin = 0 if what == "the other way" else support.HZ
+    assert fault_at is not None
+    assert fault_at - begin < 0.45 * support.HZ  # s: less than 0.1 m at full speed
+    assert int(rig.cerebellum.take_flags()[1][0]) & Watchdog.BLOCKED
+    assert (rig.plant.position[0, 0] - driven) * 0.033 < 0.012  # what the hardest stop needs
+    assert rig.cerebellum.mode[1] == Mode.TRACKING  # the other robot noticed nothing
+
+
+# --- finding 8: many commands, late commands, commands for another day -----------------------------------------------
+
+
+def test_however_many_setpoints_are_due_one_counts_and_a_tick_takes_its_time_for_one() -> None:
+    for span in (0, 30 * support.TICK_NS):  # all at the same time, or one after the other
+        rig = base_rig()
+        rig.tick(100)
+        for number in range(256):
+            due = rig.now + span * (number - 255) // 256
+            assert rig.send(0.001 * (number % 200), due=due).accepted.all()
+        taken: list[float] = []
+        follow = rig.cerebellum.controller.set_setpoint
+
+        def count(values: Array, mask: Any, follow: Any = follow, taken: list[float] = taken) -> None:
+            taken.append(float(values[0, 0]))
+            follow(values, mask)
+
+        rig.cerebellum.controller.set_setpoint = count  # type: ignore[method-assign]
+        rig.tick()
+        assert len(taken) <= 2
+        assert taken[-1] == pytest.approx(0.001 * (255 % 200))  # the newest
+        assert not len(rig.cerebellum.fifo)
+
+
+def test_what_a_silent_brain_left_in_the_queue_moves_nothing_later() -> None:
+    rig = base_rig()
+    rig.send(0.1)
+    rig.send(0.2, due=rig.now + 2 * support.NANOSECONDS)  # after the time-out
+    rig.tick(support.HZ)
+    assert rig.mode == Mode.HOLD
+    for _ in range(4 * support.HZ):
+        rig.tick()
+        assert not rig.plant.last.any()
+    assert int(rig.cerebellum.take_flags()[1][0]) == Watchdog.COMMAND_AGE
+    assert rig.send(0.1).accepted.all()  # a fresh one
+    rig.tick(10)
+    assert rig.mode == Mode.TRACKING
+
+
+def test_a_command_is_never_taken_twice() -> None:
+    """A process that puts the queue's ends back where they were: what was taken once is not taken again."""
+    rig = base_rig()
+    rig.send(0.2)
+    rig.tick(10)
+    tail, mask = rig.cerebellum.fifo._tail, rig.cerebellum.fifo._mask
+    rig.send(0.0)
+    rig.tick(40)  # the first is not too old yet
+    assert rig.command[0] == 0
+    mask[0] = True
+    tail[0] = 0
+    rig.cerebellum.fifo._seen_head = -1
+    rig.tick(10)
+    assert rig.command[0] == 0
+
+
+@pytest.mark.parametrize("ends", [(2**60, 0), (0, 2**60), (-5, 3), (10**6, 2)])
+def test_garbage_in_the_queues_ends_empties_it(ends: tuple[int, int]) -> None:
+    rig = base_rig()
+    rig.send(0.2)
+    rig.tick(10)
+    rig.cerebellum.fifo._head[0], rig.cerebellum.fifo._tail[0] = ends
+    rig.tick(300)
+    assert rig.mode == Mode.HOLD
+    assert rig.command == [0, 0]
+
+
+def test_a_command_for_later_than_the_horizon_is_refused_and_dropped_from_the_queue() -> None:
+    rig = base_rig()
+    rates = Rates(support.HZ, support.HZ, 10)
+    bridge = LockstepBridge(rig.cerebellum, rates, lambda: None)
+    row = np.array([[0.1, 0.0]])
+    assert bridge.send(row, due_ns=HORIZON_NS).accepted.all()
+    assert bridge.send(row, due_ns=HORIZON_NS + 1).reasons.tolist() == [Reason.BEYOND_HORIZON]
+    assert rig.refused(Reason.BEYOND_HORIZON) == 1
+    rig.cerebellum.restart(np.array([0]))
+    rig.cerebellum.fifo.push(1, 10 * HORIZON_NS, row, np.ones(1, np.bool_))  # another process, with another clock
+    rig.tick()
+    assert rig.cerebellum.fifo.next_due() is None
