@@ -137,8 +137,8 @@ class Cerebellum:
                 self.estop_latched |= hit
         if self._flat_reading.dot(self._zeros) != 0.0 or np.count_nonzero(self.reading.fault):
             self._handle_fault()
-        if self.reading.stamp_ns.min() < now_ns + self.stamp_origin_ns - self.oldest_ns:
-            self._handle_old_reading(now_ns)
+        if self.reading.stamp_ns is not None:
+            self._check_age(self.reading.stamp_ns, now_ns)
         if self._deadline is not None and now_ns > self._deadline:
             old = (self.mode == Mode.TRACKING) & ~self._by_goal & (now_ns - self._last_due > self._timeout_ns)
             if old.any():
@@ -162,8 +162,11 @@ class Cerebellum:
         reading.position[bad] = self._last_position[bad]
         self._set_mode((bad | reading.fault) & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT), Mode.FAULT)
 
-    def _handle_old_reading(self, now_ns: int) -> None:
-        old = self.reading.stamp_ns < now_ns + self.stamp_origin_ns - self.oldest_ns
+    def _check_age(self, stamp_ns: NDArray[np.int64], now_ns: int) -> None:
+        """Stop robots whose reading is too old to be a measurement of the present."""
+        old = stamp_ns < now_ns + self.stamp_origin_ns - self.oldest_ns
+        if not np.count_nonzero(old):
+            return
         old &= (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT) & (self.mode != Mode.UNCONFIGURED)
         self._watchdog[old] |= Watchdog.PLANT
         self._set_mode(old, Mode.FAULT)

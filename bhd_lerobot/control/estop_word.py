@@ -35,8 +35,10 @@ class EstopWord:
 
     def see(self) -> NDArray[np.bool_]:
         """Return `pressed`, and take note of those presses: `acknowledge` is about them. For the cerebellum."""
-        np.copyto(self._seen, self._pressed)
-        return np.not_equal(self._seen, self._acknowledged, out=self._flags)
+        pressed = np.not_equal(self._pressed, self._acknowledged, out=self._flags)
+        if np.count_nonzero(pressed):
+            np.copyto(self._seen, self._pressed)
+        return pressed
 
     def acknowledge(self, mask: NDArray[np.bool_]) -> None:
         """Acknowledge the presses of some robots that were seen, and no later ones. For the cerebellum.

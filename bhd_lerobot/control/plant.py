@@ -5,9 +5,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-ALWAYS_FRESH = np.int64(1 << 62)
-"""The stamp of readings that are never old [ns]."""
-
 
 class PlantReading:
     """One reading of the joints; the plant writes into it.
@@ -19,8 +16,8 @@ class PlantReading:
     Attributes:
         position: joint angles [rad], shape (n, joints).
         velocity: joint speeds [rad/s], shape (n, joints).
-        stamp_ns: when the hardware measured this, on the plant's own clock [ns], shape (n,). A plant that leaves it
-            alone is one whose readings are never old, such as a simulation in lockstep.
+        stamp_ns: when the hardware measured this, on the plant's own clock [ns], shape (n,); None for a plant whose
+            readings are never old, such as a simulation in lockstep.
         fault: whether the hardware reports a fault, shape (n,).
     """
 
@@ -29,7 +26,7 @@ class PlantReading:
         self.values = np.zeros((2, n, joints))
         self.position: NDArray[np.float64] = self.values[0]
         self.velocity: NDArray[np.float64] = self.values[1]
-        self.stamp_ns = np.full(n, ALWAYS_FRESH)
+        self.stamp_ns: NDArray[np.int64] | None = None
         self.fault = np.zeros(n, np.bool_)
 
 

@@ -145,6 +145,7 @@ class RemotePlant:
         self._record = np.zeros((), link.shape.command_dtype)
         self._record["number"] = len(link.commands)
         self._seen = 0
+        self._stamp_ns = np.zeros(1, np.int64)
         self.state: Any = None
 
     def refresh(self) -> Any:
@@ -170,7 +171,8 @@ class RemotePlant:
         state = self.refresh()
         if state is not None:
             out.position[:], out.velocity[:] = state["position"], state["velocity"]
-            out.stamp_ns[:] = state["stamp_ns"]
+            out.stamp_ns = self._stamp_ns
+            out.stamp_ns[0] = state["stamp_ns"]
         out.fault[:] = self.has_stopped
 
     def write(self, ctrl: NDArray[np.float64]) -> None:

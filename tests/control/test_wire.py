@@ -195,7 +195,7 @@ def test_a_reading_older_than_three_periods_is_a_fault(make: Callable[[], Any]) 
 
     def stamped(out: Any) -> None:
         read(out)
-        out.stamp_ns[:] = origin + rig.now - ages[0]
+        out.stamp_ns = np.array([origin + rig.now - ages[0]])
 
     rig.plant.read = stamped
     for age in (0, 1, 3):  # periods
