@@ -102,6 +102,8 @@ class Limit(IntFlag):
     """The commanded effort is above the servo's largest: the servo gives its largest, the command stays as it is."""
     POSITION = 16
     """Clipped to the range of the joint."""
+    POSTURE = 32
+    """A tool pose was refused, because no posture reaches it, or none without a jump: the arm holds the last one."""
 
 
 class Watchdog(IntFlag):

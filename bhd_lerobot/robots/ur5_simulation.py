@@ -60,6 +60,11 @@ def pose_matrices(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
 JOINT_ACTIONS = (*(f"{joint}.pos" for joint in JOINTS), "gripper.pos")
 OBSERVED = (*JOINT_ACTIONS, *(f"{joint}.vel" for joint in JOINTS), "gripper.vel")
 _MAX_TORQUE_LATENCY = 0.01  # [s] the default impedance becomes unstable somewhere between 0.02 and 0.05
+_LARGEST_TURN = 1.0  # [rad] of a joint from one tool pose to the next: a second at a third of the largest speed
+_JUMP = (
+    "{} would have to turn by {:.2f} rad at once; {} rad is the most. Come nearer to the pose in smaller steps, or "
+    "send it as a goal, which is planned"
+)
 _SPEED_NOISE = 10.0  # [1/s] noise on speeds, as a multiple of the noise on positions
 
 
@@ -179,12 +184,17 @@ class UR5Simulation(Simulation):
         return np.concatenate([tool, command[:, -1:]], axis=1)
 
     def to_setpoints(
-        self, action: NDArray[np.float64], mask: NDArray[np.bool_]
+        self, action: NDArray[np.float64], mask: NDArray[np.bool_], before: NDArray[np.float64] | None = None
     ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
-        """Turn actions into setpoints, shape (n, width), and say which cannot be, and why."""
+        """Turn actions into setpoints, shape (n, width), and say which cannot be, and why.
+
+        The posture of a tool pose is the one nearest to that before it. Near a singular posture, at the end of a
+        joint's range and where the workspace folds, the nearest one may be far away, and the tool would leave its
+        path on the way there: that is refused.
+        """
         if self.config.action_space == "joint":
             return action, {}
-        command = self.cerebellum.command
+        command = self.cerebellum.command if before is None else before
         setpoints, refused = command.copy(), {}
         impedance = self.config.control == "impedance"
         for sim in np.flatnonzero(mask).tolist():
@@ -198,6 +208,10 @@ class UR5Simulation(Simulation):
             result = self.kinematics.solve(matrix, command[sim, :-1])
             if result.code != ResultCode.SUCCEEDED:
                 refused[sim] = (Reason.NO_POSTURE, result.message)
+                continue
+            turn = np.abs(result.postures[0] - command[sim, :-1])
+            if turn.max() > _LARGEST_TURN:
+                refused[sim] = (Reason.NO_POSTURE, _JUMP.format(JOINTS[int(turn.argmax())], turn.max(), _LARGEST_TURN))
                 continue
             setpoints[sim, :-1], setpoints[sim, -1] = result.postures[0], action[sim, -1]
         return setpoints, refused

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.bodies.ur5 import JOINTS
+from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Limit, Mode, Reason
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -148,3 +149,69 @@ def test_the_arm_takes_the_posture_nearest_to_where_it_is(simulation) -> None:
         now = simulation.cerebellum.command[0, :6].copy()
         assert np.abs(now - joints).max() < 0.15  # no other branch of the inverse kinematics
         joints = now
+
+
+def test_a_tool_that_turns_on_the_spot_stays_on_the_spot() -> None:
+    """Turned far enough about any axis the arm comes to a singular posture, and then to another branch.
+
+    To jump there, the tool would leave its place by hundreds of millimetres, into the table. It is refused instead, in
+    words and in the recorded flags, and the arm holds the last pose; the stream back is taken again.
+    """
+    axes = [sign * np.array(axis) for axis in itertools.product((0, 1), repeat=3) if any(axis) for sign in (1, -1)]
+    simulation = UR5Simulation(UR5Config(action_space="tool"), len(axes), threads=1)
+    action = start(simulation)
+    place = action[:, :3].copy()
+    first = [pose_matrices(row[:7])[0][:3, :3] for row in action]
+    refused, off = np.zeros(len(axes), np.bool_), np.zeros(len(axes))
+    frames = list(range(300))  # 3.6 rad at 0.3 rad/s
+    for frame in (*frames, *frames[::-1]):
+        for sim, (axis, rotation) in enumerate(zip(axes, first, strict=True)):
+            turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * 0.3 * frame / simulation.rates.fps)
+            x, y, z, w = Rotation.from_matrix(turn.as_matrix() @ rotation).as_quat()
+            action[sim, 3:7] = w, x, y, z
+        report = simulation.step(action)
+        off = np.maximum(off, np.linalg.norm(simulation.truth().tool_pose[:, :3] - place, axis=1))
+        now = report.sent.reasons == Reason.NO_POSTURE
+        refused |= now
+        assert np.array_equal(now, (report.limits & Limit.POSTURE) > 0)
+        assert set(report.refusals) == set(np.flatnonzero(now).tolist())
+    assert refused.sum() >= 3
+    assert off.max() < 0.03
+    assert not now.any()  # where it began
+    assert np.allclose(report.applied[:, :3], place, atol=1e-3)
+
+
+def test_the_last_joint_does_not_unwind_by_a_turn() -> None:
+    simulation = UR5Simulation(UR5Config(action_space="tool"), 1, threads=1)
+    action = start(simulation)
+    rotation = pose_matrices(action[0, :7])[0][:3, :3]
+    last, most = simulation.cerebellum.command[0, 5], 0.0
+    for frame in range(700):  # 11 rad about the tool's own axis: beyond the joint's range
+        x, y, z, w = Rotation.from_matrix(
+            rotation @ Rotation.from_rotvec([0, 0, 0.4 * frame / 25]).as_matrix()
+        ).as_quat()
+        action[0, 3:7] = w, x, y, z
+        report = simulation.step(action)
+        now = simulation.cerebellum.command[0, 5]
+        most, last = max(most, abs(now - last)), now
+    assert most < 0.1
+    assert report.sent.reasons.tolist() == [Reason.NO_POSTURE]
+    assert "wrist_3 would have to turn by" in report.refusals[0]
+    assert abs(last) > 6.2
+
+
+def test_the_poses_of_a_chunk_follow_each_other() -> None:
+    """Each is solved from the one before it, not from where the arm is now."""
+    simulation = UR5Simulation(UR5Config(action_space="tool"), 1, threads=1)
+    action = start(simulation)
+    before = simulation.cerebellum.command[0, :6].copy()
+    rotation = pose_matrices(action[0, :7])[0][:3, :3]
+    rows = []
+    for frame in range(60):  # 2.4 rad, in steps of 0.04
+        x, y, z, w = Rotation.from_matrix(rotation @ Rotation.from_rotvec([0, 0, 0.04 * frame]).as_matrix()).as_quat()
+        rows.append([[*action[0, :3], w, x, y, z, action[0, 7]]])
+    report = simulation.step(Chunk(np.array(rows)))
+    assert report.sent.accepted.all()
+    for _ in range(70):
+        simulation.step(None)
+    assert abs(abs(simulation.cerebellum.command[0, 5] - before[5]) - 0.04 * 59) < 0.02  # a brake at its end

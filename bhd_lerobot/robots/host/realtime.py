@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.control.fifo import RingReader
-from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
+from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import Word
@@ -222,10 +222,10 @@ class LiveSimulation(Simulation):
     # --- frames ------------------------------------------------------------------------------------------------------
 
     def to_setpoints(
-        self, action: NDArray[np.float64], mask: NDArray[np.bool_]
+        self, action: NDArray[np.float64], mask: NDArray[np.bool_], before: NDArray[np.float64] | None = None
     ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
         """Turn an action into a setpoint, from where the mirror is, and report why it cannot be."""
-        return self.mirror.to_setpoints(action, mask)
+        return self.mirror.to_setpoints(action, mask, before)
 
     def send(self, command: Command) -> Receipt:
         """Send a command and return at once.
@@ -259,6 +259,7 @@ class LiveSimulation(Simulation):
         for frame, begun in frames:
             is_last = frame is frames[-1][0]
             limits, watchdog = raised(begun["state"], frame.end)
+            limits |= int(Limit.POSTURE) * (is_last and bool(receipt.refusals))
             reports.append(
                 FrameReport(
                     applied=self.mirror.to_action(frame.end["command"]),

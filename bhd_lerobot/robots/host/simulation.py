@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals, Mixed
-from bhd_lerobot.control.messages import NANOSECONDS, Reason, SendResult
+from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.sim.camera import Camera
@@ -212,9 +212,15 @@ class Simulation(ABC):
         return command.copy()
 
     def to_setpoints(
-        self, action: NDArray[np.float64], mask: NDArray[np.bool_]
+        self, action: NDArray[np.float64], mask: NDArray[np.bool_], before: NDArray[np.float64] | None = None
     ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
-        """Turn actions into setpoints of the cerebellum, shape (n, width), and say which cannot be, and why."""
+        """Turn actions into setpoints of the cerebellum, shape (n, width), and say which cannot be, and why.
+
+        Args:
+            action: shape (n, actions).
+            mask: the robots that they are for, shape (n,).
+            before: the setpoints before these, shape (n, width); the present commands if None.
+        """
         return action, {}
 
     # --- episodes ----------------------------------------------------------------------------------------------------
@@ -289,7 +295,7 @@ class Simulation(ABC):
     def _send_chunk(self, actions: NDArray[np.float64], receipt: Receipt) -> None:
         rows: list[NDArray[np.float64]] = []
         for action in actions:
-            setpoints, refused = self.to_setpoints(action, self.running)
+            setpoints, refused = self.to_setpoints(action, self.running, rows[-1] if rows else None)
             receipt.refuse(refused)
             if refused:
                 break  # the actions before it are sent
@@ -319,6 +325,7 @@ class Simulation(ABC):
         self.bridge.advance_frame()
         self.world.check()
         limits, watchdog = self.cerebellum.take_flags()
+        limits[list(receipt.refusals)] |= int(Limit.POSTURE)
         running = np.flatnonzero(self.running).tolist()
         results = {sim: receipt.all_results(sim, self.bridge.take_results(sim)) for sim in running}
         return FrameReport(
