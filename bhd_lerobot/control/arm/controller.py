@@ -16,6 +16,11 @@ from bhd_lerobot.control.plant import PlantReading
 BLOCKED_RAD, BLOCKED_S = 0.1, 0.05
 _BLOCKED = f"The arm stayed more than {BLOCKED_RAD} rad from its reference: something is in its way."
 _CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)  # numpy compares plain numbers faster
+_GAVE_WAY = "The arm was stopped, and gives way to what it touches."
+_STILL = 0.05  # [rad/s] the joints' speed below which a hard stop is over
+_SETTLED_S = 0.04  # [s] what was stopped may swing back once
+_GIVES_WAY_RAD = 2e-4  # [rad] nearer to its reference than this a joint presses with 8 N m at the most
+_MOST_GIVING = 6
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 
 
@@ -50,6 +55,11 @@ class ArmController(Controller):
         # Ticks for which a joint has been too far from its reference.
         self._off_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
         self._unwatched: NDArray[np.bool_] = np.zeros(n, np.bool_)  # stopped hard, or on the way back already
+        # For so many ticks has an arm that was stopped hard been still.
+        self._still_ticks, self._settled_ticks = np.zeros(n, np.int64), round(_SETTLED_S * control_hz)
+        # How often an arm that was stopped hard may still give way to what it touches.
+        self._gives_way: NDArray[np.int64] = np.zeros(n, np.int64)
+        self._any_gives_way = False
         self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
         self._speed = np.asarray(limits.velocity)
         self._most_off_ticks = round(BLOCKED_S * control_hz)
@@ -89,6 +99,8 @@ class ArmController(Controller):
         if hard:
             mask = mask & ~self.blocked  # they are on their way back, and goals have ended
             self._unwatched |= mask
+            self._gives_way[mask] = _MOST_GIVING
+            self._any_gives_way = True
         self._leave_setpoints(mask)
         self.goals.stop(mask, _STOP_CODES[cause], hard, self.command, self.velocity, self.acceleration)
 
@@ -112,6 +124,8 @@ class ArmController(Controller):
         self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
         if np.count_nonzero(self._unwatched):
             self._unwatched &= ~self.following
+        if self._any_gives_way:
+            self._give_way(reading)
         np.multiply(self.velocity, self._lead, out=self.actuators)
         self.actuators += self.command
         # A servo beyond its effort gives its largest: that is flagged, and the command stays as it is.
@@ -130,6 +144,27 @@ class ArmController(Controller):
             self._watch(reading)
         elif np.count_nonzero(self._off_ticks):
             self._off_ticks[:] = 0
+
+    def _give_way(self, reading: PlantReading) -> None:
+        """After a hard stop, bring the reference to where the arm came to rest: what it presses on is let go of."""
+        dof = self.width - 1
+        still = (np.abs(reading.velocity[:, :dof]) < _STILL).all(axis=1)
+        waiting = (self._gives_way > 0) & still & ~self.following
+        self._still_ticks = (self._still_ticks + 1) * waiting
+        ready = self._still_ticks >= self._settled_ticks
+        if not ready.any():
+            return
+        self._still_ticks[ready] = 0
+        where = np.minimum(np.maximum(reading.position, self._lower), self._upper)
+        where[:, dof] = self.command[:, dof]  # what is gripped is not let go of
+        off = ready & (np.abs(where - self.command) > _GIVES_WAY_RAD).any(axis=1)
+        # What it leans on springs back, and pushes the arm on: it takes a few times. A load, which makes the arm sag a
+        # little further each time, must not make it sink for ever.
+        self._gives_way[off] -= 1
+        self._gives_way[ready & ~off] = 0
+        self._any_gives_way = bool(self._gives_way.any())
+        if off.any():
+            self.goals.retreat(off, _GAVE_WAY, (self.command, self.velocity, self.acceleration), where)
 
     def _watch(self, reading: PlantReading) -> None:
         """Find arms that do not go where they are commanded to, and stop pressing on with them.
@@ -165,7 +200,7 @@ class ArmController(Controller):
 
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each arm is commanded to be at rest, shape (n,)."""
-        return np.asarray((np.abs(self.velocity) < _REST).all(axis=1)) & ~self.busy
+        return np.asarray((np.abs(self.velocity) < _REST).all(axis=1)) & ~self.busy & (self._gives_way == 0)
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from the posture that the arms are in."""
@@ -179,7 +214,7 @@ class ArmController(Controller):
         self.setpoints.restart(ids)
         self.velocity[ids] = self.acceleration[ids] = 0.0
         self._off_ticks[ids] = 0
-        self._unwatched[ids] = False
+        self._unwatched[ids], self._gives_way[ids] = False, 0
         for flags in (self._limited_finite, self._limited_effort, self.blocked):
             flags[ids] = False
 
