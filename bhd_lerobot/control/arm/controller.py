@@ -56,7 +56,8 @@ class ArmController(Controller):
         self._off_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
         self._unwatched: NDArray[np.bool_] = np.zeros(n, np.bool_)  # stopped hard, or on the way back already
         # For so many ticks has an arm that was stopped hard been still.
-        self._still_ticks, self._settled_ticks = np.zeros(n, np.int64), round(_SETTLED_S * control_hz)
+        self._still_ticks: NDArray[np.int64] = np.zeros(n, np.int64)
+        self._settled_ticks = round(_SETTLED_S * control_hz)
         # How often an arm that was stopped hard may still give way to what it touches.
         self._gives_way: NDArray[np.int64] = np.zeros(n, np.int64)
         self._any_gives_way = False
