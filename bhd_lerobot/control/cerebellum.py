@@ -161,6 +161,8 @@ class Cerebellum:
         reading.velocity[bad] = 0.0
         reading.position[bad] = self._last_position[bad]
         self._set_mode((bad | reading.fault) & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT), Mode.FAULT)
+        if bad.any():
+            self.controller.distrust(bad)
 
     def _check_age(self, stamp_ns: NDArray[np.int64], now_ns: int) -> None:
         """Stop robots whose reading is too old to be a measurement of the present."""

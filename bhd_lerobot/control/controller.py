@@ -67,6 +67,10 @@ class Controller(ABC):
             reading: the joints now.
         """
 
+    def distrust(self, mask: NDArray[np.bool_]) -> None:
+        """Do nothing that needs to know where some robots are: what they read now is made up. `mask` has shape (n,)."""
+        return
+
     @abstractmethod
     def at_rest(self) -> NDArray[np.bool_]:
         """Return whether each robot is commanded to be at rest, shape (n,)."""

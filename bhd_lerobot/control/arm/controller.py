@@ -90,6 +90,7 @@ class ArmController(Controller):
             # on top of what is allowed.
             self.velocity -= np.where(left[:, None], self.acceleration * self._half_tick, 0.0)
             self.goals.drop_for_setpoint(mask)
+        self._gives_way[mask] = 0
         self.setpoints.set_setpoint(values, mask, self.command)
 
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
@@ -114,6 +115,10 @@ class ArmController(Controller):
         np.copyto(self.acceleration, 0.0, where=where)
         reference = actuators - self.velocity * self._lead
         np.copyto(self.command, np.minimum(np.maximum(reference, self._lower), self._upper), where=where)
+
+    def distrust(self, mask: NDArray[np.bool_]) -> None:
+        """Give way to nothing: where the arms are is not known."""
+        self._gives_way[mask] = 0
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
@@ -262,7 +267,10 @@ class ArmController(Controller):
 
     def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
         """Take a goal; None if it was accepted, otherwise the refusal."""
-        return self.goals.submit(sim, command, blocked)
+        refusal = self.goals.submit(sim, command, blocked)
+        if refusal is None:
+            self._gives_way[sim] = 0
+        return refusal
 
     def cancel(self, sim: int, task_id: str) -> ResultCode:
         """Cancel a goal: decelerate, then hold."""
