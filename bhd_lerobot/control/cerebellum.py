@@ -156,7 +156,7 @@ class Cerebellum:
 
     def _handle_fault(self) -> None:
         reading = self.reading
-        bad = ~np.isfinite(reading.values).all(axis=(0, 2))
+        bad: NDArray[np.bool_] = np.asarray(~np.isfinite(reading.values).all(axis=(0, 2)))
         # What is not a number must not spread: it is treated as a joint at rest where the encoder last was.
         reading.velocity[bad] = 0.0
         reading.position[bad] = self._last_position[bad]

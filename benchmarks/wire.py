@@ -1,0 +1,285 @@
+"""What reaches the actuators when a brain, or what lies between, goes mad: `python -m benchmarks.wire`.
+
+Streams of commands that no sensible brain sends, one for each simulated robot: steps, reversals at every frame,
+spirals that grow beyond every limit, values at the limits, huge ones, ones that are not finite, tool poses that turn on
+the spot through singular postures. Then the same streams again, while the memory of the command queue and the
+controller's own reference are overwritten at random. Every write to the plant is judged by limits that are stated here:
+finite, in the actuator's range, and a change in one tick that the body permits. The second table is the share of the
+guard, the last check before the plant, in a tick. Exits with 1 if anything unsafe was written.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.control.geometry.poses import pose_vectors
+from bhd_lerobot.control.messages import Mode, Request
+from bhd_lerobot.robots.base_simulation import BaseSimulation
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
+
+Array = NDArray[np.float64]
+SPACES = ("wheels", "joints", "tool", "impedance")
+KINDS = ("steps", "reversals", "spirals", "at the limits", "huge", "not finite", "on the spot")
+ROUNDING = 1.021  # a trajectory ends inside a tick
+
+
+class Judge:
+    """A plant between a cerebellum and its plant, which judges what is written.
+
+    Attributes:
+        writes: how many commands were written, of all robots.
+        unsafe: how many of them were not safe.
+
+    Args:
+        simulation: whose plant it is.
+    """
+
+    def __init__(self, simulation: Any) -> None:
+        self._plant, self.n = simulation.cerebellum.plant, simulation.n
+        body, hz = simulation.body, simulation.rates.control_hz
+        limits = body.limits
+        if isinstance(body, Arm):
+            lead = np.asarray(body.servo_damping) / np.asarray(body.servo_stiffness)
+            effort = np.asarray(limits.effort[:-1])
+            change = (np.asarray(limits.velocity) + 2 * lead * np.asarray(limits.stop_deceleration)) / hz
+            lower, upper = np.asarray(limits.lower) - 1e-2, np.asarray(limits.upper) + 1e-2
+            if body.actuation == "torque":
+                lower[:-1], upper[:-1], change[:-1] = -effort, effort, effort / 0.1 / hz
+        else:
+            drive = body.drive
+            stop = limits.stop_deceleration
+            most = drive.max_wheel_speed
+            change = np.full(2, (stop[0] + stop[1] * drive.wheel_separation / 2) / drive.wheel_radius / hz)
+            lower, upper = np.full(2, -most), np.full(2, most)
+        self._lower, self._upper, self._change = lower - 1e-9, upper + 1e-9, change * ROUNDING + 1e-9
+        self._last: Array | None = None
+        self.writes = self.unsafe = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._plant, name)
+
+    def write(self, ctrl: Array) -> None:
+        """Judge and pass on."""
+        safe = (ctrl >= self._lower) & (ctrl <= self._upper)  # false for what is not a number
+        if self._last is not None:
+            safe &= np.abs(ctrl - self._last) <= self._change
+        self.unsafe += int((~safe.all(axis=1)).sum())
+        self.writes += len(ctrl)
+        self._last = ctrl.copy()
+        self._plant.write(ctrl)
+
+
+def make(space: str, n: int) -> Any:
+    """Return n simulated robots at the start of an episode."""
+    if space == "wheels":
+        base = BaseSimulation(TurtleBot3Config(beams=36), n)
+        task = AvoidTask(AvoidConfig(), n, base.rates.fps)
+        base.reset(np.arange(n), [task.sample(seed) for seed in range(n)], range(n))
+        return base
+    options: dict[str, Any] = {"joints": {}, "tool": {"action_space": "tool"}}.get(
+        space, {"action_space": "tool", "control": "impedance"}
+    )
+    arm = UR5Simulation(UR5Config(**options), n)
+    arm.reset(np.arange(n), [TableScene("empty", (), arm.body.home)] * n, range(n))
+    return arm
+
+
+def start_of(simulation: Any) -> Array:
+    """Return the actions that keep the robots where they are."""
+    command: Array = simulation.cerebellum.command
+    if len(simulation.action_names) == command.shape[1]:
+        return command.copy()
+    tool = pose_vectors(simulation.kinematics.tool(command[:, :-1]))
+    return np.concatenate([tool, command[:, -1:]], axis=1)
+
+
+def ranges(space: str, first: Array) -> tuple[Array, Array]:
+    """Return the smallest and the largest sensible action, each of shape (actions,)."""
+    if space == "wheels":
+        return np.array([-0.22, -2.84]), np.array([0.22, 2.84])
+    if space == "joints":
+        return np.array([*(-2 * np.pi,) * 6, 0.0]), np.array([*(2 * np.pi,) * 6, 0.085])
+    lower, upper = first - 0.4, first + 0.4
+    lower[3:7], upper[3:7], lower[7], upper[7] = -1.0, 1.0, 0.0, 0.085
+    return lower, upper
+
+
+class Stream:
+    """The commands of one mad brain.
+
+    Args:
+        kind: one of `KINDS`.
+        space: one of `SPACES`.
+        first: the action that keeps the robot where it is, shape (actions,).
+        rng: where chance comes from.
+    """
+
+    def __init__(self, kind: str, space: str, first: Array, rng: np.random.Generator) -> None:
+        self.kind, self.first, self.rng = kind, first, rng
+        self._poses = space in ("tool", "impedance")
+        self._lower, self._upper = ranges(space, first)
+        self._held = first
+
+    def action(self, frame: int) -> Array:
+        """Return the action of a frame, shape (actions,)."""
+        lower, upper, rng = self._lower, self._upper, self.rng
+        middle, half, width = (lower + upper) / 2, (upper - lower) / 2, len(lower)
+        action = self._held.copy()
+        match self.kind:
+            case "steps":
+                if frame % 8 == 0:
+                    action = rng.uniform(lower, upper)
+            case "reversals":
+                action = (lower if frame % 2 else upper).copy()
+            case "spirals":
+                action = middle + half * 0.03 * frame * np.sin(0.4 * frame + np.arange(width))
+            case "at the limits":
+                if frame % 20 == 0:
+                    action = np.where(rng.random(width) < 0.5, lower, upper)
+            case "huge":
+                action = middle + half * 10.0 ** rng.integers(0, 300) * rng.choice([-1.0, 1.0], width)
+            case "not finite":
+                action = middle + half * rng.uniform(-0.3, 0.3, width)
+                if rng.random() < 0.5:
+                    action[rng.integers(width)] = rng.choice([np.nan, np.inf, -np.inf])
+            case _ if self._poses:
+                w, x, y, z = self.first[3:7]
+                axis = rng.normal(size=3) * 0.02 + 0.012 * frame  # 0.5 rad/s, and a tremor
+                x, y, z, w = (Rotation.from_rotvec(axis) * Rotation.from_quat([x, y, z, w])).as_quat()
+                action[3:7] = w, x, y, z
+            case _:
+                action = middle + half * np.sin(0.05 * frame * (1 + np.arange(width)))
+        if self._poses and self.kind not in {"huge", "not finite", "on the spot"}:
+            action[3:7] /= max(float(np.linalg.norm(action[3:7])), 1e-3)
+        self._held = action
+        return action
+
+
+def vandalise(simulation: Any, rng: np.random.Generator) -> None:
+    """Overwrite memory that other processes share, or a faulty controller would spoil, with random bytes."""
+    fifo, controller = simulation.cerebellum.fifo, simulation.cerebellum.controller
+    what = rng.integers(6)
+    if what == 0:
+        fifo._values.view(np.uint64)[...] = rng.integers(0, 2**63, fifo._values.shape, np.uint64)
+    elif what == 1:
+        fifo._due[...] = rng.integers(-(2**62), 2**62, fifo._due.shape)
+    elif what == 2:
+        fifo._mask[...] = rng.random(fifo._mask.shape) < 0.5
+    elif what == 3:
+        fifo._tail[0], fifo._head[0] = rng.integers(-(2**40), 2**40, 2)
+    else:
+        chosen = rng.random(simulation.n) < 0.3
+        values = (controller.command, controller.actuators)[int(what == 4)]
+        values[chosen] = rng.choice([np.nan, np.inf, -1e300, 3.0, 0.0], values[chosen].shape)
+
+
+@dataclass
+class Outcome:
+    """What became of the streams of an action space."""
+
+    streams: int = 0
+    writes: int = 0
+    unsafe: int = 0
+    faults: int = 0
+    refused: int = 0
+
+
+def run(space: str, streams: int, frames: int, seed: int) -> tuple[Outcome, Outcome]:
+    """Run streams without and with vandals; robots that latched a fault are reset at the next frame."""
+    outcomes = Outcome(), Outcome()
+    for vandals, outcome in zip((False, True), outcomes, strict=True):
+        simulation = make(space, streams)
+        judge = simulation.cerebellum.plant = Judge(simulation)
+        first = start_of(simulation)
+        made = [
+            Stream(KINDS[stream % len(KINDS)], space, first[stream], np.random.default_rng([seed, stream]))
+            for stream in range(streams)
+        ]
+        vandal = np.random.default_rng([seed, 10**6])
+        for frame in range(frames):
+            actions = np.array([stream.action(frame) for stream in made])
+            if vandals:
+                vandalise(simulation, vandal)
+            report = simulation.step(actions)
+            outcome.refused += int((report.sent.reasons != 0).sum())
+            fault = report.mode == Mode.FAULT
+            outcome.faults += int(fault.sum())
+            for request in (Request.RESET, Request.ACTIVATE):
+                simulation.cerebellum.request(request, np.flatnonzero(fault))
+        outcome.streams += streams
+        outcome.writes, outcome.unsafe = judge.writes, judge.unsafe
+    return outcomes
+
+
+def guard_share(space: str, n: int) -> tuple[float, float]:
+    """Return what a check of the guard takes, and a whole tick with the physics [s]; the smallest of many."""
+    simulation = make(space, n)
+    action = start_of(simulation)
+    cerebellum = simulation.cerebellum
+    for frame in range(10):
+        simulation.step(action + 0.001 * (frame % 2))
+
+    def timed(function: Callable[[], object], count: int) -> float:
+        best = np.inf
+        for _ in range(20):
+            started = time.perf_counter()
+            for _ in range(count):
+                function()
+            best = min(best, (time.perf_counter() - started) / count)
+        return best
+
+    actuators = cerebellum.controller.actuators
+    shifted = actuators + 1e-6
+    pair = [actuators, shifted]
+    check = timed(lambda: [cerebellum.guard.check(one) for one in pair], 200) / 2
+    whole = timed(lambda: simulation.step(action), 3) / simulation.rates.ticks_per_frame
+    return check, whole
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--streams", type=int, default=1000, help="of each action space, and again with vandals")
+    parser.add_argument("--frames", type=int, default=60, help="of each stream")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    console = Console()
+    table = Table(title="What was written to the plants")
+    for column in ("actions", "memory", "streams", "writes", "unsafe", "frames in FAULT", "commands refused"):
+        table.add_column(column, justify="left" if column in ("actions", "memory") else "right")
+    unsafe = 0
+    with np.errstate(all="ignore"):
+        for space in SPACES:
+            outcomes = run(space, options.streams, options.frames, options.seed)
+            for memory, one in zip(("as it is", "garbage"), outcomes, strict=True):
+                unsafe += one.unsafe
+                numbers = (one.streams, one.writes, one.unsafe, one.faults, one.refused)
+                table.add_row(space, memory, *(f"{number:,}" for number in numbers))
+    console.print(table)
+    shares = Table(title="The guard's share of a tick, physics and sensors included")
+    for column in ("robot", "n", "guard", "tick", "share"):
+        shares.add_column(column, justify="left" if column == "robot" else "right")
+    for space in ("wheels", "joints", "impedance"):
+        for n in (1, 64):
+            check, whole = guard_share(space, n)
+            shares.add_row(space, str(n), f"{check * 1e6:.1f} us", f"{whole * 1e6:.0f} us", f"{check / whole:.1%}")
+    console.print(shares)
+    return int(unsafe > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,28 @@
+"""The streams of mad brains, a few of them: what `python -m benchmarks.wire` runs a thousand of."""
+
+import numpy as np
+import pytest
+
+from benchmarks import wire
+from bhd_lerobot.control.guard import Guard
+
+
+@pytest.mark.parametrize("space", wire.SPACES)
+def test_nothing_unsafe_is_written(space: str) -> None:
+    with np.errstate(all="ignore"):
+        plain, vandalised = wire.run(space, len(wire.KINDS), 16, 1)
+    assert plain.writes == vandalised.writes > 0
+    assert plain.unsafe == vandalised.unsafe == 0
+    assert vandalised.faults > 0  # the guard had something to do, and the robots went on after a reset
+
+
+def test_the_judge_is_not_blind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the guard, the same streams write what is not safe."""
+
+    def let_through(self: Guard, actuators: np.ndarray, ticks: int = 1) -> None:
+        self.written[:] = actuators
+
+    monkeypatch.setattr(Guard, "check", let_through)
+    with np.errstate(all="ignore"):
+        _, vandalised = wire.run("joints", len(wire.KINDS), 8, 1)
+    assert vandalised.unsafe > 0
