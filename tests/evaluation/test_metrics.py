@@ -88,7 +88,14 @@ def test_flags_are_counted_by_kind_in_frames():
     metrics = measured(
         episode(np.zeros((4, 2)), **{keys.LIMITS: limits.astype(np.int64), keys.WATCHDOG: watchdog.astype(np.int64)})
     )
-    assert metrics.limits == {"non_finite": 0, "velocity": 2, "acceleration": 1, "effort": 1, "position": 0}
+    assert metrics.limits == {
+        "non_finite": 0,
+        "velocity": 2,
+        "acceleration": 1,
+        "effort": 1,
+        "position": 0,
+        "posture": 0,
+    }
     assert {name: count for name, count in metrics.watchdogs.items() if count} == {"command_age": 2, "blocked": 1}
 
 

@@ -112,6 +112,8 @@ def test_modes() -> None:
     pair.cerebellum.estop.press()
     pair.tick()
     assert pair.client.request(Request.ACTIVATE) == Reason.ESTOP
+    assert pair.client.request(Request.RESET) == Reason.NOT_AT_REST
+    pair.tick(50)  # until it would have given way to what it touches
     assert pair.client.request(Request.RESET) == Reason.ACCEPTED
     assert pair.client.request(Request.ACTIVATE) == Reason.ACCEPTED
     assert pair.client.request(Request.DEACTIVATE) == Reason.ACCEPTED
