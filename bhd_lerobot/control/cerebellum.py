@@ -101,7 +101,7 @@ class Cerebellum:
         self._popped, self._popped_mask = np.zeros((n, width)), np.zeros(n, np.bool_)
         self.estop_latched = np.zeros(n, np.bool_)
         self._by_goal = np.zeros(n, np.bool_)  # moves because of a goal, not because of setpoints
-        self._watchdog = np.zeros(n, np.int8)
+        self._watchdog = np.zeros(n, np.int64)
 
     # --- one tick ----------------------------------------------------------------------------------------------------
 
@@ -231,11 +231,11 @@ class Cerebellum:
 
         TRACKING while a goal is followed, HOLD when all are done, FAULT for an arm that something is in the way of.
         """
-        blocked = self.controller.blocked
-        if np.count_nonzero(blocked):
-            # A protective stop: whatever moved it there would go on pressing.
-            self._watchdog[blocked] |= Watchdog.BLOCKED
-            self._set_mode(blocked & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT), Mode.FAULT)
+        stopped = self.controller.protective_stop
+        if np.count_nonzero(stopped):
+            # Whatever moved it there would go on pressing.
+            self._watchdog |= stopped
+            self._set_mode((stopped != 0) & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT), Mode.FAULT)
         busy = self.controller.busy
         if not np.count_nonzero(busy != self._by_goal):
             return
@@ -398,7 +398,7 @@ class Cerebellum:
 
     def take_flags(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the `Limit` and `Watchdog` flags raised since the last call, each of shape (n,), and clear them."""
-        watchdog = self._watchdog.astype(np.int64)
+        watchdog = self._watchdog.copy()
         self._watchdog[:] = 0
         return self.controller.take_limits(), watchdog
 

@@ -23,7 +23,8 @@ class Controller(ABC):
         actuators: what goes to the plant, shape (n, joints).
         busy: whether it follows one, or brakes after one, shape (n,): it moves without setpoints, and their age says
             nothing about it.
-        blocked: whether it has just been found not to go where it is commanded to, shape (n,): something is in its way.
+        protective_stop: the `Watchdog` flag of each robot that has just begun a stop of its own, shape (n,); 0 for the
+            others.
     """
 
     width: int
@@ -31,7 +32,7 @@ class Controller(ABC):
     command: NDArray[np.float64]
     actuators: NDArray[np.float64]
     busy: NDArray[np.bool_]
-    blocked: NDArray[np.bool_]
+    protective_stop: NDArray[np.int64]
 
     @abstractmethod
     def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:

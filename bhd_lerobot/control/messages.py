@@ -104,6 +104,8 @@ class Limit(IntFlag):
     """Clipped to the range of the joint."""
     POSTURE = 32
     """A tool pose was refused, because no posture reaches it, or none without a jump: the arm holds the last one."""
+    CLEARANCE = 64
+    """A setpoint would have brought the arm too near to itself or to the table: it was slowed down, or stopped."""
 
 
 class Watchdog(IntFlag):
@@ -125,6 +127,8 @@ class Watchdog(IntFlag):
     GUARD = 64
     """What was to be written to an actuator was not finite, out of its range, or too far from the last: mode FAULT, and
     the last safe command stays until the stop begins."""
+    FORCE = 128
+    """An arm pressed with more than its largest force: a protective stop, mode FAULT."""
 
 
 class Request(IntEnum):

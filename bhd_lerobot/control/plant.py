@@ -16,6 +16,9 @@ class PlantReading:
     Attributes:
         position: joint angles [rad], shape (n, joints).
         velocity: joint speeds [rad/s], shape (n, joints).
+        effort: torques that the motors give, also to carry the robot's weight [N m], a gripper's force [N], shape
+            (n, joints); all 0 if the plant does not measure them.
+        has_effort: whether it does.
         stamp_ns: when the hardware measured this, on the plant's own clock [ns], shape (n,); None for a plant whose
             readings are never old, such as a simulation in lockstep.
         fault: whether the hardware reports a fault, shape (n,).
@@ -23,9 +26,11 @@ class PlantReading:
 
     def __init__(self, n: int, joints: int) -> None:
         # One block, so that a single sum checks that every number in it is finite.
-        self.values = np.zeros((2, n, joints))
+        self.values = np.zeros((3, n, joints))
         self.position: NDArray[np.float64] = self.values[0]
         self.velocity: NDArray[np.float64] = self.values[1]
+        self.effort: NDArray[np.float64] = self.values[2]
+        self.has_effort = False
         self.stamp_ns: NDArray[np.int64] | None = None
         self.fault = np.zeros(n, np.bool_)
 

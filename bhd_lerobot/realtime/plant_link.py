@@ -77,12 +77,12 @@ class PlantShape:
           this tick.
         - ``stamp_ns``: when what follows was read; ``tick``, ``oldest``: the simulation's tick, and that of the oldest
           reading in the observation.
-        - ``touches``: in how many ticks there was each kind of touch; ``observation``; ``position``, ``velocity``: of
-          the joints; ``qpos``, ``qvel``: of the physics.
+        - ``touches``: in how many ticks there was each kind of touch; ``observation``; ``position``, ``velocity``,
+          ``effort``: of the joints; ``qpos``, ``qvel``: of the physics.
         """
         names = ("index", "due_ns", "start_ns", "executed", "skipped", "overruns", "phase", "stops", "stopped_ns")
         numbers = [(name, np.int64) for name in (*names, "command", "command_ns", "stamp_ns", "tick", "oldest")]
-        sizes = {"actuators": self.joints, "position": self.joints, "velocity": self.joints}
+        sizes = dict.fromkeys(("actuators", "position", "velocity", "effort"), self.joints)
         sizes |= {"observation": self.features, "qpos": self.positions, "qvel": self.velocities}
         floats = [(name, np.float64, (1, size)) for name, size in sizes.items()]
         return np.dtype([*numbers, ("touches", np.int64, (self.touches,)), *floats])
@@ -171,6 +171,7 @@ class RemotePlant:
         state = self.refresh()
         if state is not None:
             out.position[:], out.velocity[:] = state["position"], state["velocity"]
+            out.effort[:], out.has_effort = state["effort"], True
             out.stamp_ns = self._stamp_ns
             out.stamp_ns[0] = state["stamp_ns"]
         out.fault[:] = self.has_stopped

@@ -26,6 +26,8 @@ class UR5Config(SimulatedRobotConfig):
         tool_pose: observe the tool's pose as well, computed from the joint positions.
         scene: what is on the table when the robot is used by itself: ``"empty"``, ``"reach"`` (a target pose) or
             ``"pick"`` (objects). In a task the task decides.
+        max_force: force [N] with which the tool may press on something, whatever moves it; more is a protective stop.
+            Used with ``control = "servo"``. A force on another part of the arm counts with what the joints feel of it.
         stale_after_s: time after the end of the frame that a setpoint was for, until the arm decelerates and holds [s].
     """
 
@@ -36,6 +38,7 @@ class UR5Config(SimulatedRobotConfig):
     action_space: str = "joint"
     tool_pose: bool = False
     scene: str = "empty"
+    max_force: float = 150.0
     stale_after_s: float = 0.1
 
     def __post_init__(self) -> None:
@@ -46,6 +49,10 @@ class UR5Config(SimulatedRobotConfig):
             raise ConfigError(
                 f"robot.control is 'impedance' and robot.action_space is {self.action_space!r}; "
                 "an impedance is commanded by tool poses: use --robot.action_space=tool."
+            )
+        if not self.max_force > 0:
+            raise ConfigError(
+                f"robot.max_force is {self.max_force}; it must be positive [N]. With .inf there is no limit."
             )
         if not 0 < self.stale_after_s < float("inf"):
             raise ConfigError(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.arm.controller import ArmController
+from bhd_lerobot.control.arm.force_limit import ForceLimit
 from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import Pose, ResultCode
@@ -101,6 +102,7 @@ class UR5Simulation(Simulation):
             self.controller = ImpedanceController(body, n, config.control_hz, ticks)
         else:
             self.controller = ArmController(body, n, config.control_hz, ticks, planning)
+            self.controller.force = ForceLimit(body, n, config.control_hz, config.max_force)
         super().__init__(
             config,
             world,

@@ -11,15 +11,17 @@ from bhd_lerobot.sim.world import World
 
 
 class JointReading(Protocol):
-    """What `SimulatedPlant.read` fills: any object with these two arrays, each of shape (n, joints)."""
+    """What `SimulatedPlant.read` fills: any object with these three arrays, each of shape (n, joints)."""
 
     position: NDArray[np.float64]
     velocity: NDArray[np.float64]
+    effort: NDArray[np.float64]
+    has_effort: bool
 
 
 _MOST_VIEWS = 8  # readings that are remembered
 _Array = NDArray[np.float64]
-_Views = tuple[_Array, _Array, list[tuple[_Array, _Array, _Array]]]
+_Views = tuple[_Array, _Array, _Array, list[tuple[_Array, _Array, _Array]]]
 
 
 class SimulatedPlant:
@@ -35,18 +37,20 @@ class SimulatedPlant:
 
     def __init__(self, world: World) -> None:
         self.n = world.n
-        body = world.body
+        body, efforts = world.body, world.derived("qfrc_actuator")
         self._fingers: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         if isinstance(body, Arm):
             joints, names = body.chain.joints, body.actuators
             positions, velocities = world.joint_slice(body.gripper.joints)
             self._fingers = world.qpos[:, positions], world.qvel[:, velocities]
+            self._grip = efforts[:, velocities.start]  # the force of their one actuator acts on each of them
         elif isinstance(body, MobileBase):
             joints, names = body.drive.joints, body.drive.actuators
         else:
             raise SimulationError(f"Body {body.name!r} is a {type(body).__name__}, which has no plant.")
         positions, velocities = world.joint_slice(joints)
         self._position, self._velocity = world.qpos[:, positions], world.qvel[:, velocities]
+        self._effort = efforts[:, velocities]
         actuators = [world.model.actuator(name).id for name in names]
         if actuators != list(range(actuators[0], actuators[0] + len(actuators))):
             raise SimulationError(f"Actuators {list(names)} are not neighbours in the model.")
@@ -55,25 +59,32 @@ class SimulatedPlant:
         self._views: dict[int, tuple[JointReading, _Views]] = {}
 
     def read(self, out: JointReading) -> None:
-        """Write the joints' positions and velocities, each of shape (n, joints), into `out`."""
+        """Write the joints' positions, velocities and efforts, each of shape (n, joints), into `out`.
+
+        The efforts are those of the last physics step.
+        """
         entry = self._views.get(id(out))
         if entry is None:
             if len(self._views) >= _MOST_VIEWS:
                 self._views.clear()
             entry = self._views[id(out)] = out, self._bind(out)
-        position, velocity, sums = entry[1]
+            out.has_effort = True
+        position, velocity, effort, sums = entry[1]
         position[:] = self._position
         velocity[:] = self._velocity
+        effort[:] = self._effort
+        if self._fingers is not None:
+            out.effort[:, -1] = self._grip
         for one, other, to in sums:
             np.add(one, other, out=to)
 
     def _bind(self, out: JointReading) -> "_Views":
         """Make the views into a reading once, not at every tick."""
         if self._fingers is None:
-            return out.position, out.velocity, []
+            return out.position, out.velocity, out.effort, []
         both = zip(self._fingers, (out.position, out.velocity), strict=True)
         sums = [(fingers[:, 0], fingers[:, 1], to[:, -1]) for fingers, to in both]
-        return out.position[:, :-1], out.velocity[:, :-1], sums
+        return out.position[:, :-1], out.velocity[:, :-1], out.effort[:, :-1], sums
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the servos' commands, shape (n, joints)."""

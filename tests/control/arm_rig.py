@@ -31,6 +31,7 @@ class PerfectArm:
         self.fault = np.zeros(n, np.bool_)
         self.lie: dict[int, float] = {}  # simulation -> what its encoders read instead
         self.stuck = np.zeros(n, np.bool_)
+        self.written: list[np.ndarray] = []
 
     def read(self, out: PlantReading) -> None:
         out.position[:], out.velocity[:], out.fault[:] = self.position, self.velocity, self.fault
@@ -39,6 +40,7 @@ class PerfectArm:
 
     def write(self, ctrl: np.ndarray) -> None:
         assert np.isfinite(ctrl).all()
+        self.written.append(ctrl.copy())
         self.velocity = np.where(self.stuck[:, None], 0.0, (ctrl - self.position) / LEAD)
         self.position = self.position + self.velocity / HZ
 

@@ -20,6 +20,7 @@ class Pressed:
     def __init__(self) -> None:
         self.arm = arm = UR5Simulation(UR5Config(), 1, threads=1)
         arm.reset(np.zeros(1, int), [TableScene("empty", (), arm.body.home)], [0])
+        arm.cerebellum.controller.setpoints.clearance = None  # type: ignore[union-attr]
         action = arm.cerebellum.command.copy()
         pose = arm.kinematics.tool(action[0, :6])
         self.model = arm.world.copy_model(0)

@@ -7,7 +7,7 @@ import pytest
 
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
-from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError, RenderingError
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
@@ -285,6 +285,7 @@ def test_an_impedance_with_too_much_latency_is_refused():
 
 def test_an_arm_that_presses_on_the_table_stops_and_lets_go(robot):
     simulation = robot.simulation
+    simulation.cerebellum.controller.setpoints.clearance = None
     start = simulation.cerebellum.command.copy()
     down = start.copy()
     down[0, 1] += 1.0  # the shoulder lowers the arm into the table
@@ -293,8 +294,7 @@ def test_an_arm_that_presses_on_the_table_stops_and_lets_go(robot):
         reports.append(simulation.step(down))
         if reports[-1].mode[0] == Mode.FAULT:
             break
-    assert reports[-1].watchdog[0] & Watchdog.BLOCKED
-    assert reports[-1].limits[0] & Limit.EFFORT
+    assert reports[-1].watchdog[0] & Watchdog.FORCE
     assert simulation.truth().arm_on_table[0]
     for _ in range(40):
         simulation.bridge.advance_frame()

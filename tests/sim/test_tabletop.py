@@ -504,6 +504,7 @@ def test_the_plant_reads_six_joints_and_the_opening(actuation: str) -> None:
     class Reading:
         position = np.zeros((3, 7))
         velocity = np.zeros((3, 7))
+        effort = np.zeros((3, 7))
 
     plant.read(Reading)  # type: ignore[arg-type]
     np.testing.assert_allclose(Reading.position, [scene.posture for scene in scenes], atol=1e-15)

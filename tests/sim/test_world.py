@@ -309,6 +309,7 @@ def test_the_plant_reads_and_writes_the_wheels_by_name() -> None:
     class Reading:
         position = np.zeros((3, 2))
         velocity = np.zeros((3, 2))
+        effort = np.zeros((3, 2))
 
     plant.read(Reading)  # type: ignore[arg-type]
     np.testing.assert_allclose(Reading.velocity, [(0.5, 1.0), (1.0, 1.5), (1.5, 2.0)], rtol=0.02)

@@ -4,10 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.arm.clearance import SetpointClearance
+from bhd_lerobot.control.arm.force_limit import ForceLimit
 from bhd_lerobot.control.arm.setpoints import SetpointFilter
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.controller import Controller
-from bhd_lerobot.control.messages import Limit, Mode
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import PlantReading
@@ -16,11 +18,14 @@ from bhd_lerobot.control.plant import PlantReading
 BLOCKED_RAD, BLOCKED_S = 0.1, 0.05
 _BLOCKED = f"The arm stayed more than {BLOCKED_RAD} rad from its reference: something is in its way."
 _CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)  # numpy compares plain numbers faster
-_GAVE_WAY = "The arm was stopped, and gives way to what it touches."
+_SLOW = 0.2  # [rad/s] the joints' speed below which they are held where they are
 _STILL = 0.05  # [rad/s] the joints' speed below which a hard stop is over
 _SETTLED_S = 0.04  # [s] what was stopped may swing back once
 _GIVES_WAY_RAD = 2e-4  # [rad] nearer to its reference than this a joint presses with 8 N m at the most
-_MOST_GIVING = 6
+_MOST_GIVING = 3
+_BACK_RAD = 0.02  # [rad] the way that an arm first goes back after a protective stop, of the joint that turned most
+LIGHT_N = 20.0  # [N] an arm that presses less has given way
+_TRAIL_S, _TRAIL_PERIOD_S = 1.0, 0.01
 _REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
 
 
@@ -29,6 +34,9 @@ class ArmController(Controller):
 
     A command is the position of each joint [rad] and the gripper's opening [m]. What goes to the servos is the
     reference plus the lead that makes up for the servos' damping, so that they follow a moving reference without a lag.
+
+    Attributes:
+        force: what stops an arm that presses too hard, if the plant measures efforts; nothing does if None.
 
     Args:
         arm: the arm.
@@ -43,13 +51,15 @@ class ArmController(Controller):
         self.arm = arm
         self.width = self.joints = width = len(limits.names)
         self.goals = GoalManager(arm, n, control_hz, planning=planning)
-        self.setpoints = SetpointFilter(limits, n, control_hz, frame_ticks)
+        clearance = SetpointClearance(arm, n, control_hz, frame_ticks)
+        self.setpoints = SetpointFilter(limits, n, control_hz, frame_ticks, clearance)
         self.command = np.tile(np.asarray(arm.home), (n, 1))
         self.velocity: NDArray[np.float64] = np.zeros((n, width))
         self.acceleration: NDArray[np.float64] = np.zeros((n, width))
         self.actuators = self.command.copy()
-        self.blocked = np.zeros(n, np.bool_)
-        self._any_blocked = self._any_bad = False
+        self.protective_stop = np.zeros(n, np.int64)
+        self._any_stopped = self._any_bad = False
+        self.force: ForceLimit | None = None
         self.busy = self.goals.busy  # the same array
         self._half_tick = 0.5 / control_hz  # [s]
         # Ticks for which a joint has been too far from its reference.
@@ -61,6 +71,9 @@ class ArmController(Controller):
         # How often an arm that was stopped hard may still give way to what it touches.
         self._gives_way: NDArray[np.int64] = np.zeros(n, np.int64)
         self._any_gives_way = False
+        self._yields, self._any_yields = np.zeros(n, np.bool_), False  # stops at once, against what is in its way
+        self._back_rad = np.zeros(n)  # so far it then goes back
+        self._trail = _Trail(n, width - 1, control_hz)
         self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
         self._speed = np.asarray(limits.velocity)
         self._most_off_ticks = round(BLOCKED_S * control_hz)
@@ -99,7 +112,7 @@ class ArmController(Controller):
             return  # HOLD, INACTIVE and SAFE_OFF are entered at rest
         hard = cause in (Mode.ESTOP, Mode.FAULT)
         if hard:
-            mask = mask & ~self.blocked  # they are on their way back, and goals have ended
+            mask = mask & (self.protective_stop == 0)  # they are on their way back, and goals have ended
             self._unwatched |= mask
             self._gives_way[mask] = _MOST_GIVING
             self._any_gives_way = True
@@ -130,6 +143,9 @@ class ArmController(Controller):
         self.goals.tick(self.command, self.velocity, self.acceleration, reading.position, reading.velocity)
         if np.count_nonzero(self._unwatched):
             self._unwatched &= ~self.following
+        self._trail.note(reading, self._gives_way)
+        if self._any_yields:
+            self._yield(reading)
         if self._any_gives_way:
             self._give_way(reading)
         np.multiply(self.velocity, self._lead, out=self.actuators)
@@ -143,26 +159,33 @@ class ArmController(Controller):
         work -= self.actuators
         np.abs(work, out=work)
         beyond = work > self._largest_error
-        if self._any_blocked:
-            self.blocked[:] = self._any_blocked = False
+        if self._any_stopped:
+            self.protective_stop[:] = self._any_stopped = False
         if np.count_nonzero(beyond):
             self._limited_effort |= beyond.any(axis=1)
             self._watch(reading)
         elif np.count_nonzero(self._off_ticks):
             self._off_ticks[:] = 0
+        if self.force is not None and self.force.update(reading):
+            self._protect(self.force.exceeded & ~self._unwatched, reading, Watchdog.FORCE, self.force.explain())
 
     def _give_way(self, reading: PlantReading) -> None:
         """After a hard stop, bring the reference to where the arm came to rest: what it presses on is let go of."""
         dof = self.width - 1
         still = (np.abs(reading.velocity[:, :dof]) < _STILL).all(axis=1)
-        waiting = (self._gives_way > 0) & still & ~self.following
+        resting = (np.abs(self.velocity[:, :dof]) < _REST).all(axis=1)
+        waiting = (self._gives_way > 0) & ~self._yields & still & resting & ~self.following
         self._still_ticks = (self._still_ticks + 1) * waiting
         ready = self._still_ticks >= self._settled_ticks
         if not ready.any():
             return
         self._still_ticks[ready] = 0
-        where = np.minimum(np.maximum(reading.position, self._lower), self._upper)
-        where[:, dof] = self.command[:, dof]  # what is gripped is not let go of
+        where = self._retreat_from(reading)
+        for sim in np.flatnonzero(ready & (self._back_rad > 0.0)).tolist():
+            where[sim, :dof] = self._trail.back(sim, reading.position[sim, :dof], self._back_rad[sim], where[sim, :dof])
+            # Whatever it slid along on the way here holds it until it is back at where that began.
+            presses = self.force is not None and self.force.force[sim] > LIGHT_N
+            self._back_rad[sim] = 2 * self._back_rad[sim] if presses else 0.0
         off = ready & (np.abs(where - self.command) > _GIVES_WAY_RAD).any(axis=1)
         # What it leans on springs back, and pushes the arm on: it takes a few times. A load, which makes the arm sag a
         # little further each time, must not make it sink for ever.
@@ -170,7 +193,7 @@ class ArmController(Controller):
         self._gives_way[ready & ~off] = 0
         self._any_gives_way = bool(self._gives_way.any())
         if off.any():
-            self.goals.retreat(off, _GAVE_WAY, (self.command, self.velocity, self.acceleration), where)
+            self.goals.retreat(off, (self.command, self.velocity, self.acceleration), where)
 
     def _watch(self, reading: PlantReading) -> None:
         """Find arms that do not go where they are commanded to, and stop pressing on with them.
@@ -181,17 +204,56 @@ class ArmController(Controller):
         dof = self.width - 1
         off = (np.abs(self.command[:, :dof] - reading.position[:, :dof]) > BLOCKED_RAD).any(axis=1)
         self._off_ticks = (self._off_ticks + 1) * (off & ~self._unwatched)
-        blocked = self._off_ticks >= self._most_off_ticks
-        if not blocked.any():
+        self._protect(self._off_ticks >= self._most_off_ticks, reading, Watchdog.BLOCKED, _BLOCKED)
+
+    def _protect(self, mask: NDArray[np.bool_], reading: PlantReading, cause: Watchdog, message: str) -> None:
+        """Begin a protective stop."""
+        if not mask.any():
             return
-        np.copyto(self.blocked, blocked)
-        self._any_blocked = True
-        self._off_ticks[blocked] = 0
-        self._unwatched |= blocked
-        self._leave_setpoints(blocked)
-        where = np.minimum(np.maximum(reading.position, self._lower), self._upper)
-        where[:, dof] = self.command[:, dof]  # what is gripped is not let go of
-        self.goals.retreat(blocked, _BLOCKED, (self.command, self.velocity, self.acceleration), where)
+        self.protective_stop[mask] = int(cause)
+        self._any_stopped = True
+        self._off_ticks[mask] = 0
+        self._unwatched |= mask
+        self._leave_setpoints(mask)
+        self.goals.end_all(mask, message)
+        self._yields |= mask
+        self._back_rad[mask] = _BACK_RAD
+        self._any_yields = True
+        self._gives_way[mask] = _MOST_GIVING
+        self._any_gives_way = True
+
+    def _yield(self, reading: PlantReading) -> None:
+        """Bring the servos' commands to where the joints are, as fast as joints may turn, until these are at rest.
+
+        The reference would take its way to brake, against what the joints cannot go through. A servo that is so far
+        from its command that it gives its largest torque gives no other on the way back, and one that is where it is
+        commanded to brakes with all that it has.
+        """
+        dof, mask = self.width - 1, self._yields
+        step = self._speed[:dof] * 2 * self._half_tick
+        off = reading.position[:, :dof] - self.actuators[:, :dof]
+        where = self.actuators[:, :dof] + np.minimum(np.maximum(off, -step), step)
+        np.copyto(self.command[:, :dof], where, where=mask[:, None])
+        np.copyto(self.velocity, 0.0, where=mask[:, None])
+        np.copyto(self.acceleration, 0.0, where=mask[:, None])
+        there = (np.abs(off) <= self._largest_error[:dof]) & (np.abs(reading.velocity[:, :dof]) < _SLOW)
+        self._yields &= ~there.all(axis=1)
+        self._any_yields = bool(self._yields.any())
+        inside = np.minimum(np.maximum(self.command, self._lower), self._upper)
+        np.copyto(self.command, inside, where=(mask & ~self._yields)[:, None])
+
+    def _retreat_from(self, reading: PlantReading) -> NDArray[np.float64]:
+        """Return where references are to be, so that arms press on nothing, shape (n, width).
+
+        What an arm pressed on springs back: with a reference where the joints are it goes on pressing with about half.
+        So each joint is to be as far on the other side of where it is as its servo pulled on this one; in the end it is
+        to be where it is.
+        """
+        pull = np.minimum(np.maximum(self.command - reading.position, -self._largest_error), self._largest_error)
+        pull[self._gives_way <= 1] = 0.0
+        where = np.minimum(np.maximum(reading.position - pull, self._lower), self._upper)
+        where[:, -1] = self.command[:, -1]  # what is gripped is not let go of
+        return where
 
     def _leave_setpoints(self, mask: NDArray[np.bool_]) -> None:
         """Follow no setpoints any more; what comes next starts without speeding up.
@@ -221,7 +283,12 @@ class ArmController(Controller):
         self.velocity[ids] = self.acceleration[ids] = 0.0
         self._off_ticks[ids] = 0
         self._unwatched[ids], self._gives_way[ids] = False, 0
-        for flags in (self._limited_finite, self._limited_effort, self.blocked):
+        self._yields[ids], self._back_rad[ids] = False, 0.0
+        self._trail.restart(ids)
+        self.protective_stop[ids] = 0
+        if self.force is not None:
+            self.force.restart(ids)
+        for flags in (self._limited_finite, self._limited_effort):
             flags[ids] = False
 
     # --- reports -----------------------------------------------------------------------------------------------------
@@ -242,6 +309,7 @@ class ArmController(Controller):
             + setpoints.limited_position * int(Limit.POSITION)
             + setpoints.limited_velocity * int(Limit.VELOCITY)
             + setpoints.limited_acceleration * int(Limit.ACCELERATION)
+            + setpoints.limited_clearance * int(Limit.CLEARANCE)
             + self._limited_effort * int(Limit.EFFORT)
         )
         for flags in (
@@ -250,6 +318,7 @@ class ArmController(Controller):
             setpoints.limited_position,
             setpoints.limited_velocity,
             setpoints.limited_acceleration,
+            setpoints.limited_clearance,
         ):
             flags[:] = False
         setpoints.limited = self._any_bad = False
@@ -283,6 +352,37 @@ class ArmController(Controller):
     def feedback(self, sim: int) -> Feedback | None:
         """Return how far the goal is that one arm follows, or None."""
         return self.goals.feedback(sim)
+
+
+class _Trail:
+    """Where the joints of n arms were in the last second, as long as nothing was in their way."""
+
+    def __init__(self, n: int, dof: int, control_hz: int) -> None:
+        self._period = max(1, round(_TRAIL_PERIOD_S * control_hz))
+        self._rows = np.full((round(_TRAIL_S / _TRAIL_PERIOD_S), n, dof), np.nan)
+        self._ticks = 0
+        self._count = np.zeros(n, np.int64)
+
+    def note(self, reading: PlantReading, gives_way: NDArray[np.int64]) -> None:
+        """Take one tick into account; arms that give way leave no trail."""
+        self._ticks += 1
+        if self._ticks % self._period:
+            return
+        ids = np.flatnonzero(gives_way == 0)
+        self._rows[self._count[ids] % len(self._rows), ids] = reading.position[ids, : self._rows.shape[2]]
+        self._count[ids] += 1
+
+    def back(
+        self, sim: int, position: NDArray[np.float64], least: float, otherwise: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return where an arm was last when a joint was `least` [rad] from where it is now, or `otherwise`."""
+        rows = self._rows[(self._count[sim] - 1 - np.arange(len(self._rows))) % len(self._rows), sim]
+        away = np.abs(rows - position).max(axis=1) >= least  # never so where there is no row yet
+        return rows[int(away.argmax())] if away.any() else otherwise
+
+    def restart(self, ids: NDArray[np.intp]) -> None:
+        """Forget arms that were put somewhere else."""
+        self._rows[:, ids] = np.nan
 
 
 _STOP_CODES = {

@@ -80,7 +80,7 @@ class ImpedanceController(Controller):
         opening_limits = (arm.limits.velocity[-1], arm.limits.acceleration[-1])
         self.equilibrium = Equilibrium(n, control_hz, frame_ticks, limits or EquilibriumLimits(), opening_limits)
         self.command, self.actuators = np.zeros((n, WIDTH)), np.zeros((n, self.joints))
-        self.busy, self.blocked = (np.zeros(n, np.bool_) for _ in range(2))
+        self.busy, self.protective_stop = np.zeros(n, np.bool_), np.zeros(n, np.int64)
         self.wrench: Array = np.zeros((n, 6))
         self._wanted_wrench = np.zeros((n, 6))
         self._wrench_step = np.repeat([_FORCE_RATE, _MOMENT_RATE], 3) / control_hz

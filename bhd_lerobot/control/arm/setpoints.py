@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import PositionLimits
+from bhd_lerobot.control.arm.clearance import SetpointClearance
 
 # [1/s] How eagerly a remaining error is closed. A fifth of the highest gain that a second-order filter with one tick of
 # delay is stable with at 500 Hz; well above what an arm can follow.
@@ -23,14 +24,25 @@ class SetpointFilter:
     a lag, and never beyond the limits of position, speed and acceleration. A target out of reach in one frame is
     approached as fast as the limits allow.
 
+    Attributes:
+        clearance: what slows an arm down before it comes too near to something; nothing does if None.
+
     Args:
         limits: the limits.
         n: number of robots.
         control_hz: ticks a second [Hz].
         frame_ticks: ticks in a frame.
+        clearance: the attribute.
     """
 
-    def __init__(self, limits: PositionLimits, n: int, control_hz: int, frame_ticks: int) -> None:
+    def __init__(
+        self,
+        limits: PositionLimits,
+        n: int,
+        control_hz: int,
+        frame_ticks: int,
+        clearance: SetpointClearance | None = None,
+    ) -> None:
         width = len(limits.names)
         self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
         self._speed = np.asarray(limits.velocity)
@@ -56,10 +68,12 @@ class SetpointFilter:
         self._error, self._size, self._wanted, self._work = np.zeros((4, n, width))
         self._flags = np.zeros((n, width), np.bool_)
         self._all_active = False
+        self.clearance = clearance
         self.active: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.limited_position: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.limited_velocity: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.limited_acceleration: NDArray[np.bool_] = np.zeros(n, np.bool_)
+        self.limited_clearance: NDArray[np.bool_] = np.zeros(n, np.bool_)
         self.limited = False  # whether any of them may be set
 
     def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_], position: NDArray[np.float64]) -> None:
@@ -87,11 +101,15 @@ class SetpointFilter:
         np.multiply(self._step, self._hz, out=self._feed)
         self._arrival[mask] = self._runs + self._frame_ticks
         self._next_arrival = int(self._arrival.min())
+        if self.clearance is not None:
+            self.clearance.check_soon(mask)
 
     def drop(self, mask: NDArray[np.bool_]) -> None:
         """Stop following setpoints."""
         self.active &= ~mask
         self._all_active = False
+        if self.clearance is not None and self.clearance.slows:
+            self.clearance.release(mask)
 
     def run(
         self, position: NDArray[np.float64], velocity: NDArray[np.float64], acceleration: NDArray[np.float64]
@@ -124,11 +142,13 @@ class SetpointFilter:
         self._slow_near_ends(position)
         speed = np.maximum(wanted, self._slowest, out=size)
         np.minimum(speed, self._speed, out=speed)
+        self._note(self.limited_velocity, speed, wanted)
+        if self.clearance is not None:
+            self._keep_clear(self.clearance, position, velocity, speed)
         np.subtract(speed, velocity, out=change)
         np.multiply(change, self._hz, out=change)
         allowed = np.maximum(change, self._hardest, out=error)
         np.minimum(allowed, self._acceleration, out=allowed)
-        self._note(self.limited_velocity, speed, wanted)
         self._note(self.limited_acceleration, allowed, change)
         if self._all_active:
             acceleration[:] = allowed
@@ -139,6 +159,20 @@ class SetpointFilter:
         np.copyto(acceleration, allowed, where=active)
         np.copyto(velocity, velocity + allowed / self._hz, where=active)
         np.copyto(position, position + velocity / self._hz, where=active)
+
+    def _keep_clear(
+        self,
+        clearance: SetpointClearance,
+        position: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        speed: NDArray[np.float64],
+    ) -> None:
+        """Want no more than lets an arm stop before it comes too near to something; the gripper is free."""
+        clearance.run(self._runs, position, velocity, speed, self.active)
+        if clearance.slows:
+            speed[:, : clearance.dof] *= clearance.share[:, None]
+            self.limited = True
+            self.limited_clearance |= clearance.share < 1.0
 
     def _arrive(self) -> None:
         arrived = self._arrival == self._runs
@@ -191,5 +225,12 @@ class SetpointFilter:
         self._step[ids] = self._feed[ids] = 0.0
         self._arrival[ids] = _NEVER
         self._next_arrival = int(self._arrival.min())
-        for flags in (self.limited_position, self.limited_velocity, self.limited_acceleration):
+        if self.clearance is not None:
+            self.clearance.restart(ids)
+        for flags in (
+            self.limited_position,
+            self.limited_velocity,
+            self.limited_acceleration,
+            self.limited_clearance,
+        ):
             flags[ids] = False

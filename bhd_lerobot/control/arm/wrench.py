@@ -74,16 +74,17 @@ class ContactObserver:
         self._fresh[ids] = True
 
 
-def tool_wrench(jacobian: Array, torque: Array) -> Array:
+def tool_wrench(jacobian: Array, torque: Array, damping: float = _DAMPING) -> Array:
     """Return the wrench on the tool that joint torques amount to, by damped least squares.
 
     Args:
         jacobian: shape (n, 6, dof).
         torque: [N m], shape (n, dof).
+        damping: directions in which the Jacobian's singular value is this small are halved.
 
     Returns:
         Force [N] and moment [N m] in the base frame, shape (n, 6); near zero in directions that a singular posture can
         feel nothing from.
     """
-    square = jacobian @ np.swapaxes(jacobian, 1, 2) + _DAMPING**2 * np.eye(6)
+    square = jacobian @ np.swapaxes(jacobian, 1, 2) + damping**2 * np.eye(6)
     return np.asarray(np.linalg.solve(square, jacobian @ torque[..., None])[..., 0])

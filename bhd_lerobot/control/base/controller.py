@@ -7,7 +7,7 @@ from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.base import limits as safety
 from bhd_lerobot.control.base.diff_drive import DiffDrive
 from bhd_lerobot.control.controller import Controller
-from bhd_lerobot.control.messages import Limit, Mode
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 
@@ -39,7 +39,7 @@ class BaseController(Controller):
         self.drive = DiffDrive(drive, n)
         self.command = np.zeros((n, width))
         self.actuators = np.zeros((n, self.joints))
-        self.busy, self.blocked = (np.zeros(n, np.bool_) for _ in range(2))
+        self.busy, self.protective_stop = np.zeros(n, np.bool_), np.zeros(n, np.int64)
         self._servo_gain, self._torque = drive.servo_gain, drive.max_torque
         self._velocity = np.asarray(limits.velocity)
         self._change = np.asarray(limits.acceleration) / control_hz
@@ -72,7 +72,7 @@ class BaseController(Controller):
         self._asked, self._position = np.zeros((n, self.joints)), np.zeros((n, self.joints))
         self._least_turn = _LEAST_SPEED * self._look_ticks / control_hz
         self._stalls = np.zeros((n, self.joints), np.int64)
-        self._any_blocked = False
+        self._any_stopped = False
         self._wheels = (1.0 / drive.wheel_radius, per_yaw, drive.max_wheel_speed, self._limited_wheels)
 
     def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
@@ -102,8 +102,8 @@ class BaseController(Controller):
         if np.count_nonzero(np.greater(error, self._largest_error, out=self._beyond)):
             self._limited_effort |= self._beyond.any(axis=1)
         self.drive.update_odometry(reading.position)
-        if self._any_blocked:
-            self.blocked[:] = self._any_blocked = False
+        if self._any_stopped:
+            self.protective_stop[:] = self._any_stopped = False
         self._asked += self.actuators
         self._ticks += 1
         if self._ticks == self._next_look:
@@ -115,9 +115,10 @@ class BaseController(Controller):
         asked, turned = self._asked[ids] * self._dt, position[ids] - self._position[ids]
         stalled = (np.abs(asked) > self._least_turn) & (turned * np.sign(asked) < 0.5 * np.abs(asked))
         stalls = (self._stalls[ids] + 1) * stalled
-        self.blocked[ids] = blocked = (stalls >= _STALL_CHECKS).any(axis=1)
-        self._any_blocked = bool(blocked.any())
-        stalls[blocked] = 0
+        stalled = (stalls >= _STALL_CHECKS).any(axis=1)
+        self.protective_stop[ids] = stalled * int(Watchdog.BLOCKED)
+        self._any_stopped = bool(stalled.any())
+        stalls[stalled] = 0
         self._stalls[ids] = stalls
         self._look_again(ids, position)
 

@@ -64,6 +64,35 @@ class CollisionModel:
         pairs, heights = self._distances(q)
         return pairs.min(axis=0, initial=np.inf).reshape(rest), heights.min(axis=0, initial=np.inf).reshape(rest)
 
+    def slopes(self) -> tuple[Array, Array]:
+        """Return how much a distance can change at the most when a joint turns [m/rad].
+
+        Returns:
+            For each checked pair, shape (pairs, 6), and for each capsule's distance from the table, shape (capsules,
+            6). A pair's distance depends on the joints between its capsules only.
+        """
+        chain, joints = self.chain, np.arange(self._forward.dof)
+        lengths = np.abs((chain.a, chain.d)).sum(axis=0)
+        heights = np.zeros((self._count, len(joints)))
+        for row, capsule in zip(heights, chain.capsules, strict=True):
+            end = max(math.hypot(*capsule.start), math.hypot(*capsule.end))
+            for joint in joints[: capsule.frame]:
+                row[joint] = lengths[joint : capsule.frame].sum() + end
+        frames = [capsule.frame for capsule in chain.capsules]
+        pairs = np.zeros((len(self._first), len(joints)))
+        for row, one, other in zip(pairs, self._first, self._second, strict=True):
+            near, far = sorted((one, other), key=lambda index: frames[index])
+            row[frames[near] :] = heights[far, frames[near] :]
+        return pairs, heights
+
+    def each(self, q: Array) -> Array:
+        """Return every distance that `distances` takes the smallest of, shape (pairs + capsules, n): first the pairs.
+
+        Args:
+            q: joint positions [rad], shape (n, 6).
+        """
+        return np.concatenate(self._distances(q))
+
     def closest_pair(self, q: Array) -> tuple[str, str]:
         """Return the names of the two capsules that come closest in a posture of shape (6,)."""
         return self.chain.disjoint[int(self._distances(q)[0].argmin())]

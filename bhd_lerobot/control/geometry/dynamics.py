@@ -105,6 +105,19 @@ class ArmDynamics:
             gravity[sim] = pinocchio.computeGeneralizedGravity(model, data, q)
         return DynamicsTerms(mass, coriolis, gravity, jacobian, tool)
 
+    def torque(self, position: Array, velocity: Array, acceleration: Array) -> Array:
+        """Return the torques that a motion needs, weight included [N m], shape (n, 6): inverse dynamics.
+
+        Args:
+            position: joint positions [rad], shape (n, 6).
+            velocity: joint speeds [rad/s], shape (n, 6).
+            acceleration: [rad/s^2], shape (n, 6).
+        """
+        torque = np.empty(position.shape)
+        for sim in range(len(position)):
+            torque[sim] = pinocchio.rnea(self.model, self._data, position[sim], velocity[sim], acceleration[sim])
+        return torque
+
 
 def product(matrices: Array, vectors: Array) -> Array:
     """Return each matrix, shape (n, i, j), times its vector, shape (n, j); the same bits whatever n is."""

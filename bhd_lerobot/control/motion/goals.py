@@ -163,19 +163,29 @@ class GoalManager:
             self._rest(sim)
             self._changed(sim)
 
-    def retreat(self, mask: NDArray[np.bool_], message: str, reference: Reference, target: Array) -> None:
-        """End all goals of arms that something is in the way of, and bring their reference to where they are.
+    def end_all(self, mask: NDArray[np.bool_], message: str) -> None:
+        """End all goals of arms that something is in the way of, with PATH_TOLERANCE; their reference stays as it is.
 
         Args:
             mask: the arms, shape (n,).
-            message: why their goals end, with PATH_TOLERANCE.
-            reference: position, velocity and acceleration, each of shape (n, dof + 1).
-            target: where they are, within the limits, shape (n, dof + 1).
+            message: why.
         """
         for sim in np.flatnonzero(mask).tolist():
             self._end_all(sim, ResultCode.PATH_TOLERANCE, message)
+            self._rest(sim)
+            self._changed(sim)
+
+    def retreat(self, mask: NDArray[np.bool_], reference: Reference, target: Array) -> None:
+        """Bring the reference of arms that follow nothing somewhere else.
+
+        Args:
+            mask: the arms, shape (n,).
+            reference: position, velocity and acceleration, each of shape (n, dof + 1).
+            target: within the limits, shape (n, dof + 1).
+        """
+        for sim in np.flatnonzero(mask).tolist():
             state = State.of(*(array[sim] for array in reference))
-            way = to_target(state, target[sim], self.planner.limits, self._hz)
+            way = to_target(state, target[sim], self.planner.stop_limits, self._hz)
             if isinstance(way, PlanFailure):
                 self._brake(sim, reference, _Motion.BRAKE)
             else:

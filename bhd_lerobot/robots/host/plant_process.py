@@ -80,6 +80,7 @@ class SensedWorld:
         field["command"][0], field["command_ns"][0] = guard.number, guard.stamp_ns
         field["actuators"][0] = tick.actuators
         field["position"][0], field["velocity"][0] = reading.position, reading.velocity
+        field["effort"][0] = reading.effort
         field["observation"][0], oldest = simulation.sense()
         field["tick"][0], field["oldest"][0] = simulation.tick, oldest[0]
         field["qpos"][0], field["qvel"][0] = simulation.world.qpos, simulation.world.qvel

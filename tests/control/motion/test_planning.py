@@ -243,7 +243,8 @@ def test_ending_a_goal_during_planning_drops_the_request(way: str, ticks: int) -
         rig.velocity[:] = rig.acceleration[:] = 0.0  # what follows setpoints brings it to rest
         rig._rows, rig._stopped = [np.stack(rig.reference)], []
     elif way == "retreat":
-        rig.manager.retreat(mask, "in the way", rig.reference, rig.position + np.array((*(0.01,) * 6, 0.0)))
+        rig.manager.end_all(mask, "in the way")
+        rig.manager.retreat(mask, rig.reference, rig.position + np.array((*(0.01,) * 6, 0.0)))
         due = [("b", ResultCode.PATH_TOLERANCE)]
     elif way == "restart":
         rig.manager.restart(np.array([0]))

@@ -1,0 +1,97 @@
+"""How hard an arm presses, from its motors' efforts: what it may do no more than for a moment."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.control.arm.wrench import tool_wrench
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+_PERIOD_S = 0.02  # between two estimates
+_SHARE = 0.7  # of what is new in an estimate: one reading's noise must not be a force
+# Directions in which a singular posture feels little are left out: errors of the joints' torques, such as 16 N m in the
+# hardest reversals of a simulated UR5, would be large forces there. A force with a lever of 0.2 m is felt to 80 %.
+_DAMPING = 0.1
+_LEAST_TORQUE = 10.0  # [N m] where no joint feels more, nothing is estimated: 100 N with a lever of 0.1 m
+
+
+class ForceLimit:
+    """Estimates the forces on the tools of n arms, and says which are too large.
+
+    The motors' efforts, averaged over 20 ms, are compared with those that the motion of that time needs. A force
+    elsewhere on the arm counts with the force on the tool that would load the joints alike: half-way to the tool, about
+    half of it is felt. What is not modelled counts too: friction, and the weight of a payload.
+
+    Attributes:
+        force: the newest estimates [N], shape (n,); 0 where the joints feel too little to ask.
+        exceeded: whether each is above the largest, shape (n,).
+
+    Args:
+        arm: the arm.
+        n: number of arms.
+        control_hz: ticks a second [Hz].
+        largest: with which the tool may press [N].
+
+    Raises:
+        ConfigError: the largest force is not positive.
+    """
+
+    def __init__(self, arm: Arm, n: int, control_hz: int, largest: float) -> None:
+        if not largest > 0.0:
+            raise ConfigError(f"max_force is {largest}; it must be positive [N]. With .inf nothing is too much.")
+        self.largest = largest
+        self._dynamics, self._forward = ArmDynamics(arm), ForwardKinematics(arm.chain)
+        self._dof = dof = self._dynamics.dof
+        self._period = max(1, round(_PERIOD_S * control_hz))
+        self._hz = control_hz / self._period
+        self._sum, self._ticks = np.zeros((n, dof)), 0
+        self._position, self._velocity, self._torque = (np.zeros((n, dof)) for _ in range(3))
+        self._fresh = np.ones(n, np.bool_)
+        self.force: Array = np.zeros(n)
+        self.exceeded: NDArray[np.bool_] = np.zeros(n, np.bool_)
+
+    def update(self, reading: PlantReading) -> bool:
+        """Take one tick into account; return whether there is a new estimate that is too large for any arm."""
+        if not reading.has_effort:
+            return False
+        dof = self._dof
+        self._sum += reading.effort[:, :dof]
+        self._ticks += 1
+        if self._ticks < self._period:
+            return False
+        position, velocity = reading.position[:, :dof], reading.velocity[:, :dof]
+        middle, speed = (position + self._position) / 2, (velocity + self._velocity) / 2
+        change = (velocity - self._velocity) * self._hz
+        residual = self._sum / self._ticks - self._dynamics.torque(middle, speed, change)
+        self._position[:], self._velocity[:] = position, velocity
+        self._sum[:], self._ticks = 0.0, 0
+        residual[self._fresh] = 0.0  # where they came from is not known yet
+        self._fresh[:] = False
+        torque = self._torque
+        torque += _SHARE * (residual - torque)
+        self.force[:] = 0.0
+        felt = np.abs(torque).max(axis=1) > _LEAST_TORQUE
+        if not np.count_nonzero(felt):
+            return False
+        jacobian = self._forward.jacobian(position[felt])
+        self.force[felt] = np.linalg.norm(tool_wrench(jacobian, torque[felt], _DAMPING)[:, :3], axis=1)
+        np.greater(self.force, self.largest, out=self.exceeded)
+        return bool(np.count_nonzero(self.exceeded))
+
+    def explain(self) -> str:
+        """Return in words which force was too large."""
+        return (
+            f"The tool pressed with {self.force.max():.0f} N; {self.largest:g} N is the most. Find out what is in its "
+            "way, or allow more with robot.max_force."
+        )
+
+    def restart(self, ids: NDArray[np.intp]) -> None:
+        """Forget arms that were put somewhere else."""
+        self._fresh[ids] = True
+        self._sum[ids] = self._torque[ids] = self.force[ids] = 0.0
+        self.exceeded[ids] = False
