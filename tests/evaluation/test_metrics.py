@@ -95,6 +95,7 @@ def test_flags_are_counted_by_kind_in_frames():
         "effort": 1,
         "position": 0,
         "posture": 0,
+        "clearance": 0,
     }
     assert {name: count for name, count in metrics.watchdogs.items() if count} == {"command_age": 2, "blocked": 1}
 

@@ -198,7 +198,7 @@ def test_rates_are_those_of_the_last_two_seconds(robot: Robot) -> None:
 def test_rates_begin_anew_with_an_episode_and_need_one(robot: Robot) -> None:
     sampler, block = robot.sampler()
     sampler.sample()
-    robot.tick(200, limits=[0, 5, 0, 0, 0, 0])
+    robot.tick(200, limits=[5 * (limit == Limit.VELOCITY) for limit in LIMITS])
     assert sampler.sample().limits["VELOCITY"].per_second == pytest.approx(5)
     robot.block.words[Word.PHASE] = Phase.STANDING
     standing = sampler.sample()
@@ -206,7 +206,7 @@ def test_rates_begin_anew_with_an_episode_and_need_one(robot: Robot) -> None:
     robot.tick(1, limits=0)
     robot.start(2)
     assert sampler.sample().control_rate is None
-    robot.tick(200, limits=[0, 1, 0, 0, 0, 0])
+    robot.tick(200, limits=[int(limit == Limit.VELOCITY) for limit in LIMITS])
     shown = sampler.sample()
     assert shown.limits["VELOCITY"] == Count(1, pytest.approx(1))
     assert shown.episode == 2

@@ -244,6 +244,7 @@ def test_ending_a_goal_during_planning_drops_the_request(way: str, ticks: int) -
         rig._rows, rig._stopped = [np.stack(rig.reference)], []
     elif way == "retreat":
         rig.manager.end_all(mask, "in the way")
+        rig.hard[:] = True
         rig.manager.retreat(mask, rig.reference, rig.position + np.array((*(0.01,) * 6, 0.0)))
         due = [("b", ResultCode.PATH_TOLERANCE)]
     elif way == "restart":

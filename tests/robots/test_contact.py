@@ -1,0 +1,137 @@
+"""What setpoints may touch: nothing. And what happens to an arm that presses on something nevertheless."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+
+FIRST = np.zeros(1, np.intp)
+LEAST = 0.003  # [m] in the hardest reversals an arm may come so near, of the 0.005 that goals keep
+LIGHT_N, WITHIN_S = 20.0, 0.5
+INTO_TABLE, INTO_ITSELF = (0, 1, 0, 0, 0, 0, 0), (0, 0, 1, -1, 1, 0, 0)
+
+
+class Pusher:
+    """A UR5 on an empty table, with the forces of every tick."""
+
+    def __init__(self, *, clearance: bool = True, measures: bool = False, **config: Any) -> None:
+        self.arm = arm = UR5Simulation(UR5Config(**config), 1, threads=1)
+        arm.reset(FIRST, [TableScene("empty", (), arm.body.home)], [0])
+        self.controller: Any = arm.cerebellum.controller
+        if not clearance:
+            self.controller.setpoints.clearance = None
+        self.action = arm.cerebellum.command.copy()
+        self.limits = self.watchdog = 0
+        self.forces: list[float] = []
+        self.faulty_since: int | None = None
+        self._model = arm.world.copy_model(0)
+        self._data = mujoco.MjData(self._model)
+        if measures:
+            after = arm._after_tick
+
+            def measure() -> None:
+                after()
+                self.forces.append(self._force())
+                if self.faulty_since is None and self.mode == Mode.FAULT:
+                    self.faulty_since = len(self.forces)
+
+            arm._after_tick = measure  # type: ignore[method-assign]
+
+    def step(self, action: np.ndarray) -> None:
+        limits = self.arm.body.limits  # type: ignore[union-attr]
+        self.action = np.clip(action, limits.lower, limits.upper)
+        report = self.arm.step(self.action)
+        self.limits |= int(report.limits[0])
+        self.watchdog |= int(report.watchdog[0])
+
+    @property
+    def mode(self) -> Mode:
+        return Mode(int(self.arm.cerebellum.mode[0]))
+
+    @property
+    def distance(self) -> float:
+        """How far the arm is from itself and from the table, whichever is less [m]."""
+        q = self.arm.cerebellum.reading.position[:, :6]
+        return min(float(one[0]) for one in self.arm.kinematics.collision.distances(q))
+
+    def _force(self) -> float:
+        """Return the sum of the normal forces between the arm and what it touches now [N]."""
+        self.arm.world.copy_into(0, self._model, self._data)
+        self._data.ctrl[:] = self.arm.world.ctrl[0]
+        mujoco.mj_forward(self._model, self._data)
+        wrench, total = np.zeros(6), 0.0
+        for contact in range(self._data.ncon):
+            mujoco.mj_contactForce(self._model, self._data, contact, wrench)
+            total += abs(wrench[0])
+        return total
+
+
+@pytest.mark.parametrize("where", [INTO_TABLE, INTO_ITSELF], ids=["table", "itself"])
+def test_setpoints_slow_an_arm_down_and_stop_it_before_it_touches_anything(where: tuple[int, ...]) -> None:
+    for rate in (0.6, 3.0, 50.0):  # [rad/s] the last is a step
+        pusher = Pusher()
+        distances = []
+        for _ in range(round(2.5 / min(rate, 3.0) * 25) + 30):
+            pusher.step(pusher.action + np.array(where)[None] * rate / 25)
+            distances.append(pusher.distance)
+        assert not any(touch.any() for touch in pusher.arm.touches)
+        assert min(distances) > LEAST
+        assert distances[-1] < 0.02  # it comes near
+        assert pusher.limits & Limit.CLEARANCE
+        assert (pusher.mode, pusher.watchdog) == (Mode.TRACKING, 0)
+        assert np.abs(pusher.arm.cerebellum.reading.velocity[0, :6]).max() < 0.02
+        # Away it may go at once.
+        home = np.array(pusher.arm.body.home)[None]  # type: ignore[union-attr]
+        for _ in range(60):
+            pusher.step(home)
+        np.testing.assert_allclose(pusher.arm.cerebellum.reading.position, home, atol=2e-3)
+
+
+def test_random_setpoints_touch_nothing_and_are_no_false_alarm() -> None:
+    reached = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        pusher = Pusher()
+        far = rng.uniform(-2, 2, 7) * (1, 1, 1, 1, 1, 1, 0)
+        for frame in range(60):
+            pusher.step(pusher.action + far * (frame % 15 == 0) * rng.choice([-1, 1], 7))
+            assert pusher.distance > LEAST
+        assert not any(touch.any() for touch in pusher.arm.touches)
+        assert not pusher.watchdog
+        reached += bool(pusher.limits & Limit.CLEARANCE)
+    assert reached >= 3
+
+
+@pytest.mark.parametrize("where", [INTO_TABLE, INTO_ITSELF], ids=["table", "itself"])
+@pytest.mark.parametrize("rate", [0.5, 1.5])
+def test_an_arm_that_presses_stops_and_lets_go(where: tuple[int, ...], rate: float) -> None:
+    pusher = Pusher(clearance=False, measures=True)
+    for _ in range(round(3.5 / rate * 25)):
+        pusher.step(pusher.action + np.array(where)[None] * rate / 25)
+        if pusher.faulty_since is not None:
+            break
+    assert pusher.watchdog & Watchdog.FORCE
+    assert max(pusher.forces) > pusher.controller.force.largest
+    for _ in range(40):
+        pusher.arm.step(None)
+    after = pusher.forces[pusher.faulty_since :]
+    assert max(after[round(WITHIN_S * 500) :]) < LIGHT_N
+    assert pusher.mode == Mode.FAULT
+
+
+def test_more_force_may_be_allowed() -> None:
+    pusher = Pusher(clearance=False, max_force=float("inf"))
+    for _ in range(60):
+        pusher.step(pusher.action + np.array(INTO_TABLE)[None] * 1.0 / 25)
+    assert not pusher.watchdog & Watchdog.FORCE
+    assert pusher.watchdog & Watchdog.BLOCKED  # it is held fast
+    for wrong in (0.0, -1.0, float("nan")):
+        with pytest.raises(ConfigError, match=r"max_force is .*positive"):
+            UR5Config(max_force=wrong)
