@@ -78,7 +78,8 @@ class ForceLimit:
         felt = np.abs(torque).max(axis=1) > _LEAST_TORQUE
         if not np.count_nonzero(felt):
             return False
-        jacobian = self._forward.jacobian(position[felt])
+        # Products of matrices that lie otherwise in memory round otherwise: with it the number of arms would count.
+        jacobian = np.ascontiguousarray(self._forward.jacobian(position[felt]))
         self.force[felt] = np.linalg.norm(tool_wrench(jacobian, torque[felt], _DAMPING)[:, :3], axis=1)
         np.greater(self.force, self.largest, out=self.exceeded)
         return bool(np.count_nonzero(self.exceeded))
