@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.arm.controller import ArmController
@@ -83,16 +84,23 @@ class UR5Simulation(Simulation):
         n: how many.
         threads: threads that step the physics; all processors if None.
         planning: who plans goals; they are planned in the tick that they start in if None.
+        fixtures: what stands immovable on the tables, unknown to the arms.
     """
 
     robot_kind = "arm"
     action_names = JOINT_ACTIONS
 
     def __init__(
-        self, config: "UR5Config", n: int = 1, threads: int | None = None, planning: Planning | None = None
+        self,
+        config: "UR5Config",
+        n: int = 1,
+        threads: int | None = None,
+        planning: Planning | None = None,
+        *,
+        fixtures: Sequence[Shape] = (),
     ) -> None:
         body = config.body()
-        world = World(body, n, physics_hz=config.physics_hz, threads=threads)
+        world = World(body, n, physics_hz=config.physics_hz, threads=threads, fixtures=fixtures)
         self.table = Tabletop(world)
         self.plant = LatePlant(SimulatedPlant(world), body, round(MAX_LATENCY_S * config.control_hz))
         self.kinematics = ArmKinematics(body.chain, body.limits)

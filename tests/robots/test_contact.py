@@ -6,7 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -21,8 +23,10 @@ INTO_TABLE, INTO_ITSELF = (0, 1, 0, 0, 0, 0, 0), (0, 0, 1, -1, 1, 0, 0)
 class Pusher:
     """A UR5 on an empty table, with the forces of every tick."""
 
-    def __init__(self, *, clearance: bool = True, measures: bool = False, **config: Any) -> None:
-        self.arm = arm = UR5Simulation(UR5Config(**config), 1, threads=1)
+    def __init__(
+        self, *, clearance: bool = True, measures: bool = False, fixtures: tuple[Shape, ...] = (), **config: Any
+    ) -> None:
+        self.arm = arm = UR5Simulation(UR5Config(**config), 1, threads=1, fixtures=fixtures)
         arm.reset(FIRST, [TableScene("empty", (), arm.body.home)], [0])
         self.controller: Any = arm.cerebellum.controller
         if not clearance:
@@ -124,6 +128,24 @@ def test_an_arm_that_presses_stops_and_lets_go(where: tuple[int, ...], rate: flo
     after = pusher.forces[pusher.faulty_since :]
     assert max(after[round(WITHIN_S * 500) :]) < LIGHT_N
     assert pusher.mode == Mode.FAULT
+
+
+def test_a_goal_into_something_unknown_ends_and_lets_go() -> None:
+    pusher = Pusher(measures=True, fixtures=(Shape("box", 0.25, 0.45, 0.0, 0.2, 0.1, 0.8),))
+    home = pusher.arm.body.home  # type: ignore[union-attr]
+    assert pusher.controller.submit(0, BrainCommand("into", joint_target=(home[0] + 2.0, *home[1:6]))) is None
+    for _ in range(100):
+        report = pusher.arm.step(None)
+        pusher.watchdog |= int(report.watchdog[0])
+        if report.results:
+            break
+    assert pusher.watchdog & Watchdog.FORCE
+    (result,) = report.results[0]
+    assert result.code == ResultCode.PATH_TOLERANCE
+    assert "150 N is the most" in result.message
+    for _ in range(40):
+        pusher.arm.step(None)
+    assert max(pusher.forces[pusher.faulty_since :][round(WITHIN_S * 500) :]) < LIGHT_N
 
 
 def test_more_force_may_be_allowed() -> None:

@@ -46,11 +46,15 @@ SCALARS: dict[str, tuple[str, str]] = {
     SKIPPED: ("int64", "control ticks of the frame that were left out because one before them was late"),
     INFERENCE_TIME: ("float32", "time that the brain took for the decision that drove the frame [s]; 0 in lockstep"),
     LATE: ("bool", "the frame violates the timing tolerance; false in lockstep"),
-    LIMITS: ("int64", "what the limits changed: 1 not finite, 2 velocity, 4 acceleration, 8 effort, 16 position; sum"),
+    LIMITS: (
+        "int64",
+        "what the limits changed: 1 not finite, 2 velocity, 4 acceleration, 8 effort, 16 position, 32 posture, "
+        "64 clearance; sum",
+    ),
     WATCHDOG: (
         "int64",
         "what the watchdogs noticed: 1 command too old, 2 arm blocked, 4 brain silent, 8 recorder silent, "
-        "16 plant silent, 32 too many missed ticks; sum",
+        "16 plant silent, 32 too many missed ticks, 64 guard, 128 force; sum",
     ),
     MODE: (
         "int64",
