@@ -133,9 +133,9 @@ def _main(options: argparse.Namespace, run: RunTrials) -> int:
             measured = tested.value
         findings = examine(root, run)
         if options.realtime:
-            from bhd_lerobot.robots.host.config import RealtimeConfig
+            from bhd_lerobot.realtime.loop import LoopLimits
 
-            findings += checks.check_latency(tested, robot_rates(), RealtimeConfig().plant_timeout_s)
+            findings += checks.check_latency(tested, robot_rates(), LoopLimits().plant_timeout_s)
     if options.json:
         report = {"findings": [asdict(finding) for finding in findings], "latency_test": measured}
         print(json.dumps(report, indent=1, ensure_ascii=False))

@@ -1,3 +1,13 @@
 """The controllers of an arm."""
 
-__all__ = ["compliance", "controller", "equilibrium", "impedance", "rotations", "setpoints", "wrench"]
+__all__ = [
+    "clearance",
+    "compliance",
+    "controller",
+    "equilibrium",
+    "force_limit",
+    "impedance",
+    "rotations",
+    "setpoints",
+    "wrench",
+]

@@ -296,7 +296,10 @@ BROKEN: dict[str, tuple[Callable[[Path], list[Finding]], str]] = {
     "disk.slow": (lambda folder: checks.check_disk(folder, lambda _: 50 * GIB, ticking(16.0)), "2 MB/s"),
     "latency.late": (lambda _: checks.check_latency(latency(500e-6), {"ur5": 500}, 0.02), "50% of the period"),
     "latency.missed": (lambda _: checks.check_latency(latency(1e-3), {"ur5": 500}, 0.02), "at 500 Hz ticks are missed"),
-    "latency.stopped": (lambda _: checks.check_latency(latency(9.1e-3), {"ur5": 500}, 0.02), "waits 20 ms for a command"),
+    "latency.stopped": (
+        lambda _: checks.check_latency(latency(9.1e-3), {"ur5": 500}, 0.02),
+        "waits 20 ms for a command",
+    ),
     "latency.error": (lambda _: checks.check_latency(failed("timeout", "no answer in 70 s"), {}, 0.02), "no answer"),
 }
 
