@@ -9,7 +9,7 @@ import pytest
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
-from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.control.messages import Limit, Mode, Request, Watchdog
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5_simulation import UR5Simulation
@@ -117,17 +117,23 @@ def test_random_setpoints_touch_nothing_and_are_no_false_alarm() -> None:
 @pytest.mark.parametrize("rate", [0.5, 1.5])
 def test_an_arm_that_presses_stops_and_lets_go(where: tuple[int, ...], rate: float) -> None:
     pusher = Pusher(clearance=False, measures=True)
-    for _ in range(round(3.5 / rate * 25)):
-        pusher.step(pusher.action + np.array(where)[None] * rate / 25)
-        if pusher.faulty_since is not None:
-            break
-    assert pusher.watchdog & Watchdog.FORCE
-    assert max(pusher.forces) > pusher.controller.force.largest
-    for _ in range(40):
-        pusher.arm.step(None)
-    after = pusher.forces[pusher.faulty_since :]
-    assert max(after[round(WITHIN_S * 500) :]) < LIGHT_N
-    assert pusher.mode == Mode.FAULT
+    for _ in range(2):  # also after a reset
+        pusher.watchdog, pusher.faulty_since = 0, None
+        pusher.forces.clear()
+        for _ in range(round(3.5 / rate * 25)):
+            pusher.step(pusher.action + np.array(where)[None] * rate / 25)
+            if pusher.faulty_since is not None:
+                break
+        assert pusher.watchdog & Watchdog.FORCE
+        assert max(pusher.forces) > pusher.controller.force.largest
+        for _ in range(40):
+            pusher.arm.step(None)
+        after = pusher.forces[pusher.faulty_since :]
+        assert max(after[round(WITHIN_S * 500) :]) < LIGHT_N
+        assert pusher.mode == Mode.FAULT
+        for request in (Request.RESET, Request.ACTIVATE):
+            assert pusher.arm.cerebellum.request(request).accepted.all()
+        pusher.action = pusher.arm.cerebellum.command.copy()
 
 
 def test_a_goal_into_something_unknown_ends_and_lets_go() -> None:

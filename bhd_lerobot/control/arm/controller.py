@@ -104,6 +104,7 @@ class ArmController(Controller):
             self.velocity -= np.where(left[:, None], self.acceleration * self._half_tick, 0.0)
             self.goals.drop_for_setpoint(mask)
         self._gives_way[mask] = 0
+        self._unwatched &= ~mask
         self.setpoints.set_setpoint(values, mask, self.command)
 
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
