@@ -25,6 +25,7 @@ from bhd_lerobot.policies.navigation.navigator import NavigatorBrain, NavigatorC
 from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.realtime import make_live
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot
@@ -276,15 +277,18 @@ def make_simulation(config: Any, n: int = 1, threads: int | None = None) -> Simu
     return made
 
 
-def make_robot(config: Any, n: int = 1, threads: int | None = None) -> Simulation:
+def make_robot(config: Any, n: int = 1, threads: int | None = None) -> Host:
     """Return n robots on the clock that the configuration asks for.
 
     Raises:
-        ConfigError: more than one on the wall clock.
+        ConfigError: more than one on the wall clock, or there is no such plant.
         RealtimeError: the processes of a robot on the wall clock could not be started.
     """
-    simulation = make_simulation(config, n, threads)
-    return make_live(simulation, config.id) if config.clock == "realtime" else simulation
+    if config.clock != "realtime":
+        return make_simulation(config, n, threads)
+    if n != 1:
+        raise ConfigError(f"n_envs is {n}; with robot.clock = 'realtime' one robot runs at a time: use --n_envs=1.")
+    return make_live(_made_by(RobotConfig, ROBOTS, config), config, config.id)
 
 
 def make_task(config: TaskConfig, n: int, fps: int, body: Body | None = None) -> Task:

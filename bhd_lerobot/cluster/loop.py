@@ -16,7 +16,7 @@ from bhd_lerobot.control.tolerance import TimingTolerance
 from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.errors import ClusterError
 from bhd_lerobot.policies.brain import Brain
-from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.task import Task
@@ -48,7 +48,7 @@ class ClusterLoop(EpisodeLoop):
 
     def __init__(
         self,
-        simulation: Simulation,
+        simulation: Host,
         task: Task,
         brain: Brain,
         tolerance: TimingTolerance | None = None,

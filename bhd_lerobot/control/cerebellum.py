@@ -21,7 +21,7 @@ from bhd_lerobot.control.messages import (
     Watchdog,
     mode_reason,
 )
-from bhd_lerobot.control.plant import Plant, PlantReading
+from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 
 _TRACKING = int(Mode.TRACKING)  # numpy compares plain numbers faster
 _OLDEST_PERIODS = 3  # a reading that is older than so many is no measurement of the present
@@ -49,6 +49,7 @@ class Cerebellum:
         controller: what turns commands into actuator commands.
         fifo: where commands come from; a new one if None.
         estop: the word of the emergency stop, which any process may press; a new one if None.
+        sensors: number of values that the plant reads beside those of the joints.
 
     Attributes:
         guard: the last check of what is written to the plant.
@@ -68,6 +69,7 @@ class Cerebellum:
         *,
         fifo: CommandFifo | None = None,
         estop: EstopWord | None = None,
+        sensors: int = 0,
     ) -> None:
         self.body, self.plant, self.control_hz = body, plant, control_hz
         self.n = n = plant.n
@@ -80,7 +82,7 @@ class Cerebellum:
         self.guard = Guard(WireLimits.of(body, control_hz), n)
         self.guard.restart(np.arange(n), controller.actuators)
         self.refusals = np.zeros((len(Reason), n), np.int64)
-        self.reading = PlantReading(n, self.controller.joints)
+        self.reading = PlantReading(n, self.controller.joints, sensors)
         self.requested = np.zeros((n, width))
         self.setpoints_taken = 0
         self.ticks = 0
@@ -91,7 +93,8 @@ class Cerebellum:
         # The sum of 0 * x is 0 if and only if every x is finite; unlike a plain sum it neither overflows nor warns.
         self._flat_reading = self.reading.values.reshape(-1)
         self._zeros = np.zeros_like(self._flat_reading)
-        self._configured = np.zeros(n, np.bool_)
+        self._configured, self._may_write = np.zeros(n, np.bool_), False
+        self._mode_is_new = True  # the plant has not been told it
         self._last_due = np.zeros(n, np.int64)
         self._sent_sequence, self._taken_sequence = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
         self._sent_due = np.full(n, np.iinfo(np.int64).min, np.int64)
@@ -122,7 +125,11 @@ class Cerebellum:
         unsafe = self.guard.check(self.controller.actuators)
         if unsafe is not None:
             self._refuse_to_write(unsafe)
-        self.plant.write(self.guard.written)
+        if self._mode_is_new:
+            self._mode_is_new = False
+            self.plant.set_mode(self.mode)
+        if self._may_write:
+            self.plant.write(self.guard.written)
         self._last_position[:] = self.reading.position
         self.ticks += 1
 
@@ -135,7 +142,7 @@ class Cerebellum:
             if hit.any():
                 self._set_mode(hit, Mode.ESTOP)
                 self.estop_latched |= hit
-        if self._flat_reading.dot(self._zeros) != 0.0 or np.count_nonzero(self.reading.fault):
+        if self._flat_reading.dot(self._zeros) != 0.0 or np.count_nonzero(self.reading.safety):
             self._handle_fault()
         if self.reading.stamp_ns is not None:
             self._check_age(self.reading.stamp_ns, now_ns)
@@ -160,7 +167,13 @@ class Cerebellum:
         # What is not a number must not spread: it is treated as a joint at rest where the encoder last was.
         reading.velocity[bad] = 0.0
         reading.position[bad] = self._last_position[bad]
-        self._set_mode((bad | reading.fault) & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT), Mode.FAULT)
+        pressed = (reading.safety == SafetyStatus.EMERGENCY_STOP) & (self.mode != Mode.ESTOP)
+        if np.count_nonzero(pressed):
+            self._set_mode(pressed, Mode.ESTOP)
+            self.estop_latched |= pressed
+        faulty = (bad | (reading.safety != SafetyStatus.NORMAL)) & (self.mode != Mode.ESTOP) & (self.mode != Mode.FAULT)
+        self._watchdog[faulty & ~bad] |= Watchdog.PLANT
+        self._set_mode(faulty, Mode.FAULT)
         if bad.any():
             self.controller.distrust(bad)
 
@@ -365,6 +378,10 @@ class Cerebellum:
             self.estop.acknowledge(allowed & (self.mode == Mode.ESTOP))
             self.estop_latched &= ~allowed
             self._configure(allowed & ~self._configured)
+            if np.count_nonzero(allowed) and self.plant.recover():
+                # It stopped elsewhere than the reference came to rest: to go there would be a jump.
+                self.controller.resume(np.flatnonzero(allowed), self.reading)
+                self.guard.restart(np.flatnonzero(allowed), self.controller.actuators)
         self._set_mode(allowed, result)
         if request == Request.DEACTIVATE:
             self._deactivating |= allowed
@@ -381,6 +398,7 @@ class Cerebellum:
         chosen[ids] = True
         self.estop.acknowledge(chosen & (self.mode == Mode.ESTOP))
         self.mode[ids] = Mode.UNCONFIGURED
+        self._mode_is_new = True
         self.controller.restart(ids)
         self.guard.restart(ids, self.controller.actuators)
         self._configured[ids] = False
@@ -455,6 +473,7 @@ class Cerebellum:
         if not mask.any():
             return
         self.mode[mask] = mode
+        self._mode_is_new = True
         if mode != Mode.TRACKING:
             self.controller.stop(mask, mode)
         self._deactivating[mask] = False
@@ -485,6 +504,7 @@ class Cerebellum:
         self.controller.configure(ids, self.reading)
         self.guard.restart(ids, self.controller.actuators)
         self._configured |= mask
+        self._may_write = True  # before, it was not known where the robots are
         np.copyto(self.requested, self.command, where=mask[:, None])
 
 

@@ -80,6 +80,10 @@ class Controller(ABC):
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Take the joints as they are for the start."""
 
+    def resume(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
+        """Go on at rest from where the joints are: somebody else has stopped the robots there."""
+        return
+
     @abstractmethod
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about robots that were put somewhere else."""

@@ -1,30 +1,48 @@
-"""The small interface below the cerebellum: what a simulated and a real base have in common."""
+"""The small interface below the cerebellum: what a simulated and a real robot have in common."""
 
+from abc import abstractmethod
+from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 
+class SafetyStatus(IntEnum):
+    """What a robot's own safety functions say of it."""
+
+    NORMAL = 0
+    """It follows commands."""
+    STOPPED = 1
+    """It has stopped by itself and follows none: a protective stop, or commands did not come for too long."""
+    EMERGENCY_STOP = 2
+    """Its emergency stop is pressed."""
+    FAULT = 3
+    """It is broken, or cannot be reached."""
+
+
 class PlantReading:
-    """One reading of the joints; the plant writes into it.
+    """One reading of the robot; the plant writes into it.
 
     Args:
-        n: number of simulations.
+        n: number of robots.
         joints: number of joints.
+        sensors: number of further values that the plant measures, such as the ranges of a scan.
 
     Attributes:
-        position: joint angles [rad], shape (n, joints).
-        velocity: joint speeds [rad/s], shape (n, joints).
+        position: joint angles [rad], a gripper's opening [m], shape (n, joints).
+        velocity: joint speeds [rad/s], a gripper's [m/s], shape (n, joints).
         effort: torques that the motors give, also to carry the robot's weight [N m], a gripper's force [N], shape
             (n, joints); all 0 if the plant does not measure them.
         has_effort: whether it does.
-        stamp_ns: when the hardware measured this, on the plant's own clock [ns], shape (n,); None for a plant whose
-            readings are never old, such as a simulation in lockstep.
-        fault: whether the hardware reports a fault, shape (n,).
+        stamp_ns: when the hardware measured this, on the monotonic clock of this machine [ns], shape (n,); None for a
+            plant whose readings are never old, such as a simulation in lockstep.
+        safety: a `SafetyStatus` of each robot, shape (n,); all but `NORMAL` is a fault or an emergency stop.
+        sensors: the newest further values, shape (n, sensors), in the order of the host's `sensor_names`.
+        sensors_ns: when the oldest of these was measured, as `stamp_ns` [ns], shape (n,).
     """
 
-    def __init__(self, n: int, joints: int) -> None:
+    def __init__(self, n: int, joints: int, sensors: int = 0) -> None:
         # One block, so that a single sum checks that every number in it is finite.
         self.values = np.zeros((3, n, joints))
         self.position: NDArray[np.float64] = self.values[0]
@@ -32,16 +50,58 @@ class PlantReading:
         self.effort: NDArray[np.float64] = self.values[2]
         self.has_effort = False
         self.stamp_ns: NDArray[np.int64] | None = None
-        self.fault = np.zeros(n, np.bool_)
+        self.safety = np.zeros(n, np.int8)
+        self.sensors = np.zeros((n, sensors))
+        self.sensors_ns = np.zeros(n, np.int64)
 
 
 class Plant(Protocol):
-    """What the cerebellum reads from and writes to. Neither call may block."""
+    """What the cerebellum reads from and writes to; a subclass needs no more than `n`, `read` and `write`.
+
+    `open`, `enable` and `close` may take their time: the control loop stands meanwhile. The other calls come from
+    inside of it, once a tick, and must neither wait nor raise: what goes wrong is told by `PlantReading.safety`.
+
+    Attributes:
+        n: number of robots.
+    """
 
     n: int
 
-    def read(self, out: PlantReading) -> None:
-        """Write the newest joint readings into `out`."""
+    def open(self) -> None:
+        """Connect to the robot. Raises whatever says why that is impossible."""
+        return
 
+    def enable(self) -> None:
+        """Make the robot follow commands from now on: release brakes, switch motors on. It stays where it is."""
+        return
+
+    @abstractmethod
+    def read(self, out: PlantReading) -> None:
+        """Write the newest readings into `out`."""
+
+    @abstractmethod
     def write(self, ctrl: NDArray[np.float64]) -> None:
-        """Take the actuator commands: wheel speeds [rad/s], shape (n, actuators)."""
+        """Take actuator commands, shape (n, joints): wheel speeds [rad/s], or joint positions and the opening.
+
+        The first follows an `enable` and is where the robot was read to be; wheels stand. A robot that gets none for
+        too long has to stop by itself.
+        """
+
+    def set_mode(self, mode: NDArray[np.int8]) -> None:
+        """Take the new `Mode` of each robot, shape (n,), before the first command that is given in it.
+
+        In a mode without motion, such as `SAFE_OFF`, the robot may switch its motors off.
+        """
+        return
+
+    def recover(self) -> bool:
+        """Begin to leave a stop of the robot's own, because a person or a new episode resets it.
+
+        Returns:
+            Whether the robot may have moved by itself: its reference then starts from where it is.
+        """
+        return False
+
+    def close(self) -> None:
+        """Disconnect; the robot is to stay safe without commands. May be called twice."""
+        return

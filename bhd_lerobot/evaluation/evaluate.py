@@ -29,7 +29,7 @@ from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
 from bhd_lerobot.evaluation.text import number, percent
 from bhd_lerobot.recording.report import ESTOP_STATUS, print_refusals, progress_bars
 from bhd_lerobot.registry import make_robot, make_simulation
-from bhd_lerobot.robots.host.simulation import Simulation, describe
+from bhd_lerobot.robots.host.host import Host, describe
 from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.preview import Preview
 from bhd_lerobot.rollout.provenance import versions
@@ -195,7 +195,7 @@ def _shower(progress: Progress, bar: Any, one: BrainRun) -> Callable[[], None]:
     return show
 
 
-def _facts(config: EvalConfig, simulation: Simulation, runs: Sequence[BrainRun]) -> dict[str, Any]:
+def _facts(config: EvalConfig, simulation: Host, runs: Sequence[BrainRun]) -> dict[str, Any]:
     """Return what decides the numbers, as plain values; how many run side by side does not."""
     robot = describe(simulation.config)
     return {

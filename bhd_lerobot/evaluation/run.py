@@ -22,7 +22,7 @@ from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.recording.config import DatasetConfig, RecordConfig
 from bhd_lerobot.recording.record import open_recorder, save_episode
 from bhd_lerobot.registry import make_brain, make_task
-from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.rollout.drivers import TimedBrain
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.plots import Trajectory
@@ -72,7 +72,7 @@ class BrainRun:
         }
 
 
-def prepare(config: EvalConfig, label: str, simulation: Simulation, pool: WorkerPool | None = None) -> BrainRun:
+def prepare(config: EvalConfig, label: str, simulation: Host, pool: WorkerPool | None = None) -> BrainRun:
     """Make a brain and what runs it: one that does not fit fails here, before any episode.
 
     Args:

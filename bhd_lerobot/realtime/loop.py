@@ -58,6 +58,8 @@ class RealtimeLoop:
         advance: moves the plant on, after each tick.
         publish: publishes the state, at the end of each tick.
         count: takes the timing of each tick.
+        may_stand: asked after a pause or the end is wanted, before each tick, whether the robot may be left alone; it
+            always may if None.
         clock: monotonic time [ns].
         sleep: waits for a time [s].
     """
@@ -72,12 +74,14 @@ class RealtimeLoop:
         advance: Advance,
         publish: Publish,
         count: Count,
+        may_stand: Callable[[], bool] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.cerebellum, self.words, self.limits = cerebellum, words, limits
         self.period_ns = NANOSECONDS // cerebellum.control_hz
         self._serve, self._advance, self._publish, self._count = serve, advance, publish, count
+        self._may_stand = may_stand
         self._clock, self._sleep = clock, sleep
         self._watched = [
             (int(Word.BRAIN_ALIVE), round(limits.brain_timeout_s * NANOSECONDS), Watchdog.BRAIN, Mode.STOPPING),
@@ -107,7 +111,7 @@ class RealtimeLoop:
         # Plain numbers: an index of an enumeration costs a call.
         pause, end, alive = int(Word.PAUSE), int(Word.END), int(Word.CEREBELLUM_ALIVE)
         executed, skipped, overruns = int(Word.EXECUTED), int(Word.SKIPPED), int(Word.OVERRUNS)
-        while not (words[pause] or words[end]):
+        while not (words[pause] or words[end]) or (self._may_stand is not None and not self._may_stand()):
             now = clock()
             left = grid.next_due_ns - now
             if left > 0:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.guard import Guard
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.realtime.block import LiveBlock
 
 _COMMANDS = 8  # capacity of the ring; only the newest counts
@@ -127,7 +127,7 @@ class PlantLink:
         return cls(shape, block.section("plant_commands"), block.section("plant_states"))
 
 
-class RemotePlant:
+class RemotePlant(Plant):
     """The plant as the cerebellum's process sees it.
 
     Attributes:
@@ -161,10 +161,12 @@ class RemotePlant:
         """Whether the plant has stopped by itself, by the state taken last, and that was not acknowledged yet."""
         return self.state is None or bool(self.state["stops"] > self._record["acknowledged"])
 
-    def acknowledge(self) -> None:
-        """Let the plant be driven again, after the stops that the state taken last reports."""
-        if self.state is not None:
-            self._record["acknowledged"] = self.state["stops"]
+    def recover(self) -> bool:
+        """Let the plant be driven again after the stops that the state taken last reports; return if there were any."""
+        if self.state is None or not self.has_stopped:
+            return False
+        self._record["acknowledged"] = self.state["stops"]
+        return True
 
     def read(self, out: PlantReading) -> None:
         """Write the newest joint readings into `out`; a stop that was not acknowledged is a fault."""
@@ -174,7 +176,7 @@ class RemotePlant:
             out.effort[:], out.has_effort = state["effort"], True
             out.stamp_ns = self._stamp_ns
             out.stamp_ns[0] = state["stamp_ns"]
-        out.fault[:] = self.has_stopped
+        out.safety[:] = SafetyStatus.STOPPED if self.has_stopped else SafetyStatus.NORMAL
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Send actuator commands, shape (1, joints)."""

@@ -21,7 +21,7 @@ from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.host.host import Host
 
 PACKAGES = {"rerun": ("rerun-sdk", "rerun"), "foxglove": ("foxglove-sdk", "foxglove")}
 """What each `display_mode` needs: the package, and the module in it."""
@@ -99,7 +99,7 @@ class LiveView:
         ConfigError: the view cannot be started.
     """
 
-    def __init__(self, options: DisplayOptions, simulation: Simulation) -> None:
+    def __init__(self, options: DisplayOptions, simulation: Host) -> None:
         check_options(options)
         self.shown = self.left_out = 0
         self.problem = ""
@@ -302,7 +302,7 @@ def points(scan: NDArray[Any], range_max: float) -> NDArray[np.float64]:
 
 
 @contextmanager
-def live_view(options: DisplayOptions, simulation: Simulation, console: Console) -> Iterator[LiveView | None]:
+def live_view(options: DisplayOptions, simulation: Host, console: Console) -> Iterator[LiveView | None]:
     """Show a run live if `display_data` is set; at its end print how many frames were left out.
 
     Raises:

@@ -29,7 +29,7 @@ from bhd_lerobot.recording.live_view import live_view
 from bhd_lerobot.recording.report import RecordResult, print_refusals, print_summary, progress_bars
 from bhd_lerobot.recording.resume_advice import instead_of_resuming
 from bhd_lerobot.registry import make_brain, make_robot, make_simulation, make_task
-from bhd_lerobot.robots.host.simulation import Simulation, describe
+from bhd_lerobot.robots.host.host import Host, describe
 from bhd_lerobot.rollout.configuration import run
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.marks import KEYS, Marks
@@ -233,9 +233,7 @@ def _add_estop_inputs(config: RecordConfig, pressed: EstopInputs, console: Conso
         console.print(f"Keys: {KEYS}")
 
 
-def open_recorder(
-    config: RecordConfig, root: Path, simulation: Simulation, task: Task, brain: Brain
-) -> DatasetRecorder:
+def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task, brain: Brain) -> DatasetRecorder:
     """Open the dataset that a configuration asks for, or go on with it.
 
     Raises:
@@ -244,7 +242,7 @@ def open_recorder(
     images = dict.fromkeys(
         simulation.camera_names, (simulation.config.camera_height, simulation.config.camera_width, 3)
     )
-    nq, nv = simulation.world.qpos.shape[1], simulation.world.qvel.shape[1]
+    nq, nv = (part.shape[1] for part in simulation.physics)
     physics = [f"qpos_{i}" for i in range(nq)] + [f"qvel_{i}" for i in range(nv)]
     features = dataset_features(
         simulation.observation_names,
@@ -288,14 +286,14 @@ def save_episode(recorder: DatasetRecorder, episode: Episode, metadata: dict[str
         raise
 
 
-def _trajectory(episode: Episode, simulation: Simulation) -> Trajectory:
+def _trajectory(episode: Episode, simulation: Host) -> Trajectory:
     outcome = episode.outcome
     title = f"{episode.spec.index}: {outcome.event.cause}, score {outcome.score:.2f}"
     track = simulation.track(episode.columns[PHYSICS_STATE])
     return Trajectory(title, episode.scene, track[:, :2], outcome.success)
 
 
-def _make_preview(config: RecordConfig, simulation: Simulation, console: Console) -> Preview | None:
+def _make_preview(config: RecordConfig, simulation: Host, console: Console) -> Preview | None:
     if config.preview_video is False:
         return None
     try:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from bhd_lerobot.errors import counted
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.rollout.signals import StopRequest
 from bhd_lerobot.rollout.types import Episode
 
@@ -90,7 +90,7 @@ def progress_bars(console: Console, *fields: str) -> Progress:
     )
 
 
-def print_refusals(simulation: Simulation, console: Console) -> None:
+def print_refusals(simulation: Host, console: Console) -> None:
     """Print what the system refused the real-time process, and the remedy."""
     for grant in (grant for grant in simulation.grants or () if not grant["granted"]):
         console.print(

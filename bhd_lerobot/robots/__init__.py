@@ -1,7 +1,9 @@
 """LeRobot's view of the hand, and a check of its contract."""
 
 __all__ = [
+    "arm_host",
     "base",
+    "base_host",
     "base_simulation",
     "config",
     "config_turtlebot3",

@@ -3,7 +3,8 @@
 from typing import ClassVar
 
 from bhd_lerobot.bodies.arenas import Arena, make_arena
-from bhd_lerobot.robots.base_simulation import BaseSimulation, observation_names
+from bhd_lerobot.robots.base_host import observation_names
+from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot
 
 

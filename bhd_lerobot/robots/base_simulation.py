@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
-from bhd_lerobot.control.base.controller import BaseController
-from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
+from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.robots.base_host import BaseHost
+from bhd_lerobot.robots.host.host import FrameReport
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.world import World
@@ -19,7 +20,7 @@ if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does withou
     from bhd_lerobot.robots.config import MobileBaseConfig
 
 
-class BaseSimulation(Simulation):
+class BaseSimulation(BaseHost, Simulation):
     """n simulated bases.
 
     Args:
@@ -28,9 +29,8 @@ class BaseSimulation(Simulation):
         threads: threads that step the physics; all processors if None.
     """
 
-    robot_kind = "base"
+    host_class = BaseHost
     view = "follow"
-    action_names = ("x.vel", "theta.vel")
     video_speed = 4
 
     def __init__(self, config: "MobileBaseConfig", n: int = 1, threads: int | None = None) -> None:
@@ -38,22 +38,18 @@ class BaseSimulation(Simulation):
         if body.lidar is None:
             raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
         world = World(body, n, physics_hz=config.physics_hz, threads=threads)
-        self.plant = SimulatedPlant(world)
         self.lidar = Lidar(world, body.lidar, config.beams)
-        self._controller = BaseController(body, n, config.control_hz)
         super().__init__(
             config,
-            world,
-            Cerebellum(body, self.plant, config.control_hz, controller=self._controller),
-            action_names=self.action_names,
-            observation_names=observation_names(config),
+            SimulatedPlant(world),
+            world=world,
             camera_names=tuple(body.cameras) if config.camera else (),
         )
+        self._reading = PlantReading(n, self._controller.joints)
         self._touch = self.world.sensor(body.touch_sensor)[:, 0]
         self._gyro = self.world.sensor("imu_gyro")
         self._touched = np.zeros(n, np.bool_)
         self.scan_rate_hz = body.lidar.rate_hz
-        self.sensor_period_s = 1 / body.lidar.rate_hz
         self._scan_ticks = config.control_hz // body.lidar.rate_hz
         self._scanned_tick = np.zeros(n, np.int64)
         self._scans = np.zeros(n, np.int64)  # scans taken in the episode
@@ -123,13 +119,3 @@ class BaseSimulation(Simulation):
             self._scans[ids] += 1
         running = self._scanned_tick[self.running]
         self._next_scan = (int(running.min()) if len(running) else self.tick) + self._scan_ticks
-
-
-def observation_names(config: "MobileBaseConfig") -> tuple[str, ...]:
-    """Return the names of the observation's floats, in order."""
-    names = ["x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(config.beams))]
-    if config.odometry:
-        names += ["x.pos", "y.pos", "theta.pos"]
-    if config.imu:
-        names += ["imu_x.vel", "imu_y.vel", "imu_z.vel"]
-    return tuple(names)

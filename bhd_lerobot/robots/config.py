@@ -24,6 +24,8 @@ class SimulatedRobotConfig(RobotConfig):
             the wall clock, in processes of its own.
         require_realtime: with ``clock = "realtime"``, refuse to start if the system does not grant SCHED_FIFO.
         realtime: how it runs on the wall clock.
+        plant: what is driven in place of a simulated robot: a class of any package, ``"package.module:Class"``, see
+            "Write a plant for your robot"; needs `clock = "realtime"`.
         control_hz: cerebellum ticks a second [Hz], a multiple of fps.
         physics_hz: physics steps a second [Hz], a multiple of control_hz.
         seed: seed of the scene and of the sensor noise when the robot is used by itself.
@@ -36,6 +38,7 @@ class SimulatedRobotConfig(RobotConfig):
     clock: str = "lockstep"
     require_realtime: bool = False
     realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
+    plant: str = ""
     control_hz: int
     physics_hz: int
     seed: int = 0
@@ -49,6 +52,22 @@ class SimulatedRobotConfig(RobotConfig):
         if self.seed < 0:
             raise ConfigError(f"robot.seed is {self.seed}; seeds start at 0.")
         _ = self.rates
+        if self.plant:
+            self._check_plant()
+
+    def _check_plant(self) -> None:
+        module, sign, name = self.plant.partition(":")
+        if not (sign and name.isidentifier() and all(part.isidentifier() for part in module.split("."))):
+            raise ConfigError(f"robot.plant is {self.plant!r}; name a class as package.module:Class.")
+        if self.clock != "realtime":
+            raise ConfigError("robot.plant names a robot that goes on by itself: use --robot.clock=realtime with it.")
+        if self.realtime.plant_process:
+            raise ConfigError(
+                "robot.realtime.plant_process is of simulated robots; with robot.plant leave it false. The plant is "
+                "opened in the cerebellum's process."
+            )
+        if self.camera:
+            raise ConfigError("robot.camera is of simulated robots; with robot.plant leave it false.")
 
     def _check_choice(self, name: str, valid: Collection[str]) -> None:
         if getattr(self, name) not in valid:

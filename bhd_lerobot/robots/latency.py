@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.plant import SimulatedPlant
 
 MAX_LATENCY = 25  # [ticks] 0.05 s at 500 Hz
 
 
-class LatePlant:
+class LatePlant(Plant):
     """Passes readings on at once, and commands some ticks later, for each simulation its own number.
 
     Args:

@@ -16,7 +16,8 @@ from bhd_lerobot.control.commands import CommandResult
 from bhd_lerobot.control.estop import POLL_S, EstopInputs, Source, check_source
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ActionError, CommandRefusedError, unknown_name
-from bhd_lerobot.robots.host.realtime import LiveSimulation, make_live
+from bhd_lerobot.robots.host.host import Host
+from bhd_lerobot.robots.host.realtime import LiveHost, make_live
 from bhd_lerobot.robots.host.simulation import Simulation
 
 # Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator: a brain
@@ -46,7 +47,7 @@ class SimulatedRobot(Robot):
     def __init__(self, config: Any) -> None:
         super().__init__(config)
         self.config = config
-        self._simulation: Simulation | None = None
+        self._simulation: Host | None = None
         self._last_observation: dict[str, Any] | None = None
         self._results: list[CommandResult] = []
         self._estop_sources: list[tuple[Source, str, float]] = []
@@ -110,10 +111,9 @@ class SimulatedRobot(Robot):
         """
         if self.is_connected:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
-        self._simulation = self.make_simulation()
+        is_live = self.config.clock == "realtime"
+        self._simulation = make_live(self.simulation_class, self.config, self.id) if is_live else self.make_simulation()
         try:
-            if self.config.clock == "realtime":
-                self._simulation = make_live(self._simulation, self.id)
             self.restart()
             for name in self.camera_shapes:
                 self._simulation.render(0, name)
@@ -125,10 +125,11 @@ class SimulatedRobot(Robot):
         _connected.add(self)
 
     def restart(self) -> None:
-        """Put the robot back to the start of its scene, at rest."""
+        """Put a simulated robot back to the start of its scene, at rest; a real one starts from where it is."""
         simulation = self.simulation
-        simulation.reset(np.zeros(1, np.intp), [self.make_scene()], [self.config.seed])
-        if isinstance(simulation, LiveSimulation):
+        scene = self.make_scene()
+        simulation.reset(np.zeros(1, np.intp), [scene if simulation.is_simulated else None], [self.config.seed])
+        if isinstance(simulation, LiveHost):
             simulation.begin()
 
     def disconnect(self) -> None:
@@ -148,7 +149,7 @@ class SimulatedRobot(Robot):
         """Nothing to configure beyond the configuration."""
 
     @property
-    def simulation(self) -> Simulation:
+    def simulation(self) -> Host:
         """The simulation behind the robot.
 
         Raises:
@@ -165,7 +166,7 @@ class SimulatedRobot(Robot):
             DeviceNotConnectedError: the robot is not connected.
         """
         simulation = self.simulation
-        frame = simulation.latest() if isinstance(simulation, LiveSimulation) else simulation.observe()
+        frame = simulation.latest() if isinstance(simulation, LiveHost) else simulation.observe()
         observation: dict[str, Any] = dict(zip(self.observation_names, frame.state[0].tolist(), strict=True))
         for name in self.camera_shapes:
             observation[name] = simulation.render(0, name)
@@ -204,7 +205,7 @@ class SimulatedRobot(Robot):
         simulation = self.simulation
         values = self.action_array(action)
         refusals: Mapping[int, str]
-        if isinstance(simulation, LiveSimulation):
+        if isinstance(simulation, LiveHost):
             receipt = simulation.send(values)
             sent, refusals, mode = receipt.sent, receipt.refusals, simulation.modes
             applied = simulation.to_action(simulation.live_bridge.latest["command"])

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.robots.arm_host import JOINT_ACTIONS, TOOL_NAMES, observation_names
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.simulated_robot import SimulatedRobot
-from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, TOOL_NAMES, UR5Simulation, observation_names
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 

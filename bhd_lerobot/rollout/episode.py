@@ -15,7 +15,7 @@ from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_fra
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.robots.faults import add_faults
-from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
+from bhd_lerobot.robots.host.host import FrameReport, Host
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
 from bhd_lerobot.rollout.images import EpisodeImages, Observer
 from bhd_lerobot.rollout.marks import Marks
@@ -50,7 +50,7 @@ class EpisodeLoop:
 
     def __init__(
         self,
-        simulation: Simulation,
+        simulation: Host,
         task: Task,
         brain: Brain,
         tolerance: TimingTolerance | None = None,
@@ -145,7 +145,7 @@ class EpisodeLoop:
         brain_seeds = [int(np.random.SeedSequence([_BRAIN_STREAM, spec.seed]).generate_state(1)[0]) for spec in specs]
         instructions = [self.task.instruction(scene) for scene in scenes]
         self.brain.reset(ids, brain_seeds, self.simulation.n, instructions)
-        states = self.simulation.snapshot(ids).state
+        states = self.simulation.initial_state(ids)
         self._results = {sim: results for sim, results in self._results.items() if sim not in ids}
         for sim, spec, scene, state in zip(ids, specs, scenes, states, strict=True):
             self._specs[sim], self._scenes[sim], self._initial[sim] = spec, scene, state

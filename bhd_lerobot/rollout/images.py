@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.host.host import Host
 
 Image = NDArray[np.uint8]
 Observer = Callable[[int, Mapping[str, Any]], None]
@@ -27,7 +27,7 @@ class EpisodeImages:
         simulation: the robots.
     """
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: Host) -> None:
         self._simulation = simulation
         self.sinks: list[Any] = [None] * simulation.n
         self._pending: list[list[futures.Future[Image]]] = [[] for _ in range(simulation.n)]

@@ -27,7 +27,7 @@ _Views = tuple[_Array, _Array, _Array, list[tuple[_Array, _Array, _Array]]]
 class SimulatedPlant:
     """Reads the joints of all simulations and writes their servos' commands.
 
-    It has the two calls of the cerebellum's plant and needs none of its code. A base's joints are its wheels, and their
+    It has the calls of the cerebellum's plant and needs none of its code. A base's joints are its wheels, and their
     servos take speeds [rad/s]. An arm's are those of its chain [rad], whose servos take angles [rad] or torques [N m],
     and its gripper, whose position, speed and command are those of the opening, the sum of its two fingers [m].
 
@@ -89,3 +89,19 @@ class SimulatedPlant:
     def write(self, ctrl: NDArray[np.float64]) -> None:
         """Take the servos' commands, shape (n, joints)."""
         self._ctrl[:] = ctrl
+
+    def open(self) -> None:
+        """Connect to nothing."""
+
+    def enable(self) -> None:
+        """Switch nothing on."""
+
+    def set_mode(self, mode: NDArray[np.int8]) -> None:
+        """Take the robots' modes, shape (n,): servos have none."""
+
+    def recover(self) -> bool:
+        """Return that no robot has moved by itself."""
+        return False
+
+    def close(self) -> None:
+        """Disconnect from nothing."""

@@ -14,7 +14,7 @@ from rich.table import Table
 from bhd_lerobot.errors import counted, quoted
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.registry import robot_configs, tasks_for
-from bhd_lerobot.robots.host.simulation import describe
+from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.tasks.task import TaskConfig
 from bhd_lerobot.training.checkpoint import resume_command
 from bhd_lerobot.training.config import BhdTrainConfig

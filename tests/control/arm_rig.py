@@ -9,7 +9,7 @@ from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, SendResult, Setpoint
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.plant import Plant, PlantReading
 
 HZ, FRAME = 500, 20
 TICK_NS = NANOSECONDS // HZ
@@ -21,7 +21,7 @@ LEAD = np.array(ARM.servo_damping) / np.array(ARM.servo_stiffness)
 STOP = np.array(LIMITS.stop_deceleration)
 
 
-class PerfectArm:
+class PerfectArm(Plant):
     """Joints without inertia behind servos with stiffness and damping: they lag as the real ones do."""
 
     def __init__(self, n: int) -> None:
@@ -34,7 +34,7 @@ class PerfectArm:
         self.written: list[np.ndarray] = []
 
     def read(self, out: PlantReading) -> None:
-        out.position[:], out.velocity[:], out.fault[:] = self.position, self.velocity, self.fault
+        out.position[:], out.velocity[:], out.safety[:] = self.position, self.velocity, self.fault
         for sim, value in self.lie.items():
             out.position[sim, 2] = out.velocity[sim, 1] = value
 

@@ -15,14 +15,14 @@ from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
 from bhd_lerobot.control.messages import NANOSECONDS, Request, SendResult, Setpoint
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.plant import Plant, PlantReading
 
 HZ = 200
 TICK_NS = NANOSECONDS // HZ
 BODY = turtlebot3_burger()
 
 
-class PerfectPlant:
+class PerfectPlant(Plant):
     """Wheels that turn as commanded, and that a test can break."""
 
     def __init__(self, n: int = 1) -> None:
@@ -36,7 +36,7 @@ class PerfectPlant:
     def read(self, out: PlantReading) -> None:
         out.position[:] = self.position
         out.velocity[:] = self.velocity
-        out.fault[:] = self.fault
+        out.safety[:] = self.fault
         for sim, value in self.lie.items():
             out.position[sim, 0] = out.velocity[sim, 1] = value
 

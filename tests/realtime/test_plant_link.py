@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.control.guard import Guard, WireLimits
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.plant import PlantReading, SafetyStatus
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, PlantShape, RemotePlant
 
 SHAPE = PlantShape(joints=2, positions=9, velocities=8, features=300, touches=1, capacity=4)
@@ -93,9 +93,9 @@ def test_a_stop_is_latched_until_a_fresh_command_acknowledges_it() -> None:
     for _ in range(5):
         rig.send()
         assert rig.check(1) == PlantPhase.STOPPED
-    assert rig.publish_state().fault.tolist() == [True]
-    rig.remote.acknowledge()
-    assert rig.publish_state().fault.tolist() == [False]
+    assert rig.publish_state().safety.tolist() == [SafetyStatus.STOPPED]
+    rig.remote.recover()
+    assert rig.publish_state().safety.tolist() == [SafetyStatus.NORMAL]
     assert rig.check(1) == PlantPhase.STOPPED  # the commands so far acknowledge nothing
     rig.send()
     assert rig.check(1) == PlantPhase.DRIVEN
@@ -106,7 +106,7 @@ def test_an_old_command_acknowledges_nothing() -> None:
     rig = Rig()
     rig.stop()
     rig.publish_state()
-    rig.remote.acknowledge()
+    rig.remote.recover()
     rig.send()
     assert rig.check(21) == PlantPhase.STOPPED
 
@@ -114,7 +114,7 @@ def test_an_old_command_acknowledges_nothing() -> None:
 def test_an_acknowledgement_is_for_the_stops_that_were_seen() -> None:
     rig = Rig()
     rig.publish_state()
-    rig.remote.acknowledge()  # of none
+    rig.remote.recover()  # of none
     rig.stop()
     rig.send()
     assert rig.check(1) == PlantPhase.STOPPED
@@ -176,11 +176,11 @@ def test_the_newest_plant_state_is_read_and_a_silent_plant_is_a_fault() -> None:
     rig = Rig()
     reading = PlantReading(1, 2)
     rig.remote.read(reading)
-    assert reading.fault.tolist() == [True]
-    rig.remote.acknowledge()  # of nothing: refused without an error
+    assert reading.safety.tolist() == [SafetyStatus.STOPPED]
+    rig.remote.recover()  # of nothing: refused without an error
     reading = rig.publish_state()
     assert (reading.position.tolist(), reading.velocity.tolist()) == ([[1.0, 2.0]], [[3.0, 4.0]])
-    assert reading.fault.tolist() == [False]
+    assert reading.safety.tolist() == [SafetyStatus.NORMAL]
 
 
 def test_reading_and_writing_never_wait_for_the_other_side() -> None:

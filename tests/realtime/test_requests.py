@@ -13,7 +13,7 @@ from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, Request
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.mailbox import Mailbox
 from bhd_lerobot.realtime.requests import EVENT_DTYPE, RequestClient, RequestKind, RequestServer, request_dtype
@@ -23,7 +23,7 @@ from tests.control.goal_rig import ARM, HOME, HZ, joints
 TICK_NS = NANOSECONDS // HZ
 
 
-class ObedientArm:
+class ObedientArm(Plant):
     """A plant that is where it is commanded to be."""
 
     n = 1
@@ -35,7 +35,7 @@ class ObedientArm:
     def read(self, out: PlantReading) -> None:
         out.position[:] = HOME if self.controller is None else self.controller.command
         out.velocity[:] = 0.0 if self.controller is None else self.controller.velocity
-        out.fault[:] = self.fault
+        out.safety[:] = self.fault
 
     def write(self, ctrl: NDArray[np.float64]) -> None:
         assert np.isfinite(ctrl).all()

@@ -60,7 +60,7 @@ def test_a_stopped_arm_lets_go_of_the_table_and_stays_so_after_reset_and_activat
 
         def broken(out: Any) -> None:
             read(out)
-            out.fault[:] = bool(faults) and faults.pop()
+            out.safety[:] = bool(faults) and faults.pop()
 
         cerebellum.plant.read = broken
     else:

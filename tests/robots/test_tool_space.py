@@ -12,9 +12,10 @@ from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Limit, Mode, Reason
+from bhd_lerobot.robots.arm_host import TOOL_NAMES, pose_matrices
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.ur5 import UR5
-from bhd_lerobot.robots.ur5_simulation import TOOL_NAMES, UR5Simulation, pose_matrices
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 
 DOWN = [0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0]
 

@@ -9,10 +9,11 @@ from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError, RenderingError
+from bhd_lerobot.robots.arm_host import JOINT_ACTIONS
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.ur5 import UR5
-from bhd_lerobot.robots.ur5_simulation import JOINT_ACTIONS, UR5Simulation
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from tests.cases import each_case
 
 FIRST = np.zeros(1, np.intp)

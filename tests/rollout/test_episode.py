@@ -104,7 +104,7 @@ class Breaker(Script):
     def act(self, observation: Any) -> Any:
         if self.frame == 4 and not self.is_broken:
             self.is_broken = True
-            self.simulation.cerebellum.reading.fault[0] = True
+            self.simulation.cerebellum.reading.safety[0] = True
         return super().act(observation)
 
 
@@ -113,7 +113,7 @@ def test_a_latched_fault_ends_the_episode_and_the_next_one_moves_again() -> None
     task = make_task(AvoidConfig(duration_s=FRAMES / 10), 2, 10)
     brain = Breaker(script("turtlebot3"))
     brain.simulation = simulation
-    plant_fault = simulation.cerebellum.reading.fault
+    plant_fault = simulation.cerebellum.reading.safety
     episodes = []
     for episode in EpisodeLoop(simulation, task, brain).run([EpisodeSpec(i, 2 * i) for i in range(3)]):
         plant_fault[:] = False

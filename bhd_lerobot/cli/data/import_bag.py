@@ -183,7 +183,7 @@ def _wanted(options: argparse.Namespace) -> ImportOptions:
         raise ConfigError(f"--command_timeout is {timeout}; it must be positive.")
     if options.scan_yaw is not None and not math.isfinite(options.scan_yaw):
         raise ConfigError(f"--scan_yaw is {options.scan_yaw}; it must be an angle in rad.")
-    from bhd_lerobot.robots.base_simulation import observation_names
+    from bhd_lerobot.robots.base_host import observation_names
     from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config  # seconds to import
 
     beams, pose = 360 if options.beams is None else options.beams, bool(options.odometry)

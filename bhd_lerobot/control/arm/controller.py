@@ -277,6 +277,12 @@ class ArmController(Controller):
         self.actuators[ids] = self.command[ids]
         self.velocity[ids] = self.acceleration[ids] = 0.0
 
+    def resume(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
+        """Go on from the posture that the arms are in; what they grip is not let go of."""
+        opening = self.command[ids, -1]
+        self.configure(ids, reading)
+        self.command[ids, -1] = self.actuators[ids, -1] = opening
+
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about arms that were put somewhere else."""
         self.goals.restart(ids)

@@ -1,7 +1,9 @@
-"""n simulations of one kind under one cerebellum, in this process or in others."""
+"""n robots of one kind under one cerebellum, in this process or in others."""
 
 __all__ = [
     "config",
+    "hardware",
+    "host",
     "link",
     "plant_loop",
     "plant_process",

@@ -22,6 +22,7 @@ from bhd_lerobot.realtime.block import LiveLayout, Word
 from bhd_lerobot.realtime.frame_log import FrameLog
 from bhd_lerobot.realtime.sections import BrainSide, section_sizes
 from bhd_lerobot.robots.host.config import RealtimeConfig
+from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.process import LiveSpec
 from bhd_lerobot.robots.host.remote_plant import plant_shape
 from bhd_lerobot.robots.host.simulation import Simulation
@@ -45,7 +46,7 @@ class LiveLink:
         grants: what the real-time process was granted or refused, as plain values.
 
     Args:
-        mirror: a simulation like the one that is to run; this process's image of the robot.
+        mirror: a host like the one that is to run; this process's image of the robot.
         config: the robot's configuration.
         name: name of the running robot, for `bhd-monitor`.
 
@@ -54,12 +55,12 @@ class LiveLink:
         RealtimeError: a process could not be started, or real time is required and was refused.
     """
 
-    def __init__(self, mirror: Simulation, config: Any, name: str) -> None:
+    def __init__(self, mirror: Host, config: Any, name: str) -> None:
         realtime: RealtimeConfig = config.realtime
         rates = mirror.rates
         dtype = state_dtype(mirror)
         frames = max(64, round(realtime.buffer_s * rates.fps * 4))
-        shape = plant_shape(mirror) if realtime.plant_process else None
+        shape = plant_shape(mirror) if realtime.plant_process and isinstance(mirror, Simulation) else None
         if shape is not None and realtime.plant_timeout_s * rates.control_hz < 2:
             raise ConfigError(
                 f"robot.realtime.plant_timeout_s is {realtime.plant_timeout_s:g}; at control_hz = {rates.control_hz} "
@@ -89,6 +90,7 @@ class LiveLink:
             **({} if shape is None else {"plant": shape.as_dict()}),
         }
         self.grants: list[dict[str, Any]] = []
+        self._plant: str = config.plant
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._pipes: dict[str, Connection] = {}
         self._stop = threading.Event()
@@ -102,9 +104,10 @@ class LiveLink:
             self.close()
             raise
 
-    def _start(self, mirror: Simulation, config: Any, realtime: RealtimeConfig) -> None:
+    def _start(self, mirror: Host, config: Any, realtime: RealtimeConfig) -> None:
         spec = LiveSpec(
-            simulation=f"{type(mirror).__module__}:{type(mirror).__qualname__}",
+            host=f"{type(mirror).__module__}:{type(mirror).__qualname__}",
+            plant=config.plant,
             values=_plain(config),
             rates=mirror.rates,
             body=mirror.body,
@@ -210,9 +213,9 @@ class LiveLink:
                 )
 
     def _complain(self, name: str, how: str) -> NoReturn:
-        alone = "plant" not in self._pipes
+        simulated = not self._plant and "plant" not in self._pipes
         what = {
-            "cerebellum": "The simulated robot ended with it." if alone else "The plant stops the robot by itself.",
+            "cerebellum": "The simulated robot ended with it." if simulated else "The plant stops the robot by itself.",
             "recorder": "The robot decelerates and holds.",
             "plant": "The cerebellum is in FAULT; the simulated robot stands still.",
         }[name]

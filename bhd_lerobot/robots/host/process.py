@@ -1,6 +1,7 @@
-"""The real-time process: cerebellum and simulated plant of one robot, ticking on the wall clock.
+"""The real-time process: the cerebellum of one robot, and its plant, ticking on the wall clock.
 
-With a plant in a process of its own (`plant_process`) the cerebellum runs here alone, against what that one publishes.
+The plant is a simulated world or, with `robot.plant`, another package's class, which talks to a robot. With a simulated
+world in a process of its own (`plant_process`) the cerebellum runs here alone, against what that one publishes.
 
 Started by `LiveLink` as a program of its own, ``python -m bhd_lerobot.robots.host.process``, never forked and not by
 `multiprocessing`, whose children import the main module of their parent: it imports neither torch nor LeRobot. While
@@ -13,6 +14,7 @@ import importlib
 import os
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +25,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from bhd_lerobot.bodies.body import Arm, Body, Rates
-from bhd_lerobot.control.messages import NANOSECONDS, Mode
+from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import BhdError
@@ -33,6 +35,8 @@ from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
 from bhd_lerobot.realtime.plant_link import PlantLink
 from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
 from bhd_lerobot.realtime.sections import cerebellum_side, plan_link
+from bhd_lerobot.robots.host.hardware import Hardware, plant_class
+from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.remote_plant import RemoteSimulation
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import StatePublisher
@@ -47,7 +51,8 @@ class LiveSpec:
     """What the process is to run; everything in it can be pickled without LeRobot.
 
     Attributes:
-        simulation: module and class of the simulation, ``"package.module:Class"``.
+        host: module and class of the simulation, or of the host of a plant, ``"package.module:Class"``.
+        plant: module and class of the plant that is driven; empty for a simulated one.
         values: the robot's configuration as plain values.
         rates: the rates.
         body: the hardware.
@@ -56,7 +61,8 @@ class LiveSpec:
         limits: when the loop stops the robot.
     """
 
-    simulation: str
+    host: str
+    plant: str
     values: dict[str, Any]
     rates: Rates
     body: Body
@@ -64,18 +70,40 @@ class LiveSpec:
     privileges: RealtimeSettings
     limits: LoopLimits
 
+    @property
+    def _config(self) -> Any:
+        body = self.body
+        return SimpleNamespace(**self.values, rates=self.rates, body=lambda: body)
+
+    @property
+    def oldest_ns(self) -> int:
+        """A reading of a plant that is older than this is none of the present [ns]; at least three ticks."""
+        return max(3 * NANOSECONDS // self.rates.control_hz, round(self.limits.plant_timeout_s * NANOSECONDS))
+
     def make_simulation(self, planning: Planning | None = None) -> Simulation:
         """Return a simulation of one robot.
 
         Args:
             planning: who plans its goals, for an arm that takes goals.
         """
-        module, _, name = self.simulation.partition(":")
-        body = self.body
-        config = SimpleNamespace(**self.values, rates=self.rates, body=lambda: body)
-        kind = getattr(importlib.import_module(module), name)
-        made: Simulation = kind(config, 1, 1) if planning is None else kind(config, 1, 1, planning)
+        kind = _load(self.host)
+        made: Simulation = kind(self._config, 1, 1) if planning is None else kind(self._config, 1, 1, planning)
         return made
+
+    def make_hardware(self) -> Hardware:
+        """Return the plant; it is not opened yet."""
+        return Hardware(plant_class(self.plant)(self._config, self.body), self.plant, self.oldest_ns)
+
+    def make_host(self, hardware: Hardware, planning: Planning | None = None) -> Host:
+        """Return the host of a plant; the arguments as for `make_simulation`."""
+        kind = _load(self.host)
+        made: Host = kind(self._config, hardware) if planning is None else kind(self._config, hardware, planning)
+        return made
+
+
+def _load(name: str) -> Any:
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(module), attribute)
 
 
 class LiveProcess:
@@ -92,24 +120,29 @@ class LiveProcess:
         self._words = self._block.words
         dof = len(spec.body.chain.joints) if isinstance(spec.body, Arm) else 0
         planning = plan_link(self._block, dof, spec.rates.control_hz)
-        simulation = spec.make_simulation(planning)
-        link = PlantLink.of(self._block)
-        remote = None if link is None else RemoteSimulation(simulation, link)
-        self._simulation = simulation = simulation if remote is None else remote
-        cerebellum = simulation.cerebellum
+        self._hardware = spec.make_hardware() if spec.plant else None
+        self._host: Host
+        link, sensed_ns = PlantLink.of(self._block), time.monotonic_ns
+        if self._hardware is not None:
+            self._hardware.open()
+            self._host = spec.make_host(self._hardware, planning)
+            sensed_ns = self._stamp_ns
+        elif link is not None:
+            self._host = remote = RemoteSimulation(spec.make_simulation(planning), link)
+            sensed_ns = remote.sensed_ns
+        else:
+            self._host = spec.make_simulation(planning)
+        cerebellum = self._host.cerebellum
         cerebellum.fifo, cerebellum.estop = self._block.fifo, self._block.estop
         self._serve_bridge = cerebellum_side(self._block, cerebellum)
-        self._publisher = StatePublisher(simulation, self._block.ring)
-        if remote is not None:
-            self._publisher = StatePublisher(simulation, self._block.ring, remote.sensed_ns)
-            timeout_ns = round(spec.limits.plant_timeout_s * NANOSECONDS)
-            cerebellum.oldest_ns = max(cerebellum.oldest_ns, timeout_ns)
-            self._serve_bridge = remote.resuming(self._serve_bridge)
+        self._publisher = StatePublisher(self._host, self._block.ring, sensed_ns)
+        cerebellum.oldest_ns = spec.oldest_ns
         period = NANOSECONDS // spec.rates.control_hz
         self._statistics = TimingStatistics(period, self._block.section("statistics"))
         self._warm_up_ticks = round(_WARM_UP_S * spec.rates.control_hz)
         self._parent = os.getppid()
         self._orphan_ticks = 0
+        self._standing_ticks = 0
         self._most_orphan_ticks = round(_ORPHAN_S * spec.rates.control_hz)
         self._warm = False
         self._loop = RealtimeLoop(
@@ -120,6 +153,7 @@ class LiveProcess:
             advance=self._advance,
             publish=self._publisher.publish,
             count=self._statistics.add,
+            may_stand=None if self._hardware is None else self._may_stand,
         )
 
     def work(self) -> None:
@@ -150,19 +184,25 @@ class LiveProcess:
 
     def _reset(self, scene: Any, seed: int) -> None:
         self._block.fifo.drop(np.zeros(1, np.intp))
-        self._simulation.reset(np.zeros(1, np.intp), [scene], [seed])
+        if self._hardware is not None:
+            self._hardware.prepare(self._host.cerebellum.reading)
+        self._host.reset(np.zeros(1, np.intp), [scene], [seed])
         gc.collect()  # the loop runs without a collector
 
     def _warm_up(self, scene: Any, seed: int) -> None:
         """Run ticks before the first real one: first executions take longest."""
         self._reset(scene, seed)
+        if self._hardware is not None:
+            self._hardware.is_muted = True
         grid = TickGrid(0, self._loop.period_ns)
         for tick in range(self._warm_up_ticks):
-            self._simulation.cerebellum.tick(tick * self._loop.period_ns)
+            self._host.cerebellum.tick(tick * self._loop.period_ns)
             self._serve_bridge(0)
             self._advance(1)
             self._publisher.publish(Slot(tick, 0, 0, 0), 0, 0, grid)
             self._statistics.add(0, 0, 0, 0)
+        if self._hardware is not None:
+            self._hardware.is_muted = False
         self._warm = True
 
     def _run(self, start_ns: int) -> tuple[int, int]:
@@ -172,6 +212,7 @@ class LiveProcess:
         # What is so before the first tick: the first frame's observation.
         before = Slot(-1, start_ns - self._loop.period_ns, 0, 0)
         self._publisher.publish(before, before.due_ns, before.due_ns, TickGrid(start_ns, self._loop.period_ns))
+        self._standing_ticks = 0
         grid = self._loop.run(start_ns)
         return grid.executed, grid.skipped
 
@@ -181,18 +222,34 @@ class LiveProcess:
             return
         # The brain's process has ended: come to rest (its watchdog sees to that), then end.
         self._orphan_ticks += 1
-        moving = self._simulation.cerebellum.mode[0] in (Mode.TRACKING, Mode.STOPPING)
+        moving = self._host.cerebellum.mode[0] in (Mode.TRACKING, Mode.STOPPING)
         if not moving or self._orphan_ticks > self._most_orphan_ticks:
             self._words[Word.END] = 1
 
+    def _may_stand(self) -> bool:
+        """Bring a robot that goes on without the loop to rest; return whether it is."""
+        cerebellum = self._host.cerebellum
+        mode = cerebellum.mode[0]
+        if mode in (Mode.HOLD, Mode.TRACKING):
+            cerebellum.request(Request.DEACTIVATE)
+        self._standing_ticks += 1
+        moves = mode in (Mode.HOLD, Mode.TRACKING, Mode.STOPPING) or not cerebellum.controller.at_rest()[0]
+        return not moves or self._standing_ticks > self._most_orphan_ticks
+
+    def _stamp_ns(self) -> int:
+        stamp_ns = self._host.cerebellum.reading.stamp_ns
+        return 0 if stamp_ns is None else int(stamp_ns[0])
+
     def _advance(self, ticks: int) -> None:
         for _ in range(ticks):
-            self._simulation.advance()
+            self._host.advance()
 
     def close(self) -> None:
         """Free everything."""
         self._words[Word.PHASE] = Phase.ENDED
-        self._simulation.close()
+        if self._hardware is not None:
+            self._hardware.close()
+        self._host.close()
         self._block.close()
 
 

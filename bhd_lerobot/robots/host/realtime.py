@@ -1,30 +1,33 @@
-"""A robot on the wall clock, with the interface of a `Simulation` of one.
+"""A robot on the wall clock, with the interface of a `Host` of one.
 
-Cerebellum, physics and recorder run in processes of their own. Here is a mirror: a simulation of the same kind that is
-put into published states, to compute the truth that tasks judge by and to render images.
+Cerebellum, plant and recorder run in processes of their own. Here is a mirror: a host of the same kind that is put into
+published states, to compute the truth that tasks judge by and, if it is a simulation, to render images.
 """
 
 import itertools
 import os
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import Command
+from bhd_lerobot.control.commands import BrainCommand, Command
 from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.bridge import LiveBridge
+from bhd_lerobot.robots.host.hardware import Unconnected, plant_class
+from bhd_lerobot.robots.host.host import Frame, FrameReport, Host, Receipt
 from bhd_lerobot.robots.host.link import LiveLink
-from bhd_lerobot.robots.host.simulation import Frame, FrameReport, Receipt, Simulation
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import raised
-from bhd_lerobot.sim.world import Snapshot
+from bhd_lerobot.sim.render_thread import Deliver
 
 _SILENCE_S = 2.0  # so long after it was due a frame that does not come means that the loop or the recorder is stuck
 
@@ -56,7 +59,7 @@ class LiveFrame:
     skipped: int
 
 
-class LiveSimulation(Simulation):
+class LiveHost(Host):
     """One robot on the wall clock.
 
     Attributes:
@@ -64,7 +67,7 @@ class LiveSimulation(Simulation):
         link: its processes.
 
     Args:
-        mirror: a simulation of one robot.
+        mirror: a host of one robot: a simulation, or the host of a plant that is connected to nothing.
         name: name of the running robot, for `bhd-monitor`.
 
     Raises:
@@ -72,20 +75,19 @@ class LiveSimulation(Simulation):
         RealtimeError: the processes could not be started, or real time is required and was refused.
     """
 
-    def __init__(self, mirror: Simulation, name: str) -> None:
+    def __init__(self, mirror: Host, name: str) -> None:
         if mirror.n != 1:
             raise ConfigError(
                 f"n_envs is {mirror.n}; with robot.clock = 'realtime' one robot runs at a time: use --n_envs=1."
             )
         self.mirror = mirror
-        self.view, self.video_speed = mirror.view, mirror.video_speed
+        self.robot_kind, self.knows, self.is_simulated = mirror.robot_kind, mirror.knows, mirror.is_simulated  # type: ignore[misc]
         self.is_live, self.sensor_period_s = True, mirror.sensor_period_s
         self.link = LiveLink(mirror, mirror.config, name)
         self.grants = self.link.grants
         self.live_bridge = LiveBridge(self.link.block, mirror.rates, self.link.bridge_side.client, self.link.wait)
         super().__init__(
             mirror.config,
-            mirror.world,
             mirror.cerebellum,
             action_names=mirror.action_names,
             observation_names=mirror.observation_names,
@@ -103,20 +105,17 @@ class LiveSimulation(Simulation):
     def _show(self, state: Any, touches: NDArray[np.bool_] | None = None) -> None:
         if self._shown is not state:
             self._shown = state
-            mirror = self.mirror
-            mirror.restore_physics(0, state["physics"][0])
-            mirror.cerebellum.command[:] = state["command"]
-            mirror.cerebellum.mode[:] = state["mode"]
+            self.mirror.show(state)
         if touches is not None:
             for flag, touched in zip(self.mirror.touches, touches, strict=True):
                 flag[:] = touched
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
-        """Put the mirror into a scene; `reset` does that for the robot, too."""
+        """Put the mirror into a scene; `reset` does that for a simulated robot, too."""
         self.mirror.place(ids, scenes)
 
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where the robot was in recorded states, shape (frames, 7)."""
+        """Return where the robot was in recorded states, or observations, shape (frames, 7)."""
         return self.mirror.track(states)
 
     def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -149,25 +148,46 @@ class LiveSimulation(Simulation):
         """Return commands of the cerebellum in the space of the actions."""
         return self.mirror.to_action(command)
 
-    def snapshot(self, ids: NDArray[np.intp] | None = None) -> Snapshot:
+    def initial_state(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the mirror's physics: after a `reset` those that the episode begins with."""
-        return self.mirror.snapshot(ids)
+        return self.mirror.initial_state(ids)
 
     # --- episodes ----------------------------------------------------------------------------------------------------
 
     def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
         """Start an episode: put the robot into its scene. Its time begins with the first observation, or with `begin`.
 
+        A real robot is driven to the start of the scene, if it is an arm; a base is put there by a person.
+
         Raises:
-            RealtimeError: a process has ended or does not answer.
+            RealtimeError: a process has ended or does not answer, or the robot does not get to the start.
         """
         link = self.link
         link.place(scenes[0], int(seeds[0]))
+        goal = None if self.is_simulated else self.mirror.start_goal(scenes[0])
+        if goal is not None:
+            self._go_to_start(goal)
+            link.place(scenes[0], int(seeds[0]))
         self.mirror.reset(ids, scenes, seeds)
         self.live_bridge.begin()
         self._reader = None
         self._boundary, self._shown = None, None
         self.running[:] = True
+
+    def _go_to_start(self, goal: BrainCommand) -> None:
+        self.live_bridge.begin()
+        self.link.run()
+        refusal = self.live_bridge.submit(goal)
+        results = [] if refusal is None else [refusal]
+        while not results:
+            self.link.wait()
+            results = self.live_bridge.take_results()
+        self.link.pause()
+        if not results[0].success:
+            raise RealtimeError(
+                f"The robot did not get to the start of the episode: {results[0].code.name}, {results[0].message} "
+                "Episodes that were saved are intact."
+            )
 
     def begin(self) -> None:
         """Let the loop run, if it does not yet.
@@ -328,6 +348,18 @@ class LiveSimulation(Simulation):
 
     # --- images ------------------------------------------------------------------------------------------------------
 
+    def render(self, sim: int, camera: str) -> NDArray[np.uint8]:
+        """Return what a camera sees in the state that the mirror shows, shape (height, width, 3)."""
+        return self.mirror.render(sim, camera)
+
+    def start_rendering(self) -> None:
+        """Get ready for `render_later`."""
+        self.mirror.start_rendering()
+
+    def render_later(self, sim: int, camera: str, deliver: Deliver | None = None) -> Future[NDArray[np.uint8]]:
+        """Return what a camera sees in the state that the mirror shows, as an image to come."""
+        return self.mirror.render_later(sim, camera, deliver)
+
     def close(self) -> None:
         """End the robot's processes and free the renderers. May be called twice."""
         super().close()
@@ -335,15 +367,26 @@ class LiveSimulation(Simulation):
         self.link.close()
 
 
-def make_live(mirror: Simulation, name: str | None) -> LiveSimulation:
-    """Return a robot on the wall clock.
+def make_live(simulation: type[Simulation], config: Any, name: str | None) -> LiveHost:
+    """Return a robot on the wall clock: a simulated one, or with `config.plant` that of a plant.
 
     Args:
-        mirror: a simulation of one robot.
+        simulation: the class of its simulation, which names that of its host.
+        config: its configuration.
         name: the robot's id; its type and this process's number if None.
+
+    Raises:
+        ConfigError: there is no such plant.
+        RealtimeError: its processes could not be started, or real time is required and was refused.
     """
     number = next(_nameless) if name is None else 0
-    return LiveSimulation(mirror, name or f"{mirror.config.type}-{os.getpid()}{f'-{number}' if number else ''}")
+    kind: Any = simulation
+    if config.plant:
+        plant_class(config.plant)  # what cannot be imported is found out before a process is started
+        mirror: Host = kind.host_class(config, Unconnected())
+    else:
+        mirror = kind(config)
+    return LiveHost(mirror, name or f"{config.type}-{os.getpid()}{f'-{number}' if number else ''}")
 
 
 _nameless = itertools.count()  # several robots of one process that have no id

@@ -6,14 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.base.controller import BaseController
-from bhd_lerobot.control.messages import Mode
-from bhd_lerobot.realtime.loop import Serve
 from bhd_lerobot.realtime.plant_link import PlantLink, PlantShape, RemotePlant
-from bhd_lerobot.robots.host.simulation import FrameReport, Simulation
+from bhd_lerobot.robots.host.host import FrameReport
+from bhd_lerobot.robots.host.simulation import Simulation
 
-_LATCHED = (Mode.ESTOP, Mode.FAULT)
 _ODOMETRY = ("x.pos", "y.pos", "theta.pos")
 
 
@@ -46,8 +43,8 @@ class RemoteSimulation(Simulation):
         self._own = own
         super().__init__(
             own.config,
-            own.world,
             own.cerebellum,
+            world=own.world,
             action_names=own.action_names,
             observation_names=own.observation_names,
             camera_names=own.camera_names,
@@ -68,7 +65,7 @@ class RemoteSimulation(Simulation):
     def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> None:
         """Start an episode; the plant's process has put its world into the scene already."""
         state = self.remote.refresh()
-        self.remote.acknowledge()  # stops of another episode
+        self.remote.recover()  # stops of another episode
         self._own.reset(ids, scenes, seeds)
         self._touches[:] = state["touches"]
         for flag in self.touches:
@@ -116,33 +113,6 @@ class RemoteSimulation(Simulation):
     def sensed_ns(self) -> int:
         """Return when the plant read what `sense` returned last, monotonic [ns]."""
         return int(self.remote.state["stamp_ns"])
-
-    def resuming(self, serve: Serve) -> Serve:
-        """Return what answers requests, and lets a plant that stopped by itself be driven again after a reset.
-
-        Args:
-            serve: answers requests.
-        """
-        mode = self.cerebellum.mode
-
-        def serve_and_resume(now_ns: int) -> None:
-            was_latched = mode[0] in _LATCHED
-            serve(now_ns)
-            if was_latched and mode[0] not in _LATCHED and self.remote.has_stopped:
-                self._resume()
-
-        return serve_and_resume
-
-    def _resume(self) -> None:
-        """Let the plant be driven again, from where the robot is."""
-        self.remote.acknowledge()
-        controller = self.cerebellum.controller
-        if isinstance(controller, ArmController):
-            # The plant stopped the arm elsewhere than the reference came to rest: to go there would be a jump.
-            opening = controller.command[0, -1]  # what is gripped is not let go of
-            controller.configure(np.zeros(1, np.intp), self.cerebellum.reading)
-            controller.command[0, -1] = controller.actuators[0, -1] = opening
-        self.cerebellum.guard.restart(np.zeros(1, np.intp), controller.actuators)
 
     def close(self) -> None:
         """Free everything. May be called twice."""

@@ -12,7 +12,7 @@ from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.messages import Limit, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import FEEDBACK_DTYPE, encode_feedback
 from bhd_lerobot.realtime.grid import Slot, TickGrid
-from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.host.host import Host
 
 LIMITS, WATCHDOGS = tuple(limit for limit in Limit if limit), tuple(watchdog for watchdog in Watchdog if watchdog)
 
@@ -24,7 +24,7 @@ _NUMBERS = (
 )
 
 
-def state_dtype(simulation: Simulation) -> np.dtype:
+def state_dtype(host: Host) -> np.dtype:
     """Return the dtype of the published states of one robot.
 
     Beside the fields of `CerebellumState`:
@@ -40,12 +40,12 @@ def state_dtype(simulation: Simulation) -> np.dtype:
     - ``feedback``: how far the goal is that is followed, once a frame.
     - ``observation``: the observation's floats; ``sensed_ns``: when they were read, monotonic; ``oldest_ns``: how much
       older the oldest reading in them was.
-    - ``physics``: the simulator's generalised positions and velocities.
+    - ``physics``: the simulator's generalised positions and velocities; of no width without one.
     """
-    cerebellum = simulation.cerebellum
+    cerebellum = host.cerebellum
     odometry = cerebellum.controller.odometry().shape[1]
     own = Cerebellum.state_dtype(1, cerebellum.controller.joints, cerebellum.width, odometry)
-    physics = simulation.world.qpos.shape[1] + simulation.world.qvel.shape[1]
+    physics = sum(part.shape[1] for part in host.physics)
     return np.dtype(
         [
             *((name, np.int64) for name in _NUMBERS),
@@ -54,8 +54,8 @@ def state_dtype(simulation: Simulation) -> np.dtype:
             ("limits", np.int64, (len(LIMITS),)),
             ("watchdogs", np.int64, (len(WATCHDOGS),)),
             ("refusals", np.int64, (len(Reason),)),
-            ("touches", np.int64, (len(simulation.touches),)),
-            ("observation", np.float64, (1, len(simulation.observation_names))),
+            ("touches", np.int64, (len(host.touches),)),
+            ("observation", np.float64, (1, len(host.observation_names))),
             ("physics", np.float64, (1, physics)),
             ("feedback", FEEDBACK_DTYPE),
         ]
@@ -66,26 +66,26 @@ class StatePublisher:
     """Publishes the states of one robot, into a ring.
 
     Args:
-        simulation: the robot.
-        ring: where they go, of dtype `state_dtype(simulation)`.
+        host: the robot.
+        ring: where they go, of dtype `state_dtype(host)`.
         clock: monotonic time [ns].
     """
 
-    def __init__(self, simulation: Simulation, ring: StateRing, clock: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(self, host: Host, ring: StateRing, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock = clock
-        self._simulation, self._cerebellum, self._ring = simulation, simulation.cerebellum, ring
-        self._record = np.zeros(1, state_dtype(simulation))
+        self._host, self._cerebellum, self._ring = host, host.cerebellum, ring
+        self._record = np.zeros(1, state_dtype(host))
         # The one robot's values, as views: an index costs as much as a write.
         self._field = {name: self._record[name][0] for name in self._record.dtype.names or ()}
         self._state = self._record[0]
-        self._speed = np.zeros_like(simulation.cerebellum.reading.velocity)
+        self._speed = np.zeros_like(host.cerebellum.reading.velocity)
         self._numbers = np.frombuffer(self._record.data, np.int64, len(_NUMBERS))  # one write instead of thirteen
         self._feedback = self._state["feedback"]
-        self._touches = np.zeros(len(simulation.touches), np.int64)
+        self._touches = np.zeros(len(host.touches), np.int64)
         self._limits, self._watchdogs = np.zeros(len(LIMITS), np.int64), np.zeros(len(WATCHDOGS), np.int64)
-        nq = simulation.world.qpos.shape[1]
+        nq = host.physics[0].shape[1]
         self._physics = self._field["physics"][:, :nq], self._field["physics"][:, nq:]
-        self._frame = simulation.rates.ticks_per_frame
+        self._frame = host.rates.ticks_per_frame
         self._next_frame = 0
         self.segment = 0
 
@@ -104,7 +104,7 @@ class StatePublisher:
             ended_ns: when its predecessor ended [ns].
             grid: what the loop has done so far.
         """
-        simulation, cerebellum, field = self._simulation, self._cerebellum, self._field
+        host, cerebellum, field = self._host, self._cerebellum, self._field
         self._count(slot)
         controller, reading = cerebellum.controller, cerebellum.reading
         field["joint_positions"][:], field["joint_velocities"][:] = reading.position, reading.velocity
@@ -116,7 +116,7 @@ class StatePublisher:
         field["is_moving"][:] = np.count_nonzero(self._speed > MOVING) > 0
         field["emergency_stop"][:] = cerebellum.estop_latched
         field["refusals"][:] = cerebellum.refusals[:, 0]
-        field["observation"][:], oldest = simulation.sense()
+        field["observation"][:], oldest = host.sense()
         self._numbers[:] = (
             slot.index,
             self.segment,
@@ -131,19 +131,19 @@ class StatePublisher:
             cerebellum.command_age_of(0, slot.due_ns - grid.start_ns),
             # Before the first tick everything stands still: what is read then is so until that tick.
             self._clock() if slot.index >= 0 else slot.due_ns,
-            (simulation.tick - int(oldest[0])) * grid.period_ns,
+            (host.tick - int(oldest[0])) * grid.period_ns,
         )
-        self._physics[0][:], self._physics[1][:] = simulation.world.qpos, simulation.world.qvel
+        self._physics[0][:], self._physics[1][:] = host.physics
         self._ring.publish(self._state)
 
     def _count(self, slot: Slot) -> None:
         """Count what was raised since the last tick; limits and watchdogs at the last tick of every frame."""
         field = self._field
-        flags = [flag[0] for flag in self._simulation.touches]
+        flags = [flag[0] for flag in self._host.touches]
         if any(flags):
             self._touches += flags
             field["touches"][:] = self._touches
-            for flag in self._simulation.touches:
+            for flag in self._host.touches:
                 flag[0] = False
         # The state that a frame ends with holds all that was raised in it, also if its last tick was skipped.
         frame = (slot.index + 1) // self._frame

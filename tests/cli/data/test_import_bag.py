@@ -9,7 +9,7 @@ import pytest
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.robots.base_simulation import observation_names
+from bhd_lerobot.robots.base_host import observation_names
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from tests.cli.data.import_support import TASK, imported, refused, run
 from tests.rosbag import support as bags

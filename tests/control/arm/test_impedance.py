@@ -11,7 +11,7 @@ from bhd_lerobot.control.arm.compliance import Compliance
 from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Setpoint
-from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ HOME = np.array(ARM.home)
 ALL = np.ones(1, np.bool_)
 
 
-class StuckPlant:
+class StuckPlant(Plant):
     """Joints that stay where they are put, whatever the motors do."""
 
     n = 1
@@ -32,7 +32,7 @@ class StuckPlant:
         self.written: list[Array] = []
 
     def read(self, out: PlantReading) -> None:
-        out.position[0], out.velocity[0], out.fault[0] = self.position, self.velocity, self.fault
+        out.position[0], out.velocity[0], out.safety[0] = self.position, self.velocity, self.fault
 
     def write(self, ctrl: Array) -> None:
         self.written.append(ctrl[0].copy())

@@ -346,28 +346,17 @@ def test_after_a_stop_and_a_reset_the_arm_goes_on_from_where_it_is() -> None:
     assert cerebellum.mode[0] == Mode.TRACKING
     parts.hang()
 
-    requests: list[Request] = []
-
-    def answer(now_ns: int) -> None:
-        for request in requests:
-            cerebellum.request(request)
-
-    serve = parts.remote.resuming(answer)
     for _ in range(400):
         parts.tick()
-        serve(parts.now)
         assert cerebellum.mode[0] == Mode.FAULT
         assert parts.guard.phase == PlantPhase.STOPPED
     away = np.abs(cerebellum.command - cerebellum.reading.position)[0, :6].max()
     assert away < 5e-3  # the reference came to rest elsewhere, and gave way to where the plant stopped the arm
     opening = cerebellum.command[0, -1]
     before = cerebellum.reading.position.copy()
-    requests.append(Request.RESET)
-    serve(parts.now)
-    requests.clear()
+    assert cerebellum.request(Request.RESET).accepted.all()
     for _ in range(200):
         parts.tick()
-        serve(parts.now)
     assert parts.guard.phase == PlantPhase.DRIVEN
     assert cerebellum.mode[0] == Mode.INACTIVE
     assert np.abs(cerebellum.reading.position - before)[0, :6].max() < 1e-3  # no jump

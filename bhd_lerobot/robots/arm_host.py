@@ -1,0 +1,191 @@
+"""n UR5s under one cerebellum, whatever is below it: what they observe, and how their actions become setpoints."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene
+from bhd_lerobot.bodies.ur5 import JOINTS
+from bhd_lerobot.control.arm.controller import ArmController
+from bhd_lerobot.control.arm.force_limit import ForceLimit
+from bhd_lerobot.control.arm.impedance import ImpedanceController
+from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
+from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.geometry.poses import pose_vectors
+from bhd_lerobot.control.messages import Reason
+from bhd_lerobot.control.motion.planning import Planning
+from bhd_lerobot.control.plant import Plant, PlantReading
+from bhd_lerobot.robots.host.host import FrameReport, Host
+from bhd_lerobot.tasks.task import ArmTruth
+
+if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
+    from bhd_lerobot.robots.config_ur5 import UR5Config
+
+TOOL_NAMES = (
+    "tool_x.pos",
+    "tool_y.pos",
+    "tool_z.pos",
+    "tool_qw.pos",
+    "tool_qx.pos",
+    "tool_qy.pos",
+    "tool_qz.pos",
+    "gripper.pos",
+)
+"""Position [m] and orientation (unit quaternion) of the tool frame in the base frame, and the gripper's opening [m]."""
+
+_SLACK = 0.2  # how far a policy's quaternion may be from unit length; it is normalised
+
+
+def pose_matrices(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], str | None]:
+    """Return the homogeneous transform of a position and a quaternion wxyz, and what is wrong with them, if anything.
+
+    Args:
+        values: x, y, z [m], w, x, y, z, shape (7,). The quaternion is normalised, as a network's output is only nearly
+            of unit length.
+    """
+    length = float(np.sqrt((values[3:] * values[3:]).sum()))
+    if not abs(length - 1) <= _SLACK:
+        return np.eye(4), f"the quaternion {values[3:].tolist()} has the length {length:g}; it must be near 1"
+    x, y, z, *quaternion = values.tolist()
+    return Pose((x, y, z), (quaternion[0], quaternion[1], quaternion[2], quaternion[3])).matrix(), None
+
+
+JOINT_ACTIONS = (*(f"{joint}.pos" for joint in JOINTS), "gripper.pos")
+OBSERVED = (*JOINT_ACTIONS, *(f"{joint}.vel" for joint in JOINTS), "gripper.vel")
+_TO_START = 0.5  # [rad/s] so fast does a joint turn at the most on the way to the start of an episode
+_LARGEST_TURN = 1.0  # [rad] of a joint from one tool pose to the next: a second at a third of the largest speed
+_JUMP = (
+    "{} would have to turn by {:.2f} rad at once; {} rad is the most. Come nearer to the pose in smaller steps, or "
+    "send it as a goal, which is planned"
+)
+
+
+class ArmHost(Host):
+    """n arms.
+
+    Attributes:
+        plant: the joints.
+        controller: an `ArmController`, or with ``control = "impedance"`` an `ImpedanceController`, whose compliance and
+            feed-forward wrench may be set and whose estimate of the contact wrench may be read.
+        kinematics: the arm's.
+
+    Args:
+        config: the robot.
+        plant: the joints.
+        planning: who plans goals; they are planned in the tick that they start in if None.
+        options: those of `Host`.
+    """
+
+    robot_kind = "arm"
+    action_names = JOINT_ACTIONS
+    knows = frozenset({"tool_pose", "opening"})
+
+    def __init__(self, config: "UR5Config", plant: Plant, planning: Planning | None = None, **options: Any) -> None:
+        body = config.body()
+        self.plant = plant
+        self.kinematics = ArmKinematics(body.chain, body.limits)
+        ticks = config.rates.ticks_per_frame
+        self.controller: ArmController | ImpedanceController
+        if config.control == "impedance":
+            self.controller = ImpedanceController(body, plant.n, config.control_hz, ticks)
+        else:
+            self.controller = ArmController(body, plant.n, config.control_hz, ticks, planning)
+            if body.mjcf:  # without inertias it is not known what torques a motion needs
+                self.controller.force = ForceLimit(body, plant.n, config.control_hz, config.max_force)
+        super().__init__(
+            config,
+            Cerebellum(body, plant, config.control_hz, controller=self.controller),
+            action_names=TOOL_NAMES if config.action_space == "tool" else JOINT_ACTIONS,
+            observation_names=observation_names(config),
+            **options,
+        )
+
+    def _newest(self) -> PlantReading:
+        """Return the newest reading of the joints."""
+        return self.cerebellum.reading
+
+    def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
+        reading = self._newest()
+        return self._observed(np.concatenate([reading.position, reading.velocity], axis=1)), np.full(self.n, self.tick)
+
+    def _observed(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return observations of positions and speeds, shape (n, 2 joints): with the tool's pose if asked for."""
+        if not self.config.tool_pose:
+            return state
+        return np.concatenate([state, pose_vectors(self.kinematics.tool(state[:, : len(JOINTS)]))], axis=1)
+
+    def truth(self, report: FrameReport | None = None) -> ArmTruth:
+        """Return what the joints say: where the tools are. Of objects and touches nothing is known."""
+        position = self._newest().position
+        return ArmTruth(
+            tool_pose=pose_vectors(self.kinematics.tool(position[:, :-1])),
+            object_poses=np.zeros((self.n, MAX_OBJECTS, 7)),
+            opening=position[:, -1].copy(),
+            arm_on_table=np.zeros(self.n, np.bool_),
+            arm_on_object=np.zeros(self.n, np.bool_),
+            self_contact=np.zeros(self.n, np.bool_),
+            fingers_on_object=np.zeros((self.n, MAX_OBJECTS), np.bool_),
+        )
+
+    def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pose of the tool in recorded observations, shape (frames, 7)."""
+        return pose_vectors(self.kinematics.tool(np.asarray(states, np.float64)[:, : len(JOINTS)]))
+
+    def start_goal(self, scene: TableScene | None) -> BrainCommand | None:
+        """Return the goal that brings an arm to the start of a scene; it stays where it is if there is none."""
+        if scene is None or self.config.control == "impedance":
+            return None
+        *joints, opening = scene.posture
+        return BrainCommand(
+            "start", joint_target=tuple(joints), gripper=opening, max_velocity=_TO_START, timeout_s=60.0
+        )
+
+    # --- tool space ---------------------------------------------------------------------------------------------------
+
+    def to_action(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return joint positions and openings as actions: as they are, or as tool poses."""
+        if self.config.action_space == "joint" or self.config.control == "impedance":
+            return command.copy()
+        tool = pose_vectors(self.kinematics.tool(command[:, :-1]))
+        return np.concatenate([tool, command[:, -1:]], axis=1)
+
+    def to_setpoints(
+        self, action: NDArray[np.float64], mask: NDArray[np.bool_], before: NDArray[np.float64] | None = None
+    ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
+        """Turn actions into setpoints, shape (n, width), and say which cannot be, and why.
+
+        The posture of a tool pose is the one nearest to that before it. Near a singular posture, at the end of a
+        joint's range and where the workspace folds, the nearest one may be far away, and the tool would leave its
+        path on the way there: that is refused.
+        """
+        if self.config.action_space == "joint":
+            return action, {}
+        command = self.cerebellum.command if before is None else before
+        setpoints, refused = command.copy(), {}
+        impedance = self.config.control == "impedance"
+        for sim in np.flatnonzero(mask).tolist():
+            matrix, problem = pose_matrices(action[sim, :7])
+            if problem is not None:
+                refused[sim] = (Reason.NO_POSTURE, problem)
+                continue
+            if impedance:  # where the spring pulls to; whether the arm gets there is for the spring to find out
+                setpoints[sim] = action[sim]
+                continue
+            result = self.kinematics.solve(matrix, command[sim, :-1])
+            if result.code != ResultCode.SUCCEEDED:
+                refused[sim] = (Reason.NO_POSTURE, result.message)
+                continue
+            turn = np.abs(result.postures[0] - command[sim, :-1])
+            if turn.max() > _LARGEST_TURN:
+                refused[sim] = (Reason.NO_POSTURE, _JUMP.format(JOINTS[int(turn.argmax())], turn.max(), _LARGEST_TURN))
+                continue
+            setpoints[sim, :-1], setpoints[sim, -1] = result.postures[0], action[sim, -1]
+        return setpoints, refused
+
+
+def observation_names(config: "UR5Config") -> tuple[str, ...]:
+    """Return the names of the observation's floats, in order."""
+    return OBSERVED + TOOL_NAMES[:-1] * config.tool_pose

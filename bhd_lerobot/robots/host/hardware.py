@@ -1,0 +1,178 @@
+"""The plant of another package, as the cerebellum's process holds it: nothing of it is taken on trust."""
+
+import importlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
+from bhd_lerobot.errors import ConfigError, RealtimeError
+
+_READY_S = 10.0  # that a robot may take until it follows commands: brakes are released, a stop is left
+_POLL_S = 0.005
+_CALLS = ("open", "enable", "read", "write", "set_mode", "recover", "close")
+
+
+class Unconnected(Plant):
+    """The plant of a host that only mirrors another: it reads and writes nothing."""
+
+    n = 1
+
+    def read(self, out: PlantReading) -> None:
+        """Leave `out` as it is."""
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        """Do nothing."""
+
+
+def plant_class(name: str) -> Callable[[Any, Any], Plant]:
+    """Return the class of a plant.
+
+    Args:
+        name: ``"package.module:Class"``.
+
+    Raises:
+        ConfigError: there is none, or it lacks a call.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        found: Any = getattr(importlib.import_module(module), attribute)
+    except Exception as error:  # whatever a module raises while it is imported
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ConfigError(
+            f"robot.plant is {name!r}, which cannot be imported: {reason}. Name a class as package.module:Class, of a "
+            "module that Python finds: one that is installed, or in a folder of PYTHONPATH."
+        ) from error
+    missing = [call for call in _CALLS if not callable(getattr(found, call, None))]
+    if missing:
+        raise ConfigError(
+            f"robot.plant is {name!r}, which has no {' and no '.join(missing)}. A subclass of "
+            "bhd_lerobot.control.plant.Plant inherits all but read and write."
+        )
+    return found
+
+
+class Hardware(Plant):
+    """Passes calls on to a plant, and takes what it raises or what is not a number for a fault of the robot.
+
+    Attributes:
+        problem: what it raised in the control loop, in words; empty if nothing.
+        is_muted: whether commands are dropped, because the loop only warms up.
+
+    Args:
+        plant: the plant.
+        name: what it is called in messages.
+        oldest_ns: a reading that is older than this is none of the present [ns].
+        clock: monotonic time [ns].
+        sleep: waits for a time [s].
+    """
+
+    n = 1
+
+    def __init__(
+        self,
+        plant: Plant,
+        name: str,
+        oldest_ns: int,
+        clock: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        if plant.n != 1:
+            raise ConfigError(f"The plant {name} is of n = {plant.n} robots; on the wall clock there is one.")
+        self._plant, self._name, self._oldest_ns, self._clock, self._sleep = plant, name, oldest_ns, clock, sleep
+        self._stamp_ns = np.zeros(1, np.int64)
+        self.problem = ""
+        self.is_muted = False
+
+    def open(self) -> None:
+        """Connect to the robot.
+
+        Raises:
+            RealtimeError: that is impossible.
+        """
+        self._patiently(self._plant.open, "opened")
+
+    def prepare(self, reading: PlantReading) -> None:
+        """Make the robot follow commands, and wait until it does.
+
+        Raises:
+            RealtimeError: it does not within ten seconds.
+        """
+        self.problem = ""
+        self.read(reading)
+        if reading.safety[0] != SafetyStatus.NORMAL:
+            self._patiently(self._plant.recover, "recovered")
+        self._patiently(self._plant.enable, "enabled")
+        end = self._clock() + round(_READY_S * 1e9)
+        while why := self._not_ready(reading):
+            if self._clock() > end:
+                raise RealtimeError(f"The plant {self._name} is not ready after {_READY_S:g} s: {why}.")
+            self._sleep(_POLL_S)
+
+    def _not_ready(self, reading: PlantReading) -> str:
+        self.read(reading)
+        age = self._clock() - int(self._stamp_ns[0])
+        if self.problem:
+            return self.problem
+        if self._stamp_ns[0] == 0:
+            return "it has read nothing yet, or does not say when (PlantReading.stamp_ns)"
+        if age > self._oldest_ns:
+            return f"its newest reading is {age / 1e9:.2f} s old"
+        if not (np.isfinite(reading.values).all() and np.isfinite(reading.sensors).all()):
+            return "it reads what is not a finite number"
+        status = SafetyStatus(int(reading.safety[0]))
+        return "" if status == SafetyStatus.NORMAL else f"its safety status is {status.name}"
+
+    def _patiently(self, call: Callable[[], Any], done: str) -> None:
+        try:
+            call()
+        except Exception as error:  # of another package's code
+            raise RealtimeError(f"The plant {self._name} cannot be {done}: {_words(error)}.") from error
+
+    # --- in the control loop -----------------------------------------------------------------------------------------
+
+    def read(self, out: PlantReading) -> None:
+        """Write the newest readings into `out`."""
+        out.stamp_ns = self._stamp_ns
+        try:
+            self._plant.read(out)
+        except Exception as error:  # of another package's code: the loop goes on, and stops the robot
+            self._fail(error)
+        if self.problem or not np.isfinite(out.sensors).all():
+            out.safety[:] = SafetyStatus.FAULT
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        """Take actuator commands, shape (1, joints)."""
+        if not self.is_muted:
+            self._try(self._plant.write, ctrl.copy())
+
+    def set_mode(self, mode: NDArray[np.int8]) -> None:
+        """Take the new mode, shape (1,)."""
+        if not self.is_muted:
+            self._try(self._plant.set_mode, mode.copy())
+
+    def recover(self) -> bool:
+        """Begin to leave a stop of the robot's own; return whether the robot may have moved by itself."""
+        self.problem = ""
+        return bool(self._try(self._plant.recover))
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._try(self._plant.close)
+
+    def _try(self, call: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return call(*arguments)
+        except Exception as error:  # of another package's code: the loop goes on, and stops the robot
+            self._fail(error)
+            return None
+
+    def _fail(self, error: Exception) -> None:
+        self.problem = self.problem or _words(error)
+
+
+def _words(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
