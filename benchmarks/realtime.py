@@ -348,7 +348,7 @@ def make_recorder(simulation: Any, task: Any, config: Any, folder: Path) -> Data
     images = dict.fromkeys(simulation.camera_names, (config.camera_height, config.camera_width, 3))
     physics = [f"physics_{index}" for index in range(simulation.physics_state.shape[1])]
     names = simulation.observation_names, simulation.action_names
-    features = dataset_features(*names, images, physics, task.environment_names)
+    features = dataset_features(*names, images, physics, task.environment_names, simulation.effort_names)
     root = Path(tempfile.mkdtemp(dir=folder)) / "data"
     return DatasetRecorder.create("bench/realtime", config.fps, features, robot_type=config.type, root=root)
 

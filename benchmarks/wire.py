@@ -53,7 +53,7 @@ class Judge:
         body, hz = simulation.body, simulation.rates.control_hz
         limits = body.limits
         if isinstance(body, Arm):
-            lead = np.asarray(body.servo_damping) / np.asarray(body.servo_stiffness)
+            lead = np.asarray(body.lead_s)
             effort = np.asarray(limits.effort[:-1])
             change = (np.asarray(limits.velocity) + 2 * lead * np.asarray(limits.stop_deceleration)) / hz
             lower, upper = np.asarray(limits.lower) - 1e-2, np.asarray(limits.upper) + 1e-2

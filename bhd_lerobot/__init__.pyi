@@ -21,6 +21,10 @@ from bhd_lerobot.control.commands import Chunk as Chunk
 from bhd_lerobot.control.commands import Goals as Goals
 from bhd_lerobot.control.commands import Mixed as Mixed
 from bhd_lerobot.control.commands import Pose as Pose
+from bhd_lerobot.control.messages import Mode as Mode
+from bhd_lerobot.control.plant import Plant as Plant
+from bhd_lerobot.control.plant import PlantReading as PlantReading
+from bhd_lerobot.control.plant import SafetyStatus as SafetyStatus
 from bhd_lerobot.datasets.format.summary import dataset_info as dataset_info
 from bhd_lerobot.datasets.loader.config import LoaderConfig as LoaderConfig
 from bhd_lerobot.datasets.loader.loader import make_loader as make_loader
@@ -44,7 +48,10 @@ from bhd_lerobot.registry import register_robot as register_robot
 from bhd_lerobot.registry import register_task as register_task
 from bhd_lerobot.robots.base import SimulatedBase as SimulatedBase
 from bhd_lerobot.robots.config import MobileBaseConfig as MobileBaseConfig
+from bhd_lerobot.robots.config_ur5 import UR5Config as UR5Config
 from bhd_lerobot.robots.conformance import check_robot as check_robot
+from bhd_lerobot.robots.host.config import RealtimeConfig as RealtimeConfig
+from bhd_lerobot.robots.ur5 import UR5 as UR5
 from bhd_lerobot.rollout.replay import ReplayConfig as ReplayConfig
 from bhd_lerobot.tasks.task import ArmTask as ArmTask
 from bhd_lerobot.tasks.task import BaseTask as BaseTask

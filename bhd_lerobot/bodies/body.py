@@ -247,7 +247,8 @@ class Body:
 
     Attributes:
         name: body name, for example ``"turtlebot3_burger"``.
-        mjcf: MJCF document of the robot alone, without floor or scene.
+        mjcf: MJCF document of the robot alone, without floor or scene; empty for a robot that is not simulated, whose
+            forces and torques are then not known from its motion either.
         root: name of the root body, which carries a free joint if the robot moves.
         limits: limits of the commands it takes.
         cameras: the cameras, by name.
@@ -274,6 +275,7 @@ class MobileBase(Body):
         touch_sensor: name of the contact sensor that counts touches with the scene.
         radius: radius of the vertical cylinder around the root body's origin that holds the whole robot [m].
         height: height of the robot [m].
+        stalled_s: a wheel that turns less than half as far as commanded for so long is blocked [s].
         outline: rectangles around the middle of the wheel axis that together hold the robot, seen from above: rear,
             front, and half the width of each [m].
     """
@@ -284,6 +286,7 @@ class MobileBase(Body):
     radius: float
     height: float
     outline: tuple[tuple[float, float, float], ...]
+    stalled_s: float = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -304,6 +307,9 @@ class Arm(Body):
         actuation: ``"position"``: servos take positions and compensate gravity; ``"torque"``: they take torques.
         home: the posture that it starts in [rad], and the gripper's opening [m].
         payload: largest mass in the gripper [kg].
+        latency_s: time until a command acts [s]; the reference is led by it, as by the servos' own lag.
+        blocked_rad: a joint that is farther than this from its reference does not follow it [rad]; goals end then.
+        blocked_s: an arm with such a joint, whose servo gives all it has, is stopped after so long [s].
     """
 
     limits: PositionLimits
@@ -315,6 +321,15 @@ class Arm(Body):
     actuation: Literal["position", "torque"]
     home: tuple[float, ...]
     payload: float
+    latency_s: float = 0.0
+    blocked_rad: float = 0.1
+    blocked_s: float = 0.05
+
+    @property
+    def lead_s(self) -> tuple[float, ...]:
+        """By how long the commands of each position servo are led, so that it follows without a lag [s]."""
+        servos = zip(self.servo_damping, self.servo_stiffness, strict=True)
+        return tuple(damping / stiffness + self.latency_s for damping, stiffness in servos)
 
 
 @dataclass(frozen=True)

@@ -420,6 +420,13 @@ class Cerebellum:
         self._watchdog[:] = 0
         return self.controller.take_limits(), watchdog
 
+    def efforts(self) -> NDArray[np.float64]:
+        """Return the torques of the joints [N m], a gripper's force [N], shape (n, joints).
+
+        As they were measured; where the plant does not measure them, what its servos are commanded to give.
+        """
+        return self.reading.effort.copy() if self.reading.has_effort else self.controller.efforts(self.reading)
+
     def command_age_ns(self, now_ns: int) -> NDArray[np.int64]:
         """Return how long ago the command in force was due [ns], shape (n,); 0 for a robot that follows none."""
         by_setpoint = (self.mode == _TRACKING) & ~self._by_goal
@@ -438,7 +445,7 @@ class Cerebellum:
             stamp_ns=now_ns,
             joint_positions=self.reading.position.copy(),
             joint_velocities=velocity,
-            joint_efforts=self.controller.efforts(self.reading),
+            joint_efforts=self.efforts(),
             command=self.command.copy(),
             odometry=self.controller.odometry(),
             measured=self.controller.measured(self.reading),

@@ -59,7 +59,7 @@ class WireLimits:
         if not isinstance(body, Arm):
             raise ConfigError(f"Body {body.name!r} is a {type(body).__name__}; no limits are known for its actuators.")
         reference = body.limits
-        lead = np.asarray(body.servo_damping) / np.asarray(body.servo_stiffness)
+        lead = np.asarray(body.lead_s)
         hardest = np.maximum(reference.acceleration, reference.stop_deceleration)
         if body.actuation == "torque":
             lead[:] = 0.0

@@ -182,7 +182,7 @@ class CerebellumState:
         stamp_ns: time of the tick [ns].
         joint_positions: joint or wheel angles [rad], a gripper's opening [m], shape (n, joints).
         joint_velocities: their speeds [rad/s, m/s], shape (n, joints).
-        joint_efforts: commanded effort of the servos [N m, N], shape (n, joints).
+        joint_efforts: torques of the joints [N m], force of a gripper [N], shape (n, joints); measured if possible.
         command: the command applied, after all limits, shape (n, width).
         measured: where the robot really is in the space of the commands, shape (n, width).
         odometry: x [m], y [m] and yaw [rad] since the last reset, from the encoders, shape (n, 3); shape (n, 0) for a

@@ -27,7 +27,7 @@ from bhd_lerobot.evaluation.report import ReportInput, Video, write_report
 from bhd_lerobot.evaluation.results import EvalResults, summarise, write_json, write_table
 from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
 from bhd_lerobot.evaluation.text import number, percent
-from bhd_lerobot.recording.report import ESTOP_STATUS, print_refusals, progress_bars
+from bhd_lerobot.recording.report import ESTOP_STATUS, FAULT_STATUS, print_refusals, progress_bars
 from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.host import Host, describe
 from bhd_lerobot.rollout.configuration import run
@@ -104,12 +104,15 @@ class EvalResult:
     missed: list[str] = field(default_factory=list)
     stopped_by: StopRequest | None = None
     estop: str | None = None
+    fault: str | None = None
 
     @property
     def exit_status(self) -> int:
         """The program's exit status: 0 if all episodes were run and no brain missed `fail_below`."""
         if self.estop is not None:
             return ESTOP_STATUS
+        if self.fault is not None:
+            return FAULT_STATUS
         if self.stopped_by:
             return self.stopped_by.exit_status
         return FAILED_STATUS if self.missed else 0
@@ -154,12 +157,13 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
                 progress.add_task(escape(brain_run.label), total=len(config.indices), success="") for brain_run in runs
             ]
             for one, bar in zip(runs, bars, strict=True):
-                if stop or any(other.loop.emergency_stop for other in runs):
+                if stop or any(other.loop.emergency_stop or other.loop.fault for other in runs):
                     break
                 run_episodes(config, one, lambda: bool(stop), _shower(progress, bar, one))
         estop = None
         if any(brain_run.loop.emergency_stop for brain_run in runs):
             estop = ", ".join(pressed.causes) or "from another process"
+        fault = simulation.problem if any(brain_run.loop.fault for brain_run in runs) else None
     results = summarise(
         facts,
         _versions(),
@@ -174,6 +178,7 @@ def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
         "brains": {brain_run.label: brain_run.timing() for brain_run in runs if brain_run.timed.times},
     }
     result = EvalResult(output_dir, results, timing, output_dir / "report.html", stopped_by=stop, estop=estop)
+    result.fault = fault
     result.missed = _missed(config, results)
     try:
         _write(config, result, runs, preview, no_videos)
@@ -267,6 +272,8 @@ def _make_preview(config: EvalConfig, console: Console) -> tuple[Preview | None,
     """Return what makes videos, or None and why not."""
     if config.videos == 0:
         return None, "videos was 0."
+    if config.robot.plant:
+        return None, "there is no simulator to render."
     try:
         return Preview(make_simulation(config.robot)), ""
     except RenderingError as error:

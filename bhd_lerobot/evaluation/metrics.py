@@ -125,6 +125,10 @@ class EpisodeMetrics:
         return {**values, "seed": str(self.seed)}
 
 
+# What is the same to the last bit when a simulated episode is run again.
+_REPEATED = (keys.ACTION, keys.APPLIED_ACTION, keys.PHYSICS_STATE, keys.REWARD)
+
+
 def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: JerkMeasure, fps: int) -> EpisodeMetrics:
     """Return an episode's numbers.
 
@@ -158,7 +162,7 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
         problem="" if outcome.success else str(episode.plan.get("problem") or ""),
         details=dict(outcome.details),
         initial_state=_digest(episode.initial_state),
-        digest=_digest(*(columns[key] for key in (keys.ACTION, keys.APPLIED_ACTION, keys.PHYSICS_STATE, keys.REWARD))),
+        digest=_digest(*(columns[key] for key in _REPEATED if key in columns)),
         wall=_wall(episode),
     )
 

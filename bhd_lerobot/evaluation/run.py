@@ -24,10 +24,11 @@ from bhd_lerobot.recording.record import open_recorder, save_episode
 from bhd_lerobot.registry import make_brain, make_task
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.rollout.drivers import TimedBrain
-from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.plots import Trajectory
 from bhd_lerobot.rollout.provenance import episode_metadata
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.tasks.operator import judged
 from bhd_lerobot.tasks.task import episode_seed
 
 VIDEOS = 2  # failures of each brain of which videos are made, by default
@@ -88,6 +89,7 @@ def prepare(config: EvalConfig, label: str, simulation: Host, pool: WorkerPool |
     try:
         timed = TimedBrain(make_brain(config.brains[label]))
         task = make_task(config.task, simulation.n, robot.fps, simulation.body)
+        task = judged(task, simulation.knows, simulation.n, robot.fps)
         brain = cast(Brain, timed)
         if pool is None:
             return BrainRun(label, EpisodeLoop(simulation, task, brain), timed)
@@ -106,7 +108,7 @@ def run_episodes(config: EvalConfig, one: BrainRun, stop: Callable[[], bool], sh
     with _recorder(config, one.label, loop) as recorder:
         started = time.perf_counter()
         for episode in loop.run(specs, stop, recorder.begin_episode if recorder else None):
-            track = simulation.track(episode.columns[PHYSICS_STATE])
+            track = track_of(simulation, episode.columns)
             metrics = measure(one.label, episode, track, jerk, fps)
             if recorder:
                 task, brain = loop.task.parameters(), loop.brain.parameters()
@@ -154,5 +156,7 @@ def _store(
     wanted = VIDEOS if config.videos is None else config.videos
     if not metrics.success and failures == 1:
         one.videos.clear()  # the first episode, for the case that none fails
+    if PHYSICS_STATE not in episode.columns:
+        return
     if (not metrics.success and failures <= wanted) or (len(one.episodes) == 1 and wanted):
         one.videos.append((metrics, episode.scene, episode.columns[PHYSICS_STATE]))

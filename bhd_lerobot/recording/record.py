@@ -31,7 +31,7 @@ from bhd_lerobot.recording.resume_advice import instead_of_resuming
 from bhd_lerobot.registry import make_brain, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.host import Host, describe
 from bhd_lerobot.rollout.configuration import run
-from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
 from bhd_lerobot.rollout.marks import KEYS, Marks
 from bhd_lerobot.rollout.plots import Trajectory, TrajectoryAlbum
 from bhd_lerobot.rollout.preview import Preview
@@ -39,6 +39,7 @@ from bhd_lerobot.rollout.provenance import episode_metadata
 from bhd_lerobot.rollout.run_folder import run_folder
 from bhd_lerobot.rollout.signals import stop_on_signals
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
+from bhd_lerobot.tasks.operator import OperatorTask, judged
 from bhd_lerobot.tasks.task import Task, episode_seed, outcomes_of
 
 
@@ -95,6 +96,12 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)
         task = make_task(config.task, simulation.n, config.dataset.fps, simulation.body)
+        task = judged(task, simulation.knows, simulation.n, config.dataset.fps)
+        if isinstance(task, OperatorTask):
+            console.print(
+                f"The robot does not measure what {task.name!r} is judged by: say how each episode ends, with the keys "
+                "s (success) and f (failure); otherwise it ends in a time-out."
+            )
         brain = make_brain(config.brain)
         # A brain that does not fit the robot fails here, before a dataset exists.
         if is_here:
@@ -118,6 +125,8 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
             if recorder.repair_report:
                 console.print(f"Repaired before resuming: {recorder.repair_report}")
             album, first = _run(config, recorder, loop, result, console)
+        if loop.fault:
+            result.fault = simulation.problem
         if loop.emergency_stop:
             result.estop = ", ".join(pressed.causes) or "from another process"
     if album.added:
@@ -250,6 +259,7 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
         images,
         physics,
         task.environment_names,
+        effort_names=simulation.effort_names,
         subtask=brain.has_plan,
         language=brain.has_plan and config.dataset.language,
     )
@@ -289,12 +299,16 @@ def save_episode(recorder: DatasetRecorder, episode: Episode, metadata: dict[str
 def _trajectory(episode: Episode, simulation: Host) -> Trajectory:
     outcome = episode.outcome
     title = f"{episode.spec.index}: {outcome.event.cause}, score {outcome.score:.2f}"
-    track = simulation.track(episode.columns[PHYSICS_STATE])
+    track = track_of(simulation, episode.columns)
     return Trajectory(title, episode.scene, track[:, :2], outcome.success)
 
 
 def _make_preview(config: RecordConfig, simulation: Host, console: Console) -> Preview | None:
     if config.preview_video is False:
+        return None
+    if not simulation.is_simulated:
+        if config.preview_video:
+            raise ConfigError("preview_video is true, but a video is rendered from a simulator, and there is none.")
         return None
     try:
         return Preview(make_simulation(config.robot))

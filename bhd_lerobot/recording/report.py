@@ -18,6 +18,7 @@ from bhd_lerobot.rollout.signals import StopRequest
 from bhd_lerobot.rollout.types import Episode
 
 ESTOP_STATUS = 3  # exit status of a run that an emergency stop ended
+FAULT_STATUS = 4  # of one that a real robot's fault ended
 
 
 @dataclass
@@ -37,6 +38,7 @@ class RecordResult:
         simulated_s: simulated time of the episodes that this run added [s].
         wall_s: time that this took [s], from the first observation to the last save.
         stopped_by: the signal that ended the run early, or None.
+        fault: why a real robot's fault ended the run, in words; None if none did.
         estop: what pressed the emergency stop that ended the run, in words; None if there was none.
     """
 
@@ -53,12 +55,15 @@ class RecordResult:
     wall_s: float = 0.0
     stopped_by: StopRequest | None = None
     estop: str | None = None
+    fault: str | None = None
 
     @property
     def exit_status(self) -> int:
         """The program's exit status: 0 if the dataset is complete."""
         if self.estop is not None:
             return ESTOP_STATUS
+        if self.fault is not None:
+            return FAULT_STATUS
         return self.stopped_by.exit_status if self.stopped_by else 0
 
     @property
@@ -129,6 +134,11 @@ def print_summary(console: Console, config: RecordConfig, result: RecordResult, 
         console.print(
             f"[bold]Emergency stop ({escape(result.estop)}).[/bold] The episode that was running is saved with the "
             "outcome 'estop', and no other was begun. Clear the cause and go on with --resume=true."
+        )
+    if result.fault is not None:
+        console.print(
+            f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] The episode that was running is saved "
+            "with the outcome 'fault', and no other was begun. Clear the cause and go on with --resume=true."
         )
     if result.stopped_by:
         console.print(

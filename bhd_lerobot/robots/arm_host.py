@@ -80,7 +80,7 @@ class ArmHost(Host):
 
     robot_kind = "arm"
     action_names = JOINT_ACTIONS
-    knows = frozenset({"tool_pose", "opening"})
+    knows: frozenset[str] | None = frozenset({"tool_pose", "opening"})
 
     def __init__(self, config: "UR5Config", plant: Plant, planning: Planning | None = None, **options: Any) -> None:
         body = config.body()

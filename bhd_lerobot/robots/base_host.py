@@ -37,7 +37,7 @@ class BaseHost(Host):
 
     robot_kind = "base"
     action_names = ("x.vel", "theta.vel")
-    knows = frozenset({"base_pose_in_world"})
+    knows: frozenset[str] | None = frozenset({"base_pose_in_world"})
 
     def __init__(self, config: "MobileBaseConfig", plant: Plant, **options: Any) -> None:
         body: MobileBase = config.body()

@@ -30,6 +30,7 @@ class BaseSimulation(BaseHost, Simulation):
     """
 
     host_class = BaseHost
+    knows = None
     view = "follow"
     video_speed = 4
 

@@ -45,6 +45,7 @@ class UR5Simulation(ArmHost, Simulation):
     """
 
     host_class = ArmHost
+    knows = None
     plant: LatePlant
 
     def __init__(

@@ -26,6 +26,11 @@ from bhd_lerobot.tasks.task import Event, Task, outcomes_of
 _BRAIN_STREAM = 2
 
 
+def track_of(robots: Host, columns: Mapping[str, NDArray]) -> NDArray[np.float64]:
+    """Return where a robot was in the frames of an episode, as `Host.track` says it, shape (frames, 7)."""
+    return robots.track(columns[keys.PHYSICS_STATE if robots.is_simulated else keys.OBSERVATION_STATE])
+
+
 class EpisodeLoop:
     """Runs episodes on n simulations. A simulation that is done with one takes the next.
 
@@ -43,6 +48,7 @@ class EpisodeLoop:
 
     Attributes:
         emergency_stop: whether an emergency stop has ended the run: no episode is started after one.
+        fault: whether a real robot's fault has.
         marks: takes the marks of a person for the running episodes.
     """
 
@@ -57,7 +63,7 @@ class EpisodeLoop:
     ) -> None:
         self.simulation, self.task, self.brain = simulation, task, brain
         self.tolerance = tolerance or TimingTolerance()
-        self.emergency_stop = False
+        self.emergency_stop = self.fault = False
         self.marks = Marks(simulation.n, outcomes_of(task.name))
         self._last_frame = -1  # number of the last frame on the wall clock
         self._open_images: Callable[[], Any] | None = None
@@ -114,6 +120,8 @@ class EpisodeLoop:
                     episode = self._finish(sim, event)
                     done[episode.spec.index] = episode
                     self.emergency_stop |= event == Event.ESTOP
+                    # A person finds out why a real robot stopped before it moves again.
+                    self.fault |= event == Event.FAULT and not self.simulation.is_simulated
                 if not finished:
                     continue
                 ids = np.array([sim for sim, _ in finished])
@@ -135,7 +143,7 @@ class EpisodeLoop:
             return
         # A person decides when the robot moves again; the stop may also have come between two episodes.
         self.emergency_stop |= self.simulation.bridge.estop_pressed
-        if self.emergency_stop:
+        if self.emergency_stop or self.fault:
             waiting.clear()
             return
         specs = [waiting.pop() for _ in ids]
@@ -204,8 +212,9 @@ class EpisodeLoop:
             keys.TIME: frame.time_ns / NANOSECONDS,
             keys.AGE: frame.age_ns / NANOSECONDS,
             keys.INFERENCE_TIME: inference_time,
-            keys.PHYSICS_STATE: physics,
         }
+        if physics.shape[1]:
+            values[keys.PHYSICS_STATE] = physics
         finished: list[tuple[int, Event]] = []
         for frame_report in (*report.missed, report):
             if frame_report.live is not None:
@@ -234,6 +243,7 @@ class EpisodeLoop:
             keys.LIMITS: report.limits,
             keys.WATCHDOG: report.watchdog,
             keys.MODE: report.mode,
+            keys.EFFORT: report.effort,
             keys.REWARD: reward,
             keys.EVENT: flagged(event, taken | driven),
         }
@@ -264,8 +274,9 @@ class EpisodeLoop:
             keys.OBSERVATION_STATE: live.seen.state.astype(np.float32),
             keys.TIME: live.seen.time_ns / NANOSECONDS,
             keys.AGE: live.seen.age_ns / NANOSECONDS,
-            keys.PHYSICS_STATE: live.physics,
         }
+        if live.physics.shape[1]:
+            values[keys.PHYSICS_STATE] = live.physics
         if self.task.environment_names:
             values[keys.ENVIRONMENT_STATE] = self.task.environment_state(self._truth).astype(np.float32)
         for sim in np.flatnonzero(self.simulation.running).tolist():

@@ -70,6 +70,7 @@ class AvoidTask(BaseTask):
     """
 
     name = "avoid"
+    needs: frozenset[str] | None = frozenset({"base_pose_in_world"})
     lasts = True
 
     def __init__(self, config: AvoidConfig, n: int, fps: int, body: Body | None = None) -> None:

@@ -102,6 +102,7 @@ class NavigateTask(BaseTask):
     """
 
     name = "navigate"
+    needs: frozenset[str] | None = frozenset({"base_pose_in_world"})
     environment_names: tuple[str, ...] = ENVIRONMENT
 
     def __init__(self, config: NavigateConfig, n: int, fps: int, body: Body | None = None) -> None:

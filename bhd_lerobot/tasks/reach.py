@@ -71,6 +71,7 @@ class ReachTask(ArmTask):
 
     name = "reach"
     environment_names = ENVIRONMENT
+    needs: frozenset[str] | None = frozenset({"tool_pose"})
 
     def __init__(self, config: ReachConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)

@@ -155,6 +155,7 @@ class Task(Protocol):
         duration_s: longest duration of an episode [s].
         environment_names: names of what the task reports to the brain, in order; empty if nothing.
         lasts: whether success is to have lasted until the time is over; an episode is then truncated, not terminated.
+        needs: the fields of the truth without which it cannot be judged; None if it needs a simulator's.
     """
 
     name: str
@@ -162,6 +163,7 @@ class Task(Protocol):
     duration_s: float
     environment_names: tuple[str, ...]
     lasts: bool
+    needs: frozenset[str] | None
 
     def sample(self, seed: int) -> Any:
         """Return the scene of the episode with this seed: an `Arena` or a `TableScene`."""
@@ -209,6 +211,7 @@ class ConfiguredTask:
     name: str
     environment_names: tuple[str, ...] = ()
     lasts = False
+    needs: frozenset[str] | None = None
     never: ClassVar[tuple[Event, ...]] = ()
     """Events that cannot happen in this task."""
 

@@ -14,9 +14,6 @@ from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import PlantReading
 
-# A joint this far from its reference for so long does not follow it; goals end with PATH_TOLERANCE at that distance.
-BLOCKED_RAD, BLOCKED_S = 0.1, 0.05
-_BLOCKED = f"The arm stayed more than {BLOCKED_RAD} rad from its reference: something is in its way."
 _CONVERTING, _EXECUTING = int(GoalPhase.CONVERTING), int(GoalPhase.EXECUTING)  # numpy compares plain numbers faster
 _SLOW = 0.2  # [rad/s] the joints' speed below which they are held where they are
 _STILL = 0.05  # [rad/s] the joints' speed below which a hard stop is over
@@ -76,8 +73,9 @@ class ArmController(Controller):
         self._trail = _Trail(n, width - 1, control_hz)
         self._lower, self._upper = np.asarray(limits.lower), np.asarray(limits.upper)
         self._speed = np.asarray(limits.velocity)
-        self._most_off_ticks = round(BLOCKED_S * control_hz)
-        self._lead = np.asarray(arm.servo_damping) / np.asarray(arm.servo_stiffness)
+        self._most_off_ticks = max(1, round(arm.blocked_s * control_hz))
+        self._blocked = f"The arm stayed more than {arm.blocked_rad} rad from its reference: something is in its way."
+        self._lead = np.asarray(arm.lead_s)
         self._stiffness, self._damping = np.asarray(arm.servo_stiffness), np.asarray(arm.servo_damping)
         self._effort = np.asarray(limits.effort)
         self._lowest_effort = -self._effort
@@ -203,9 +201,9 @@ class ArmController(Controller):
         where the arm is: what it pressed against is let go of.
         """
         dof = self.width - 1
-        off = (np.abs(self.command[:, :dof] - reading.position[:, :dof]) > BLOCKED_RAD).any(axis=1)
+        off = (np.abs(self.command[:, :dof] - reading.position[:, :dof]) > self.arm.blocked_rad).any(axis=1)
         self._off_ticks = (self._off_ticks + 1) * (off & ~self._unwatched)
-        self._protect(self._off_ticks >= self._most_off_ticks, reading, Watchdog.BLOCKED, _BLOCKED)
+        self._protect(self._off_ticks >= self._most_off_ticks, reading, Watchdog.BLOCKED, self._blocked)
 
     def _protect(self, mask: NDArray[np.bool_], reading: PlantReading, cause: Watchdog, message: str) -> None:
         """Begin a protective stop."""

@@ -12,8 +12,7 @@ from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 
 _REST = 1e-9  # a ramp has arrived when the command is this close to zero
-# A wheel that is to turn, and for so long turns less than half as far by its encoder, is blocked, or its encoder is.
-_STALL_S, _STALL_CHECKS = 0.3, 6
+_STALL_CHECKS = 6  # looks at the wheels' progress until one is blocked, or its encoder is
 _LEAST_SPEED = 1.0  # [rad/s] a wheel that is to turn slower than this is not judged
 
 
@@ -65,7 +64,7 @@ class BaseController(Controller):
         self._limited_effort = np.zeros(n, np.bool_)
         self._limited_finite = np.zeros(n, np.bool_)
         # Of the wheels since the last look at their progress: how far they were to turn, and where they were.
-        self._look_ticks = max(1, round(_STALL_S / _STALL_CHECKS * control_hz))
+        self._look_ticks = max(1, round(body.stalled_s / _STALL_CHECKS * control_hz))
         # Each robot has its own time for it, counted from its start: an episode does not depend on those beside it.
         self._ticks, self._next_look, self._dt = 0, self._look_ticks, 1 / control_hz
         self._look_at = np.full(n, self._look_ticks)

@@ -11,7 +11,6 @@ from bhd_lerobot.control.commands import BrainCommand, ResultCode
 
 Array = NDArray[np.float64]
 
-PATH_TOLERANCE = 0.1  # [rad] a joint this far from its reference does not follow
 JOINT_TOLERANCE = 0.002  # [rad] a joint this close to its target has arrived,
 JOINT_STILL = 0.01  # [rad/s] if it is also slower than this: it does not move
 SETTLING_S = 0.5  # [s] after its trajectory's end that the arm may take to arrive
@@ -46,7 +45,7 @@ class Supervisor:
     """
 
     def __init__(self, arm: Arm, n: int, control_hz: int) -> None:
-        self._joints, self._dof = arm.chain.joints, len(arm.chain.joints)
+        self._joints, self._dof, self._most_off = arm.chain.joints, len(arm.chain.joints), arm.blocked_rad
         self._stall_ticks = round(GRIPPER_STALL_S * control_hz)
         self._settling_ticks = round(SETTLING_S * control_hz)
         self._gripping_ticks = round(GRIPPING_S * control_hz)
@@ -95,7 +94,7 @@ class Supervisor:
         # All rows, also of those that follow nothing, and nothing but comparisons: this runs every tick.
         np.subtract(measured[0], reference[0], out=self._away)
         np.abs(self._away, out=self._away)
-        np.greater(self._arm_away, PATH_TOLERANCE, out=self._off)
+        np.greater(self._arm_away, self._most_off, out=self._off)
         self._tick += 1
         if np.count_nonzero(self._moves_gripper):
             self._watch_grippers(reference[1], measured[1])
@@ -118,12 +117,12 @@ class Supervisor:
     def _judge(self, sim: int, playing: bool, measured: tuple[Array, Array]) -> Verdict | None:
         position, velocity = measured[0][sim], measured[1][sim]
         error = self.error(sim)
-        if error > PATH_TOLERANCE:
+        if error > self._most_off:
             joint = int(self._arm_away[sim].argmax())
             return Verdict(
                 sim,
                 ResultCode.PATH_TOLERANCE,
-                f"{self._joints[joint]} is {error:.3f} rad from its reference; {PATH_TOLERANCE} rad is the "
+                f"{self._joints[joint]} is {error:.3f} rad from its reference; {self._most_off} rad is the "
                 "most: something is in its way, or it carries too much.",
             )
         verdict = None if playing else self._judge_end(sim, position, velocity)

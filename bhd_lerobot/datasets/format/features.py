@@ -25,6 +25,7 @@ LATE = "control.late"
 LIMITS = "control.limits"
 WATCHDOG = "control.watchdog"
 MODE = "control.mode"
+EFFORT = "control.effort"
 
 REWARD = "next.reward"
 SUCCESS = "next.success"
@@ -82,6 +83,7 @@ def dataset_features(
     physics_names: Sequence[str],
     environment_names: Sequence[str] = (),
     *,
+    effort_names: Sequence[str] = (),
     subtask: bool = False,
     language: bool = False,
 ) -> dict[str, dict[str, Any]]:
@@ -91,8 +93,9 @@ def dataset_features(
         observation_names: the robot's floats, in order.
         action_names: the action's floats, in order.
         images: image shapes (height, width, 3) by camera name.
-        physics_names: the simulator's generalised positions and velocities, in order.
+        physics_names: the simulator's generalised positions and velocities, in order; none without one.
         environment_names: the values of the environment state, in order; no such column if there are none.
+        effort_names: the joints' efforts, in order; likewise.
         subtask: whether the brain reports its subtask.
         language: whether the subtask is stored in LeRobot's language column, too.
     """
@@ -113,7 +116,10 @@ def dataset_features(
         features[SUBTASK] = {"dtype": "string", "shape": (1,), "names": None}
     if language:
         features[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
-    features[PHYSICS_STATE] = _vector("float64", physics_names)
+    if effort_names:
+        features[EFFORT] = _vector("float32", effort_names)
+    if physics_names:
+        features[PHYSICS_STATE] = _vector("float64", physics_names)
     return features
 
 

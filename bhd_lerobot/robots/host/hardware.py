@@ -107,12 +107,13 @@ class Hardware(Plant):
             self._patiently(self._plant.recover, "recovered")
         self._patiently(self._plant.enable, "enabled")
         end = self._clock() + round(_READY_S * 1e9)
-        while why := self._not_ready(reading):
+        while why := self.not_ready(reading):
             if self._clock() > end:
                 raise RealtimeError(f"The plant {self._name} is not ready after {_READY_S:g} s: {why}.")
             self._sleep(_POLL_S)
 
-    def _not_ready(self, reading: PlantReading) -> str:
+    def not_ready(self, reading: PlantReading) -> str:
+        """Return in words why the robot cannot be driven now; nothing if it can."""
         self.read(reading)
         age = self._clock() - int(self._stamp_ns[0])
         if self.problem:
@@ -141,6 +142,9 @@ class Hardware(Plant):
             self._plant.read(out)
         except Exception as error:  # of another package's code: the loop goes on, and stops the robot
             self._fail(error)
+        if out.stamp_ns is not self._stamp_ns:
+            self._stamp_ns[:] = 0 if out.stamp_ns is None else out.stamp_ns
+            out.stamp_ns = self._stamp_ns
         if self.problem or not np.isfinite(out.sensors).all():
             out.safety[:] = SafetyStatus.FAULT
 

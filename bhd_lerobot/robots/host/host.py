@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, CommandResult, Goals, Mixed
@@ -46,6 +47,7 @@ class FrameReport:
         mode: `Mode` at the end of the frame, shape (n,).
         results: how goals ended, or were refused, during the frame, by simulation.
         refusals: in words why setpoints were refused, by simulation, where a `Reason` does not say it all.
+        effort: torques of the joints at the end of the frame [N m], force of a gripper [N], shape (n, joints).
         live: the `LiveFrame` of a robot on the wall clock.
         missed: the frames before this one that went by on the wall clock during inference.
     """
@@ -56,6 +58,7 @@ class FrameReport:
     watchdog: NDArray[np.int64]
     command_age_ns: NDArray[np.int64]
     mode: NDArray[np.int8]
+    effort: NDArray[np.float64]
     results: Mapping[int, Sequence[CommandResult]] = field(default_factory=dict)
     refusals: Mapping[int, str] = field(default_factory=dict)
     live: Any = None
@@ -115,7 +118,9 @@ class Host(ABC):
         tick: control ticks that have gone by.
         is_live: whether it runs on the wall clock, in processes of its own.
         is_simulated: whether there is a world, which can be placed, stored and rendered.
-        knows: the fields of a task's truth that the robots measure themselves; those of a world are all known.
+        knows: the fields of a task's truth that the robots measure themselves; None if there is a world, of which all
+            is known.
+        problem: why robots on the wall clock were last stopped by a fault, in words, as far as it is known.
         sensor_period_s: time between two readings of the slowest sensor [s]; 0 if all are read at every tick.
         grants: what the real-time process was granted and refused, as plain values; None on the lockstep clock.
     """
@@ -124,7 +129,8 @@ class Host(ABC):
     action_names: tuple[str, ...]
     is_live = False
     is_simulated = False
-    knows: ClassVar[frozenset[str]] = frozenset()
+    knows: frozenset[str] | None = frozenset()
+    problem = ""
     sensor_period_s = 0.0
     grants: list[dict[str, Any]] | None = None
 
@@ -317,6 +323,7 @@ class Host(ABC):
             watchdog=watchdog,
             command_age_ns=self.cerebellum.command_age_ns(self.bridge.now_ns),
             mode=self.cerebellum.mode.copy(),
+            effort=self.cerebellum.efforts(),
             results={sim: ended for sim, ended in results.items() if ended},
             refusals=receipt.refusals,
         )
@@ -329,6 +336,13 @@ class Host(ABC):
     def modes(self) -> NDArray[np.int8]:
         """The present `Mode` of each robot, shape (n,)."""
         return self.cerebellum.mode
+
+    @property
+    def effort_names(self) -> tuple[str, ...]:
+        """Names of the joints' efforts, in order."""
+        body = self.body
+        joints = body.drive.joints if isinstance(body, MobileBase) else body.limits.names
+        return tuple(f"{joint.removesuffix('.pos')}.effort" for joint in joints)
 
     @property
     def physics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -44,6 +44,7 @@ class LiveLink:
         block: what they share.
         bridge_side: this process's ends of the queues for requests and goals.
         grants: what the real-time process was granted or refused, as plain values.
+        problem: what was wrong with a plant in FAULT when the loop last stood still, in words.
 
     Args:
         mirror: a host like the one that is to run; this process's image of the robot.
@@ -91,6 +92,7 @@ class LiveLink:
         }
         self.grants: list[dict[str, Any]] = []
         self._plant: str = config.plant
+        self.problem = ""
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._pipes: dict[str, Connection] = {}
         self._stop = threading.Event()
@@ -189,7 +191,7 @@ class LiveLink:
         """Let the loop stand; the simulated world stands still with it."""
         if self._running:
             self.block.words[Word.PAUSE] = 1
-            self._answer("run", _ANSWER_S)
+            *_, self.problem = self._answer("run", _ANSWER_S)
             if "plant" in self._pipes:
                 self._answer("stood", _ANSWER_S, "plant")
             self._running = False

@@ -205,8 +205,12 @@ class LiveProcess:
             self._hardware.is_muted = False
         self._warm = True
 
-    def _run(self, start_ns: int) -> tuple[int, int]:
-        """Run a segment that begins at a monotonic time [ns]; return how many ticks were executed and skipped."""
+    def _run(self, start_ns: int) -> tuple[int, int, str]:
+        """Run a segment that begins at a monotonic time [ns].
+
+        Returns:
+            How many ticks were executed and skipped, and what is wrong with a plant that is in FAULT, in words.
+        """
         self._statistics.reset()
         self._publisher.restart(int(self._words[Word.SEGMENT]) + 1)
         # What is so before the first tick: the first frame's observation.
@@ -214,7 +218,9 @@ class LiveProcess:
         self._publisher.publish(before, before.due_ns, before.due_ns, TickGrid(start_ns, self._loop.period_ns))
         self._standing_ticks = 0
         grid = self._loop.run(start_ns)
-        return grid.executed, grid.skipped
+        hardware, cerebellum = self._hardware, self._host.cerebellum
+        has_fault = hardware is not None and cerebellum.mode[0] == Mode.FAULT
+        return grid.executed, grid.skipped, hardware.not_ready(cerebellum.reading) if hardware and has_fault else ""
 
     def _serve(self, now_ns: int) -> None:
         self._serve_bridge(now_ns)

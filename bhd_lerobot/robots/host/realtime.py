@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, Command
 from bhd_lerobot.control.fifo import RingReader
-from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult
+from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult, Watchdog
 from bhd_lerobot.control.timing import TimingStatistics
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.realtime.block import Word
@@ -98,6 +98,7 @@ class LiveHost(Host):
         self._reader: RingReader | None = None
         self._boundary: Any = None  # the newest boundary of a frame that was taken
         self._shown: Any = None  # the state that the mirror shows
+        self._watchdog = Watchdog(0)  # of the last frame
         self._origin = 0  # when the episode's first observation was taken, monotonic [ns]
 
     # --- the mirror --------------------------------------------------------------------------------------------------
@@ -184,9 +185,9 @@ class LiveHost(Host):
             results = self.live_bridge.take_results()
         self.link.pause()
         if not results[0].success:
+            why = self.link.problem or f"{results[0].code.name}, {results[0].message.removesuffix('.')}"
             raise RealtimeError(
-                f"The robot did not get to the start of the episode: {results[0].code.name}, {results[0].message} "
-                "Episodes that were saved are intact."
+                f"The robot did not get to the start of the episode: {why}. Episodes that were saved are intact."
             )
 
     def begin(self) -> None:
@@ -288,12 +289,14 @@ class LiveHost(Host):
                     watchdog=np.array([watchdog]),
                     command_age_ns=np.array([int(frame.end["command_age_ns"])]),
                     mode=frame.end["mode"].copy(),
+                    effort=frame.end["joint_efforts"].copy(),
                     results={0: results} if results and is_last else {},
                     refusals=receipt.refusals if is_last else {},
                     live=frame,
                 )
             )
         *missed, report = reports
+        self._watchdog = Watchdog(int(report.watchdog[0]))
         report.missed.extend(missed)
         return report
 
@@ -335,6 +338,12 @@ class LiveHost(Host):
                 time.sleep(left / NANOSECONDS)
             else:
                 link.wait()
+
+    @property
+    def problem(self) -> str:  # type: ignore[override]
+        """What was wrong with the plant in its last fault, or which watchdog noticed something, in words."""
+        noticed = ", ".join(str(flag.name).lower().replace("_", " ") for flag in self._watchdog)
+        return self.link.problem or (f"watchdog: {noticed}" if noticed else "no watchdog says why")
 
     def statistics(self) -> TimingStatistics:
         """Return how punctual the ticks of the present episode are; live."""

@@ -41,6 +41,7 @@ class Simulation(Host):
     view = "overview"
     video_speed = 1
     is_simulated = True
+    knows = None
 
     def __init__(self, config: Any, cerebellum: Cerebellum, *, world: World, **options: Any) -> None:
         self.world = world

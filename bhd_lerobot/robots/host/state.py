@@ -108,7 +108,7 @@ class StatePublisher:
         self._count(slot)
         controller, reading = cerebellum.controller, cerebellum.reading
         field["joint_positions"][:], field["joint_velocities"][:] = reading.position, reading.velocity
-        field["joint_efforts"][:] = controller.efforts(reading)
+        field["joint_efforts"][:] = cerebellum.efforts()
         field["command"][:], field["measured"][:] = cerebellum.command, controller.measured(reading)
         field["odometry"][:] = controller.odometry()
         field["mode"][:], field["requested"][:] = cerebellum.mode, cerebellum.requested

@@ -1,0 +1,216 @@
+"""The arm of `examples/network_arm`: a plant that is no simulation of ours, in a process of its own."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bhd_lerobot.control.messages import Mode
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format.columns import read_episode
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.validate.dataset import check_dataset
+from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.realtime.block import LiveBlock, Word
+from tests.waiting import until
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "network_arm"
+PATIENT = ["--robot.realtime.plant_timeout_s=1.0", "--robot.realtime.most_misses=1000000"]
+ALONE = r"""
+import json, sys
+from lerobot_robot_network_arm import NetworkArmConfig, NetworkArmRobot
+from bhd_lerobot import Mode, RealtimeConfig, check_robot
+from bhd_lerobot.errors import BhdError, CommandRefusedError
+
+def make(address=sys.argv[1]):
+    realtime = RealtimeConfig(plant_timeout_s=1.0, most_misses=1_000_000)
+    return NetworkArmRobot(NetworkArmConfig(address=address, realtime=realtime))
+
+print(json.dumps({"findings": check_robot(make)}), flush=True)
+robot = make()
+robot.connect()
+for line in sys.stdin:  # drives for as long as it is asked to
+    start = robot.get_observation()
+    action = {name: start[name] for name in robot.action_features}
+    action["wrist_3.pos"] += 0.02
+    try:
+        robot.send_action(action)
+        refused = ""
+    except CommandRefusedError as error:
+        refused = str(error)
+    if line.strip() == "reset":
+        try:
+            robot.reset()
+            robot.activate()
+        except CommandRefusedError as error:
+            refused = str(error)
+    mode = Mode(int(robot.simulation.modes[0])).name
+    print(json.dumps({"mode": mode, "refused": refused, "at": start["wrist_3.pos"]}), flush=True)
+robot.disconnect()
+try:
+    make("127.0.0.1:9").connect()
+except BhdError as error:
+    print(json.dumps({"unreachable": str(error)}), flush=True)
+"""
+
+
+class Arm:
+    """The arm's process.
+
+    Attributes:
+        address: where it is.
+        process: the process.
+    """
+
+    def __init__(self, *options: str) -> None:
+        command = [sys.executable, str(EXAMPLE / "network_arm.py"), "--port=0", "--watchdog=1.0", *options]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        self.address = self.process.stdout.readline().split()[-1]
+
+    def signal(self, number: int) -> None:
+        self.process.send_signal(number)
+
+
+@pytest.fixture
+def network_arm() -> Iterator[Arm]:
+    arm = Arm()
+    yield arm
+    arm.process.kill()
+    arm.process.wait()
+
+
+@pytest.fixture
+def installed(tmp_path: Path) -> dict[str, str]:
+    """Return the environment of a process that finds the example as if it were installed."""
+    about = tmp_path / "site" / "lerobot_robot_network_arm-0.1.0.dist-info" / "METADATA"
+    about.parent.mkdir(parents=True)
+    about.write_text("Metadata-Version: 2.1\nName: lerobot_robot_network_arm\nVersion: 0.1.0\n", encoding="utf-8")
+    return {**os.environ, "PYTHONPATH": f"{EXAMPLE}{os.pathsep}{tmp_path / 'site'}"}
+
+
+def recording(arm: Arm, root: Path, *options: str) -> list[str]:
+    return [
+        *(sys.executable, "-m", "bhd_lerobot.recording.record"),
+        "--robot.type=network_arm",
+        *(f"--robot.address={arm.address}", *PATIENT, "--task.type=reach", "--brain.type=reach"),
+        *("--dataset.repo_id=me/arm", f"--dataset.root={root}", f"--output_dir={root}-run", *options),
+    ]
+
+
+def test_it_is_recorded_and_its_death_ends_the_episode_with_the_reason(
+    network_arm: Arm, installed: dict[str, str], tmp_path: Path
+) -> None:
+    root = tmp_path / "data"
+    done = subprocess.run(
+        recording(network_arm, root, "--dataset.num_episodes=2"),
+        env=installed,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert check_dataset(root).is_valid
+    # The time is over before the tool has been at the target for so long: the next episode goes on until it is ended.
+    longer = ("--task.hold_s=500", "--task.duration_s=600", "--task.start_spread_rad=0", "--dataset.num_episodes=2")
+    other = tmp_path / "other"
+    process = subprocess.Popen(
+        [*recording(network_arm, other, *longer), "--robot.id=dies"],
+        env=installed,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    block = until(lambda: _block("dies"), "its block is there")
+    until(lambda: block.words[Word.SEGMENT] >= 2 and block.words[Word.EXECUTED] > 250, "the first episode runs")
+    network_arm.signal(signal.SIGKILL)
+    _, errors = process.communicate()
+    block.close()
+    assert process.returncode == 4, errors
+    words = " ".join(errors.split())
+    assert re.search(r"stopped by a fault: its newest reading is \d+\.\d\d s old", words), words
+    assert check_dataset(other).is_valid
+    info = dataset_info(other)
+    assert [episode.metadata["outcome"] for episode in info.episodes] == ["fault"]
+    columns = read_episode(other, 0)
+    assert len(columns[keys.MODE]) > 40
+    assert columns[keys.MODE][-1] == Mode.FAULT
+    assert keys.PHYSICS_STATE not in info.features
+    assert info.features[keys.EFFORT]["names"][0] == "shoulder_pan.effort"
+
+
+def _block(name: str) -> Any:
+    try:
+        return LiveBlock.watch(name)
+    except RealtimeError:
+        return None
+
+
+def test_it_is_a_robot_that_is_stopped_frozen_and_driven_again(network_arm: Arm, installed: dict[str, str]) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", ALONE, network_arm.address],
+        env=installed,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    lines, answers = process.stdin, process.stdout
+    assert json.loads(answers.readline()) == {"findings": []}
+
+    def drive(word: str = "") -> dict[str, Any]:
+        lines.write(f"{word}\n")
+        lines.flush()
+        answer: dict[str, Any] = json.loads(answers.readline())
+        return answer
+
+    def drive_until(mode: Mode, word: str = "") -> dict[str, Any]:
+        return until(lambda: answer if (answer := drive(word))["mode"] == mode.name else None, mode.name)  # type: ignore[no-any-return]
+
+    first = drive()["at"]
+    until(lambda: drive()["at"] > first + 0.05, "it moves")
+    # Its own emergency stop, pressed and released.
+    network_arm.signal(signal.SIGUSR1)
+    drive_until(Mode.ESTOP)
+    assert "emergency stop" in drive()["refused"].lower()
+    network_arm.signal(signal.SIGUSR1)
+    drive_until(Mode.TRACKING, "reset")
+    # It freezes: readings grow old, and it has stopped by itself by the time it is back.
+    network_arm.signal(signal.SIGSTOP)
+    frozen = drive_until(Mode.FAULT)["at"]
+    network_arm.signal(signal.SIGCONT)
+    again = drive_until(Mode.TRACKING, "reset")["at"]
+    assert abs(again - frozen) < 0.1
+    until(lambda: drive()["at"] > again + 0.05, "it moves")
+    lines.close()
+    unreachable = json.loads(answers.readline())["unreachable"]
+    assert re.search(r"The plant network_arm:NetworkArm cannot be opened: TimeoutError: no arm answers", unreachable)
+    assert process.wait() == 0
+
+
+def test_the_stock_recorder_drives_it(network_arm: Arm, installed: dict[str, str], tmp_path: Path) -> None:
+    options = [option for option in PATIENT if "most" not in option]
+    code = "import sys; from lerobot.scripts.lerobot_record import main; main()"
+    done = subprocess.run(
+        [
+            *(sys.executable, "-c", code),
+            *("--robot.type=network_arm", f"--robot.address={network_arm.address}", *options),
+            *("--teleop.type=bhd_brain", "--teleop.brain.type=noop", "--dataset.repo_id=me/arm", "--dataset.fps=25"),
+            *(f"--dataset.root={tmp_path / 'data'}", "--dataset.num_episodes=1", "--dataset.episode_time_s=2"),
+            *("--dataset.reset_time_s=0", "--dataset.push_to_hub=false", "--dataset.single_task=nothing"),
+            *("--play_sounds=false", "--dataset.video=false"),
+        ],
+        env=installed,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert dataset_info(tmp_path / "data").frames > 10
