@@ -16,7 +16,7 @@ class NetworkArmConfig(bhd.UR5Config):
     clock: str = "realtime"
     control_hz: int = 125
     physics_hz: int = 125
-    plant: str = "network_arm:NetworkArm"
+    plant: str = "network_arm:NetworkPlant"
     address: str = "127.0.0.1:47654"
     realtime: bhd.RealtimeConfig = field(default_factory=lambda: bhd.RealtimeConfig(plant_timeout_s=0.1))
 
@@ -26,7 +26,7 @@ class NetworkArmConfig(bhd.UR5Config):
 
 
 @bhd.register_robot
-class NetworkArmRobot(bhd.UR5):
+class NetworkArm(bhd.UR5):
     """The arm on the network."""
 
     config_class = NetworkArmConfig

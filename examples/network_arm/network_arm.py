@@ -6,8 +6,8 @@ time constant each, get them late, and lose some of them.
     python examples/network_arm/network_arm.py --port=47654
 
 It has what a robot's controller has: a watchdog, which holds the joints where they are when commands cease, a status,
-and an emergency stop (`kill -USR1`). `NetworkArm` is its plant. It imports neither LeRobot nor torch, because it lives
-in the real-time process.
+and an emergency stop (`kill -USR1`). `NetworkPlant` is its plant. It imports neither LeRobot nor torch, because it
+lives in the real-time process.
 """
 
 import argparse
@@ -34,7 +34,7 @@ FASTEST = np.array([3.2] * 6 + [0.16])  # [rad/s, m/s]
 START = np.array([np.pi, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0.0, 0.085])
 
 
-class NetworkArm(bhd.Plant):
+class NetworkPlant(bhd.Plant):
     """The arm as the cerebellum sees it.
 
     Args:

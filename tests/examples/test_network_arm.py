@@ -25,13 +25,13 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "network_arm"
 PATIENT = ["--robot.realtime.plant_timeout_s=1.0", "--robot.realtime.most_misses=1000000"]
 ALONE = r"""
 import json, sys
-from lerobot_robot_network_arm import NetworkArmConfig, NetworkArmRobot
+from lerobot_robot_network_arm import NetworkArmConfig, NetworkArm
 from bhd_lerobot import Mode, RealtimeConfig, check_robot
 from bhd_lerobot.errors import BhdError, CommandRefusedError
 
 def make(address=sys.argv[1]):
     realtime = RealtimeConfig(plant_timeout_s=1.0, most_misses=1_000_000)
-    return NetworkArmRobot(NetworkArmConfig(address=address, realtime=realtime))
+    return NetworkArm(NetworkArmConfig(address=address, realtime=realtime))
 
 print(json.dumps({"findings": check_robot(make)}), flush=True)
 robot = make()
@@ -191,7 +191,7 @@ def test_it_is_a_robot_that_is_stopped_frozen_and_driven_again(network_arm: Arm,
     until(lambda: drive()["at"] > again + 0.05, "it moves")
     lines.close()
     unreachable = json.loads(answers.readline())["unreachable"]
-    assert re.search(r"The plant network_arm:NetworkArm cannot be opened: TimeoutError: no arm answers", unreachable)
+    assert re.search(r"The plant network_arm:NetworkPlant cannot be opened: TimeoutError: no arm answers", unreachable)
     assert process.wait() == 0
 
 

@@ -1,0 +1,291 @@
+"""A plant of another package: whatever it raises, returns or claims, the robot is stopped and the loop goes on."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
+from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
+from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.robots.arm_host import ArmHost
+from bhd_lerobot.robots.base_host import BaseHost
+from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.hardware import Hardware, plant_class
+from bhd_lerobot.tasks.operator import OperatorTask, judged
+from bhd_lerobot.tasks.pick import PickConfig, PickTask
+from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
+from bhd_lerobot.tasks.task import Event
+from tests.cases import each_case
+
+START = np.array([3.0, -1.4, 1.5, -1.6, -1.5, 0.2, 0.04])
+FIRST = np.zeros(1, np.intp)
+
+
+class Perfect(Plant):
+    """Joints that are where they were commanded to be a tick ago; a test may break each of its calls."""
+
+    n = 1
+
+    def __init__(self, sensors: int = 0, start: Any = START) -> None:
+        self.position = np.array(start, np.float64)
+        self.offset, self.safety = 1, SafetyStatus.NORMAL
+        self.time: Callable[[], int] = lambda: 0
+        self.written: list[NDArray[np.float64]] = []
+        self.modes: list[Mode] = []
+        self.calls: list[str] = []
+        self.broken: dict[str, Callable[..., Any]] = {}
+        self.sensors = np.linspace(1.0, 2.0, sensors)
+
+    @property
+    def now(self) -> int:
+        return self.offset + self.time()
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        self.calls.append(name)
+        return self.broken[name](*arguments) if name in self.broken else None
+
+    def open(self) -> None:
+        self._call("open")
+
+    def enable(self) -> None:
+        self._call("enable")
+
+    def read(self, out: PlantReading) -> None:
+        out.position[0] = self.position
+        out.safety[0] = self.safety
+        out.sensors[0], out.sensors_ns[0] = self.sensors, self.now
+        assert out.stamp_ns is not None
+        out.stamp_ns[0] = self.now
+        if "read" in self.broken:
+            self.broken["read"](out)
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        self._call("write", ctrl)
+        self.written.append(ctrl[0].copy())
+        self.position = ctrl[0].copy()
+
+    def set_mode(self, mode: NDArray[np.int8]) -> None:
+        self.modes.append(Mode(int(mode[0])))
+        self._call("set_mode", mode)
+
+    def recover(self) -> bool:
+        return bool(self._call("recover"))
+
+    def close(self) -> None:
+        self._call("close")
+
+
+class Rig:
+    """An arm without a world, in lockstep."""
+
+    def __init__(self, plant: Perfect | None = None) -> None:
+        self.plant = plant or Perfect()
+        self.slept = 0.0
+        self.hardware = Hardware(self.plant, "mine:Arm", NANOSECONDS, lambda: self.plant.now, self._sleep)
+        self.host = ArmHost(UR5Config(control_hz=125, physics_hz=125), self.hardware)
+        self.plant.time = lambda: self.host.bridge.now_ns
+        self.hardware.open()
+
+    def _sleep(self, seconds: float) -> None:
+        self.slept += seconds
+        self.plant.offset += round(seconds * NANOSECONDS)
+
+    def start(self) -> None:
+        self.hardware.prepare(self.host.cerebellum.reading)
+        self.host.cerebellum.stamp_origin_ns = self.plant.offset
+        self.host.reset(FIRST, [None], [0])
+
+    def drive(self, frames: int = 1, turn: float = 0.01) -> Mode:
+        for _ in range(frames):
+            action = self.host.cerebellum.command.copy()
+            action[0, 5] += turn
+            self.host.step(action)
+        return Mode(int(self.host.modes[0]))
+
+
+def test_nothing_is_written_before_it_is_known_where_the_robot_is_and_then_it_stays_there() -> None:
+    rig = Rig()
+    rig.host.bridge.advance_frame()
+    assert rig.host.modes[0] == Mode.UNCONFIGURED
+    assert not rig.plant.written
+    rig.start()
+    rig.host.step(None)
+    assert np.abs(np.array(rig.plant.written) - START).max() < 1e-12
+
+
+def test_the_plant_is_told_every_mode_before_what_is_written_in_it() -> None:
+    rig = Rig()
+    rig.start()
+    rig.host.step(None)
+    assert rig.drive(3) == Mode.TRACKING
+    rig.host.bridge.deactivate()
+    for _ in range(25):
+        rig.host.step(None)
+    assert rig.plant.modes == [Mode.HOLD, Mode.TRACKING, Mode.STOPPING, Mode.SAFE_OFF]
+    assert rig.plant.calls[:3] == ["open", "enable", "set_mode"]
+
+
+def boom(*_: Any) -> None:
+    raise OSError("the cable is out")
+
+
+def not_a_number(out: PlantReading) -> None:
+    out.position[0, 2] = np.nan
+
+
+def no_stamp(out: PlantReading) -> None:
+    out.stamp_ns = None
+
+
+def wrong_shape(out: PlantReading) -> None:
+    out.position[0] = np.zeros(3)
+
+
+@each_case(
+    "call, how",
+    [
+        ("read", boom),
+        ("read", not_a_number),
+        ("read", no_stamp),
+        ("read", wrong_shape),
+        ("write", boom),
+        ("set_mode", boom),
+    ],
+)
+def test_a_plant_that_fails_is_a_fault_that_stays_until_a_reset(call: str, how: Callable[..., Any]) -> None:
+    rig = Rig()
+    rig.start()
+    assert rig.drive(3, 0.05) == Mode.TRACKING
+    rig.plant.broken[call] = how
+    if call == "set_mode":
+        rig.host.bridge.deactivate()
+    before = len(rig.plant.written)
+    rig.drive(2)
+    assert rig.host.modes[0] == Mode.FAULT
+    written = np.array(rig.plant.written[before - 1 :])
+    assert np.isfinite(written).all()
+    assert np.abs(np.diff(written, axis=0)).max(initial=0.0) < 0.05
+    assert rig.hardware.not_ready(rig.host.cerebellum.reading)
+    rig.plant.broken.clear()
+    for _ in range(25):
+        rig.host.step(None)
+    assert rig.host.modes[0] == Mode.FAULT
+    assert rig.host.bridge.reset().accepted.all()
+    assert rig.host.bridge.activate().accepted.all()
+    assert rig.drive(2) == Mode.TRACKING
+
+
+@each_case("status, mode", [(SafetyStatus.STOPPED, Mode.FAULT), (SafetyStatus.EMERGENCY_STOP, Mode.ESTOP)])
+def test_the_robots_own_safety_functions_are_heard_and_a_reset_starts_from_where_it_is(
+    status: SafetyStatus, mode: Mode
+) -> None:
+    rig = Rig()
+    rig.plant.broken["recover"] = lambda: True
+    rig.start()
+    assert rig.drive(3) == Mode.TRACKING
+    rig.plant.safety = status
+    report = rig.host.step(None)
+    assert rig.host.modes[0] == mode
+    if mode == Mode.FAULT:
+        assert report.watchdog[0] & Watchdog.PLANT
+    where = rig.plant.position + np.eye(7)[0] * 0.3  # it fell, say
+    for _ in range(400):
+        rig.plant.position = where.copy()
+        rig.host.bridge.advance_ticks(1)
+    rig.plant.safety = SafetyStatus.NORMAL
+    rig.plant.position = where.copy()
+    rig.host.bridge.advance_ticks(1)
+    rig.plant.position = where.copy()
+    assert rig.host.bridge.reset().accepted.all()
+    before = len(rig.plant.written)
+    rig.host.bridge.advance_ticks(3)
+    assert np.abs(np.array(rig.plant.written[before:])[:, :6] - where[:6]).max() < 1e-9
+
+
+@each_case(
+    "how, why",
+    [
+        (lambda plant: plant.broken.update(read=no_stamp), "has read nothing yet"),
+        (lambda plant: setattr(plant, "safety", SafetyStatus.STOPPED), "its safety status is STOPPED"),
+        (lambda plant: plant.broken.update(read=not_a_number), "not a finite number"),
+        (lambda plant: plant.broken.update(read=boom), "OSError: the cable is out"),
+    ],
+)
+def test_a_robot_that_is_not_ready_is_waited_for_and_then_given_up(how: Callable[[Any], Any], why: str) -> None:
+    rig = Rig()
+    how(rig.plant)
+    with pytest.raises(RealtimeError, match=f"mine:Arm is not ready after 10 s: .*{why}"):
+        rig.start()
+    assert rig.slept >= 10
+    assert not rig.plant.written
+
+
+@each_case("done", ["opened", "enabled"])
+def test_a_robot_that_cannot_be_reached_is_named(done: str) -> None:
+    plant = Perfect()
+    plant.broken["open" if done == "opened" else "enable"] = boom
+    with pytest.raises(RealtimeError, match=f"The plant mine:Arm cannot be {done}: OSError: the cable is out"):
+        Rig(plant).start()
+
+
+@each_case(
+    "name, why",
+    [
+        ("nowhere.at_all:Arm", "cannot be imported: ModuleNotFoundError"),
+        ("bhd_lerobot.control.plant:Nothing", "cannot be imported: AttributeError"),
+        ("bhd_lerobot.control.plant:SafetyStatus", "has no open and no enable"),
+    ],
+)
+def test_what_is_no_plant_is_refused(name: str, why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        plant_class(name)
+
+
+@each_case(
+    "options, why",
+    [
+        ({"plant": "my plant", "clock": "realtime"}, "name a class as package.module:Class"),
+        ({"plant": "mine:Arm"}, "use --robot.clock=realtime"),
+        ({"plant": "mine:Arm", "clock": "realtime", "camera": True}, "robot.camera is of simulated robots"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        UR5Config(**options)
+
+
+def test_a_base_observes_what_its_plant_measures() -> None:
+    plant = Perfect(sensors=39, start=[0.0, 0.0])
+    config = TurtleBot3Config(beams=36, imu=True, odometry=True)
+    hardware = Hardware(plant, "mine:Base", NANOSECONDS, lambda: plant.now)
+    base = BaseHost(config, hardware)
+    hardware.prepare(base.cerebellum.reading)
+    plant.time = lambda: base.bridge.now_ns
+    base.reset(FIRST, [None], [0])
+    base.step(None)
+    seen = dict(zip(base.observation_names, base.observe().state[0], strict=True))
+    assert [seen[f"scan_{beam:03d}.pos"] for beam in range(36)] == plant.sensors[:36].tolist()
+    assert [seen[f"imu_{axis}.vel"] for axis in "xyz"] == plant.sensors[36:].tolist()
+    plant.sensors[3] = np.inf
+    base.step(None)
+    assert base.modes[0] == Mode.FAULT
+
+
+def test_what_a_robot_does_not_measure_a_person_judges() -> None:
+    knows = ArmHost.knows
+    assert isinstance(judged(ReachTask(ReachConfig(), 1, 25), knows, 1, 25), ReachTask)
+    task = PickTask(PickConfig(duration_s=0.2), 1, 25)
+    assert judged(task, None, 1, 25) is task
+    asked = judged(task, knows, 1, 25)
+    assert isinstance(asked, OperatorTask)
+    assert asked.environment_names == ()
+    asked.begin(FIRST, [asked.sample(0)])
+    events = [int(asked.judge(None, np.ones(1, np.bool_))[1][0]) for _ in range(5)]
+    assert events == [Event.NOTHING] * 4 + [Event.TIMEOUT]
+    assert asked.outcome(0, Event.SUCCESS).success
+    assert not asked.outcome(0, Event.FAILURE).success
+    assert asked.parameters()["judged_by"] == "operator"
