@@ -16,11 +16,12 @@ from rich.markup import escape
 from bhd_lerobot.cluster.loop import ClusterLoop, open_pool
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
-from bhd_lerobot.datasets.format.features import LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
+from bhd_lerobot.datasets.format.features import EFFORT, LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
 from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import ConfigError, DatasetEditedError, RealtimeError, RenderingError
+from bhd_lerobot.errors import BhdError, ConfigError, DatasetEditedError, RealtimeError, RenderingError
 from bhd_lerobot.hub.push import check_pushable, format_push_report, left_by_interrupt, push_command, push_dataset
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.brain import Brain
@@ -274,6 +275,8 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
         "split": config.split,
     }
     goes_on = config.resume and not is_free(root)
+    if goes_on and not _has_effort(root):
+        features.pop(EFFORT, None)  # the dataset is older than this column
     make = DatasetRecorder.resume if goes_on else DatasetRecorder.create
     return make(
         config.dataset.repo_id,
@@ -285,11 +288,19 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
     )
 
 
+def _has_effort(root: Path) -> bool:
+    try:
+        return EFFORT in dataset_info(root).features
+    except BhdError:  # what is wrong with it is said when it is resumed
+        return True
+
+
 def save_episode(recorder: DatasetRecorder, episode: Episode, metadata: dict[str, Any]) -> None:
     """Save an episode; when this returns, it survives a kill."""
     writer = episode.writer or recorder.begin_episode()
     try:
-        writer.set_columns(episode.columns)
+        known = recorder.features
+        writer.set_columns({key: column for key, column in episode.columns.items() if key != EFFORT or key in known})
         recorder.save(writer, task=episode.instruction, metadata=metadata)
     except BaseException:
         writer.discard()

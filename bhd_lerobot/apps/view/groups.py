@@ -20,7 +20,7 @@ _COUNTS = {keys.SKIPPED: "skipped", keys.OVERRUNS: "overruns"}
 _PLACED = (  # what has a place of its own on the page
     *(keys.TIME, keys.LATE, keys.LIMITS, keys.WATCHDOG, keys.MODE, keys.EVENT, keys.SUCCESS, keys.DONE),
     *(keys.ACTION, keys.APPLIED_ACTION, keys.OBSERVATION_STATE, keys.ENVIRONMENT_STATE, keys.REWARD),
-    keys.PHYSICS_STATE,
+    *(keys.EFFORT, keys.PHYSICS_STATE),
 )
 
 
@@ -66,8 +66,10 @@ def names_of(feature: Mapping[str, Any], width: int) -> list[str]:
 def unit_of(name: str, robot: str | None) -> str:
     """Return the unit of a robot's number, of which only those of simulated robots are known; else nothing."""
     stem, _, kind = name.rpartition(".")
-    if body_of(robot) is None or kind not in ("pos", "vel") or stem.startswith("tool_q"):
+    if body_of(robot) is None or kind not in ("pos", "vel", "effort") or stem.startswith("tool_q"):
         return ""
+    if kind == "effort":
+        return "N" if stem in _METRES else "N m"
     length = stem in _METRES or stem.startswith("scan_")
     return ("m" if length else "rad") + ("/s" if kind == "vel" else "")
 
@@ -96,6 +98,8 @@ def sections(features: Mapping[str, Any], widths: Mapping[str, int], robot: str 
         add("Action", _actions(names(keys.ACTION), keys.APPLIED_ACTION in widths, robot), is_open=True, kind="action")
     if keys.OBSERVATION_STATE in widths:
         add("State", list(_by_kind(keys.OBSERVATION_STATE, names(keys.OBSERVATION_STATE), robot)), is_open=True)
+    if keys.EFFORT in widths:
+        add("Effort", list(_by_kind(keys.EFFORT, names(keys.EFFORT), robot)), is_open=False)
     add("Timing", list(_timing(widths)), is_open=True, kind="timing")
     if keys.REWARD in widths:
         add("Reward", [_plot("reward", "", [_line(keys.REWARD, 0, "reward")])], is_open=False)
@@ -126,7 +130,7 @@ def _by_kind(key: str, names: Sequence[str], robot: str | None) -> Iterator[dict
         if number not in beams:
             kind = name.rpartition(".")[2] if "." in name else ""
             groups.setdefault((kind, unit_of(name, robot)), []).append(number)
-    words = {"pos": "positions", "vel": "speeds"}
+    words = {"pos": "positions", "vel": "speeds", "effort": "efforts"}
     for (kind, unit), numbers in groups.items():
         title = words.get(kind, kind or key.rpartition(".")[2])
         yield from _chunks(key, names, title, numbers, unit, suffix=f".{kind}" if kind else "")

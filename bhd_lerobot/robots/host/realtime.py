@@ -138,6 +138,11 @@ class LiveHost(Host):
         return self.mirror.touches
 
     @property
+    def physics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Generalised positions and velocities of the state that the mirror shows, live."""
+        return self.mirror.physics
+
+    @property
     def physics_state(self) -> NDArray[np.float64]:
         """Generalised positions and velocities at the start of the present frame, shape (1, nq + nv)."""
         if self._boundary is None:  # the episode's time has not begun
