@@ -101,8 +101,8 @@ def test_the_life_of_a_robot() -> None:
     bridge.advance_frame()
     assert bridge.state().mode.tolist() == [Mode.TRACKING, Mode.ESTOP]
     assert bridge.deactivate(np.array([0])).accepted.all()
-    bridge.advance_frame()
-    bridge.advance_frame()
+    for _ in range(4):
+        bridge.advance_frame()
     assert bridge.state().mode.tolist() == [Mode.SAFE_OFF, Mode.ESTOP]
     assert bridge.activate().reasons.tolist() == [Reason.WRONG_MODE, Reason.ESTOP]
     assert bridge.reset().accepted.all()

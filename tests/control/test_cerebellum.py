@@ -294,7 +294,7 @@ def test_non_finite_queue_entries_stop_the_robot(value: float) -> None:
 def test_integer_commands_are_accepted() -> None:
     rig = Rig()
     assert rig.cerebellum.offer(Setpoint(1, 0, np.array([[0, 1]]))).accepted.all()
-    rig.tick(80)
+    rig.tick(95)
     assert rig.command == [0, 1]
 
 

@@ -225,13 +225,15 @@ def test_a_command_that_grows_old_ramps_to_zero_and_motion_resumes_with_the_next
     assert rig.command == [0, 0]
     assert (np.diff(ramp, axis=0) <= 0).all()
     assert (np.diff(ramp, axis=0) >= -np.array([2.5, 3.2]) / HZ - 1e-12).all()
-    # No longer than the normal accelerations take: 1.0 rad/s at 3.2 rad/s^2.
-    assert len(commands) == pytest.approx(HZ / 3.2, abs=2)
+    changes = np.diff(np.concatenate([ramp[:1], ramp, ramp[-1:]]), axis=0)
+    assert (np.abs(np.diff(changes, axis=0)) <= 7 * np.array([2.5, 3.2]) / HZ**2 + 1e-12).all()
+    # No longer than the normal limits take: 1.0 rad/s at 3.2 rad/s^2, which takes a seventh of a second to build up.
+    assert len(commands) == pytest.approx(HZ * (1 / 3.2 + 1 / 7), abs=3)
     assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.NONE]
     rig.tick(1000)
     assert rig.mode == Mode.HOLD
     assert rig.send(0.1).accepted.all()
-    rig.tick(30)
+    rig.tick(40)
     assert rig.mode == Mode.TRACKING
     assert rig.command == [0.1, 0.0]
 
@@ -241,12 +243,15 @@ def test_a_new_command_while_the_robot_stops_takes_over_without_a_jump() -> None
     rig.send(0.2)
     rig.tick(TIMEOUT_TICKS + 5)
     assert rig.mode == Mode.STOPPING
-    before = rig.command[0]
-    assert 0 < before < 0.2
-    rig.send(0.2)
-    rig.tick()
-    assert rig.mode == Mode.TRACKING
-    assert rig.command[0] == pytest.approx(before + 2.5 / HZ)
+    seen = [rig.command[0]]
+    assert 0 < seen[0] < 0.2
+    for _ in range(40):
+        rig.send(0.2)
+        rig.tick()
+        seen.append(rig.command[0])
+        assert rig.mode == Mode.TRACKING
+    assert seen[-1] == 0.2
+    assert np.abs(np.diff(seen, 2)).max() <= 7 * 2.5 / HZ**2 + 1e-12
 
 
 def test_a_command_that_is_late_on_arrival_is_refused_as_stale() -> None:
@@ -352,7 +357,7 @@ def test_commands_from_before_a_stop_never_start_motion_after_it(stop: Callable[
         assert rig.send(0.2, due=rig.now + k * 20 * TICK_NS).accepted.all()
     rig.tick(21)
     stop(rig)
-    rig.tick(50)
+    rig.tick(70)
     rig.plant.fault[0] = False
     assert rig.request(Request.RESET).accepted.all()
     assert rig.request(Request.ACTIVATE).accepted.all()

@@ -52,7 +52,9 @@ class BaseController(Controller):
                 f"the most can turn the base at {fastest:g} rad/s."
             )
         self._target = np.zeros((n, width))
-        self._largest = np.broadcast_to(self._change, (n, width)).copy()
+        self._jerk = np.asarray(limits.jerk) / control_hz**2
+        self._hard = np.zeros(n, np.bool_)  # brakes as hard as it can
+        self._before, self._rate, self._braking = np.zeros((3, n, width))
         self._clipped = np.zeros((n, width))
         self._error, self._beyond = np.zeros((n, self.joints)), np.zeros((n, self.joints), np.bool_)
         self._settled = self._is_clipped = False
@@ -77,19 +79,20 @@ class BaseController(Controller):
     def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:
         """Head for new twists, with the normal accelerations."""
         np.copyto(self._target, values, where=mask[:, None])
-        np.copyto(self._largest, self._change, where=mask[:, None])
+        self._hard &= ~mask
         self._settled = self._is_clipped = False
 
     def stop(self, mask: NDArray[np.bool_], cause: Mode) -> None:
         """Head for rest, with the normal decelerations or with those of an emergency stop."""
         hard = cause in (Mode.ESTOP, Mode.FAULT)
         self._target[mask] = 0.0
-        self._largest[mask] = self._stop_change if hard else self._change
+        self._hard[mask] = hard
         self._settled = self._is_clipped = False
 
     def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], reading: PlantReading) -> None:
         """Make the twist again what the wheels have."""
         np.copyto(self.command, self.drive.twist_from_wheels(actuators), where=mask[:, None])
+        np.copyto(self._rate, 0.0, where=mask[:, None])
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
@@ -132,11 +135,25 @@ class BaseController(Controller):
         """From the targets to the commands applied in this tick, and the wheel speeds that they mean."""
         if not self._is_clipped:
             self._clip()
-        arrived = safety.limit_change(self._clipped, self.command, self._largest, self.command, self._limited_change)
+        target, command, before, flags = self._clipped, self.command, self._before, self._limited_change
+        np.copyto(before, command)
+        arrived = safety.limit_jerk(
+            target, before, self._rate, largest=self._change, jerk=self._jerk, out=command, changed=flags
+        )
+        other = self._hard  # whose change is not that of the jerk limit
+        if np.count_nonzero(other):
+            safety.limit_change(target, before, self._stop_change, self._braking, flags)
+            np.copyto(command, self._braking, where=other[:, None])
+            np.equal(command, target, out=arrived, where=other[:, None])
         # Both ends of a change can be within the wheels' limit and the way between them not: the two dimensions
         # change at different rates.
-        limited = safety.limit_wheel_speed(self.command, *self._wheels)
-        self._settled = arrived and not limited
+        forward = command[:, 0].copy()
+        limited = safety.limit_wheel_speed(command, *self._wheels)
+        if limited:
+            other = other | (forward != command[:, 0])
+        if np.count_nonzero(other):
+            np.subtract(command, before, out=self._rate, where=other[:, None])
+        self._settled = not limited and np.count_nonzero(arrived) == arrived.size
         self.drive.wheels_from_twist(self.command, self.actuators)
 
     def _clip(self) -> None:
@@ -162,9 +179,9 @@ class BaseController(Controller):
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about bases that were put somewhere else."""
-        for array in (self.command, self._target, self.actuators):
+        for array in (self.command, self._target, self.actuators, self._rate):
             array[ids] = 0.0
-        self._largest[ids] = self._change
+        self._hard[ids] = False
         for flags in self._flags():
             flags[ids] = False
         self._settled = self._is_clipped = False

@@ -6,6 +6,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_ARRIVED = 1e-12  # nearer than this it is there
+
 
 def limit_velocity(requested: Array, limit: Array, out: Array, changed: Mask) -> None:
     """Clip commands to the velocity limits.
@@ -45,6 +47,47 @@ def limit_change(requested: Array, previous: Array, largest: Array, out: Array, 
     np.add(previous, step, out=out)
     np.copyto(out, requested, where=~held)  # previous + (requested - previous) may differ in the last bit
     return False
+
+
+def limit_jerk(
+    requested: Array, previous: Array, rate: Array, *, largest: Array, jerk: Array, out: Array, changed: Mask
+) -> Mask:
+    """Bring commands to what was requested with changes that change gradually, and arrive without overshoot.
+
+    The change of each tick is the largest from which the changes can still fall, by `jerk` from tick to tick, so that
+    their sum ends at what was requested. Changes 1, 2, … k times `jerk` add up to k (k + 1) / 2 times `jerk`; what is
+    left over is spread over these ticks.
+
+    Args:
+        requested: shape (n, width).
+        previous: what was applied a tick ago, shape (n, width).
+        rate: the last change, shape (n, width); replaced by this one.
+        largest: largest change in one tick, shape (n, width).
+        jerk: largest difference of two changes, shape (n, width).
+        out: where the result goes, shape (n, width); may be `previous`, may not be `requested`.
+        changed: set to True where `largest` alone would have held a value back, and left alone elsewhere, shape (n,
+            width).
+
+    Returns:
+        Which values arrived at what was requested, and rest there, shape (n, width).
+    """
+    step = requested - previous
+    size = np.abs(step) / jerk
+    whole = np.floor((np.sqrt(1.0 + 8.0 * size) - 1.0) / 2.0)
+    change = (whole + (size - whole * (whole + 1.0) / 2.0) / (whole + 1.0)) * jerk
+    np.minimum(change, largest, out=change)
+    np.copysign(change, step, out=change)
+    np.maximum(change, rate - jerk, out=change)
+    np.minimum(change, rate + jerk, out=change)
+    arrived = np.abs(step) <= _ARRIVED
+    arrived &= np.abs(rate) <= jerk
+    np.copyto(change, step, where=arrived)
+    np.copyto(rate, change)
+    np.add(previous, change, out=out)
+    np.copyto(out, requested, where=np.abs(step - change) <= _ARRIVED)  # sums miss it by their rounding
+    np.copyto(rate, 0.0, where=arrived)
+    np.logical_or(changed, np.abs(step) > largest, out=changed)
+    return arrived
 
 
 def limit_wheel_speed(twist: Array, per_speed: float, per_yaw: float, limit: float, changed: Mask) -> bool:

@@ -57,6 +57,38 @@ def test_change_arrives_exactly_after_the_ticks_that_it_takes(
     assert command.tobytes() == requested.tobytes()
 
 
+@given(
+    targets=arrays(np.float64, (12, N, 2), elements=st.sampled_from([-0.3, 0.0, 0.3]) | st.floats(-0.3, 0.3)),
+    ticks=st.integers(1, 60),
+    jerk=arrays(np.float64, (2,), elements=st.floats(1e-4, 1e-2)),
+    largest=arrays(np.float64, (2,), elements=st.floats(1e-3, 0.05)),
+)
+def test_jerk(targets: np.ndarray, ticks: int, jerk: np.ndarray, largest: np.ndarray) -> None:
+    command, rate, flags = np.zeros((N, 2)), np.zeros((N, 2)), np.zeros((N, 2), np.bool_)
+    seen = [command.copy(), command.copy()]
+    for target in targets:
+        for _ in range(ticks):
+            limits.limit_jerk(target, command, rate, largest=largest, jerk=jerk, out=command, changed=flags)
+            seen.append(command.copy())
+    changes = np.diff(seen, axis=0)
+    assert (np.abs(seen) <= 0.3 * (1 + 1e-9)).all()  # never past the farthest of all targets
+    assert (np.abs(changes) <= largest * (1 + 1e-9) + 1e-12).all()
+    assert (np.abs(np.diff(changes, axis=0)) <= jerk * (1 + 1e-9) + 2e-12).all()
+    # What stays is reached exactly, in time, and not passed once it is approached.
+    for _ in range(10 + int((0.7 / np.minimum(largest, 10) + 2 * largest / jerk + 3 * np.sqrt(0.7 / jerk)).max())):
+        arrived = limits.limit_jerk(target, command, rate, largest=largest, jerk=jerk, out=command, changed=flags)
+    assert arrived.all()
+    assert command.tobytes() == target.tobytes()
+    assert not rate.any()
+    start = np.zeros((N, 2))
+    last, rate = start.copy(), np.zeros((N, 2))
+    for _ in range(200):
+        before = last.copy()
+        limits.limit_jerk(target, last, rate, largest=largest, jerk=jerk, out=last, changed=flags)
+        assert ((last - before) * np.sign(target) >= 0).all()
+        assert (np.abs(last) <= np.abs(target)).all()
+
+
 @given(twist=arrays(np.float64, (N, 2), elements=st.floats(-10, 10)))
 def test_wheel_speed(twist: np.ndarray) -> None:
     limited, changed = twist.copy(), np.zeros(N, np.bool_)
