@@ -162,16 +162,21 @@ class PositionLimits(CommandLimits):
         upper: largest position [rad or m].
         stop_jerk: largest change of the acceleration when the robot has to stop at once [rad/s^3 or m/s^3].
         effort: largest torque or force of the servo [N m or N].
+        setpoint_jerk: largest change of the acceleration while setpoints are followed [rad/s^3 or m/s^3]; 20 times
+            `jerk` if left out. A smaller one follows a stream later and overshoots more where it ends.
     """
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     stop_jerk: tuple[float, ...]
     effort: tuple[float, ...]
+    setpoint_jerk: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("stop_jerk", "effort"):
+        if not self.setpoint_jerk:
+            object.__setattr__(self, "setpoint_jerk", tuple(20.0 * value for value in self.jerk))
+        for name in ("stop_jerk", "effort", "setpoint_jerk"):
             values = getattr(self, name)
             if len(values) != len(self.names) or not all(0 < v < float("inf") for v in values):
                 raise ConfigError(f"{name} is {values}; it needs {len(self.names)} positive finite numbers.")

@@ -1,4 +1,4 @@
-"""From a stream of position setpoints to a smooth reference within the limits of speed and acceleration."""
+"""From a stream of position setpoints to a smooth reference within the limits of speed, acceleration and jerk."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.control.arm.clearance import SetpointClearance
 
-# [1/s] How eagerly a remaining error is closed. A fifth of the highest gain that a second-order filter with one tick of
-# delay is stable with at 500 Hz; well above what an arm can follow.
-_GAIN = 50.0
+# [1/s] How eagerly a remaining error is closed. With the jerk limit of a UR5 this follows random setpoints best: less
+# lags, more overshoots.
+_GAIN = 25.0
 # The share of the acceleration limit that approaching a target may count on, so that discrete time leaves room.
 _APPROACH = 0.7
 # Which joints may come near an end of their range is found once in so many ticks.
@@ -21,7 +21,7 @@ class SetpointFilter:
 
     Over the frame that follows a setpoint the target moves evenly from where the last setpoint put it to the new one,
     and the reference follows the target: with the target's own speed added, so that a steady motion is followed without
-    a lag, and never beyond the limits of position, speed and acceleration. A target out of reach in one frame is
+    a lag, and never beyond the limits of position, speed, acceleration and jerk. A target out of reach in one frame is
     approached as fast as the limits allow.
 
     Attributes:
@@ -49,6 +49,7 @@ class SetpointFilter:
         self._acceleration = np.asarray(limits.acceleration)
         # [rad/s, m/s] by which a speed changes while a brake's acceleration rises to its limit
         self._ramp = self._acceleration**2 / (2 * np.asarray(limits.jerk))
+        self._jerk = np.asarray(limits.setpoint_jerk) / control_hz  # of an acceleration in a tick [rad/s^2, m/s^2]
         self._hz, self._frame_ticks = control_hz, frame_ticks
         self._slowest = -self._speed
         self._hardest = -self._acceleration
@@ -150,6 +151,7 @@ class SetpointFilter:
         allowed = np.maximum(change, self._hardest, out=error)
         np.minimum(allowed, self._acceleration, out=allowed)
         self._note(self.limited_acceleration, allowed, change)
+        self._change_gradually(allowed, change, acceleration)
         if self._all_active:
             acceleration[:] = allowed
             velocity += np.divide(allowed, self._hz, out=allowed)
@@ -159,6 +161,19 @@ class SetpointFilter:
         np.copyto(acceleration, allowed, where=active)
         np.copyto(velocity, velocity + allowed / self._hz, where=active)
         np.copyto(position, position + velocity / self._hz, where=active)
+
+    def _change_gradually(
+        self, allowed: NDArray[np.float64], change: NDArray[np.float64], acceleration: NDArray[np.float64]
+    ) -> None:
+        """Keep accelerations near to those of the last tick, and small enough to end when the speed is there.
+
+        Accelerations of 1, 2, … k jerks add up to k (k + 1) / 2; see `bhd_lerobot.control.base.limits.limit_jerk`.
+        """
+        size = np.abs(change) / self._jerk
+        whole = np.floor((np.sqrt(1.0 + 8.0 * size) - 1.0) / 2.0)
+        most = (whole + (size - whole * (whole + 1.0) / 2.0) / (whole + 1.0)) * self._jerk
+        np.minimum(np.maximum(allowed, -most), most, out=allowed)
+        np.minimum(np.maximum(allowed, acceleration - self._jerk), acceleration + self._jerk, out=allowed)
 
     def _keep_clear(
         self,

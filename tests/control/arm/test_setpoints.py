@@ -39,6 +39,7 @@ class Stream:
         assert (LOWER - p).max() <= SLACK
         assert (np.abs(v) - SPEED).max() <= SLACK
         assert (np.abs(a) - ACCELERATION).max() <= SLACK
+        assert (np.abs(np.diff(a, axis=0)) * HZ - np.array(LIMITS.setpoint_jerk)).max() <= HZ * SLACK
         assert np.allclose(np.diff(v, axis=0), a[1:] / HZ, atol=1e-12)
         assert np.allclose(np.diff(p, axis=0), v[1:] / HZ, atol=1e-12)
 
