@@ -316,6 +316,7 @@ class Arm(Body):
         actuation: ``"position"``: servos take positions and compensate gravity; ``"torque"``: they take torques.
         home: the posture that it starts in [rad], and the gripper's opening [m].
         payload: largest mass in the gripper [kg].
+        load: mass that the gripper is declared to carry, at the tool centre point [kg]: motions are planned with it.
         latency_s: time until a command acts [s]; the reference is led by it, as by the servos' own lag.
         blocked_rad: a joint that is farther than this from its reference does not follow it [rad]; goals end then.
         blocked_s: an arm with such a joint, whose servo gives all it has, is stopped after so long [s].
@@ -330,6 +331,7 @@ class Arm(Body):
     actuation: Literal["position", "torque"]
     home: tuple[float, ...]
     payload: float
+    load: float = 0.0
     latency_s: float = 0.0
     blocked_rad: float = 0.1
     blocked_s: float = 0.05

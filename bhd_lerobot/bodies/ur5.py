@@ -59,10 +59,13 @@ _DISJOINT = (
     *(("wrist_1", other) for other in ("hand", "finger_left", "finger_right")),
 )
 
+_PAYLOAD = 5.0  # [kg]
+
 
 def ur5(
     *,
     actuation: Literal["position", "torque"] = "position",
+    load: float = 0.0,
     command_timeout_s: float = 0.14,
     camera_width: int = 320,
     camera_height: int = 240,
@@ -71,6 +74,7 @@ def ur5(
 
     Args:
         actuation: ``"position"`` for position servos, ``"torque"`` for joint torques.
+        load: mass that the gripper is declared to carry [kg].
         command_timeout_s: age at which a setpoint is no longer trusted [s].
         camera_width: width of the cameras' images [px].
         camera_height: height of the cameras' images [px].
@@ -82,6 +86,8 @@ def ur5(
         raise ConfigError(unknown_name("actuation", actuation, ("position", "torque")))
     if camera_width <= 0 or camera_height <= 0:
         raise ConfigError(f"The camera image is {camera_width} x {camera_height} px; both must be positive.")
+    if not 0.0 <= load <= _PAYLOAD:
+        raise ConfigError(f"The load is {load} kg; a UR5 carries between 0 and {_PAYLOAD:g} kg.")
     turn = 2 * math.pi
     return Arm(
         name="ur5",
@@ -117,7 +123,8 @@ def ur5(
         actuation=actuation,
         # The tool points down, 0.49 m before the base and 0.11 m to its left, 0.28 m above the table.
         home=(math.pi, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0, MAX_OPENING),
-        payload=5.0,
+        payload=_PAYLOAD,
+        load=load,
         cameras={name: CameraSpec(name, camera_width, camera_height) for name in ("scene", "wrist")},
         physics_hz=500,
         control_hz=500,

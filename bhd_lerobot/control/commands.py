@@ -81,6 +81,8 @@ class ResultCode(IntEnum):
     """No trajectory was found although everything is in range."""
     REPLACED_BY_SETPOINT = 24
     """A setpoint came, and the newer command counts."""
+    OVERLOAD = 25
+    """The motors cannot carry the declared load on this way."""
 
 
 @dataclass(frozen=True)

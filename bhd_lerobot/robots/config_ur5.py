@@ -28,6 +28,8 @@ class UR5Config(SimulatedRobotConfig):
             ``"pick"`` (objects). In a task the task decides.
         max_force: force [N] with which the tool may press on something, whatever moves it; more is a protective stop.
             Used with ``control = "servo"``. A force on another part of the arm counts with what the joints feel of it.
+        payload: mass of what the gripper is going to carry [kg]. Accelerations are planned so that the motors can move
+            it; what it weighs beyond that, by 20 N, stops the arm when it is at rest.
         stale_after_s: time after the end of the frame that a setpoint was for, until the arm decelerates and holds [s].
     """
 
@@ -39,6 +41,7 @@ class UR5Config(SimulatedRobotConfig):
     tool_pose: bool = False
     scene: str = "empty"
     max_force: float = 150.0
+    payload: float = 0.0
     stale_after_s: float = 0.1
 
     def __post_init__(self) -> None:
@@ -64,6 +67,7 @@ class UR5Config(SimulatedRobotConfig):
     def body(self) -> Arm:
         """Return the hardware that this configuration describes."""
         return ur5(
+            load=self.payload,
             actuation="torque" if self.control == "impedance" else "position",
             command_timeout_s=1 / self.fps + self.stale_after_s,
             camera_width=self.camera_width,

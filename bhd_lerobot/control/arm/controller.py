@@ -1,5 +1,7 @@
 """The controller of arms with position servos: setpoints and goals to servo positions."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ from bhd_lerobot.control.arm.force_limit import ForceLimit
 from bhd_lerobot.control.arm.setpoints import SetpointFilter
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, GoalPhase, ResultCode
 from bhd_lerobot.control.controller import Controller
+from bhd_lerobot.control.geometry.dynamics import acceleration_share
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.control.motion.goals import GoalManager
 from bhd_lerobot.control.motion.planning import Planning
@@ -48,8 +51,10 @@ class ArmController(Controller):
         self.arm = arm
         self.width = self.joints = width = len(limits.names)
         self.goals = GoalManager(arm, n, control_hz, planning=planning)
-        clearance = SetpointClearance(arm, n, control_hz, frame_ticks)
-        self.setpoints = SetpointFilter(limits, n, control_hz, frame_ticks, clearance)
+        share = acceleration_share(arm)  # setpoints are not planned: their torques have to suffice in any posture
+        calm = replace(limits, acceleration=tuple(share * value for value in limits.acceleration))
+        clearance = SetpointClearance(replace(arm, limits=calm), n, control_hz, frame_ticks)
+        self.setpoints = SetpointFilter(calm, n, control_hz, frame_ticks, clearance)
         self.command = np.tile(np.asarray(arm.home), (n, 1))
         self.velocity: NDArray[np.float64] = np.zeros((n, width))
         self.acceleration: NDArray[np.float64] = np.zeros((n, width))

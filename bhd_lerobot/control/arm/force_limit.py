@@ -17,6 +17,11 @@ _SHARE = 0.7  # of what is new in an estimate: one reading's noise must not be a
 # Directions in which a singular posture feels little are left out: errors of the joints' torques, such as 16 N m in the
 # hardest reversals of a simulated UR5, would be large forces there. A force with a lever of 0.2 m is felt to 80 %.
 _DAMPING = 0.1
+# A load that was not declared hangs on the tool: the force on it points down, at rest, for so long.
+_LOAD_N, _LOAD_S = 20.0, 0.3
+_DOWN = 0.9  # the least cosine between that force and the vertical
+_STILL = 0.02  # [rad/s]
+_GRAVITY = 9.81  # [m/s^2]
 _LEAST_TORQUE = 10.0  # [N m] where no joint feels more, nothing is estimated: 100 N with a lever of 0.1 m
 
 
@@ -25,11 +30,13 @@ class ForceLimit:
 
     The motors' efforts, averaged over 20 ms, are compared with those that the motion of that time needs. A force
     elsewhere on the arm counts with the force on the tool that would load the joints alike: half-way to the tool, about
-    half of it is felt. What is not modelled counts too: friction, and the weight of a payload.
+    half of it is felt. What is not modelled counts too: friction, and the weight of a load that was not declared. Of
+    that no more than 20 N is permitted: an arm at rest whose tool is pulled down by more has another load than its
+    motions were planned with.
 
     Attributes:
         force: the newest estimates [N], shape (n,); 0 where the joints feel too little to ask.
-        exceeded: whether each is above the largest, shape (n,).
+        exceeded: whether each is above the largest, or a load hangs on the tool that was not declared, shape (n,).
 
     Args:
         arm: the arm.
@@ -44,7 +51,10 @@ class ForceLimit:
     def __init__(self, arm: Arm, n: int, control_hz: int, largest: float) -> None:
         if not largest > 0.0:
             raise ConfigError(f"max_force is {largest}; it must be positive [N]. With .inf nothing is too much.")
-        self.largest = largest
+        self.largest, self._load = largest, arm.load
+        self._hung: NDArray[np.int64] = np.zeros(n, np.int64)  # estimates at rest with a load that was not declared
+        self._most_hung = round(_LOAD_S / _PERIOD_S)
+        self._pull = np.zeros(n)
         self._dynamics, self._forward = ArmDynamics(arm), ForwardKinematics(arm.chain)
         self._dof = dof = self._dynamics.dof
         self._period = max(1, round(_PERIOD_S * control_hz))
@@ -74,18 +84,31 @@ class ForceLimit:
         self._fresh[:] = False
         torque = self._torque
         torque += _SHARE * (residual - torque)
-        self.force[:] = 0.0
+        self.force[:] = self._pull[:] = 0.0
+        self.exceeded[:] = False
         felt = np.abs(torque).max(axis=1) > _LEAST_TORQUE
         if not np.count_nonzero(felt):
+            self._hung[:] = 0
             return False
         # Products of matrices that lie otherwise in memory round otherwise: with it the number of arms would count.
         jacobian = np.ascontiguousarray(self._forward.jacobian(position[felt]))
-        self.force[felt] = np.linalg.norm(tool_wrench(jacobian, torque[felt], _DAMPING)[:, :3], axis=1)
+        force = tool_wrench(jacobian, torque[felt], _DAMPING)[:, :3]
+        self.force[felt] = np.linalg.norm(force, axis=1)
         np.greater(self.force, self.largest, out=self.exceeded)
+        self._pull[felt] = force[:, 2]  # the tool pulls it up
+        hangs = (self._pull > _LOAD_N) & (self._pull > _DOWN * self.force) & (np.abs(velocity) < _STILL).all(axis=1)
+        self._hung += 1
+        self._hung *= hangs
+        self.exceeded |= self._hung >= self._most_hung
         return bool(np.count_nonzero(self.exceeded))
 
     def explain(self) -> str:
         """Return in words which force was too large."""
+        if (self._hung >= self._most_hung).any():
+            return (
+                f"About {self._load + self._pull.max() / _GRAVITY:.1f} kg hang on the tool, or it presses upwards; "
+                f"declared are {self._load:g} kg. Declare what it carries with robot.payload."
+            )
         return (
             f"The tool pressed with {self.force.max():.0f} N; {self.largest:g} N is the most. Find out what is in its "
             "way, or allow more with robot.max_force."
@@ -94,5 +117,6 @@ class ForceLimit:
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget arms that were put somewhere else."""
         self._fresh[ids] = True
+        self._hung[ids] = 0
         self._sum[ids] = self._torque[ids] = self.force[ids] = 0.0
         self.exceeded[ids] = False

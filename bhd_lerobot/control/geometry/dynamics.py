@@ -14,6 +14,8 @@ from bhd_lerobot.errors import ConfigError
 Array = NDArray[np.float64]
 
 TOOL_SITE = "tool"
+TORQUE_SHARE = 0.8  # of the motors' torque that a plan may need: servos swing by up to a fifth beyond it
+_POSTURES, _LEAST_SHARE = 1000, 0.1
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class DynamicsTerms:
 
 
 class ArmDynamics:
-    """The rigid-body model of an arm, from the same MJCF that is simulated.
+    """The rigid-body model of an arm, from the same MJCF that is simulated, with its declared load.
 
     Args:
         arm: the arm.
@@ -82,6 +84,11 @@ class ArmDynamics:
         self.dof = self.model.nv
         self._data = self.model.createData()
         self._tool = self.model.getFrameId(TOOL_SITE)
+        if arm.load:
+            last = self.model.frames[self._tool].parentJoint
+            lever = self.model.frames[self._tool].placement.translation
+            self.model.inertias[last] += pinocchio.Inertia(arm.load, lever, np.zeros((3, 3)))
+            self._data = self.model.createData()
 
     def terms(self, position: Array, velocity: Array) -> DynamicsTerms:
         """Return the dynamics in a state of n arms.
@@ -117,6 +124,23 @@ class ArmDynamics:
         for sim in range(len(position)):
             torque[sim] = pinocchio.rnea(self.model, self._data, position[sim], velocity[sim], acceleration[sim])
         return torque
+
+
+def acceleration_share(arm: Arm) -> float:
+    """Return the share of an arm's accelerations that its motors can give in any posture, with its declared load.
+
+    All joints at once, in the worst directions: for motions that are not planned. An arm without a load is taken to be
+    able to do what its limits say.
+    """
+    if not arm.load or not arm.mjcf:
+        return 1.0
+    dof = len(arm.chain.joints)
+    lower, upper = np.asarray(arm.limits.lower[:dof]), np.asarray(arm.limits.upper[:dof])
+    acceleration, effort = np.asarray(arm.limits.acceleration[:dof]), np.asarray(arm.limits.effort[:dof])
+    postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, dof))
+    terms = ArmDynamics(arm).terms(postures, np.zeros_like(postures))
+    room = TORQUE_SHARE * effort - np.abs(terms.gravity)
+    return float(np.clip((room / (np.abs(terms.mass) @ acceleration)).min(), _LEAST_SHARE, 1.0))
 
 
 def product(matrices: Array, vectors: Array) -> Array:

@@ -1,5 +1,6 @@
 """From a goal and the commanded state to a trajectory, or the reason why there is none. Pure: the same each time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
+from bhd_lerobot.control.geometry.dynamics import TORQUE_SHARE, ArmDynamics, acceleration_share
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_TOOL_SPEED, check
 from bhd_lerobot.control.motion.line import ToolLimits, along_line
@@ -24,6 +26,9 @@ Array = NDArray[np.float64]
 
 _CHECK_STEP = 0.03  # [rad] no joint turns further between two postures that are checked for collisions
 _ATTEMPTS = 8  # postures that reach a pose, of which so many are tried
+_TORQUE_STEP_S = 0.01  # between two states of a trajectory whose torques are looked at
+_SLOWER = 8  # times that a motion is planned with smaller accelerations, until its torques fit
+_LEAST_SHARE = 0.05  # of the accelerations, with which a motion is still one
 _ROUNDING = 1e-9  # [m] a distance that shrinks by less does not shrink
 
 
@@ -59,6 +64,9 @@ class GoalPlanner:
         self.limits = MotionLimits.of(arm.limits)
         self.stop_limits = MotionLimits.of(arm.limits, stop=True)
         self._arm, self._gripper = slice(0, dof), slice(dof, dof + 1)
+        # Without a load the limits leave the motors room enough.
+        self._dynamics = ArmDynamics(arm) if arm.load and arm.mjcf else None
+        self._calm = self.limits.scaled(1.0, acceleration_share(arm))
 
     def check(self, command: BrainCommand) -> PlanFailure | None:
         """Return what is wrong with a goal whatever the arm's state, or None."""
@@ -98,7 +106,9 @@ class GoalPlanner:
 
     def brake(self, state: State, *, hard: bool) -> Trajectory:
         """Return how all dimensions come to rest, with the limits of normal motion or with those of a stop."""
-        trajectory = to_rest(state, self.stop_limits if hard else self.limits, self.hz)
+        trajectory = to_rest(state, self.stop_limits if hard else self._calm, self.hz)
+        if isinstance(trajectory, PlanFailure) and self._dynamics is not None:
+            trajectory = to_rest(state, self.limits, self.hz)  # it was faster than its load permits now
         # A state that nothing can brake is not a state of a reference; what remains is to stand still.
         return at_once(state.position) if isinstance(trajectory, PlanFailure) else trajectory
 
@@ -125,7 +135,9 @@ class GoalPlanner:
         )
         # An arm that is already faster than the goal permits may need more than the goal's deceleration at an end of
         # the joints' range.
-        trajectory = to_target(state, target, scaled, self.hz, limits)
+        trajectory = self._within_torque(
+            lambda share: to_target(state, target, scaled.scaled(1.0, share), self.hz, limits)
+        )
         return trajectory if isinstance(trajectory, PlanFailure) else self._checked(trajectory, state)
 
     def _plan_pose(self, command: BrainCommand, pose: Pose, state: State) -> Trajectory | PlanFailure:
@@ -148,10 +160,46 @@ class GoalPlanner:
         if isinstance(brake, PlanFailure):
             return brake
         start = state.position if brake is None else brake.target
-        line = along_line(start, pose.matrix(), self.kinematics, (limits, tool), self.hz)
+        line = self._within_torque(
+            lambda share: along_line(start, pose.matrix(), self.kinematics, (limits.scaled(1.0, share), tool), self.hz)
+        )
         if isinstance(line, PlanFailure):
             return line
         return self._checked(line if brake is None else brake.then(line), state)
+
+    # --- torques -----------------------------------------------------------------------------------------------------
+
+    def _within_torque(self, plan: Callable[[float], Trajectory | PlanFailure]) -> Trajectory | PlanFailure:
+        """Return a motion whose torques the motors can give, with the declared load.
+
+        Args:
+            plan: returns the motion with a share of the accelerations.
+        """
+        share = 1.0
+        for _ in range(_SLOWER):
+            trajectory = plan(share)
+            if isinstance(trajectory, PlanFailure) or self._dynamics is None:
+                return trajectory
+            possible = self._torque_share(self._dynamics, trajectory)
+            if possible >= 1.0:
+                return trajectory
+            share *= min(possible, 0.97)
+            if share < _LEAST_SHARE:
+                break
+        return PlanFailure(
+            ResultCode.OVERLOAD,
+            f"The motors cannot carry the declared load of {self.arm.load:g} kg on this way, however slowly.",
+        )
+
+    def _torque_share(self, dynamics: ArmDynamics, trajectory: Trajectory) -> float:
+        """Return the largest share of a trajectory's accelerations for which the torques suffice."""
+        every = slice(None, None, max(1, round(_TORQUE_STEP_S * self.hz)))
+        position, velocity = trajectory.position[every], trajectory.velocity[every]
+        still = np.zeros_like(position)
+        weight = dynamics.torque(position, still, still)
+        motion = dynamics.torque(position, velocity, trajectory.acceleration[every]) - weight
+        room = TORQUE_SHARE * np.asarray(self.arm.limits.effort[: self.dof]) - np.copysign(weight, weight * motion)
+        return float((room / np.maximum(np.abs(motion), _ROUNDING)).min())
 
     # --- the gripper -------------------------------------------------------------------------------------------------
 

@@ -251,3 +251,13 @@ def test_an_unbrakeable_state_stops_at_once() -> None:
     assert brake.ticks == 1
     assert np.array_equal(brake.target, HOME)
     assert not brake.velocity.any()
+
+
+def test_what_the_motors_cannot_carry_is_refused_with_the_load() -> None:
+    arm = dataclasses.replace(ARM, load=5.0)
+    weak = dataclasses.replace(arm, limits=dataclasses.replace(arm.limits, effort=(10.0,) * 6 + (60.0,)))
+    target = HOME[:6] + 0.3
+    failure = GoalPlanner(weak, HZ).plan(BrainCommand("x", joint_target=tuple(target)), HOME, np.zeros(7), np.zeros(7))
+    assert not isinstance(failure, Plan)
+    assert failure.code == ResultCode.OVERLOAD
+    assert "load of 5 kg" in failure.message
