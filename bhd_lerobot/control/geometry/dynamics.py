@@ -14,7 +14,7 @@ from bhd_lerobot.errors import ConfigError
 Array = NDArray[np.float64]
 
 TOOL_SITE = "tool"
-TORQUE_SHARE = 0.8  # of the motors' torque that a plan may need: servos swing by up to a fifth beyond it
+SWING = 1.5  # [1] so many times the torque that accelerating a joint needs does its servo give for a moment
 _POSTURES, _LEAST_SHARE = 1000, 0.1
 
 
@@ -139,8 +139,8 @@ def acceleration_share(arm: Arm) -> float:
     acceleration, effort = np.asarray(arm.limits.acceleration[:dof]), np.asarray(arm.limits.effort[:dof])
     postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, dof))
     terms = ArmDynamics(arm).terms(postures, np.zeros_like(postures))
-    room = TORQUE_SHARE * effort - np.abs(terms.gravity)
-    return float(np.clip((room / (np.abs(terms.mass) @ acceleration)).min(), _LEAST_SHARE, 1.0))
+    room = effort - np.abs(terms.gravity)
+    return float(np.clip((room / (SWING * np.abs(terms.mass) @ acceleration)).min(), _LEAST_SHARE, 1.0))
 
 
 def product(matrices: Array, vectors: Array) -> Array:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
-from bhd_lerobot.control.geometry.dynamics import TORQUE_SHARE, ArmDynamics, acceleration_share
+from bhd_lerobot.control.geometry.dynamics import SWING, ArmDynamics, acceleration_share
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_TOOL_SPEED, check
 from bhd_lerobot.control.motion.line import ToolLimits, along_line
@@ -198,8 +198,8 @@ class GoalPlanner:
         still = np.zeros_like(position)
         weight = dynamics.torque(position, still, still)
         motion = dynamics.torque(position, velocity, trajectory.acceleration[every]) - weight
-        room = TORQUE_SHARE * np.asarray(self.arm.limits.effort[: self.dof]) - np.copysign(weight, weight * motion)
-        return float((room / np.maximum(np.abs(motion), _ROUNDING)).min())
+        room = np.asarray(self.arm.limits.effort[: self.dof]) - np.copysign(weight, weight * motion)
+        return float((room / np.maximum(SWING * np.abs(motion), _ROUNDING)).min())
 
     # --- the gripper -------------------------------------------------------------------------------------------------
 
