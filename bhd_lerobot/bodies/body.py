@@ -4,10 +4,12 @@ Nothing here computes and nothing here knows a physics engine. Every other room 
 it from a `Body`, so that a simulated and a real robot are limited by the same figures.
 """
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 from bhd_lerobot.errors import ConfigError
+
+_NO_JERK_LIMIT = 1e12
 
 
 @dataclass(frozen=True)
@@ -341,6 +343,17 @@ class Arm(Body):
         """By how long the commands of each position servo are led, so that it follows without a lag [s]."""
         servos = zip(self.servo_damping, self.servo_stiffness, strict=True)
         return tuple(damping / stiffness + self.latency_s for damping, stiffness in servos)
+
+
+def without_jerk_limits[T: MobileBase | Arm](body: T) -> T:
+    """Return a body whose accelerations may change at once when setpoints are followed."""
+    limits: Any = body.limits
+    unlimited = (_NO_JERK_LIMIT,) * len(limits.names)
+    if isinstance(limits, PositionLimits):
+        limits = replace(limits, setpoint_jerk=unlimited)
+    else:
+        limits = replace(limits, jerk=unlimited)
+    return replace(body, limits=limits)
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,8 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         check_pushable(config.dataset.repo_id)  # before hours of recording, not after
     console = console or Console(stderr=True)
     root = Path(config.dataset.root).expanduser() if config.dataset.root else default_root(config.dataset.repo_id)
+    if config.resume and not is_free(root):
+        _keep_to(root, config.robot, console)
     is_here = config.engine == "local"  # otherwise one simulation, which only says what is recorded
     n = 1 if config.robot.clock == "realtime" or not is_here else min(config.n_envs, config.dataset.num_episodes)
     simulation = make_robot(config.robot, n, config.threads)
@@ -96,13 +98,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
     pressed = EstopInputs(simulation.bridge.estop, marks.on_key)
     with closing(simulation), stop_on_signals() as stop, pressed, ExitStack() as cluster:
         _add_estop_inputs(config, pressed, console)
-        task = make_task(config.task, simulation.n, config.dataset.fps, simulation.body)
-        task = judged(task, simulation.knows, simulation.n, config.dataset.fps)
-        if isinstance(task, OperatorTask):
-            console.print(
-                f"The robot does not measure what {task.name!r} is judged by: say how each episode ends, with the keys "
-                "s (success) and f (failure); otherwise it ends in a time-out."
-            )
+        task = _judged_task(config, simulation, console)
         brain = make_brain(config.brain)
         # A brain that does not fit the robot fails here, before a dataset exists.
         if is_here:
@@ -286,6 +282,28 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
         root=root,
         recording=recording,
     )
+
+
+def _judged_task(config: RecordConfig, robots: Host, console: Console) -> Task:
+    task = make_task(config.task, robots.n, config.dataset.fps, robots.body)
+    task = judged(task, robots.knows, robots.n, config.dataset.fps)
+    if isinstance(task, OperatorTask):
+        console.print(
+            f"The robot does not measure what {task.name!r} is judged by: say how each episode ends, with the keys s "
+            "(success) and f (failure); otherwise it ends in a time-out."
+        )
+    return task
+
+
+def _keep_to(root: Path, robot: Any, console: Console) -> None:
+    """Go on as a dataset began that is older than the jerk limits."""
+    try:
+        recorded = dataset_info(root).recording.get("robot", {})
+    except BhdError:  # what is wrong with it is said when it is resumed
+        return
+    if recorded and robot.jerk_limits and "jerk_limits" not in recorded:
+        robot.jerk_limits = False
+        console.print("The dataset was recorded without jerk limits: it goes on with robot.jerk_limits=false.")
 
 
 def _has_effort(root: Path) -> bool:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import without_jerk_limits
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene
 from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.arm.controller import ArmController
@@ -83,7 +84,7 @@ class ArmHost(Host):
     knows: frozenset[str] | None = frozenset({"tool_pose", "opening"})
 
     def __init__(self, config: "UR5Config", plant: Plant, planning: Planning | None = None, **options: Any) -> None:
-        body = config.body()
+        body = config.body() if config.jerk_limits else without_jerk_limits(config.body())
         self.plant = plant
         self.kinematics = ArmKinematics(body.chain, body.limits)
         ticks = config.rates.ticks_per_frame

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import MobileBase
+from bhd_lerobot.bodies.body import MobileBase, without_jerk_limits
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.messages import NANOSECONDS
@@ -40,7 +40,7 @@ class BaseHost(Host):
     knows: frozenset[str] | None = frozenset({"base_pose_in_world"})
 
     def __init__(self, config: "MobileBaseConfig", plant: Plant, **options: Any) -> None:
-        body: MobileBase = config.body()
+        body: MobileBase = config.body() if config.jerk_limits else without_jerk_limits(config.body())
         if body.lidar is None:
             raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
         self.plant = plant

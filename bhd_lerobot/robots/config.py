@@ -26,6 +26,7 @@ class SimulatedRobotConfig(RobotConfig):
         realtime: how it runs on the wall clock.
         plant: what is driven in place of a simulated robot: a class of any package, ``"package.module:Class"``, see
             "Write a plant for your robot"; needs `clock = "realtime"`.
+        jerk_limits: let accelerations change gradually when setpoints are followed. Off, it moves as in version 0.1.
         control_hz: cerebellum ticks a second [Hz], a multiple of fps.
         physics_hz: physics steps a second [Hz], a multiple of control_hz.
         seed: seed of the scene and of the sensor noise when the robot is used by itself.
@@ -39,6 +40,7 @@ class SimulatedRobotConfig(RobotConfig):
     require_realtime: bool = False
     realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
     plant: str = ""
+    jerk_limits: bool = True
     control_hz: int
     physics_hz: int
     seed: int = 0

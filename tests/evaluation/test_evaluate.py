@@ -29,7 +29,7 @@ def options(folder, **overrides) -> list[str]:
         "robot.beams": 36,
         "task.type": "avoid",
         "task.duration_s": 3,
-        "task.min_path_m": 0.3,
+        "task.min_path_m": 0.2,
         "brains.old.type": "avoidance",
         "brains.new.type": "gap_follower",
         "n_episodes": 5,

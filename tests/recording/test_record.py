@@ -67,7 +67,7 @@ def test_what_is_recorded_is_consistent(tmp_path):
         # The command applied follows the requested one, within what the acceleration allows in one frame.
         applied, requested = columns["control.applied_action"][rows], columns["action"][rows]
         assert (np.abs(np.diff(applied, axis=0)) <= np.array([0.25, 0.32]) + 1e-6).all()
-        assert np.allclose(applied[requested[:, 0] > 0, 0], 0.2, atol=1e-6)
+        assert np.allclose(applied[requested[:, 0] > 0, 0][2:], 0.2, atol=1e-6)  # it takes two frames to speed up
         seeds = [int(e.metadata["seed"]) for e in dataset_info(root).episodes]
         assert len(set(seeds)) == 4
         assert all(seed % 2 == 0 for seed in seeds)  # training seeds are even

@@ -87,6 +87,8 @@ class BaseController(Controller):
         hard = cause in (Mode.ESTOP, Mode.FAULT)
         self._target[mask] = 0.0
         self._hard[mask] = hard
+        # What is to stop gets no faster meanwhile: an acceleration ends at once, the brake comes gradually.
+        np.copyto(self._rate, 0.0, where=mask[:, None] & (self._rate * self.command > 0))
         self._settled = self._is_clipped = False
 
     def go_back(self, mask: NDArray[np.bool_], actuators: NDArray[np.float64], reading: PlantReading) -> None:

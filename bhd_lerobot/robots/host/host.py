@@ -401,8 +401,8 @@ def describe(config: Any) -> dict[str, Any]:
     left_out = ["id", "calibration_dir", "seed", "arena", "scene", "realtime"]
     if config.clock == "lockstep":
         left_out.append("require_realtime")  # it has no effect
-    if not config.plant:
-        left_out.append("plant")
+    # What is off is not mentioned, as in the data of versions that did not have it.
+    left_out += [name for name in ("plant", "jerk_limits", "payload") if not getattr(config, name, None)]
     values = {key: value for key, value in vars(config).items() if key not in left_out}
     return {
         "type": config.type,

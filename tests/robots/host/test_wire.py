@@ -5,13 +5,16 @@ import os
 import random
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bhd_lerobot.control.commands import BrainCommand, GoalPhase
+from bhd_lerobot.control.arm.wrench import tool_wrench
+from bhd_lerobot.control.commands import BrainCommand, GoalPhase, Pose
+from bhd_lerobot.control.geometry.dynamics import ArmDynamics
+from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.plan_link import PlanLink
@@ -24,6 +27,7 @@ from tests.waiting import until
 NAME = unique("wire")
 HZ = 500
 AWAY_S = 0.3
+DOWN = (0.0, 0.7071067811865476, 0.7071067811865476, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -147,3 +151,56 @@ def test_no_press_around_a_reset_is_lost(arm: tuple[UR5, States], tmp_path: Path
         # been reset meanwhile.
         tick = int(np.searchsorted(starts, pressed_ns, "right"))
         assert stopped[tick] or stopped[tick - 1]
+
+
+@pytest.fixture
+def pressing() -> Iterator[tuple[UR5, Callable[[], float]]]:
+    """An arm that presses from above on a box, and what it presses with [N], from the torques of an arm at rest."""
+    name = unique("press")
+    config = UR5Config(
+        id=name, clock="realtime", scene="pick", seed=3, max_force=float("inf"), realtime=relaxed(plant_timeout_s=20.0)
+    )
+    robot = UR5(config)
+    robot.connect()
+    states = States(name)
+    body = robot.simulation.body
+    dynamics, forward = ArmDynamics(body), ForwardKinematics(body.chain)  # type: ignore[arg-type, attr-defined]
+
+    def force() -> float:
+        state = states.read().all[-1]
+        position, still = state["joint_positions"][:, :6], np.zeros((1, 6))
+        torque = state["joint_efforts"][:, :6] - dynamics.torque(position, still, still)
+        wrench = tool_wrench(forward.jacobian(position), torque)
+        return float(np.linalg.norm(wrench[0, :3]))
+
+    def go(height: float, number: int) -> None:
+        pose = Pose((x, y, height), DOWN)
+        goal = BrainCommand(f"go {number}", target_pose=pose, gripper=0.0, max_velocity=0.5, timeout_s=600.0)
+        assert robot.simulation.bridge.submit(goal) is None
+        until(robot.take_results, "the goal has ended")
+
+    names, values = robot.environment
+    scene = dict(zip(names, values.tolist(), strict=True))
+    x, y, top = scene["object_0_x"], scene["object_0_y"], 2 * scene["object_0_z"]
+    height = top + 0.05
+    go(height, 0)
+    number = 0
+    while force() < 60.0:
+        number += 1
+        height -= 0.01 if height > top + 0.025 else 0.001
+        go(height, number)
+    yield robot, force
+    states.block.close()
+    robot.disconnect()
+
+
+def test_after_an_emergency_stop_an_arm_presses_no_more_nor_after_a_reset(
+    pressing: tuple[UR5, Callable[[], float]],
+) -> None:
+    robot, force = pressing
+    robot.estop()
+    until(lambda: mode(robot) == Mode.ESTOP, "the emergency stop is latched")
+    until(lambda: force() < 20.0, "it has given way")
+    lead_out(robot)
+    assert mode(robot) == Mode.HOLD
+    assert force() < 20.0
