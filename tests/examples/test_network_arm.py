@@ -17,8 +17,9 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.validate.dataset import check_dataset
-from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.errors import DatasetError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock, Word
+from bhd_lerobot.rollout.replay import Replay
 from tests.waiting import until
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "network_arm"
@@ -118,6 +119,8 @@ def test_it_is_recorded_and_its_death_ends_the_episode_with_the_reason(
     )
     assert done.returncode == 0, done.stderr
     assert check_dataset(root).is_valid
+    with pytest.raises(DatasetError, match="not simulated, by the plant network_arm:NetworkPlant"):
+        Replay(root, 0)
     # The time is over before the tool has been at the target for so long: the next episode goes on until it is ended.
     longer = ("--task.hold_s=500", "--task.duration_s=600", "--task.start_spread_rad=0", "--dataset.num_episodes=2")
     other = tmp_path / "other"
