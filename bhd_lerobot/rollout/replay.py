@@ -121,8 +121,8 @@ class Replay:
         metadata = summary.episodes[episode].metadata
         if plant := summary.recording.get("robot", {}).get("plant"):
             raise DatasetError(
-                f"{root} was recorded on a robot that is not simulated, by the plant {plant}: there is no world to replay "
-                "it in. Send its actions to the robot with lerobot-replay."
+                f"{root} was recorded on a robot that is not simulated, by the plant {plant}: there is no world to "
+                "replay it in. Send its actions to the robot with lerobot-replay."
             )
         missing = [key for key in (keys.PHYSICS_STATE, keys.ACTION, keys.AGE) if key not in self.columns]
         missing += [key for key in ("scene", "initial_state", "seed") if key not in metadata]
