@@ -111,6 +111,7 @@ class Hardware(Plant):
             if self._clock() > end:
                 raise RealtimeError(f"The plant {self._name} is not ready after {_READY_S:g} s: {why}.")
             self._sleep(_POLL_S)
+            self.problem = ""  # it may have been over in a moment
 
     def not_ready(self, reading: PlantReading) -> str:
         """Return in words why the robot cannot be driven now; nothing if it can."""
@@ -138,6 +139,7 @@ class Hardware(Plant):
     def read(self, out: PlantReading) -> None:
         """Write the newest readings into `out`."""
         out.stamp_ns = self._stamp_ns
+        out.safety[:] = SafetyStatus.NORMAL  # if the plant does not say otherwise
         try:
             self._plant.read(out)
         except Exception as error:  # of another package's code: the loop goes on, and stops the robot

@@ -224,6 +224,21 @@ def test_a_robot_that_is_not_ready_is_waited_for_and_then_given_up(how: Callable
     assert not rig.plant.written
 
 
+def test_a_robot_that_fails_for_a_moment_before_it_starts_is_waited_for() -> None:
+    rig = Rig()
+    left = [3]
+
+    def flaky(out: PlantReading) -> None:
+        if left[0]:
+            left[0] -= 1
+            boom()
+
+    rig.plant.broken["read"] = flaky
+    rig.start()
+    assert rig.hardware.problem == ""
+    assert rig.drive(2) == Mode.TRACKING
+
+
 @each_case("done", ["opened", "enabled"])
 def test_a_robot_that_cannot_be_reached_is_named(done: str) -> None:
     plant = Perfect()
