@@ -47,7 +47,7 @@ class SetpointClearance:
         self._ticks = max(1, frame_ticks // _LOOKS)
         self._period = self._ticks / control_hz
         self._acceleration = np.asarray(limits.acceleration[:dof])
-        # A brake that changes its acceleration gradually begins so much later [s], and what speeds an arm up ends first.
+        # A brake that changes its acceleration gradually begins so much later [s]; what speeds an arm up ends first.
         self._ramp = self._acceleration / (2 * np.asarray(limits.jerk[:dof]))
         self._ramp += 2 * self._acceleration / np.asarray(limits.setpoint_jerk[:dof])
         pairs, heights = self._model.slopes()
