@@ -72,21 +72,30 @@ def limit_jerk(
         Which values arrived at what was requested, and rest there, shape (n, width).
     """
     step = requested - previous
-    size = np.abs(step) / jerk
-    whole = np.floor((np.sqrt(1.0 + 8.0 * size) - 1.0) / 2.0)
-    change = (whole + (size - whole * (whole + 1.0) / 2.0) / (whole + 1.0)) * jerk
-    np.minimum(change, largest, out=change)
+    size = np.abs(step)
+    size /= jerk
+    np.logical_or(changed, size > largest / jerk, out=changed)
+    arrived: Mask = size <= _ARRIVED / jerk
+    whole = size * 2.0
+    whole += 0.25
+    np.sqrt(whole, out=whole)
+    whole -= 0.5
+    np.floor(whole, out=whole)
+    # whole + (size - whole (whole + 1) / 2) / (whole + 1)
+    size /= whole + 1.0
+    whole *= 0.5
+    size += whole
+    size *= jerk
+    change = np.minimum(size, largest, out=size)
     np.copysign(change, step, out=change)
     np.maximum(change, rate - jerk, out=change)
     np.minimum(change, rate + jerk, out=change)
-    arrived = np.abs(step) <= _ARRIVED
     arrived &= np.abs(rate) <= jerk
-    np.copyto(change, step, where=arrived)
-    np.copyto(rate, change)
     np.add(previous, change, out=out)
-    np.copyto(out, requested, where=np.abs(step - change) <= _ARRIVED)  # sums miss it by their rounding
+    step -= change
+    np.copyto(out, requested, where=np.abs(step, out=step) <= _ARRIVED)  # sums miss it by their rounding
+    np.copyto(rate, change)
     np.copyto(rate, 0.0, where=arrived)
-    np.logical_or(changed, np.abs(step) > largest, out=changed)
     return arrived
 
 
