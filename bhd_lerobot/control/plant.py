@@ -38,7 +38,8 @@ class PlantReading:
         stamp_ns: when the hardware measured this, on the monotonic clock of this machine [ns], shape (n,); None for a
             plant whose readings are never old, such as a simulation in lockstep.
         safety: a `SafetyStatus` of each robot, shape (n,); all but `NORMAL` is a fault or an emergency stop.
-        sensors: the newest further values, shape (n, sensors), in the order of the host's `sensor_names`.
+        sensors: the newest further values, shape (n, sensors): what they are, and in which order, says the host; see
+            `bhd_lerobot.robots.base_host.BaseHost`.
         sensors_ns: when the oldest of these was measured, as `stamp_ns` [ns], shape (n,).
     """
 

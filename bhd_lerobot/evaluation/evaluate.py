@@ -65,6 +65,10 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
     console.print(table)
     if result.estop is not None:
         console.print(f"[bold]Emergency stop ({escape(result.estop)}).[/bold] No further episode was begun.")
+    if result.fault is not None:
+        console.print(
+            f"[bold]The robot stopped by a fault: {escape(result.fault)}.[/bold] No further episode was begun."
+        )
     if results.is_partial:
         by = f" by {result.stopped_by.name}" if result.stopped_by else ""
         console.print(f"Stopped{by}: the results are partial, and hold every episode that was finished.")
@@ -94,6 +98,7 @@ class EvalResult:
         report: the HTML report.
         missed: brains whose interval of success begins below `fail_below`.
         stopped_by: the signal that ended the run early, or None.
+        fault: why a real robot's fault ended the run, in words; None if none did.
         estop: what pressed the emergency stop that ended the run, in words; None if there was none.
     """
 

@@ -203,7 +203,7 @@ def _episodes(
                 episode = next(run_once, None)
             if episode is None:
                 return
-            if loop.emergency_stop:  # it is not run again, however punctual it was
+            if loop.emergency_stop or loop.fault:  # it is not run again, however punctual it was
                 yield episode
                 return
             why = verdict(episode.timing, loop.tolerance)

@@ -55,7 +55,6 @@ class BaseHost(Host):
             **options,
         )
         self.sensor_period_s = 1 / body.lidar.rate_hz
-        self._odometry = np.zeros((plant.n, 3))
         self._start = np.zeros((plant.n, 3))  # where odometry began, in the scene: x, y [m], yaw [rad]
 
     def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -74,7 +73,7 @@ class BaseHost(Host):
 
     def truth(self, report: FrameReport | None = None) -> BaseTruth:
         """Return where the bases are by their wheels' odometry; nothing is known of touches."""
-        turn, odometry = self._start[:, 2], self._odometry
+        turn, odometry = self._start[:, 2], self._controller.odometry()
         pose = self._start + odometry
         pose[:, 0] = self._start[:, 0] + np.cos(turn) * odometry[:, 0] - np.sin(turn) * odometry[:, 1]
         pose[:, 1] = self._start[:, 1] + np.sin(turn) * odometry[:, 0] + np.cos(turn) * odometry[:, 1]
@@ -83,7 +82,7 @@ class BaseHost(Host):
     def show(self, state: Any) -> None:
         """Take over what the process of a robot on the wall clock published, a record of `state_dtype`."""
         super().show(state)
-        self._odometry = state["odometry"].copy()
+        self._controller.drive.odometry[:] = state["odometry"]
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
         """Take over where in their arenas the bases start: a person has put them there."""

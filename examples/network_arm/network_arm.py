@@ -46,6 +46,8 @@ class NetworkPlant(bhd.Plant):
 
     def __init__(self, config: Any, body: bhd.Arm) -> None:
         host, _, port = config.address.partition(":")
+        if not port.isdecimal():
+            raise ValueError(f"robot.address is {config.address!r}; write host:port, such as 127.0.0.1:47654")
         self._address = host, int(port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._number = self._seen = self._stamp_ns = 0

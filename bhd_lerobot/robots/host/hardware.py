@@ -3,7 +3,7 @@
 import importlib
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +86,26 @@ class Hardware(Plant):
         self._stamp_ns = np.zeros(1, np.int64)
         self.problem = ""
         self.is_muted = False
+
+    @classmethod
+    def made(cls, name: str, config: Any, body: Any, oldest_ns: int) -> Self:
+        """Return a plant, which is not opened yet.
+
+        Args:
+            name: of its class.
+            config: the robot's configuration.
+            body: its hardware.
+            oldest_ns: a reading that is older than this is none of the present [ns].
+
+        Raises:
+            ConfigError: there is no such class, or it takes no such configuration.
+        """
+        make = plant_class(name)
+        try:
+            plant = make(config, body)
+        except Exception as error:  # of another package's code
+            raise ConfigError(f"The plant {name} cannot be made of this configuration: {_words(error)}.") from error
+        return cls(plant, name, oldest_ns)
 
     def open(self) -> None:
         """Connect to the robot.

@@ -35,7 +35,7 @@ from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
 from bhd_lerobot.realtime.plant_link import PlantLink
 from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
 from bhd_lerobot.realtime.sections import cerebellum_side, plan_link
-from bhd_lerobot.robots.host.hardware import Hardware, plant_class
+from bhd_lerobot.robots.host.hardware import Hardware
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.remote_plant import RemoteSimulation
 from bhd_lerobot.robots.host.simulation import Simulation
@@ -92,7 +92,7 @@ class LiveSpec:
 
     def make_hardware(self) -> Hardware:
         """Return the plant; it is not opened yet."""
-        return Hardware(plant_class(self.plant)(self._config, self.body), self.plant, self.oldest_ns)
+        return Hardware.made(self.plant, self._config, self.body, self.oldest_ns)
 
     def make_host(self, hardware: Hardware, planning: Planning | None = None) -> Host:
         """Return the host of a plant; the arguments as for `make_simulation`."""

@@ -19,7 +19,7 @@ from bhd_lerobot.control.commands import BrainCommand, Command
 from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult, Watchdog
 from bhd_lerobot.control.timing import TimingStatistics
-from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.bridge import LiveBridge
 from bhd_lerobot.robots.host.hardware import Unconnected, plant_class
@@ -71,15 +71,10 @@ class LiveHost(Host):
         name: name of the running robot, for `bhd-monitor`.
 
     Raises:
-        ConfigError: the mirror is of more than one robot.
         RealtimeError: the processes could not be started, or real time is required and was refused.
     """
 
     def __init__(self, mirror: Host, name: str) -> None:
-        if mirror.n != 1:
-            raise ConfigError(
-                f"n_envs is {mirror.n}; with robot.clock = 'realtime' one robot runs at a time: use --n_envs=1."
-            )
         self.mirror = mirror
         self.robot_kind, self.knows, self.is_simulated = mirror.robot_kind, mirror.knows, mirror.is_simulated  # type: ignore[misc]
         self.is_live, self.sensor_period_s = True, mirror.sensor_period_s

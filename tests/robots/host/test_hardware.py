@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.errors import ConfigError, RealtimeError
@@ -273,6 +274,18 @@ def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], wh
         UR5Config(**options)
 
 
+def test_a_plant_that_cannot_be_made_says_why() -> None:
+    with pytest.raises(
+        ConfigError, match="Refusing cannot be made of this configuration: ValueError: no"
+    ):
+        Hardware.made(f"{__name__}:Refusing", UR5Config(), None, NANOSECONDS)
+
+
+class Refusing(Perfect):
+    def __init__(self, config: Any, body: Any) -> None:
+        raise ValueError("no such address")
+
+
 def test_a_base_observes_what_its_plant_measures() -> None:
     plant = Perfect(sensors=39, start=[0.0, 0.0])
     config = TurtleBot3Config(beams=36, imu=True, odometry=True)
@@ -285,6 +298,13 @@ def test_a_base_observes_what_its_plant_measures() -> None:
     seen = dict(zip(base.observation_names, base.observe().state[0], strict=True))
     assert [seen[f"scan_{beam:03d}.pos"] for beam in range(36)] == plant.sensors[:36].tolist()
     assert [seen[f"imu_{axis}.vel"] for axis in "xyz"] == plant.sensors[36:].tolist()
+    for _ in range(20):
+        base.step(np.array([[0.1, 0.5]]))
+    pose, odometry = base.truth().base_pose_in_world[0], base.cerebellum.controller.odometry()[0]
+    assert pose.tolist() == odometry.tolist()
+    base.place(FIRST, [Arena("here", (), (-1, 1, -1, 1), (0.5, 0.0, np.pi / 2))])
+    turned = [0.5 - odometry[1], odometry[0], np.pi / 2 + odometry[2]]
+    np.testing.assert_allclose(base.truth().base_pose_in_world[0], turned, atol=1e-12)
     plant.sensors[3] = np.inf
     base.step(None)
     assert base.modes[0] == Mode.FAULT
