@@ -12,6 +12,7 @@ __all__ = [
     "estop_word",
     "fifo",
     "geometry",
+    "gradual",
     "guard",
     "messages",
     "motion",

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import PositionLimits
 from bhd_lerobot.control.arm.clearance import SetpointClearance
+from bhd_lerobot.control.gradual import largest_change
 
 # [1/s] How eagerly a remaining error is closed. With the jerk limit of a UR5 the first follows random setpoints best:
 # less lags, more overshoots. Without a jerk limit it may be twice as much.
@@ -168,13 +169,8 @@ class SetpointFilter:
     def _change_gradually(
         self, allowed: NDArray[np.float64], change: NDArray[np.float64], acceleration: NDArray[np.float64]
     ) -> None:
-        """Keep accelerations near to those of the last tick, and small enough to end when the speed is there.
-
-        Accelerations of 1, 2, … k jerks add up to k (k + 1) / 2; see `bhd_lerobot.control.base.limits.limit_jerk`.
-        """
-        size = np.abs(change) / self._jerk
-        whole = np.floor((np.sqrt(1.0 + 8.0 * size) - 1.0) / 2.0)
-        most = (whole + (size - whole * (whole + 1.0) / 2.0) / (whole + 1.0)) * self._jerk
+        """Keep accelerations near to those of the last tick, and small enough to end when the speed is there."""
+        most = largest_change(np.abs(change) / self._jerk) * self._jerk
         np.minimum(np.maximum(allowed, -most), most, out=allowed)
         np.minimum(np.maximum(allowed, acceleration - self._jerk), acceleration + self._jerk, out=allowed)
 

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.gradual import largest_change
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -55,8 +57,7 @@ def limit_jerk(
     """Bring commands to what was requested with changes that change gradually, and arrive without overshoot.
 
     The change of each tick is the largest from which the changes can still fall, by `jerk` from tick to tick, so that
-    their sum ends at what was requested. Changes 1, 2, … k times `jerk` add up to k (k + 1) / 2 times `jerk`; what is
-    left over is spread over these ticks.
+    their sum ends at what was requested.
 
     Args:
         requested: shape (n, width).
@@ -76,15 +77,7 @@ def limit_jerk(
     size /= jerk
     np.logical_or(changed, size > largest / jerk, out=changed)
     arrived: Mask = size <= _ARRIVED / jerk
-    whole = size * 2.0
-    whole += 0.25
-    np.sqrt(whole, out=whole)
-    whole -= 0.5
-    np.floor(whole, out=whole)
-    # whole + (size - whole (whole + 1) / 2) / (whole + 1)
-    size /= whole + 1.0
-    whole *= 0.5
-    size += whole
+    size = largest_change(size)
     size *= jerk
     change = np.minimum(size, largest, out=size)
     np.copysign(change, step, out=change)

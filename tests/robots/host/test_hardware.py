@@ -275,9 +275,7 @@ def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], wh
 
 
 def test_a_plant_that_cannot_be_made_says_why() -> None:
-    with pytest.raises(
-        ConfigError, match="Refusing cannot be made of this configuration: ValueError: no"
-    ):
+    with pytest.raises(ConfigError, match="Refusing cannot be made of this configuration: ValueError: no"):
         Hardware.made(f"{__name__}:Refusing", UR5Config(), None, NANOSECONDS)
 
 
