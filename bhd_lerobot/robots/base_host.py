@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import MobileBase, without_jerk_limits
+from bhd_lerobot.control.base.collision_monitor import CollisionMonitor
 from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.messages import NANOSECONDS
@@ -44,7 +45,10 @@ class BaseHost(Host):
         if body.lidar is None:
             raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
         self.plant = plant
-        self._controller = BaseController(body, plant.n, config.control_hz)
+        monitor = None
+        if config.collision_monitor:
+            monitor = CollisionMonitor(body, body.lidar, plant.n, config.control_hz, config.beams)
+        self._controller = BaseController(body, plant.n, config.control_hz, monitor=monitor)
         super().__init__(
             config,
             Cerebellum(

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.robots.base_host import BaseHost
 from bhd_lerobot.robots.host.host import FrameReport
@@ -117,6 +118,9 @@ class BaseSimulation(BaseHost, Simulation):
         if len(ids):
             self.lidar.scan(self._rngs, ids)
             self._scanned_tick[ids] = self.tick
+            reading = self.cerebellum.reading
+            reading.sensors[ids, : self.config.beams] = self.lidar.ranges[ids]
+            reading.sensors_ns[ids] = self.tick * NANOSECONDS // self.config.control_hz
             self._scans[ids] += 1
         running = self._scanned_tick[self.running]
         self._next_scan = (int(running.min()) if len(running) else self.tick) + self._scan_ticks

@@ -96,6 +96,8 @@ class MobileBaseConfig(SimulatedRobotConfig):
         lidar_noise_std: standard deviation of the range noise [m]; 0 turns it off.
         odometry: observe `x.pos`, `y.pos` and `theta.pos` from the wheel encoders as well.
         imu: observe the angular velocity from the IMU, `imu_x.vel`, `imu_y.vel` and `imu_z.vel`, as well.
+        collision_monitor: let the robot drive, whoever commands it, only as fast as it can brake before it gets to what
+            its lidar sees.
         command_timeout_s: age of the last command at which the robot ramps to rest [s].
     """
 
@@ -107,6 +109,7 @@ class MobileBaseConfig(SimulatedRobotConfig):
     lidar_noise_std: float = 0.01
     odometry: bool = False
     imu: bool = False
+    collision_monitor: bool = False
     command_timeout_s: float = 0.5
 
     def __post_init__(self) -> None:

@@ -5,9 +5,10 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import MobileBase
 from bhd_lerobot.control.base import limits as safety
+from bhd_lerobot.control.base.collision_monitor import CollisionMonitor
 from bhd_lerobot.control.base.diff_drive import DiffDrive
 from bhd_lerobot.control.controller import Controller
-from bhd_lerobot.control.messages import Limit, Mode, Watchdog
+from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 
@@ -25,6 +26,7 @@ class BaseController(Controller):
         body: limits and wheels.
         n: number of bases.
         control_hz: ticks a second [Hz].
+        monitor: what keeps them from driving into what their scans show, the first values of the reading's sensors.
 
     Raises:
         ConfigError: the wheels cannot turn the base as fast as its velocity limit allows.
@@ -32,8 +34,11 @@ class BaseController(Controller):
 
     joints = 2
 
-    def __init__(self, body: MobileBase, n: int, control_hz: int) -> None:
+    def __init__(
+        self, body: MobileBase, n: int, control_hz: int, *, monitor: CollisionMonitor | None = None
+    ) -> None:
         limits, drive = body.limits, body.drive
+        self._monitor = monitor
         self.width = width = len(limits.names)
         self.drive = DiffDrive(drive, n)
         self.command = np.zeros((n, width))
@@ -65,6 +70,7 @@ class BaseController(Controller):
         self._limited_wheels = np.zeros(n, np.bool_)
         self._limited_effort = np.zeros(n, np.bool_)
         self._limited_finite = np.zeros(n, np.bool_)
+        self._limited_clearance = np.zeros(n, np.bool_)
         # Of the wheels since the last look at their progress: how far they were to turn, and where they were.
         self._look_ticks = max(1, round(body.stalled_s / _STALL_CHECKS * control_hz))
         # Each robot has its own time for it, counted from its start: an episode does not depend on those beside it.
@@ -98,6 +104,10 @@ class BaseController(Controller):
 
     def run(self, reading: PlantReading) -> None:
         """Advance by one tick."""
+        self.drive.update_odometry(reading.position)
+        if self._monitor is not None:
+            self._monitor.see(reading.sensors[:, : self._monitor.beams], reading.sensors_ns, self._seen_from(reading))
+            self._settled = False  # the room that is left changes while commands stand
         if not self._settled:
             self._filter()
         # A servo beyond its torque gives its largest: that is flagged, and the command stays as it is.
@@ -105,13 +115,22 @@ class BaseController(Controller):
         np.abs(error, out=error)
         if np.count_nonzero(np.greater(error, self._largest_error, out=self._beyond)):
             self._limited_effort |= self._beyond.any(axis=1)
-        self.drive.update_odometry(reading.position)
         if self._any_stopped:
             self.protective_stop[:] = self._any_stopped = False
         self._asked += self.actuators
         self._ticks += 1
         if self._ticks == self._next_look:
             self._look(reading.position)
+
+    def _seen_from(self, reading: PlantReading) -> NDArray[np.float64]:
+        """Return where the bases were when they measured what the sensors read, by odometry, shape (n, 3)."""
+        pose = self.drive.odometry
+        if reading.stamp_ns is None:
+            return pose
+        age = (reading.stamp_ns - reading.sensors_ns) / NANOSECONDS
+        forward, turn = self.drive.twist_from_wheels(reading.velocity).T * age
+        middle = pose[:, 2] - turn / 2
+        return pose - np.stack([forward * np.cos(middle), forward * np.sin(middle), turn], axis=1)
 
     def _look(self, position: NDArray[np.float64]) -> None:
         """Find bases with a wheel that does not turn as it is commanded to: it is blocked, or its encoder lies."""
@@ -155,6 +174,11 @@ class BaseController(Controller):
             other = other | (forward != command[:, 0])
         if np.count_nonzero(other):
             np.subtract(command, before, out=self._rate, where=other[:, None])
+        near = None if self._monitor is None else self._monitor.limit(command, before, self.drive.odometry)
+        if near is not None:
+            self._limited_clearance |= near.any(axis=1)
+            limited = True
+            self._rate[near] = 0.0  # the next change starts anew: such a large one could not end in time
         self._settled = not limited and np.count_nonzero(arrived) == arrived.size
         self.drive.wheels_from_twist(self.command, self.actuators)
 
@@ -184,6 +208,8 @@ class BaseController(Controller):
         for array in (self.command, self._target, self.actuators, self._rate):
             array[ids] = 0.0
         self._hard[ids] = False
+        if self._monitor is not None:
+            self._monitor.forget(ids)
         for flags in self._flags():
             flags[ids] = False
         self._settled = self._is_clipped = False
@@ -195,6 +221,7 @@ class BaseController(Controller):
             + (self._limited_velocity.any(axis=1) | self._limited_wheels) * int(Limit.VELOCITY)
             + self._limited_change.any(axis=1) * int(Limit.ACCELERATION)
             + self._limited_effort * int(Limit.EFFORT)
+            + self._limited_clearance * int(Limit.CLEARANCE)
         )
         for flags in self._flags():
             flags[:] = False
@@ -221,4 +248,5 @@ class BaseController(Controller):
             self._limited_wheels,
             self._limited_effort,
             self._limited_finite,
+            self._limited_clearance,
         )
