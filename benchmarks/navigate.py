@@ -93,7 +93,7 @@ def main() -> int:
 
 def drive(config: NavigateConfig, seeds: list[int], n: int) -> tuple[list[Outcome], np.ndarray]:
     """Run the brain in the scenes of these seeds, n side by side; return the outcomes, and the times of its calls."""
-    robot, brain = TurtleBot3Config(), TimedBrain()
+    robot, brain = TurtleBot3Config(collision_monitor=True), TimedBrain()
     episodes = run(BaseSimulation(robot, n), NavigateTask(config, n, robot.fps), brain, seeds)
     return [episode.outcome for episode in episodes], np.array(brain.times)
 

@@ -1,7 +1,7 @@
 """The sections about what is learned: recorded, trained and evaluated by the commands that a user has."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -48,9 +48,23 @@ def avoid(run: Runner, section: Section) -> None:
     for name in brains:
         results["brains"][name] = with_trail["brains"][name]
     results["episodes"] += [one for one in with_trail["episodes"] if one["brain"] in brains]
+    monitored = evaluate(
+        run,
+        "avoid_monitor_eval",
+        "turtlebot3_avoid",
+        brains,
+        rules=("gap_follower",),
+        baseline="gap_follower",
+        options=(*_TRAIL, "--robot.collision_monitor=true"),
+    )
     for name in (*_ROAMING, "bc", *brains):
         section.rows.append(_success_row(results, name))
         section.rows.append(Row(f"{name}: mean score", mean(results["brains"][name]["means"]["score"])))
+    for name in ("gap_follower", *brains):
+        success = _success_row(monitored, name)
+        section.rows.append(replace(success, what=f"with the collision monitor, {success.what}"))
+        score = mean(monitored["brains"][name]["means"]["score"])
+        section.rows.append(Row(f"with the collision monitor, {name}: mean score", score))
     difference = mean_difference(_scores(results, "bc"), _scores(results, "avoidance"))
     more = _failures(results, "bc") - _failures(results, "avoidance")
     section.rows += [

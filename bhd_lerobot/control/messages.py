@@ -105,7 +105,8 @@ class Limit(IntFlag):
     POSTURE = 32
     """A tool pose was refused, because no posture reaches it, or none without a jump: the arm holds the last one."""
     CLEARANCE = 64
-    """A setpoint would have brought the arm too near to itself or to the table: it was slowed down, or stopped."""
+    """A setpoint would have brought an arm too near to itself or to the table, or a base with a collision monitor too
+    near to what its lidar sees: it was slowed down, or stopped."""
 
 
 class Watchdog(IntFlag):
@@ -121,7 +122,8 @@ class Watchdog(IntFlag):
     RECORDER = 8
     """The recorder's process showed no sign of life for its time-out; the robot decelerates and holds."""
     PLANT = 16
-    """The plant showed no sign of life for its time-out, or its readings were too old: mode FAULT."""
+    """The plant showed no sign of life for its time-out, or its readings were too old, or contradicted each other: mode
+    FAULT."""
     MISSES = 32
     """So many ticks in a row came too late that the loop is no control loop any more: mode FAULT."""
     GUARD = 64

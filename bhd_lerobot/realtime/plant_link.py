@@ -44,6 +44,7 @@ class PlantShape:
         velocities: generalised velocities of the physics.
         features: floats in an observation.
         touches: kinds of touches.
+        sensors: further values that the plant measures, see `PlantReading.sensors`.
         capacity: states that can still be read.
     """
 
@@ -52,6 +53,7 @@ class PlantShape:
     velocities: int
     features: int
     touches: int
+    sensors: int
     capacity: int
 
     @property
@@ -79,11 +81,24 @@ class PlantShape:
           reading in the observation.
         - ``touches``: in how many ticks there was each kind of touch; ``observation``; ``position``, ``velocity``,
           ``effort``: of the joints; ``qpos``, ``qvel``: of the physics.
+        - ``sensors``: the newest further values; ``sensors_ns``: when the oldest of them was measured.
         """
-        names = ("index", "due_ns", "start_ns", "executed", "skipped", "overruns", "phase", "stops", "stopped_ns")
-        numbers = [(name, np.int64) for name in (*names, "command", "command_ns", "stamp_ns", "tick", "oldest")]
+        names: tuple[str, ...] = (
+            "index",
+            "due_ns",
+            "start_ns",
+            "executed",
+            "skipped",
+            "overruns",
+            "phase",
+            "stops",
+            "stopped_ns",
+        )
+        names += ("command", "command_ns", "stamp_ns", "tick", "oldest", "sensors_ns")
+        numbers = [(name, np.int64) for name in names]
         sizes = dict.fromkeys(("actuators", "position", "velocity", "effort"), self.joints)
         sizes |= {"observation": self.features, "qpos": self.positions, "qvel": self.velocities}
+        sizes["sensors"] = self.sensors
         floats = [(name, np.float64, (1, size)) for name, size in sizes.items()]
         return np.dtype([*numbers, ("touches", np.int64, (self.touches,)), *floats])
 
@@ -169,13 +184,14 @@ class RemotePlant(Plant):
         return True
 
     def read(self, out: PlantReading) -> None:
-        """Write the newest joint readings into `out`; a stop that was not acknowledged is a fault."""
+        """Write the newest readings into `out`; a stop that was not acknowledged is a fault."""
         state = self.refresh()
         if state is not None:
             out.position[:], out.velocity[:] = state["position"], state["velocity"]
             out.effort[:], out.has_effort = state["effort"], True
             out.stamp_ns = self._stamp_ns
             out.stamp_ns[0] = state["stamp_ns"]
+            out.sensors[:], out.sensors_ns[0] = state["sensors"], state["sensors_ns"]
         out.safety[:] = SafetyStatus.STOPPED if self.has_stopped else SafetyStatus.NORMAL
 
     def write(self, ctrl: NDArray[np.float64]) -> None:

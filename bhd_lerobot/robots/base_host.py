@@ -48,7 +48,8 @@ class BaseHost(Host):
         monitor = None
         if config.collision_monitor:
             monitor = CollisionMonitor(body, body.lidar, plant.n, config.control_hz, config.beams)
-        self._controller = BaseController(body, plant.n, config.control_hz, monitor=monitor)
+        gyro = config.beams + _GYRO.index("imu_z.vel") if config.imu else None
+        self._controller = BaseController(body, plant.n, config.control_hz, monitor=monitor, gyro=gyro)
         super().__init__(
             config,
             Cerebellum(

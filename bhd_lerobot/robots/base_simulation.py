@@ -110,6 +110,8 @@ class BaseSimulation(BaseHost, Simulation):
             np.logical_or(self._touched, self._touch, out=self._touched)
 
     def _after_tick(self) -> None:
+        if self.config.imu:
+            self.cerebellum.reading.sensors[:, self.config.beams :] = self._gyro
         if self.tick >= self._next_scan:
             due = self.running & (self.tick - self._scanned_tick >= self._scan_ticks)
             self._scan(np.flatnonzero(due))

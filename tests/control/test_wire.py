@@ -11,7 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Rates
+from bhd_lerobot.control.base.controller import BaseController
 from bhd_lerobot.control.bridge import LockstepBridge
+from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.messages import HORIZON_NS, Mode, Reason, Request, Watchdog
 from bhd_lerobot.control.motion.planner import GoalPlanner
@@ -243,6 +245,29 @@ def test_wheels_that_do_not_turn_as_commanded_are_a_fault(what: str) -> None:
     assert int(rig.cerebellum.take_flags()[1][0]) & Watchdog.BLOCKED
     assert (rig.plant.position[0, 0] - driven) * 0.033 < 0.012  # what the hardest stop needs
     assert rig.cerebellum.mode[1] == Mode.TRACKING  # the other robot noticed nothing
+
+
+@pytest.mark.parametrize(("turns", "is_fault"), [(1.0, False), (0.8, False), (0.0, True), (-1.0, True), (2.5, True)])
+def test_wheels_that_turn_and_a_gyroscope_that_says_otherwise_are_a_fault(turns: float, is_fault: bool) -> None:
+    """Slipping wheels, an encoder that counts too much, a gyroscope that hangs: nobody can tell which, but it stops."""
+    rig = base_rig(2)
+    controller = BaseController(support.BODY, 2, support.HZ, gyro=0)
+    rig.cerebellum = Cerebellum(support.BODY, rig.plant, support.HZ, controller, sensors=1)
+    for request in (Request.CONFIGURE, Request.ACTIVATE):
+        assert rig.request(request).accepted.all()
+    fault_at = None
+    for tick in range(400):
+        rig.send(0.1, 1.0)
+        rig.tick()
+        yaw_rate = controller.drive.twist_from_wheels(rig.plant.velocity)[:, 1]
+        rig.cerebellum.reading.sensors[:, 0] = yaw_rate * (turns, 1.0) + 0.1  # which drifts a little
+        if fault_at is None and rig.mode == Mode.FAULT:
+            fault_at = tick
+    assert rig.cerebellum.mode[1] == Mode.TRACKING
+    assert (fault_at is not None) == is_fault
+    if fault_at is not None:
+        assert fault_at < 0.75 * support.HZ  # of which the first 0.3 s are those in which it begins to turn
+        assert int(rig.cerebellum.take_flags()[1][0]) & Watchdog.PLANT
 
 
 # --- finding 8: many commands, late commands, commands for another day -----------------------------------------------

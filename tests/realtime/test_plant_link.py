@@ -15,7 +15,7 @@ from bhd_lerobot.control.guard import Guard, WireLimits
 from bhd_lerobot.control.plant import PlantReading, SafetyStatus
 from bhd_lerobot.realtime.plant_link import CommandGuard, PlantLink, PlantPhase, PlantShape, RemotePlant
 
-SHAPE = PlantShape(joints=2, positions=9, velocities=8, features=300, touches=1, capacity=4)
+SHAPE = PlantShape(joints=2, positions=9, velocities=8, features=300, touches=1, sensors=3, capacity=4)
 MS = 1_000_000
 TIMEOUT = 20 * MS
 
@@ -48,7 +48,7 @@ class Rig:
         state = np.zeros((), SHAPE.state_dtype)
         state["stops"], state["position"], state["velocity"] = self.guard.stops, (1.0, 2.0), (3.0, 4.0)
         self.link.states.publish(state)
-        reading = PlantReading(1, 2)
+        reading = PlantReading(1, 2, 3)
         self.remote.read(reading)
         return reading
 
@@ -174,7 +174,7 @@ def test_a_pause_is_no_absence() -> None:
 
 def test_the_newest_plant_state_is_read_and_a_silent_plant_is_a_fault() -> None:
     rig = Rig()
-    reading = PlantReading(1, 2)
+    reading = PlantReading(1, 2, 3)
     rig.remote.read(reading)
     assert reading.safety.tolist() == [SafetyStatus.STOPPED]
     rig.remote.recover()  # of nothing: refused without an error

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec, MobileBase
 
-MARGIN = 0.02  # [m] beside the robot's radius: twice the noise of an LDS-01
+MARGIN = 0.02  # [m] beside the robot's outline: twice the noise of an LDS-01
 _DELAY_S = 0.03  # from a measurement to wheels that brake: two ticks and the servos' time constant, 11 ms
 # Of the stopping deceleration. The rest is for what turning adds: 0.22 m/s times 2.84 rad/s bring a return that was
 # beside the robot nearer with 0.6 m/s^2.
@@ -18,12 +18,13 @@ _OLDEST_SCANS = 3  # a scan that is older than so many periods shows nothing of 
 
 
 class CollisionMonitor:
-    """Limits the forward speed of n bases, so that each can brake before it gets to the nearest returns of its scan.
+    """Limits what n bases are commanded, so that each can brake before it gets to what its scan shows.
 
-    A base is taken for the circle that holds it, so that turning on the spot is always free and brings it nearer to
-    nothing. The speed at which a return comes nearer may be no larger than what can be braked on the way that is left.
-    Returns stay where they were seen, by odometry, until the next scan. Without a scan of the last three periods a base
-    does not drive.
+    The speed at which a return comes nearer to the robot's outline may be no larger than what can be braked on the way
+    that is left; what leads away from it is free. Yaw rates come first, because turning is what avoids an obstacle, and
+    are limited where a corner would sweep over something. Returns stay where they were seen, by odometry, until the
+    next scan, and those that have come too near to be measured for as long as they are. Without a scan of the last
+    three periods a base does not move.
 
     It knows what the lidar sees: nothing below or above its plane, nothing thinner than two beams are apart, and what
     moves only where it was.
@@ -48,12 +49,13 @@ class CollisionMonitor:
         self._oldest_ticks = round(_OLDEST_SCANS * control_hz / lidar.rate_hz)
         way = fastest * (_OLDEST_SCANS / lidar.rate_hz + _DELAY_S) + fastest**2 / (2 * self._deceleration)
         self._reach = body.radius + MARGIN + way  # what is farther cannot matter before the scan is too old
-        self._near = [np.zeros((0, 2))] * n  # returns in the frame of the odometry [m]
-        self._too_near = [np.zeros(0, np.bool_)] * n  # which of them are nearer than the lidar can measure
+        self._near: list[NDArray[np.float64]] = [np.zeros((0, 2))] * n  # returns in the frame of the odometry [m]
+        self._too_near: list[NDArray[np.bool_]] = [np.zeros(0, np.bool_)] * n  # nearer than the lidar can measure
         width = round(math.radians(_BESIDE_DEG) / (2 * np.pi) * beams)
         self._beside = np.arange(-width, width + 1)
-        self._hidden = np.zeros(0, np.bool_)
-        self._points, self._sims = np.zeros((0, 2)), np.zeros(0, np.intp)
+        self._hidden: NDArray[np.bool_] = np.zeros(0, np.bool_)
+        self._points: NDArray[np.float64] = np.zeros((0, 2))
+        self._sims: NDArray[np.intp] = np.zeros(0, np.intp)
         self._seen_ns = np.full(n, -1, np.int64)
         self._age = np.full(n, self._oldest_ticks + 1)  # [ticks]
 
@@ -64,9 +66,7 @@ class CollisionMonitor:
         self._seen_ns[ids] = -1
         self._age[ids] = self._oldest_ticks + 1
 
-    def see(
-        self, ranges: NDArray[np.float64], stamp_ns: NDArray[np.int64], pose: NDArray[np.float64]
-    ) -> None:
+    def see(self, ranges: NDArray[np.float64], stamp_ns: NDArray[np.int64], pose: NDArray[np.float64]) -> None:
         """Take what was measured since the last tick.
 
         Args:
@@ -102,12 +102,12 @@ class CollisionMonitor:
             points.append(self._ahead_of(seen[kept]))
             hidden[around[kept]] = False
             unknown = self._ahead_of(scan[hidden, None] * self._directions[hidden])
-        both = np.concatenate([*points, unknown])
-        self._near[sim] = both @ to_world + middle
+        both: NDArray[np.float64] = np.concatenate([*points, unknown]) @ to_world + middle
+        self._near[sim] = both
         self._too_near[sim] = np.arange(len(both)) >= len(both) - len(unknown)
 
     def _ahead_of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return points + (self._ahead, 0.0)
+        return points + np.array((self._ahead, 0.0))
 
     def limit(
         self, twist: NDArray[np.float64], before: NDArray[np.float64], pose: NDArray[np.float64]

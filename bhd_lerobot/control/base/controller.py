@@ -15,6 +15,7 @@ from bhd_lerobot.errors import ConfigError
 _REST = 1e-9  # a ramp has arrived when the command is this close to zero
 _STALL_CHECKS = 6  # looks at the wheels' progress until one is blocked, or its encoder is
 _LEAST_SPEED = 1.0  # [rad/s] a wheel that is to turn slower than this is not judged
+_LEAST_TURN = 0.3  # [rad/s] by which wheels and gyroscope may differ: several times what a cheap one drifts
 
 
 class BaseController(Controller):
@@ -27,6 +28,7 @@ class BaseController(Controller):
         n: number of bases.
         control_hz: ticks a second [Hz].
         monitor: what keeps them from driving into what their scans show, the first values of the reading's sensors.
+        gyro: which of the reading's sensors is the yaw rate of a gyroscope [rad/s]; None if there is none.
 
     Raises:
         ConfigError: the wheels cannot turn the base as fast as its velocity limit allows.
@@ -35,10 +37,16 @@ class BaseController(Controller):
     joints = 2
 
     def __init__(
-        self, body: MobileBase, n: int, control_hz: int, *, monitor: CollisionMonitor | None = None
+        self,
+        body: MobileBase,
+        n: int,
+        control_hz: int,
+        *,
+        monitor: CollisionMonitor | None = None,
+        gyro: int | None = None,
     ) -> None:
         limits, drive = body.limits, body.drive
-        self._monitor = monitor
+        self._monitor, self._gyro = monitor, gyro
         self.width = width = len(limits.names)
         self.drive = DiffDrive(drive, n)
         self.command = np.zeros((n, width))
@@ -79,6 +87,8 @@ class BaseController(Controller):
         self._asked, self._position = np.zeros((n, self.joints)), np.zeros((n, self.joints))
         self._least_turn = _LEAST_SPEED * self._look_ticks / control_hz
         self._stalls = np.zeros((n, self.joints), np.int64)
+        # How far the gyroscope says that the bases turned since the last look, and looks that found otherwise.
+        self._turned, self._contradictions = np.zeros(n), np.zeros(n, np.int64)
         self._any_stopped = False
         self._wheels = (1.0 / drive.wheel_radius, per_yaw, drive.max_wheel_speed, self._limited_wheels)
 
@@ -118,6 +128,8 @@ class BaseController(Controller):
         if self._any_stopped:
             self.protective_stop[:] = self._any_stopped = False
         self._asked += self.actuators
+        if self._gyro is not None:
+            self._turned += reading.sensors[:, self._gyro]
         self._ticks += 1
         if self._ticks == self._next_look:
             self._look(reading.position)
@@ -140,14 +152,29 @@ class BaseController(Controller):
         stalls = (self._stalls[ids] + 1) * stalled
         stalled = (stalls >= _STALL_CHECKS).any(axis=1)
         self.protective_stop[ids] = stalled * int(Watchdog.BLOCKED)
-        self._any_stopped = bool(stalled.any())
         stalls[stalled] = 0
         self._stalls[ids] = stalls
+        if self._gyro is not None:
+            self._compare_turns(ids, position)
+        self._any_stopped = bool(self.protective_stop.any())
         self._look_again(ids, position)
+
+    def _compare_turns(self, ids: NDArray[np.intp], position: NDArray[np.float64]) -> None:
+        """Find bases whose gyroscope and wheels do not agree about how far they turned: one of them lies, or slips."""
+        wheels = self.drive.twist_from_wheels(position[ids] - self._position[ids])[:, 1]
+        gyro = self._turned[ids] * self._dt
+        apart, largest = np.abs(wheels - gyro), np.maximum(np.abs(wheels), np.abs(gyro))
+        differ = (apart > _LEAST_TURN * self._look_ticks * self._dt) & (apart > 0.5 * largest)
+        contradictions = (self._contradictions[ids] + 1) * differ
+        implausible = contradictions >= _STALL_CHECKS
+        self.protective_stop[ids[implausible]] = int(Watchdog.PLANT)
+        contradictions[implausible] = 0
+        self._contradictions[ids] = contradictions
 
     def _look_again(self, ids: NDArray[np.intp], position: NDArray[np.float64]) -> None:
         """Begin a new period in which the wheels' progress is looked at; `position` has shape (n, joints)."""
         self._asked[ids] = 0.0
+        self._turned[ids] = 0.0
         self._position[ids] = position[ids]
         self._look_at[ids] = self._ticks + self._look_ticks
         self._next_look = int(self._look_at.min())
@@ -199,7 +226,7 @@ class BaseController(Controller):
 
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start odometry here."""
-        self._stalls[ids] = 0
+        self._stalls[ids] = self._contradictions[ids] = 0
         self._look_again(ids, reading.position)
         self.drive.reset_odometry(ids, reading.position[ids])
 

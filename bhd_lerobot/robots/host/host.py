@@ -402,7 +402,9 @@ def describe(config: Any) -> dict[str, Any]:
     if config.clock == "lockstep":
         left_out.append("require_realtime")  # it has no effect
     # What is off is not mentioned, as in the data of versions that did not have it.
-    left_out += [name for name in ("plant", "jerk_limits", "payload", "collision_monitor") if not getattr(config, name, None)]
+    left_out += [
+        name for name in ("plant", "jerk_limits", "payload", "collision_monitor") if not getattr(config, name, None)
+    ]
     values = {key: value for key, value in vars(config).items() if key not in left_out}
     return {
         "type": config.type,

@@ -48,6 +48,7 @@ class SensedWorld:
         self.simulation, self._states, self._clock = simulation, states, clock
         self._plant = simulation.cerebellum.plant
         self._record = np.zeros(1, dtype)
+        self._sensors_ns = -1  # when what was published last was measured, in the simulation's time
         self._field = {name: self._record[name] for name in dtype.names or ()}
 
     def place(self, scene: Any, seed: int) -> None:
@@ -84,7 +85,11 @@ class SensedWorld:
         field["observation"][0], oldest = simulation.sense()
         field["tick"][0], field["oldest"][0] = simulation.tick, oldest[0]
         field["qpos"][0], field["qvel"][0] = simulation.world.qpos, simulation.world.qvel
-        field["stamp_ns"][0] = self._clock()
+        field["stamp_ns"][0] = now = self._clock()
+        newest = simulation.cerebellum.reading
+        if newest.sensors_ns[0] != self._sensors_ns:
+            self._sensors_ns, field["sensors_ns"][0] = int(newest.sensors_ns[0]), now
+        field["sensors"][0] = newest.sensors
         self._states.publish(self._record[0])
 
 

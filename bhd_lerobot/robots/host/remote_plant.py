@@ -22,6 +22,7 @@ def plant_shape(simulation: Simulation) -> PlantShape:
         velocities=simulation.world.qvel.shape[1],
         features=len(simulation.observation_names),
         touches=len(simulation.touches),
+        sensors=simulation.cerebellum.reading.sensors.shape[1],
         capacity=simulation.rates.control_hz,
     )
 

@@ -514,3 +514,28 @@ def test_a_stopped_cerebellum_goes_on_after_a_reset_and_a_stopped_or_killed_plan
             live_link.check()
         block_name = live_link.block.name
     assert block_name not in names()
+
+
+# --- a base that watches its scan ------------------------------------------------------------------------------------
+
+
+def test_a_base_on_the_wall_clock_stops_before_a_wall_that_its_plant_sees() -> None:
+    """The scan comes from another process. On a busy machine it comes late, and the base is slower for it."""
+    config = live(TurtleBot3Config)
+    config.arena, config.collision_monitor, config.command_timeout_s = "turtlebot3_world", True, 20.0
+    robot = TurtleBot3(config)
+    robot.connect()
+    simulation: Any = robot.simulation
+    speeds: list[float] = []
+
+    def stands() -> bool:
+        speeds.append(robot.send_action({"x.vel": -0.22, "theta.vel": 0.0})["x.vel"])
+        return min(speeds) < -0.2 and speeds[-1] > -0.01
+
+    try:
+        until(stands, "it stands before a wall")
+        assert not simulation.truth().touched.any()
+        assert int(simulation.modes[0]) == Mode.TRACKING
+        assert robot.get_observation()["scan_180.pos"] < 0.25
+    finally:
+        robot.disconnect()
