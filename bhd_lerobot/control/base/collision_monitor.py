@@ -92,10 +92,10 @@ class CollisionMonitor:
         hidden = scan <= self._range_min
         near = (scan < min(self._reach + abs(self._ahead), self._range_max)) & ~hidden
         points = [self._ahead_of(scan[near, None] * self._directions[near])]
-        unknown = np.zeros((0, 2))
+        unknown: NDArray[np.float64] = np.zeros((0, 2))
         if np.count_nonzero(hidden):
             last = self._near[sim][~self._too_near[sim]]
-            seen = (last - middle) @ to_world.T - (self._ahead, 0.0)
+            seen: NDArray[np.float64] = (last - middle) @ to_world.T - (self._ahead, 0.0)
             beam = np.rint(np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) * self.beams).astype(np.int64)
             around = (beam[:, None] + self._beside) % self.beams
             kept = hidden[around].any(axis=1)

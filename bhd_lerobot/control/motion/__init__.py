@@ -6,6 +6,7 @@ __all__ = [
     "goal_codec",
     "goals",
     "line",
+    "path_timing",
     "planner",
     "planning",
     "player",

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
+from bhd_lerobot.control.motion.path_timing import PathLimits, PathTimer, PathTiming, follow
 from bhd_lerobot.control.motion.trajectory import MotionLimits, PlanFailure, State, Trajectory, at_once, to_target
 
 Array = NDArray[np.float64]
@@ -18,6 +19,8 @@ _STEP = 0.004  # [m] distance of the poses that the first spline goes through
 _TURN = 0.03  # [rad] and the angle between them
 _DEVIATION = 2e-5  # [m] a spline that leaves the line by more gets twice as many poses
 _MOST_POSES = 4000
+_GOOD = 1.15  # times the shortest duration there is without limits of the jerk: a law that is not worth improving
+_FURTHER = 1.0005  # ticks fall elsewhere on a slower law
 _NO_MOTION = 1e-9  # [m and rad] a line shorter than this is none
 
 
@@ -108,7 +111,62 @@ def along_line(
 def _timed(
     spline: CubicSpline, length: float, limits: tuple[MotionLimits, ToolLimits], hz: int
 ) -> Trajectory | PlanFailure:
-    """Run along a spline over shares of the way, 0 to 1, as one law of time permits."""
+    """Run along a spline over shares of the way, 0 to 1, as fast as the limits permit.
+
+    One law with the same limits on the whole way is found at once, and good enough where the tool limits it. Where the
+    joints do, it is as slow everywhere as they are where they are slowest; then the law follows what they permit.
+    """
+    even = _evenly(spline, length, limits, hz)
+    joints, tool = limits
+    # The tool is one joint more, which moves evenly.
+    path = CubicSpline(spline.x, np.column_stack((spline(spline.x), spline.x * length)))
+    own = PathLimits(
+        np.append(joints.velocity, tool.velocity),
+        np.append(joints.acceleration, tool.acceleration),
+        np.append(joints.jerk, np.inf),
+    )
+    timer = PathTimer(path, own)
+    if isinstance(even, Trajectory):
+        bound = timer.bound()
+        if bound is None or even.ticks <= _GOOD * bound * hz:
+            return even
+    timing = timer.find()
+    quick = None if timing is None else _sampled(path, timing, own, hz)
+    if quick is None or (isinstance(even, Trajectory) and even.ticks <= quick.ticks):
+        return even
+    return quick
+
+
+def _sampled(path: CubicSpline, timing: PathTiming, limits: PathLimits, hz: int) -> Trajectory | None:
+    """Return the joints at ticks; the law becomes as much slower as its limits need between its nodes."""
+    slower = 1.0
+    for _ in range(10):
+        ticks = int(np.ceil(timing.duration * slower * hz))
+        times = np.minimum(np.arange(1, ticks + 1) / hz / slower, timing.duration)
+        position, velocity, acceleration, _ = follow(path, timing.share, times)
+        velocity, acceleration = velocity / slower, acceleration / slower**2
+        position[-1], velocity[-1], acceleration[-1] = path(1.0), 0.0, 0.0
+        jerks = np.diff(acceleration, axis=0, prepend=0.0) * hz
+        more = _excess(velocity, acceleration, jerks, limits)
+        if more <= 1.0:
+            return Trajectory(position[:, :-1], velocity[:, :-1], acceleration[:, :-1])
+        slower *= more * _FURTHER
+    return None
+
+
+def _excess(velocity: Array, acceleration: Array, jerks: Array, limits: PathLimits | MotionLimits) -> float:
+    """Return by which factor a motion has to be slower to keep the limits."""
+    return max(
+        float((np.abs(velocity) / limits.velocity).max()),
+        float(np.sqrt((np.abs(acceleration) / limits.acceleration).max())),
+        float(np.cbrt((np.abs(jerks) / limits.jerk).max())),
+    )
+
+
+def _evenly(
+    spline: CubicSpline, length: float, limits: tuple[MotionLimits, ToolLimits], hz: int
+) -> Trajectory | PlanFailure:
+    """Run along a spline as one law of time permits that has the same limits on the whole way."""
     joints, tool = limits
     slope, bend, twist = (np.abs(spline(spline.x, order)) + 1e-12 for order in (1, 2, 3))
     # A first guess, from a share of the limits for each of the terms that add up; scaled below.
@@ -131,13 +189,9 @@ def _timed(
         first, second = spline(share[:, 0], 1), spline(share[:, 0], 2)
         trajectory = Trajectory(spline(share[:, 0]), first * rate, second * rate * rate + first * rate_change)
         jerks = np.diff(trajectory.acceleration, axis=0, prepend=0.0) * hz
-        slower = max(
-            float((np.abs(trajectory.velocity) / joints.velocity).max()),
-            float(np.sqrt((np.abs(trajectory.acceleration) / joints.acceleration).max())),
-            float(np.cbrt((np.abs(jerks) / joints.jerk).max())),
-        )
+        slower = _excess(trajectory.velocity, trajectory.acceleration, jerks, joints)
         if slower <= 1.0:
             return trajectory
-        slower *= 1.0005  # ticks fall elsewhere on the slower law
+        slower *= _FURTHER
         speed, change, jerk = speed / slower, change / slower**2, jerk / slower**3
     return PlanFailure(ResultCode.PLANNING_FAILED, "No law of time keeps the line within the joints' limits.")

@@ -1,0 +1,83 @@
+"""Straight lines as fast as the joints permit: every limit kept at every tick, and how near to the shortest time."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_TOOL_SPEED
+from bhd_lerobot.control.motion.line import Line, ToolLimits, along_line
+from bhd_lerobot.control.motion.path_timing import PathLimits, PathTimer, follow
+from bhd_lerobot.control.motion.trajectory import MotionLimits, PlanFailure
+from tests.control.goal_rig import ARM, HZ, KINEMATICS
+
+LIMITS = MotionLimits.of(ARM.limits)[slice(0, 6)]
+HOME = np.array(ARM.home[:6])
+BOX = np.array([[0.30, -0.35, 0.10], [0.65, 0.35, 0.50]])  # [m]
+
+
+def test_random_lines_keep_every_limit_and_are_nearly_as_quick_as_one_without_a_limit_of_the_jerk() -> None:
+    rng, posture, ratios = np.random.default_rng(1), HOME, []
+    while len(ratios) < 16:
+        goal = KINEMATICS.tool(posture)
+        goal[:3, 3] = rng.uniform(*BOX)
+        tool = ToolLimits(MAX_TOOL_SPEED, MAX_TOOL_ACCELERATION)
+        motion = along_line(posture, goal, KINEMATICS, (LIMITS, tool), HZ)
+        if isinstance(motion, PlanFailure):
+            continue
+        line = Line(KINEMATICS.tool(posture), goal)
+        rest = np.zeros((1, 6))
+        position = np.concatenate((posture[None], motion.position))
+        velocity = np.concatenate((rest, motion.velocity))
+        acceleration = np.concatenate((rest, motion.acceleration))
+        # Limits, also of what is only written: positions at ticks.
+        assert (np.abs(velocity) <= LIMITS.velocity * (1 + 1e-9)).all()
+        assert (np.abs(acceleration) <= LIMITS.acceleration * (1 + 1e-9)).all()
+        assert (np.abs(np.diff(acceleration, axis=0)) * HZ <= LIMITS.jerk * (1 + 1e-9)).all()
+        assert np.allclose(np.diff(position, axis=0) * HZ, (velocity[1:] + velocity[:-1]) / 2, atol=2e-4)
+        assert np.allclose(np.diff(velocity, axis=0) * HZ, (acceleration[1:] + acceleration[:-1]) / 2, atol=0.05)
+        assert not velocity[-1].any()
+        assert not acceleration[-1].any()
+        # On the line, only forward, and no faster than the tool may be.
+        tools = KINEMATICS.tool(position)[:, :3, 3] - line.start[:3, 3]
+        way = (goal[:3, 3] - line.start[:3, 3]) / line.length
+        assert np.linalg.norm(tools - np.outer(tools @ way, way), axis=1).max() < 3e-5
+        along = np.diff(tools @ way) * HZ
+        assert along.min() > -1e-6
+        assert along.max() <= MAX_TOOL_SPEED + 1e-6
+        assert np.abs(tools[-1] - way * line.length).max() < 1e-9
+        share = tools @ way / line.length
+        kept = np.concatenate(((True,), np.diff(share) > 1e-9))
+        ratios.append(motion.ticks / HZ / bound(share[kept], position[kept]))
+        posture = motion.target
+    assert np.median(ratios) < 1.3
+    assert max(ratios) < 1.7
+
+
+def bound(share: np.ndarray, postures: np.ndarray) -> float:
+    """Return how long the way takes without limits of the jerk, and of the tool [s]."""
+    limits = PathLimits(LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk)
+    found = PathTimer(CubicSpline(share / share[-1], postures), limits).bound()
+    assert found is not None
+    return found
+
+
+def test_one_joint_takes_as_long_as_is_known() -> None:
+    """From rest to rest: without a jerk limit by a triangle or a trapezium of speed, with one by the seven phases."""
+    path = CubicSpline([0.0, 0.5, 1.0], np.array([[0.0], [0.5], [1.0]]))
+    for speed, change, jerk in ((10.0, 8.0, 80.0), (0.5, 8.0, 80.0), (1.5, 4.0, 100.0)):
+        timer = PathTimer(path, PathLimits(*(np.array([value]) for value in (speed, change, jerk))))
+        triangle = speed**2 > change
+        least = 2 / np.sqrt(change) if triangle else 1 / speed + speed / change
+        assert timer.bound() == pytest.approx(least, rel=0.02)
+        ramp = change / jerk
+        known = ramp + np.sqrt(ramp**2 + 4 / change) if triangle else 1 / speed + speed / change + ramp
+        timing = timer.find()
+        assert timing is not None
+        assert timing.duration == pytest.approx(known, rel=0.06)
+        times = np.linspace(0.0, timing.duration, 200)
+        position, velocity, acceleration, _ = follow(path, timing.share, times)
+        assert position[[0, -1], 0].tolist() == pytest.approx([0.0, 1.0])
+        assert velocity.min() > -1e-6
+        assert velocity.max() < 1.03 * speed
+        assert np.abs(acceleration).max() < 1.15 * change
+        assert acceleration[[0, -1], 0].tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
