@@ -188,6 +188,10 @@ class PositionLimits(CommandLimits):
             raise ConfigError(f"lower is {self.lower} and upper is {self.upper}; each range must be finite.")
 
 
+OBSTACLE = "obstacle_"
+"""What the names of capsules begin with that are no part of the arm."""
+
+
 @dataclass(frozen=True)
 class Capsule:
     """All points within `radius` of a segment that is fixed to a link of an arm.

@@ -20,6 +20,7 @@ limits.
 """
 
 import math
+from collections.abc import Sequence
 from importlib import resources
 from typing import Literal
 
@@ -58,6 +59,7 @@ _DISJOINT = (
     *(("forearm", other) for other in ("wrist_3", *_TOOLING)),
     *(("wrist_1", other) for other in ("hand", "finger_left", "finger_right")),
 )
+_MOVING = ("upper_arm", "elbow", "forearm", "wrist_1", "wrist_2", "wrist_3", *_TOOLING)
 
 _PAYLOAD = 5.0  # [kg]
 
@@ -66,6 +68,7 @@ def ur5(
     *,
     actuation: Literal["position", "torque"] = "position",
     load: float = 0.0,
+    obstacles: Sequence[Capsule] = (),
     command_timeout_s: float = 0.14,
     camera_width: int = 320,
     camera_height: int = 240,
@@ -75,6 +78,7 @@ def ur5(
     Args:
         actuation: ``"position"`` for position servos, ``"torque"`` for joint torques.
         load: mass that the gripper is declared to carry [kg].
+        obstacles: what else is known to stand on the table, or to hang above it: capsules of frame 0.
         command_timeout_s: age at which a setpoint is no longer trusted [s].
         camera_width: width of the cameras' images [px].
         camera_height: height of the cameras' images [px].
@@ -111,8 +115,8 @@ def ur5(
             d=_D,
             alpha=_ALPHA,
             tool=(0.0, 0.0, 0.150),
-            capsules=_CAPSULES,
-            disjoint=_DISJOINT,
+            capsules=(*_CAPSULES, *obstacles),
+            disjoint=(*_DISJOINT, *((obstacle.name, link) for obstacle in obstacles for link in _MOVING)),
             min_distance=0.005,
             min_manipulability=0.003,
         ),

@@ -446,6 +446,7 @@ class Cerebellum:
             joint_positions=self.reading.position.copy(),
             joint_velocities=velocity,
             joint_efforts=self.efforts(),
+            contact_wrench=self.controller.contact_wrench.copy(),
             command=self.command.copy(),
             odometry=self.controller.odometry(),
             measured=self.controller.measured(self.reading),
@@ -455,7 +456,7 @@ class Cerebellum:
         )
 
     @staticmethod
-    def state_dtype(n: int, joints: int, width: int, odometry: int) -> np.dtype:
+    def state_dtype(n: int, joints: int, width: int, odometry: int, wrench: int) -> np.dtype:
         """Return the dtype of published states: the fields of `CerebellumState`."""
         per_joint, per_command = (np.float64, (n, joints)), (np.float64, (n, width))
         return np.dtype(
@@ -464,6 +465,7 @@ class Cerebellum:
                 ("joint_positions", *per_joint),
                 ("joint_velocities", *per_joint),
                 ("joint_efforts", *per_joint),
+                ("contact_wrench", np.float64, (n, wrench)),
                 ("command", *per_command),
                 ("measured", *per_command),
                 ("odometry", np.float64, (n, odometry)),

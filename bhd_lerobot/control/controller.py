@@ -25,6 +25,8 @@ class Controller(ABC):
             nothing about it.
         protective_stop: the `Watchdog` flag of each robot that has just begun a stop of its own, shape (n,); 0 for the
             others.
+        contact_wrench: what the surroundings put on the tools, estimated from the motors' efforts, in the base frame:
+            forces [N], and moments about the tool centre points [N m], shape (n, 6), or (n, 0) if nobody asks for it.
     """
 
     width: int
@@ -33,6 +35,7 @@ class Controller(ABC):
     actuators: NDArray[np.float64]
     busy: NDArray[np.bool_]
     protective_stop: NDArray[np.int64]
+    contact_wrench: NDArray[np.float64]
 
     @abstractmethod
     def set_setpoint(self, values: NDArray[np.float64], mask: NDArray[np.bool_]) -> None:

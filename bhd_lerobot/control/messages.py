@@ -185,6 +185,7 @@ class CerebellumState:
         joint_positions: joint or wheel angles [rad], a gripper's opening [m], shape (n, joints).
         joint_velocities: their speeds [rad/s, m/s], shape (n, joints).
         joint_efforts: torques of the joints [N m], force of a gripper [N], shape (n, joints); measured if possible.
+        contact_wrench: what the surroundings put on the tools, see `Controller.contact_wrench`.
         command: the command applied, after all limits, shape (n, width).
         measured: where the robot really is in the space of the commands, shape (n, width).
         odometry: x [m], y [m] and yaw [rad] since the last reset, from the encoders, shape (n, 3); shape (n, 0) for a
@@ -198,6 +199,7 @@ class CerebellumState:
     joint_positions: NDArray[np.float64]
     joint_velocities: NDArray[np.float64]
     joint_efforts: NDArray[np.float64]
+    contact_wrench: NDArray[np.float64]
     command: NDArray[np.float64]
     measured: NDArray[np.float64]
     odometry: NDArray[np.float64]

@@ -18,7 +18,7 @@ from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
 from bhd_lerobot.datasets.format.features import EFFORT, LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
 from bhd_lerobot.datasets.format.identity import default_root
-from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetEditedError, RealtimeError, RenderingError
@@ -257,6 +257,7 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
         physics,
         task.environment_names,
         effort_names=simulation.effort_names,
+        wrench_names=simulation.wrench_names,
         subtask=brain.has_plan,
         language=brain.has_plan and config.dataset.language,
     )
@@ -271,7 +272,7 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
         "split": config.split,
     }
     goes_on = config.resume and not is_free(root)
-    if goes_on and not _has_effort(root):
+    if goes_on and (info := _info(root)) is not None and EFFORT not in info.features:
         features.pop(EFFORT, None)  # the dataset is older than this column
     make = DatasetRecorder.resume if goes_on else DatasetRecorder.create
     return make(
@@ -297,20 +298,18 @@ def _judged_task(config: RecordConfig, robots: Host, console: Console) -> Task:
 
 def _keep_to(root: Path, robot: Any, console: Console) -> None:
     """Go on as a dataset began that is older than the jerk limits."""
-    try:
-        recorded = dataset_info(root).recording.get("robot", {})
-    except BhdError:  # what is wrong with it is said when it is resumed
-        return
+    info = _info(root)
+    recorded = info.recording.get("robot", {}) if info else {}
     if recorded and robot.jerk_limits and "jerk_limits" not in recorded:
         robot.jerk_limits = False
         console.print("The dataset was recorded without jerk limits: it goes on with robot.jerk_limits=false.")
 
 
-def _has_effort(root: Path) -> bool:
+def _info(root: Path) -> DatasetSummary | None:
     try:
-        return EFFORT in dataset_info(root).features
+        return dataset_info(root)
     except BhdError:  # what is wrong with it is said when it is resumed
-        return True
+        return None
 
 
 def save_episode(recorder: DatasetRecorder, episode: Episode, metadata: dict[str, Any]) -> None:

@@ -18,6 +18,7 @@ from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Reason
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import Plant, PlantReading
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.host.host import FrameReport, Host
 from bhd_lerobot.tasks.task import ArmTruth
 
@@ -94,7 +95,14 @@ class ArmHost(Host):
         else:
             self.controller = ArmController(body, plant.n, config.control_hz, ticks, planning)
             if body.mjcf:  # without inertias it is not known what torques a motion needs
-                self.controller.force = ForceLimit(body, plant.n, config.control_hz, config.max_force)
+                self.controller.limit_force(
+                    ForceLimit(body, plant.n, config.control_hz, config.max_force, wrench=config.wrench)
+                )
+            elif config.wrench:
+                raise ConfigError(
+                    f"robot.wrench is true, and the body {body.name!r} says nothing of its inertias (Body.mjcf): what "
+                    "its surroundings put on it cannot be told from its motors' efforts. Leave robot.wrench false."
+                )
         super().__init__(
             config,
             Cerebellum(body, plant, config.control_hz, controller=self.controller),

@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from lerobot.robots.config import RobotConfig
 
@@ -33,7 +33,11 @@ class SimulatedRobotConfig(RobotConfig):
         camera: observe the robot's cameras as well.
         camera_width: width of their images [px].
         camera_height: height of their images [px].
+        not_recorded: options that say where a robot is and not what it is, such as an address: datasets do not name
+            them, and are continued with others. A robot type may have some.
     """
+
+    not_recorded: ClassVar[tuple[str, ...]] = ()
 
     fps: int
     clock: str = "lockstep"

@@ -1,10 +1,11 @@
 """Configuration of the simulated UR5."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
 from lerobot.robots.config import RobotConfig
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import OBSTACLE, Arm, Capsule
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config import SimulatedRobotConfig
@@ -30,6 +31,10 @@ class UR5Config(SimulatedRobotConfig):
             Used with ``control = "servo"``. A force on another part of the arm counts with what the joints feel of it.
         payload: mass of what the gripper is going to carry [kg]. Accelerations are planned so that the motors can move
             it; what it weighs beyond that, by 20 N, stops the arm when it is at rest.
+        obstacles: what is known to be in its way besides the table and itself: capsules, each with x, y, z of one end,
+            x, y, z of the other, and the radius, in the base frame [m]. Goals and setpoints keep away from them.
+        wrench: record what the surroundings put on the tool as well, force and moment as estimated from the motors'
+            efforts: `control.wrench`.
         stale_after_s: time after the end of the frame that a setpoint was for, until the arm decelerates and holds [s].
     """
 
@@ -42,6 +47,8 @@ class UR5Config(SimulatedRobotConfig):
     scene: str = "empty"
     max_force: float = 150.0
     payload: float = 0.0
+    obstacles: list[list[float]] = field(default_factory=list)
+    wrench: bool = False
     stale_after_s: float = 0.1
 
     def __post_init__(self) -> None:
@@ -57,6 +64,12 @@ class UR5Config(SimulatedRobotConfig):
             raise ConfigError(
                 f"robot.max_force is {self.max_force}; it must be positive [N]. With .inf there is no limit."
             )
+        for number, values in enumerate(self.obstacles):
+            if len(values) != 7 or not np.isfinite(values).all() or not values[6] > 0:
+                raise ConfigError(
+                    f"robot.obstacles has {values} as number {number}; an obstacle is 7 finite numbers [m]: x, y, z of "
+                    "one end, x, y, z of the other, and the radius, which is positive."
+                )
         if not 0 < self.stale_after_s < float("inf"):
             raise ConfigError(
                 f"robot.stale_after_s is {self.stale_after_s}; it must be positive and finite. "
@@ -68,6 +81,10 @@ class UR5Config(SimulatedRobotConfig):
         """Return the hardware that this configuration describes."""
         return ur5(
             load=self.payload,
+            obstacles=[
+                Capsule(f"{OBSTACLE}{number}", 0, (x, y, z), (to_x, to_y, to_z), radius)
+                for number, (x, y, z, to_x, to_y, to_z, radius) in enumerate(self.obstacles)
+            ],
             actuation="torque" if self.control == "impedance" else "position",
             command_timeout_s=1 / self.fps + self.stale_after_s,
             camera_width=self.camera_width,

@@ -247,6 +247,8 @@ class EpisodeLoop:
             keys.REWARD: reward,
             keys.EVENT: flagged(event, taken | driven),
         }
+        if simulation.wrench_names:
+            values[keys.WRENCH] = report.wrench
         self._store(running, values)
         if self.observer is not None:
             for sim in running.tolist():

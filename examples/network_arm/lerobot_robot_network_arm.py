@@ -1,6 +1,7 @@
 """The arm of `network_arm.py` as a robot type, for our commands and for LeRobot's."""
 
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import bhd_lerobot as bhd
 
@@ -12,6 +13,8 @@ class NetworkArmConfig(bhd.UR5Config):
     Attributes:
         address: where the arm is, ``"host:port"``.
     """
+
+    not_recorded: ClassVar[tuple[str, ...]] = ("address",)
 
     clock: str = "realtime"
     control_hz: int = 125

@@ -146,6 +146,7 @@ def test_it_is_recorded_and_its_death_ends_the_episode_with_the_reason(
     assert columns[keys.MODE][-1] == Mode.FAULT
     assert keys.PHYSICS_STATE not in info.features
     assert info.features[keys.EFFORT]["names"][0] == "shoulder_pan.effort"
+    assert "address" not in info.recording["robot"]  # which is nobody else's business
 
 
 def _block(name: str) -> Any:

@@ -22,7 +22,7 @@ from tests.control.support import BODY, PerfectPlant
 HZ, FPS = 200, 10
 TICK = 1_000_000_000 // HZ
 F = HZ // FPS
-STATE = Cerebellum.state_dtype(1, 2, 2, 3)
+STATE = Cerebellum.state_dtype(1, 2, 2, 3, 0)
 
 
 class Rig:

@@ -163,3 +163,50 @@ def test_more_force_may_be_allowed() -> None:
     for wrong in (0.0, -1.0, float("nan")):
         with pytest.raises(ConfigError, match=r"max_force is .*positive"):
             UR5Config(max_force=wrong)
+
+
+def test_what_the_surroundings_put_on_the_tool_is_estimated_if_asked_for() -> None:
+    """Beside the contact forces of the simulator: the table pushes the tool up, and a frame later it is known."""
+    pusher = Pusher(clearance=False, measures=True, wrench=True, max_force=400.0)
+    felt, true = [], []
+    for _ in range(60):
+        report = pusher.arm.step(pusher.action)
+        felt.append(report.wrench[0])
+        true.append(pusher.forces[-1])
+        if pusher.forces[-1] < 60.0:
+            pusher.action = pusher.action + np.array(INTO_TABLE)[None] * 0.5 / 25
+    assert true[-1] > 60.0  # it rests on the table, and presses
+    assert felt[-1][2] == pytest.approx(true[-1], rel=0.3)
+    assert np.linalg.norm(felt[-1][:2]) < 0.5 * felt[-1][2]
+    free = [np.linalg.norm(one[:3]) for one, force in zip(felt, true, strict=True) if not force]
+    assert np.median(free) < 15.0
+    assert Pusher().arm.step(pusher.action).wrench.shape == (1, 0)
+
+
+def test_setpoints_and_goals_keep_away_from_obstacles_that_are_declared() -> None:
+    """A post in the way of the turning base, as the simulator has it, and as it was declared: a little thicker."""
+    post = Shape("cylinder", 0.25, 0.55, 0.0, 0.08, 0.08, 0.8)
+    declared = [0.25, 0.55, 0.0, 0.25, 0.55, 0.8, 0.085]
+    for rate in (0.6, 3.0):
+        blind, pusher = (Pusher(fixtures=(post,), obstacles=obstacles) for obstacles in ([], [declared]))
+        least = []
+        for _ in range(round(2.0 / rate * 25) + 40):
+            for one in (blind, pusher):
+                one.step(one.action + np.array([1, 0, 0, 0, 0, 0, 0])[None] * rate / 25)
+            least.append(pusher.distance)
+        assert blind.watchdog & Watchdog.FORCE
+        assert not any(touch.any() for touch in pusher.arm.touches)
+        assert LEAST < min(least) < 0.02
+        assert (pusher.mode, pusher.watchdog) == (Mode.TRACKING, 0)
+        assert pusher.limits & Limit.CLEARANCE
+    pusher = Pusher(fixtures=(post,), obstacles=[declared])
+    home = pusher.arm.body.home  # type: ignore[union-attr]
+    assert pusher.controller.submit(0, BrainCommand("by", joint_target=(home[0] + 2.5, *home[1:6]))) is None
+    while not (results := pusher.arm.step(None).results):
+        pass
+    (result,) = results[0]
+    assert result.code == ResultCode.SELF_COLLISION
+    assert "of obstacle_0; 0.005 m is the least" in result.message
+    for wrong in ([0.1] * 6, [0.1] * 6 + [0.0], [float("nan")] + [0.1] * 6):
+        with pytest.raises(ConfigError, match=r"robot.obstacles has .* as number 0; an obstacle is 7 finite numbers"):
+            UR5Config(obstacles=[wrong])

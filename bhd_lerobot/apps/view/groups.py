@@ -20,7 +20,7 @@ _COUNTS = {keys.SKIPPED: "skipped", keys.OVERRUNS: "overruns"}
 _PLACED = (  # what has a place of its own on the page
     *(keys.TIME, keys.LATE, keys.LIMITS, keys.WATCHDOG, keys.MODE, keys.EVENT, keys.SUCCESS, keys.DONE),
     *(keys.ACTION, keys.APPLIED_ACTION, keys.OBSERVATION_STATE, keys.ENVIRONMENT_STATE, keys.REWARD),
-    *(keys.EFFORT, keys.PHYSICS_STATE),
+    *(keys.EFFORT, keys.WRENCH, keys.PHYSICS_STATE),
 )
 
 
@@ -100,6 +100,9 @@ def sections(features: Mapping[str, Any], widths: Mapping[str, int], robot: str 
         add("State", list(_by_kind(keys.OBSERVATION_STATE, names(keys.OBSERVATION_STATE), robot)), is_open=True)
     if keys.EFFORT in widths:
         add("Effort", list(_by_kind(keys.EFFORT, names(keys.EFFORT), robot)), is_open=False)
+    if keys.WRENCH in widths:
+        lines = [_line(keys.WRENCH, number, name) for number, name in enumerate(names(keys.WRENCH))]
+        add("Force on the tool", [_plot("force", "N", lines[:3]), _plot("moment", "N m", lines[3:])], is_open=False)
     add("Timing", list(_timing(widths)), is_open=True, kind="timing")
     if keys.REWARD in widths:
         add("Reward", [_plot("reward", "", [_line(keys.REWARD, 0, "reward")])], is_open=False)

@@ -62,6 +62,7 @@ class ArmController(Controller):
         self.protective_stop = np.zeros(n, np.int64)
         self._any_stopped = self._any_bad = False
         self.force: ForceLimit | None = None
+        self.contact_wrench = np.zeros((n, 0))
         self.busy = self.goals.busy  # the same array
         self._half_tick = 0.5 / control_hz  # [s]
         # Ticks for which a joint has been too far from its reference.
@@ -88,6 +89,10 @@ class ArmController(Controller):
         self._largest_error[-1] = np.inf  # a gripping gripper is always commanded more than its effort
         self._limited_finite, self._limited_effort = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._work = np.zeros((n, width))
+
+    def limit_force(self, force: ForceLimit) -> None:
+        """Stop an arm that presses too hard, from now on."""
+        self.force, self.contact_wrench = force, force.wrench
 
     # --- motion ------------------------------------------------------------------------------------------------------
 

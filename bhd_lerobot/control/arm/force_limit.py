@@ -36,6 +36,8 @@ class ForceLimit:
 
     Attributes:
         force: the newest estimates [N], shape (n,); 0 where the joints feel too little to ask.
+        wrench: what the surroundings put on the tools, in the base frame: forces [N] and moments about the tool centre
+            points [N m], shape (n, 6); shape (n, 0) if it is not asked for.
         exceeded: whether each is above the largest, or a load hangs on the tool that was not declared, shape (n,).
 
     Args:
@@ -43,12 +45,13 @@ class ForceLimit:
         n: number of arms.
         control_hz: ticks a second [Hz].
         largest: with which the tool may press [N].
+        wrench: estimate also the wrenches.
 
     Raises:
         ConfigError: the largest force is not positive.
     """
 
-    def __init__(self, arm: Arm, n: int, control_hz: int, largest: float) -> None:
+    def __init__(self, arm: Arm, n: int, control_hz: int, largest: float, *, wrench: bool = False) -> None:
         if not largest > 0.0:
             raise ConfigError(f"max_force is {largest}; it must be positive [N]. With .inf nothing is too much.")
         self.largest, self._load = largest, arm.load
@@ -63,6 +66,7 @@ class ForceLimit:
         self._position, self._velocity, self._torque = (np.zeros((n, dof)) for _ in range(3))
         self._fresh = np.ones(n, np.bool_)
         self.force: Array = np.zeros(n)
+        self.wrench: Array = np.zeros((n, 6 if wrench else 0))
         self.exceeded: NDArray[np.bool_] = np.zeros(n, np.bool_)
 
     def update(self, reading: PlantReading) -> bool:
@@ -84,6 +88,9 @@ class ForceLimit:
         self._fresh[:] = False
         torque = self._torque
         torque += _SHARE * (residual - torque)
+        if self.wrench.size:
+            every = np.ascontiguousarray(self._forward.jacobian(position))
+            np.negative(tool_wrench(every, torque, _DAMPING), out=self.wrench)
         self.force[:] = self._pull[:] = 0.0
         self.exceeded[:] = False
         felt = np.abs(torque).max(axis=1) > _LEAST_TORQUE
@@ -119,4 +126,5 @@ class ForceLimit:
         self._fresh[ids] = True
         self._hung[ids] = 0
         self._sum[ids] = self._torque[ids] = self.force[ids] = 0.0
+        self.wrench[ids] = 0.0
         self.exceeded[ids] = False

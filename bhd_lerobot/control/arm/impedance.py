@@ -77,6 +77,7 @@ class ImpedanceController(Controller):
         self.dynamics = ArmDynamics(arm)
         dof = self.dynamics.dof
         self.contact = ContactObserver(n, dof, control_hz, OBSERVER_GAIN)
+        self.contact_wrench = self.contact.wrench
         opening_limits = (arm.limits.velocity[-1], arm.limits.acceleration[-1])
         self.equilibrium = Equilibrium(n, control_hz, frame_ticks, limits or EquilibriumLimits(), opening_limits)
         self.command, self.actuators = np.zeros((n, WIDTH)), np.zeros((n, self.joints))

@@ -52,6 +52,7 @@ class BaseController(Controller):
         self.command = np.zeros((n, width))
         self.actuators = np.zeros((n, self.joints))
         self.busy, self.protective_stop = np.zeros(n, np.bool_), np.zeros(n, np.int64)
+        self.contact_wrench = np.zeros((n, 0))
         self._servo_gain, self._torque = drive.servo_gain, drive.max_torque
         self._velocity = np.asarray(limits.velocity)
         self._change = np.asarray(limits.acceleration) / control_hz

@@ -177,7 +177,7 @@ class PathTimer:
     def _law(self, squared: Array) -> tuple[BSpline, float]:
         durations = self._durations(squared)
         for end, speed in ((0, np.sqrt(squared[1])), (-1, np.sqrt(squared[-2]))):
-            # From rest the acceleration comes first; with a constant jerk on the whole segment it takes half as long again.
+            # From rest the acceleration comes first; with a constant jerk all the way it takes half as long again.
             later = speed**2 / (4 * self._steps[end] * self._jerks[end])
             durations[end] += min(later, durations[end] / 2)
         times = np.concatenate(((0.0,), np.cumsum(durations)))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.body import OBSTACLE, Arm
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.dynamics import SWING, ArmDynamics, acceleration_share
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
@@ -223,11 +223,9 @@ class GoalPlanner:
         marks = np.linspace(0.0, way[-1], int(np.ceil(way[-1] / _CHECK_STEP)) + 1)
         postures = np.stack([np.interp(marks, way, joint) for joint in path.T], axis=1)
         least = self.arm.chain.min_distance
-        for distances, code, what in zip(
-            self.kinematics.collision.distances(postures),
-            (ResultCode.SELF_COLLISION, ResultCode.TABLE_COLLISION),
-            ("itself", "the table"),
-            strict=True,
+        collision = self.kinematics.collision
+        for distances, code in zip(
+            collision.distances(postures), (ResultCode.SELF_COLLISION, ResultCode.TABLE_COLLISION), strict=True
         ):
             inside = distances < least
             if not inside.any():
@@ -237,6 +235,10 @@ class GoalPlanner:
             if escapes and (np.diff(distances[: leaves + 1]) >= -_ROUNDING).all():
                 continue
             where = "The arm starts" if inside[0] else "On the way the arm comes"
+            what = "the table"
+            if code == ResultCode.SELF_COLLISION:
+                other, _ = collision.closest_pair(postures[int(distances.argmin())])
+                what = other if other.startswith(OBSTACLE) else "itself"
             advice = "; it may only move straight away" if inside[0] else ""
             return PlanFailure(
                 code, f"{where} within {distances.min():.4f} m of {what}; {least} m is the least{advice}."

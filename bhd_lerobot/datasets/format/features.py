@@ -26,6 +26,7 @@ LIMITS = "control.limits"
 WATCHDOG = "control.watchdog"
 MODE = "control.mode"
 EFFORT = "control.effort"
+WRENCH = "control.wrench"
 
 REWARD = "next.reward"
 SUCCESS = "next.success"
@@ -84,6 +85,7 @@ def dataset_features(
     environment_names: Sequence[str] = (),
     *,
     effort_names: Sequence[str] = (),
+    wrench_names: Sequence[str] = (),
     subtask: bool = False,
     language: bool = False,
 ) -> dict[str, dict[str, Any]]:
@@ -96,6 +98,7 @@ def dataset_features(
         physics_names: the simulator's generalised positions and velocities, in order; none without one.
         environment_names: the values of the environment state, in order; no such column if there are none.
         effort_names: the joints' efforts, in order; likewise.
+        wrench_names: forces and moments on the tool, in order; likewise.
         subtask: whether the brain reports its subtask.
         language: whether the subtask is stored in LeRobot's language column, too.
     """
@@ -118,6 +121,8 @@ def dataset_features(
         features[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
     if effort_names:
         features[EFFORT] = _vector("float32", effort_names)
+    if wrench_names:
+        features[WRENCH] = _vector("float32", wrench_names)
     if physics_names:
         features[PHYSICS_STATE] = _vector("float64", physics_names)
     return features

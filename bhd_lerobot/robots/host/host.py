@@ -48,6 +48,7 @@ class FrameReport:
         results: how goals ended, or were refused, during the frame, by simulation.
         refusals: in words why setpoints were refused, by simulation, where a `Reason` does not say it all.
         effort: torques of the joints at the end of the frame [N m], force of a gripper [N], shape (n, joints).
+        wrench: what the surroundings put on the tools, likewise, see `Controller.contact_wrench`.
         live: the `LiveFrame` of a robot on the wall clock.
         missed: the frames before this one that went by on the wall clock during inference.
     """
@@ -59,6 +60,7 @@ class FrameReport:
     command_age_ns: NDArray[np.int64]
     mode: NDArray[np.int8]
     effort: NDArray[np.float64]
+    wrench: NDArray[np.float64]
     results: Mapping[int, Sequence[CommandResult]] = field(default_factory=dict)
     refusals: Mapping[int, str] = field(default_factory=dict)
     live: Any = None
@@ -324,6 +326,7 @@ class Host(ABC):
             command_age_ns=self.cerebellum.command_age_ns(self.bridge.now_ns),
             mode=self.cerebellum.mode.copy(),
             effort=self.cerebellum.efforts(),
+            wrench=self.cerebellum.controller.contact_wrench.copy(),
             results={sim: ended for sim, ended in results.items() if ended},
             refusals=receipt.refusals,
         )
@@ -343,6 +346,12 @@ class Host(ABC):
         body = self.body
         joints = body.drive.joints if isinstance(body, MobileBase) else body.limits.names
         return tuple(f"{joint.removesuffix('.pos')}.effort" for joint in joints)
+
+    @property
+    def wrench_names(self) -> tuple[str, ...]:
+        """Names of what the surroundings put on a tool, in order; none if nobody asked for it."""
+        asked = getattr(self.config, "wrench", False)
+        return tuple(f"tool_{kind}_{axis}" for kind in ("force", "moment") for axis in "xyz") if asked else ()
 
     @property
     def physics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -398,13 +407,12 @@ class Host(ABC):
 
 def describe(config: Any) -> dict[str, Any]:
     """Return everything about a robot that shapes its data, as plain values."""
-    left_out = ["id", "calibration_dir", "seed", "arena", "scene", "realtime"]
+    left_out = ["id", "calibration_dir", "seed", "arena", "scene", "realtime", *config.not_recorded]
     if config.clock == "lockstep":
         left_out.append("require_realtime")  # it has no effect
     # What is off is not mentioned, as in the data of versions that did not have it.
-    left_out += [
-        name for name in ("plant", "jerk_limits", "payload", "collision_monitor") if not getattr(config, name, None)
-    ]
+    newer = ("plant", "jerk_limits", "payload", "wrench", "obstacles", "collision_monitor")
+    left_out += [name for name in newer if not getattr(config, name, None)]
     values = {key: value for key, value in vars(config).items() if key not in left_out}
     return {
         "type": config.type,

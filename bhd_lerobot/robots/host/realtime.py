@@ -290,6 +290,7 @@ class LiveHost(Host):
                     command_age_ns=np.array([int(frame.end["command_age_ns"])]),
                     mode=frame.end["mode"].copy(),
                     effort=frame.end["joint_efforts"].copy(),
+                    wrench=frame.end["contact_wrench"].copy(),
                     results={0: results} if results and is_last else {},
                     refusals=receipt.refusals if is_last else {},
                     live=frame,

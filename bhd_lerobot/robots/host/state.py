@@ -43,8 +43,9 @@ def state_dtype(host: Host) -> np.dtype:
     - ``physics``: the simulator's generalised positions and velocities; of no width without one.
     """
     cerebellum = host.cerebellum
-    odometry = cerebellum.controller.odometry().shape[1]
-    own = Cerebellum.state_dtype(1, cerebellum.controller.joints, cerebellum.width, odometry)
+    controller = cerebellum.controller
+    widths = controller.odometry().shape[1], controller.contact_wrench.shape[1]
+    own = Cerebellum.state_dtype(1, controller.joints, cerebellum.width, *widths)
     physics = sum(part.shape[1] for part in host.physics)
     return np.dtype(
         [
@@ -109,6 +110,7 @@ class StatePublisher:
         controller, reading = cerebellum.controller, cerebellum.reading
         field["joint_positions"][:], field["joint_velocities"][:] = reading.position, reading.velocity
         field["joint_efforts"][:] = cerebellum.efforts()
+        field["contact_wrench"][:] = controller.contact_wrench
         field["command"][:], field["measured"][:] = cerebellum.command, controller.measured(reading)
         field["odometry"][:] = controller.odometry()
         field["mode"][:], field["requested"][:] = cerebellum.mode, cerebellum.requested
