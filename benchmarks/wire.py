@@ -5,7 +5,8 @@ spirals that grow beyond every limit, values at the limits, huge ones, ones that
 the spot through singular postures. Then the same streams again, while the memory of the command queue and the
 controller's own reference are overwritten at random. Every write to the plant is judged by limits that are stated here:
 finite, in the actuator's range, and a change in one tick that the body permits. The second table is the share of the
-guard, the last check before the plant, in a tick. Exits with 1 if anything unsafe was written.
+guard, the last check before the plant, in a tick, and that of the collision monitor. Exits with 1 if anything unsafe
+was written.
 """
 
 import argparse
@@ -32,7 +33,8 @@ from bhd_lerobot.robots.ur5_simulation import UR5Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 
 Array = NDArray[np.float64]
-SPACES = ("wheels", "joints", "tool", "impedance")
+MONITORED = "wheels, monitored"
+SPACES = ("wheels", MONITORED, "joints", "tool", "impedance")
 KINDS = ("steps", "reversals", "spirals", "at the limits", "huge", "not finite", "on the spot")
 ROUNDING = 1.021  # a trajectory ends inside a tick
 
@@ -85,8 +87,9 @@ class Judge:
 
 def make(space: str, n: int) -> Any:
     """Return n simulated robots at the start of an episode."""
-    if space == "wheels":
-        base = BaseSimulation(TurtleBot3Config(beams=36), n)
+    if space in ("wheels", MONITORED):
+        monitored = space == MONITORED
+        base = BaseSimulation(TurtleBot3Config(beams=360 if monitored else 36, collision_monitor=monitored), n)
         task = AvoidTask(AvoidConfig(), n, base.rates.fps)
         base.reset(np.arange(n), [task.sample(seed) for seed in range(n)], range(n))
         return base
@@ -109,7 +112,7 @@ def start_of(simulation: Any) -> Array:
 
 def ranges(space: str, first: Array) -> tuple[Array, Array]:
     """Return the smallest and the largest sensible action, each of shape (actions,)."""
-    if space == "wheels":
+    if space in ("wheels", MONITORED):
         return np.array([-0.22, -2.84]), np.array([0.22, 2.84])
     if space == "joints":
         return np.array([*(-2 * np.pi,) * 6, 0.0]), np.array([*(2 * np.pi,) * 6, 0.085])
@@ -196,6 +199,7 @@ class Outcome:
     unsafe: int = 0
     faults: int = 0
     refused: int = 0
+    touched: int = 0
 
 
 def run(space: str, streams: int, frames: int, seed: int) -> tuple[Outcome, Outcome]:
@@ -210,23 +214,29 @@ def run(space: str, streams: int, frames: int, seed: int) -> tuple[Outcome, Outc
             for stream in range(streams)
         ]
         vandal = np.random.default_rng([seed, 10**6])
+        touched = np.zeros(streams, np.bool_)
         for frame in range(frames):
             actions = np.array([stream.action(frame) for stream in made])
             if vandals:
                 vandalise(simulation, vandal)
             report = simulation.step(actions)
+            touched |= np.any(simulation.touches, axis=0)
             outcome.refused += int((report.sent.reasons != 0).sum())
             fault = report.mode == Mode.FAULT
             outcome.faults += int(fault.sum())
             for request in (Request.RESET, Request.ACTIVATE):
                 simulation.cerebellum.request(request, np.flatnonzero(fault))
         outcome.streams += streams
+        outcome.touched = int(touched.sum())
         outcome.writes, outcome.unsafe = judge.writes, judge.unsafe
     return outcomes
 
 
-def guard_share(space: str, n: int) -> tuple[float, float]:
-    """Return what a check of the guard takes, and a whole tick with the physics [s]; the smallest of many."""
+def share(space: str, n: int) -> tuple[float, float]:
+    """Return what the check takes, and a whole tick with the physics [s]; the smallest of many.
+
+    The check is that of the guard; of monitored wheels that of the collision monitor.
+    """
     simulation = make(space, n)
     action = start_of(simulation)
     cerebellum = simulation.cerebellum
@@ -245,7 +255,11 @@ def guard_share(space: str, n: int) -> tuple[float, float]:
     actuators = cerebellum.controller.actuators
     shifted = actuators + 1e-6
     pair = [actuators, shifted]
-    check = timed(lambda: [cerebellum.guard.check(one) for one in pair], 200) / 2
+    if space == MONITORED:
+        monitor, command, pose = cerebellum.controller._monitor, np.tile([0.2, 1.0], (n, 1)), np.zeros((n, 3))
+        check = timed(lambda: monitor.limit(command.copy(), command, pose), 200)
+    else:
+        check = timed(lambda: [cerebellum.guard.check(one) for one in pair], 200) / 2
     whole = timed(lambda: simulation.step(action), 3) / simulation.rates.ticks_per_frame
     return check, whole
 
@@ -259,7 +273,16 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     console = Console()
     table = Table(title="What was written to the plants")
-    for column in ("actions", "memory", "streams", "writes", "unsafe", "frames in FAULT", "commands refused"):
+    for column in (
+        "actions",
+        "memory",
+        "streams",
+        "writes",
+        "unsafe",
+        "frames in FAULT",
+        "commands refused",
+        "touched",
+    ):
         table.add_column(column, justify="left" if column in ("actions", "memory") else "right")
     unsafe = 0
     with np.errstate(all="ignore"):
@@ -267,15 +290,17 @@ def main(arguments: list[str] | None = None) -> int:
             outcomes = run(space, options.streams, options.frames, options.seed)
             for memory, one in zip(("as it is", "garbage"), outcomes, strict=True):
                 unsafe += one.unsafe
-                numbers = (one.streams, one.writes, one.unsafe, one.faults, one.refused)
+                numbers = (one.streams, one.writes, one.unsafe, one.faults, one.refused, one.touched)
                 table.add_row(space, memory, *(f"{number:,}" for number in numbers))
     console.print(table)
-    shares = Table(title="The guard's share of a tick, physics and sensors included")
-    for column in ("robot", "n", "guard", "tick", "share"):
+    shares = Table(
+        title="The share of the guard, and of the collision monitor, in a tick, physics and sensors included"
+    )
+    for column in ("robot", "n", "check", "tick", "share"):
         shares.add_column(column, justify="left" if column == "robot" else "right")
-    for space in ("wheels", "joints", "impedance"):
+    for space in ("wheels", MONITORED, "joints", "impedance"):
         for n in (1, 64):
-            check, whole = guard_share(space, n)
+            check, whole = share(space, n)
             shares.add_row(space, str(n), f"{check * 1e6:.1f} us", f"{whole * 1e6:.0f} us", f"{check / whole:.1%}")
     console.print(shares)
     return int(unsafe > 0)

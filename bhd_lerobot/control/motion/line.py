@@ -66,6 +66,12 @@ class ToolLimits:
     velocity: float
     acceleration: float
 
+    def least_s(self, length: float) -> float:
+        """Return the time that a line of this length takes at least, from rest to rest [s]."""
+        if length * self.acceleration < self.velocity**2:
+            return float(2 * np.sqrt(length / self.acceleration))
+        return length / self.velocity + self.velocity / self.acceleration
+
 
 def along_line(
     posture: Array, goal: Array, kinematics: ArmKinematics, limits: tuple[MotionLimits, ToolLimits], hz: int
@@ -118,6 +124,8 @@ def _timed(
     """
     even = _evenly(spline, length, limits, hz)
     joints, tool = limits
+    if isinstance(even, Trajectory) and even.ticks <= _GOOD * tool.least_s(length) * hz:
+        return even
     # The tool is one joint more, which moves evenly.
     path = CubicSpline(spline.x, np.column_stack((spline(spline.x), spline.x * length)))
     own = PathLimits(
