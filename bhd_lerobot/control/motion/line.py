@@ -11,7 +11,15 @@ from scipy.spatial.transform import Rotation
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.motion.path_timing import PathLimits, PathTimer, PathTiming, follow
-from bhd_lerobot.control.motion.trajectory import MotionLimits, PlanFailure, State, Trajectory, at_once, to_target
+from bhd_lerobot.control.motion.trajectory import (
+    MAX_DURATION_S,
+    MotionLimits,
+    PlanFailure,
+    State,
+    Trajectory,
+    at_once,
+    to_target,
+)
 
 Array = NDArray[np.float64]
 
@@ -134,13 +142,16 @@ def _timed(
         np.append(joints.jerk, np.inf),
     )
     timer = PathTimer(path, own)
-    if isinstance(even, Trajectory):
-        bound = timer.bound()
-        if bound is None or even.ticks <= _GOOD * bound * hz:
-            return even
+    bound = timer.bound()
+    if bound is None or bound > MAX_DURATION_S or (isinstance(even, Trajectory) and even.ticks <= _GOOD * bound * hz):
+        return even
     timing = timer.find()
     quick = None if timing is None else _sampled(path, timing, own, hz)
-    if quick is None or (isinstance(even, Trajectory) and even.ticks <= quick.ticks):
+    if (
+        quick is None
+        or quick.ticks > MAX_DURATION_S * hz
+        or (isinstance(even, Trajectory) and even.ticks <= quick.ticks)
+    ):
         return even
     return quick
 
