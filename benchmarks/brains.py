@@ -63,7 +63,7 @@ def main() -> int:
     for brain, result in zip(brains, results, strict=True):
         print(row(brain.name, result))
     ratio = ratio_of_means(new.scores, old.scores)
-    interval = f"95 % {ratio.low:.3f} to {ratio.high:.3f} (paired bootstrap)"
+    interval = f"95 % {ratio.low:.3f} to {ratio.high:.3f} (Fieller, paired)"
     print(f"\nscore ratio {ratio.value:.3f}, {interval}; goal: {GOAL_RATIO}")
     allowed = old.failures // 3 if old.failures > 0.05 * args.episodes else old.failures
     print(f"failures {new.failures}; allowed: {allowed}")

@@ -92,7 +92,8 @@ class EpisodeMetrics:
         faults: 1 if a fault was latched in it, else 0.
         problem: why the brain gave up, in words, if it did and says so.
         details: further numbers of the task.
-        initial_state: a digest of the simulator's complete state at the start: the same for all brains.
+        initial_state: a digest of the simulator's complete state at the start, the same for all brains; empty without a
+            simulator.
         digest: a digest of everything that was commanded and of every state of the physics.
         wall: what was measured on the wall clock: nothing on the lockstep clock.
     """
@@ -161,7 +162,7 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
         faults=int((modes == Mode.FAULT).any()),
         problem="" if outcome.success else str(episode.plan.get("problem") or ""),
         details=dict(outcome.details),
-        initial_state=_digest(episode.initial_state),
+        initial_state=_digest(episode.initial_state) if episode.initial_state.size else "",
         digest=_digest(*(columns[key] for key in _REPEATED if key in columns)),
         wall=_wall(episode),
     )

@@ -153,9 +153,9 @@ def _summary(given: ReportInput) -> str:
     unit, what = results.config["jerk_unit"], results.config["jerk"]
     head = ["success", "score", "length [s]", "path [m]", f"mean jerk [{unit}]", f"largest jerk [{unit}]", "return"]
     note = (
-        "In brackets 95 % intervals: Wilson's for success rates, percentile bootstrap over episodes for means (10,000 "
-        f"resamples, fixed seed). Jerk is that of the commanded motion ({what}), from frame to frame; “largest” is the "
-        "mean over episodes of each one's largest."
+        "In brackets 95 % intervals: Wilson's for success rates, Student's, corrected for skewness, for means; those "
+        f"of scores also hold what may have stayed unseen. Jerk is that of the commanded motion ({what}), from frame to "
+        "frame; “largest” is the mean over episodes of each one's largest."
     )
     drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and scores with intervals")
     return drawn + table(head, rows, results.config["baseline"]) + f'<p class="note">{note}</p>'
@@ -179,10 +179,11 @@ def _paired(given: ReportInput) -> str:
         rows.append((label, cells))
     head = ["success, difference", "episodes that differ", "McNemar p", "score, difference", "score, ratio", "episodes"]
     note = (
-        f"Every brain beside {escape(baseline)}, episode by episode. Intervals at 95 %: Newcombe's method 10 for "
-        "paired rates, paired percentile bootstrap for scores. p is that of McNemar's exact test, two-sided. An "
-        "interval that leaves out the dashed line says that the difference is more than chance; with several brains, "
-        "expect a false one in twenty."
+        f"Every brain beside {escape(baseline)}, episode by episode. Intervals: Newcombe's method 10 for paired rates, "
+        "Student's, corrected for skewness, for differences of scores, Fieller's for ratios. p is that of McNemar's "
+        "exact test, two-sided; where it finds no difference, the interval of the rates holds 0. An interval that "
+        "leaves out the dashed line says that the difference is more than chance"
+        + (f": with 95 % confidence all {len(rows)} brains' intervals hold at once." if len(rows) > 1 else ".")
     )
     drawn = chart(plots.paired_forest(results.paired), f"Differences from {baseline} with intervals")
     return drawn + table(head, rows) + f'<p class="note">{note}</p>'

@@ -4,7 +4,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,8 @@ class BrainSummary:
         successes: how many of them were a success.
         success: its success rate with its Wilson interval.
         outcomes: how many ended how, the most frequent first.
-        means: means with their bootstrap intervals, by name, see `MEANS`; of the episodes in which they are defined.
+        starts: how many different initial states these episodes had; those of the same one are not independent.
+        means: means with their intervals, by name, see `MEANS`; of the episodes in which they are defined.
         limits: frames in which the safety filter changed the command, by kind of limit, of all episodes.
         watchdogs: frames in which a watchdog noticed something, by kind.
         estops: episodes with an emergency stop.
@@ -40,6 +41,7 @@ class BrainSummary:
     episodes: int
     successes: int
     success: Estimate
+    starts: int
     outcomes: dict[str, int]
     means: dict[str, Estimate]
     limits: dict[str, int]
@@ -53,14 +55,17 @@ class BrainSummary:
 class PairedSummary:
     """A brain beside the baseline, on the episodes that both ran.
 
+    Where several brains are compared with it, all their intervals hold at once with the confidence that is reported
+    (Bonferroni), and p is multiplied by their number.
+
     Attributes:
         brain: the brain.
         baseline: what it is compared with.
         episodes: how many episodes both ran.
         success: difference of the success rates, with Newcombe's paired interval.
         differ: on how many episodes they differed in success, with McNemar's exact test.
-        score: difference of the mean scores, with its paired bootstrap interval.
-        ratio: ratio of the mean scores, with its paired bootstrap interval.
+        score: difference of the mean scores, with its interval.
+        ratio: ratio of the mean scores, with its interval.
     """
 
     brain: str
@@ -129,11 +134,12 @@ def summarise(
         baseline: the brain that the others are compared with.
     """
     results = EvalResults(config, versions, requested)
+    compared = max(1, len(episodes) - 1)
     for label, ran in episodes.items():
         results.episodes += ran
         results.brains[label] = _brain(label, ran)
         if label != baseline:
-            results.paired[label] = _pair(ran, episodes[baseline], label, baseline)
+            results.paired[label] = _pair(ran, episodes[baseline], label, baseline, compared)
     return results
 
 
@@ -142,12 +148,14 @@ def _brain(label: str, episodes: Sequence[EpisodeMetrics]) -> BrainSummary:
     means = {}
     for name in MEANS:
         values = np.array([getattr(episode, name) for episode in episodes], np.float64)
-        means[name] = statistics.mean(values[np.isfinite(values)])
+        within = (0.0, 1.0) if name == "score" else (-math.inf, math.inf)
+        means[name] = statistics.mean(values[np.isfinite(values)], within=within)
     return BrainSummary(
         brain=label,
         episodes=len(episodes),
         successes=successes,
         success=statistics.wilson(successes, len(episodes)),
+        starts=len({episode.initial_state or episode.episode for episode in episodes}),
         outcomes=dict(Counter(episode.outcome for episode in episodes).most_common()),
         means=means,
         limits=_sum(episode.limits for episode in episodes),
@@ -159,20 +167,22 @@ def _brain(label: str, episodes: Sequence[EpisodeMetrics]) -> BrainSummary:
 
 
 def _pair(
-    episodes: Sequence[EpisodeMetrics], others: Sequence[EpisodeMetrics], label: str, baseline: str
+    episodes: Sequence[EpisodeMetrics], others: Sequence[EpisodeMetrics], label: str, baseline: str, compared: int
 ) -> PairedSummary:
+    confidence = 1 - (1 - statistics.CONFIDENCE) / compared
     by_number = {metrics.episode: metrics for metrics in others}
     pairs = [(episode, by_number[episode.episode]) for episode in episodes if episode.episode in by_number]
     success = [one.success for one, _ in pairs], [other.success for _, other in pairs]
     score = [one.score for one, _ in pairs], [other.score for _, other in pairs]
+    differ = statistics.discordance(*success)
     return PairedSummary(
         brain=label,
         baseline=baseline,
         episodes=len(pairs),
-        success=statistics.rate_difference(*success),
-        differ=statistics.discordance(*success),
-        score=statistics.mean_difference(*score),
-        ratio=statistics.ratio_of_means(*score),
+        success=statistics.rate_difference(*success, confidence),
+        differ=replace(differ, p=min(1.0, compared * differ.p)),
+        score=statistics.mean_difference(*score, confidence),
+        ratio=statistics.ratio_of_means(*score, confidence),
     )
 
 

@@ -34,6 +34,9 @@ def sentences(results: EvalResults) -> list[str]:
             found.append(f"{label} ran no episode.")
             continue
         text = f"{label} succeeded in {one.successes} of {one.episodes} episodes, {percent(one.success)}"
+        if one.starts < one.episodes:
+            began = "all of which began alike" if one.starts == 1 else f"which began in {one.starts} different states"
+            text += f", {began}: they are not independent, and the intervals are too narrow"
         pair = results.paired.get(label)
         if pair is not None and pair.episodes:
             text += f"; beside {pair.baseline} {verdict(pair)}"
