@@ -98,6 +98,10 @@ def avoid(run: Runner, section: Section) -> None:
         "does not, so the task reports to `gap_bc` and `ppo`, which starts from it, what ground around them "
         "they have visited (`task.trail`)."
     )
+    section.remarks.append(
+        "With the collision monitor (`robot.collision_monitor`) no brain touches anything; it takes speed away and "
+        "does not steer, so one that would have driven into something stands before it, and is stuck."
+    )
 
 
 def reach(run: Runner, section: Section) -> None:

@@ -154,8 +154,8 @@ def _summary(given: ReportInput) -> str:
     head = ["success", "score", "length [s]", "path [m]", f"mean jerk [{unit}]", f"largest jerk [{unit}]", "return"]
     note = (
         "In brackets 95 % intervals: Wilson's for success rates, Student's, corrected for skewness, for means; those "
-        f"of scores also hold what may have stayed unseen. Jerk is that of the commanded motion ({what}), from frame to "
-        "frame; “largest” is the mean over episodes of each one's largest."
+        f"of scores also hold what may have stayed unseen. Jerk is that of the commanded motion ({what}), from frame "
+        "to frame; “largest” is the mean over episodes of each one's largest."
     )
     drawn = chart(plots.forest(results.brains, results.config["baseline"]), "Success rates and scores with intervals")
     return drawn + table(head, rows, results.config["baseline"]) + f'<p class="note">{note}</p>'
