@@ -114,22 +114,22 @@ class PathTimer:
         """
         low, high = self._accelerations
         segments = np.arange(len(self._steps))
-        entries: list[tuple[Any, Any, Array, Array]] = [
-            ((segments, segments + 1), (low, high), acceleration[:, None] + 0 * low, 0 * low)
+        entries: list[tuple[Any, Any, Array]] = [
+            ((segments, segments + 1), (low, high), acceleration[:, None] + 0 * low)
         ]
         if before is not None:
             limited = np.isfinite(self._limits.jerk)
             speed, jerks = np.sqrt(before[1:-1])[:, None], self._limits.jerk[limited]
             slope, bend = self._slope[:, limited] * speed / jerks, self._bend[:, limited] * speed / jerks
-            twist = self._twist[:, limited] * speed**3 / jerks
+            twist = self._twist[:, limited] * speed / jerks
             change = slope / np.diff(self._middles)[:, None]
             left, right = 1.5 * bend - change, 1.5 * bend + change  # of the accelerations before and after a node
             half = (0.5 / self._steps)[:, None]
             columns = (segments[:-1], segments[:-1] + 1, segments[:-1] + 2)
-            values = (-left * half[:-1], left * half[:-1] - right * half[1:], right * half[1:])
-            entries.append((columns, values, jerk[:, None] + 0 * twist, twist))
+            values = (-left * half[:-1], left * half[:-1] - right * half[1:] + twist, right * half[1:])
+            entries.append((columns, values, jerk[:, None] + 0 * twist))
         rows, places, factors, most, first = [], [], [], [], 0
-        for columns, values, limit, constant in entries:
+        for columns, values, limit in entries:
             for sign in (1.0, -1.0):
                 number = first + np.arange(limit.size).reshape(limit.shape)
                 first += limit.size
@@ -137,7 +137,7 @@ class PathTimer:
                     rows.append(number.ravel())
                     places.append(np.broadcast_to(column[:, None], limit.shape).ravel())
                     factors.append(sign * value.ravel())
-                most.append((limit - sign * constant).ravel())
+                most.append(limit.ravel())
         matrix = csr_matrix(
             (np.concatenate(factors), (np.concatenate(rows), np.concatenate(places))), shape=(first, len(self._nodes))
         )
