@@ -33,7 +33,8 @@ class BhdEnvConfig(EnvConfig):
         robot: options of the robot that differ from their defaults, by name: ``--env.robot='{beams: 36}'``.
         task_options: options of the task that differ from their defaults, by name.
         seed: the run's seed; seed k of an evaluation is episode k of this run.
-        split: `held_out` or `train`: which of two disjoint sets of episodes.
+        split: `held_out`, `validation` or `train`: which set of episodes; `bhd-train` takes `validation` in place of
+            `held_out`.
         cameras: whether the robot's cameras are observed; the robot's own option if None.
         obs_type: what an observation holds: `state`, `pixels`, `pixels_agent_pos` or
             `pixels_environment_state_agent_pos`; all that there is if None.

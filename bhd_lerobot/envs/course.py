@@ -21,14 +21,14 @@ class Course:
 
     Attributes:
         seed: the run's seed.
-        split: `train` or `held_out`.
+        split: `train`, `validation` or `held_out`.
         episode: number of the present episode; -1 before the first.
         following: number of the next one.
         stride: how many episodes further each one after it is.
 
     Args:
         seed: the run's seed.
-        split: which of two disjoint sets of episodes.
+        split: which of the sets of episodes.
         first: number of the first episode, if `advance` gets none; drawn at random below `STREAM` if None, so that
             environments that do not know of each other run different ones.
         stride: how many episodes further each next one is.

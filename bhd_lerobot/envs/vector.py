@@ -40,7 +40,7 @@ class BhdVectorEnv(VectorEnv[dict[str, Any], NDArray[np.float32], NDArray[Any]])
         robot: options of the robot that differ from their defaults, by name, or its configuration.
         task: the same of the task.
         seed: the run's seed.
-        split: `train` or `held_out`: which of two disjoint sets of episodes.
+        split: `train`, `validation` or `held_out`: which set of episodes.
         cameras: whether the robots' cameras are observed.
         obs_type: what an observation holds: one of `settings.OBS_TYPES`; all that there is if None.
         normalise_actions: take actions in [-1, 1], mapped to the bounds.

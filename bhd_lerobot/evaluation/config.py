@@ -42,7 +42,7 @@ class EvalConfig:
         n_episodes: number of episodes of each brain.
         episodes: run only these, by number, for example `[17]`: each is what it is in the whole run.
         seed: every episode's seed follows from this and its number.
-        split: `held_out` or `train`: which of two sets of seeds, disjoint by construction.
+        split: `held_out`, `validation` or `train`: which set of seeds.
         baseline: name of the brain that the others are compared with; the first one if nothing.
         n_envs: simulations that run side by side; changes the speed and nothing else.
         threads: threads that step the physics; all processors if nothing.

@@ -56,7 +56,7 @@ class RecordConfig:
         task: what it is to achieve, and where.
         timing: how unpunctual frames may be, and what becomes of an episode with too many of them.
         seed: every episode's seed follows from this and its number.
-        split: `train` or `held_out`: which of two sets of seeds, disjoint by construction.
+        split: `train`, `validation` or `held_out`: which set of seeds.
         n_envs: simulations that run side by side; changes the speed and nothing else.
         threads: threads that step the physics; all processors if nothing.
         engine: where episodes run: `local`, in this process, or `ray`, on a cluster; changes the speed, nothing else.

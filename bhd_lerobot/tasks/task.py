@@ -18,8 +18,9 @@ class TaskConfig(draccus.ChoiceRegistry):
     """Base class of task configurations."""
 
 
-Split = Literal["train", "held_out"]
-SPLITS: tuple[Split, ...] = ("train", "held_out")
+Split = Literal["train", "held_out", "validation"]
+SPLITS: tuple[Split, ...] = ("train", "held_out", "validation")
+_VALIDATION = 1  # makes other episodes of a run's seed and numbers
 
 
 class Event(IntEnum):
@@ -75,12 +76,14 @@ def outcomes_of(task: str | None, body: Body | None = None) -> tuple[str, ...]:
 def episode_seed(seed: int, episode: int, split: Split) -> int:
     """Return the seed of an episode, a whole number below 2**63.
 
-    Training seeds are even and held-out seeds are odd, so that the two can never meet, whatever run they come from.
+    Training seeds are even, and all others are odd, so that they can never meet, whatever run they come from. Held-out
+    episodes are for what is reported; those of validation are to choose by, while a policy is trained. These two are
+    drawn apart, and have a seed in common with a probability of 2**-62.
 
     Args:
         seed: the run's seed.
         episode: the episode's number in the run.
-        split: which of the two sets the episode belongs to.
+        split: which of the sets the episode belongs to.
 
     Raises:
         ConfigError: there is no such split, or a number is negative.
@@ -89,8 +92,9 @@ def episode_seed(seed: int, episode: int, split: Split) -> int:
         raise ConfigError(f"Unknown split {split!r}. Valid: {', '.join(SPLITS)}.")
     if seed < 0 or episode < 0:
         raise ConfigError(f"Seeds and episode numbers start at 0; got seed {seed}, episode {episode}.")
-    word = np.random.SeedSequence([seed, episode]).generate_state(1, np.uint64)[0]
-    return (int(word) >> 2) * 2 + SPLITS.index(split)
+    words = [seed, episode] if split != "validation" else [seed, episode, _VALIDATION]
+    word = np.random.SeedSequence(words).generate_state(1, np.uint64)[0]
+    return (int(word) >> 2) * 2 + int(split != "train")
 
 
 @dataclass(frozen=True)

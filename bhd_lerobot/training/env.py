@@ -1,5 +1,9 @@
-"""Success in a simulated environment, measured by LeRobot's own evaluation while a policy is trained."""
+"""Success in a simulated environment, measured by LeRobot's own evaluation while a policy is trained.
 
+The episodes are of the split `validation` where the environment has splits and no other than `held_out` is asked for.
+"""
+
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +36,10 @@ class EnvEvaluation:
         """
         _check_robot(config, parts.contract.robot_type)
         self._config, self._parts, self._accelerator = config, parts, accelerator
+        self._env: Any = config.env
+        if getattr(self._env, "split", None) == "held_out":
+            # What is chosen by while training must not be what is reported in the end.
+            self._env = replace(self._env, split="validation")
         self._before, self._after = make_env_pre_post_processors(env_cfg=config.env, policy_cfg=config.policy)
 
     def run(self, step: int) -> Row:
@@ -44,7 +52,7 @@ class EnvEvaluation:
         row: Row = {}
         if self._accelerator.is_main_process:
             seed = config.seed or 0
-            envs = make_env(config.env, n_envs=config.eval.batch_size, use_async_envs=config.eval.use_async_envs)
+            envs = make_env(self._env, n_envs=config.eval.batch_size, use_async_envs=config.eval.use_async_envs)
             try:
                 with seeded_context(seed), torch.no_grad(), self._accelerator.autocast():
                     info = eval_policy_all(

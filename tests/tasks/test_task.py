@@ -26,6 +26,14 @@ def test_seeds_fit_the_columns_of_a_dataset_and_do_not_change() -> None:
     assert episode_seed(0, 0, "held_out") == episode_seed(0, 0, "train") + 1
 
 
+def test_episodes_to_choose_by_are_none_of_those_that_are_learned_from_or_reported() -> None:
+    sets = {split: {episode_seed(seed, i, split) for seed in range(20) for i in range(200)} for split in SPLITS}
+    assert all(len(one) == 4000 for one in sets.values())
+    assert not sets["validation"] & (sets["train"] | sets["held_out"])
+    assert all(seed % 2 == 0 for seed in sets["train"])
+    assert all(seed % 2 for seed in sets["validation"] | sets["held_out"])
+
+
 @pytest.mark.parametrize(("seed", "episode"), [(-1, 0), (0, -1)])
 def test_negative_numbers_are_refused(seed: int, episode: int) -> None:
     with pytest.raises(ConfigError, match="-1"):
@@ -35,7 +43,7 @@ def test_negative_numbers_are_refused(seed: int, episode: int) -> None:
 def test_an_unknown_split_is_an_error_that_lists_the_valid_ones() -> None:
     with pytest.raises(ConfigError, match="train, held_out"):
         episode_seed(0, 0, "test")  # type: ignore[arg-type]
-    assert SPLITS == ("train", "held_out")
+    assert SPLITS == ("train", "held_out", "validation")
 
 
 def test_numbers_that_are_recorded_stay_what_they_are() -> None:

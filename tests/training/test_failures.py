@@ -214,6 +214,25 @@ def test_an_environment_of_another_robot(tmp_path: Path) -> None:
     refused(options(root, tmp_path / "run", MLP, **env), ConfigError, message)
 
 
+def test_what_is_chosen_by_while_training_is_not_what_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside the episodes of the split that was asked for, an evaluation while training runs none that are held out."""
+    root, splits = make_dataset(tmp_path / "set", robot="turtlebot3"), []
+
+    def make(config: Any, **_: Any) -> Any:
+        splits.append(config.split)
+        raise BhdError("seen")
+
+    monkeypatch.setattr("bhd_lerobot.training.env.make_env", make)
+    env = {"env__type": "bhd", "env__task": "TurtleBot3Avoid-v0", "env_eval_freq": 2}
+    for number, split in enumerate((None, "train", "validation")):
+        asked = {} if split is None else {"env__split": split}
+        with pytest.raises(BhdError, match="seen"):
+            run_train(options(root, tmp_path / f"run{number}", MLP, **env, **asked))
+    assert splits == ["validation", "train", "validation"]
+
+
 def test_metrics_that_cannot_be_written_leave_the_checkpoint(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
