@@ -230,6 +230,8 @@ class BaseController(Controller):
         self._stalls[ids] = self._contradictions[ids] = 0
         self._look_again(ids, reading.position)
         self.drive.reset_odometry(ids, reading.position[ids])
+        if self._monitor is not None:
+            self._monitor.forget(ids)  # what it remembers is where odometry was before
 
     def restart(self, ids: NDArray[np.intp]) -> None:
         """Forget everything about bases that were put somewhere else."""

@@ -136,6 +136,24 @@ def test_beside_an_obstacle_only_what_leads_nearer_is_taken_away() -> None:
             assert rig.plant.position.mean() * 0.033 < 0.06 - MARGIN + 0.001
 
 
+def test_what_is_near_stays_near_when_odometry_begins_anew() -> None:
+    rig = watched()
+    for _ in range(10):
+        scan(rig, 3.0)
+        rig.send(0.2)
+        rig.tick(SCAN_TICKS)
+    scan(rig, 0.14)
+    rig.tick(2)
+    controller = rig.cerebellum.controller
+    assert controller.odometry()[0, 0] > 0.3
+    controller.configure(np.zeros(1, np.intp), rig.cerebellum.reading)
+    before = rig.plant.position.mean() * 0.033
+    for _ in range(4):
+        rig.send(0.2)
+        rig.tick(10)
+    assert rig.plant.position.mean() * 0.033 - before < 0.03
+
+
 def test_scans_of_a_mad_lidar_stop_it_but_nothing_jumps_at_the_wire() -> None:
     """The plant of the rig asserts at every write that the wheels' commands change no faster than a stop."""
     rng = np.random.default_rng(0)
