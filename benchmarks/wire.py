@@ -5,8 +5,8 @@ spirals that grow beyond every limit, values at the limits, huge ones, ones that
 the spot through singular postures. Then the same streams again, while the memory of the command queue and the
 controller's own reference are overwritten at random. Every write to the plant is judged by limits that are stated here:
 finite, in the actuator's range, and a change in one tick that the body permits. The second table is the share of the
-guard, the last check before the plant, in a tick, and that of the collision monitor. Exits with 1 if anything unsafe
-was written.
+guard, the last check before the plant, in a tick, that of the collision monitor, and that of the distance check of
+setpoints. Exits with 1 if anything unsafe was written.
 """
 
 import argparse
@@ -232,6 +232,38 @@ def run(space: str, streams: int, frames: int, seed: int) -> tuple[Outcome, Outc
     return outcomes
 
 
+def timed(function: Callable[[], object], count: int) -> float:
+    """Return how long a call takes [s]; the shortest of 20 times `count` calls."""
+    best = np.inf
+    for _ in range(20):
+        started = time.perf_counter()
+        for _ in range(count):
+            function()
+        best = min(best, (time.perf_counter() - started) / count)
+    return best
+
+
+def distance_share(n: int) -> tuple[float, float]:
+    """Return what the distance check of setpoints adds to a tick [s], and such a tick.
+
+    The arms are close above the table and sway, so that every check computes distances.
+    """
+    ticks = []
+    for checks in (False, True):
+        arm = make("joints", n)
+        action = start_of(arm)
+        for _ in range(60):
+            action[:, 1] += 0.02  # the shoulder lowers the arm, until the check stops it
+            arm.step(action)
+        held = arm.cerebellum.command.copy()
+        if not checks:
+            arm.controller.setpoints.clearance = None
+        swayed = [held, held + np.array([0.02, -0.02, 0, 0, 0, 0, 0])]
+        ticks.append(timed(lambda arm=arm, swayed=swayed: [arm.step(one) for one in swayed], 2))
+    without, whole = (one / 2 / arm.rates.ticks_per_frame for one in ticks)
+    return whole - without, whole
+
+
 def share(space: str, n: int) -> tuple[float, float]:
     """Return what the check takes, and a whole tick with the physics [s]; the smallest of many.
 
@@ -242,15 +274,6 @@ def share(space: str, n: int) -> tuple[float, float]:
     cerebellum = simulation.cerebellum
     for frame in range(10):
         simulation.step(action + 0.001 * (frame % 2))
-
-    def timed(function: Callable[[], object], count: int) -> float:
-        best = np.inf
-        for _ in range(20):
-            started = time.perf_counter()
-            for _ in range(count):
-                function()
-            best = min(best, (time.perf_counter() - started) / count)
-        return best
 
     actuators = cerebellum.controller.actuators
     shifted = actuators + 1e-6
@@ -293,15 +316,18 @@ def main(arguments: list[str] | None = None) -> int:
                 numbers = (one.streams, one.writes, one.unsafe, one.faults, one.refused, one.touched)
                 table.add_row(space, memory, *(f"{number:,}" for number in numbers))
     console.print(table)
-    shares = Table(
-        title="The share of the guard, and of the collision monitor, in a tick, physics and sensors included"
-    )
+    shares = Table(title="The share of the checks in a tick, physics and sensors included")
     for column in ("robot", "n", "check", "tick", "share"):
         shares.add_column(column, justify="left" if column == "robot" else "right")
     for space in ("wheels", MONITORED, "joints", "impedance"):
         for n in (1, 64):
             check, whole = share(space, n)
             shares.add_row(space, str(n), f"{check * 1e6:.1f} us", f"{whole * 1e6:.0f} us", f"{check / whole:.1%}")
+    for n in (1, 64):
+        check, whole = distance_share(n)
+        shares.add_row(
+            "joints, distances", str(n), f"{check * 1e6:.1f} us", f"{whole * 1e6:.0f} us", f"{check / whole:.1%}"
+        )
     console.print(shares)
     return int(unsafe > 0)
 
