@@ -29,6 +29,8 @@ class DatasetConfig:
         language: also write what the brain was doing, and its plan, into LeRobot's column `language_persistent`, for
             brains with a plan. Off, because PyTorch's own collating and `lerobot-dataset-viz` fail on that column;
             LeRobot's training knows it.
+        expert_action: also record what the expert would do in every frame, `expert.action`: of the brain `dagger` its
+            expert, if it gives setpoints; of any other rule what it does.
         push_to_hub: upload the dataset when it is complete.
         private: whether the uploaded dataset is private.
         tags: tags of the uploaded dataset.
@@ -40,6 +42,7 @@ class DatasetConfig:
     num_episodes: int = 50
     episode_time_s: float | None = None
     language: bool = False
+    expert_action: bool = False
     push_to_hub: bool = False
     private: bool = False
     tags: list[str] = field(default_factory=list)

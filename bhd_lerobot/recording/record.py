@@ -16,7 +16,15 @@ from rich.markup import escape
 from bhd_lerobot.cluster.loop import ClusterLoop, open_pool
 from bhd_lerobot.control.estop import EstopInputs, estop_signal
 from bhd_lerobot.control.tolerance import verdict
-from bhd_lerobot.datasets.format.features import EFFORT, LANGUAGE, PHYSICS_STATE, SUBTASK, dataset_features
+from bhd_lerobot.datasets.format.features import (
+    ACTION,
+    EFFORT,
+    EXPERT_ACTION,
+    LANGUAGE,
+    PHYSICS_STATE,
+    SUBTASK,
+    dataset_features,
+)
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
 from bhd_lerobot.datasets.storage.atomic import is_free
@@ -258,9 +266,12 @@ def open_recorder(config: RecordConfig, root: Path, simulation: Host, task: Task
         task.environment_names,
         effort_names=simulation.effort_names,
         wrench_names=simulation.wrench_names,
+        expert=config.dataset.expert_action,
         subtask=brain.has_plan,
         language=brain.has_plan and config.dataset.language,
     )
+    if config.dataset.expert_action:
+        _check_expert(brain)
     # What decides the episodes. How many there are, and how many run side by side, does not.
     recording = {
         "robot": {
@@ -312,12 +323,32 @@ def _info(root: Path) -> DatasetSummary | None:
         return None
 
 
+def _check_expert(brain: Any) -> None:
+    """Raise if nobody says what an expert would do."""
+    advice = getattr(brain, "gives_advice", None)
+    if advice is None and brain.name != "learned":
+        return  # a rule is its own expert
+    if not advice:
+        what = "a policy, and no expert" if advice is None else "with an expert that gives goals"
+        raise ConfigError(
+            f"dataset.expert_action asks for what an expert would do, and brain.type is {brain.name!r}, {what}. Use a "
+            "rule, or brain.type=dagger with an expert that gives setpoints, such as gap_follower."
+        )
+
+
+_BY_OPTION = (EFFORT, EXPERT_ACTION)
+"""Columns that a dataset may do without: it is older, or did not ask for them."""
+
+
 def save_episode(recorder: DatasetRecorder, episode: Episode, metadata: dict[str, Any]) -> None:
     """Save an episode; when this returns, it survives a kill."""
     writer = episode.writer or recorder.begin_episode()
     try:
         known = recorder.features
-        writer.set_columns({key: column for key, column in episode.columns.items() if key != EFFORT or key in known})
+        columns = {key: column for key, column in episode.columns.items() if key not in _BY_OPTION or key in known}
+        if EXPERT_ACTION in known:
+            columns.setdefault(EXPERT_ACTION, columns[ACTION])  # of a rule, which is the expert
+        writer.set_columns(columns)
         recorder.save(writer, task=episode.instruction, metadata=metadata)
     except BaseException:
         writer.discard()

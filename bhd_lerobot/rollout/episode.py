@@ -99,6 +99,7 @@ class EpisodeLoop:
             open_images: called at the start of every episode of a robot with cameras; returns where its images go.
         """
         self._open_images = open_images
+        self._advice: Callable[[], NDArray[np.float64] | None] | None = getattr(self.brain, "advice", None)
         waiting = list(reversed(specs))
         done: dict[int, Episode] = {}
         order = [spec.index for spec in specs]
@@ -215,6 +216,8 @@ class EpisodeLoop:
         }
         if physics.shape[1]:
             values[keys.PHYSICS_STATE] = physics
+        if self._advice is not None and (advised := self._advice()) is not None:
+            values[keys.EXPERT_ACTION] = advised.astype(np.float32)
         finished: list[tuple[int, Event]] = []
         for frame_report in (*report.missed, report):
             if frame_report.live is not None:

@@ -31,6 +31,7 @@ class SelectionConfig:
         exclude_late: leave out episodes with more late frames than their recording tolerated.
         intervention_weight: how often frames in which somebody intervened are drawn, compared with others; 0 drops
             them.
+        expert_action: learn what the expert would have done in every frame, `expert.action`, in place of what was done.
         hold_out: of what `dataset.eval_split` is the share that is held out: `episode`, of all episodes; `instruction`,
             of each instruction's, and at least one of each, as `lerobot-train` does.
     """
@@ -39,6 +40,7 @@ class SelectionConfig:
     min_score: float | None = None
     exclude_late: bool = False
     intervention_weight: float = 1.0
+    expert_action: bool = False
     hold_out: str = "episode"
 
     def __post_init__(self) -> None:
@@ -150,6 +152,7 @@ class BhdTrainConfig(TrainPipelineConfig):
             seed=0 if self.seed is None else self.seed,
             episodes=self.dataset.episodes,
             intervention_weight=self.selection.intervention_weight,
+            expert_action=self.selection.expert_action,
             eval_split=self.dataset.eval_split,
             hold_out=self.selection.hold_out,
             max_eval_samples=self.max_eval_samples,

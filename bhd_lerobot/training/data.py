@@ -13,7 +13,7 @@ from lerobot.transforms import ImageTransforms
 
 from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.state import load_info
-from bhd_lerobot.datasets.loader.loader import Loader, check, imagenet_stats, make_loader
+from bhd_lerobot.datasets.loader.loader import Loader, check, expert_stats, imagenet_stats, make_loader
 from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.loader.table import checked_episodes
 from bhd_lerobot.datasets.storage import layout
@@ -67,6 +67,8 @@ def open_metadata(config: BhdTrainConfig) -> LeRobotDatasetMetadata:
         )
     if dataset.use_imagenet_stats:
         imagenet_stats(meta)
+    if config.selection.expert_action:
+        expert_stats(meta)
     return meta
 
 

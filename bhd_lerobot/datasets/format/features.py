@@ -27,6 +27,7 @@ WATCHDOG = "control.watchdog"
 MODE = "control.mode"
 EFFORT = "control.effort"
 WRENCH = "control.wrench"
+EXPERT_ACTION = "expert.action"
 
 REWARD = "next.reward"
 SUCCESS = "next.success"
@@ -86,6 +87,7 @@ def dataset_features(
     *,
     effort_names: Sequence[str] = (),
     wrench_names: Sequence[str] = (),
+    expert: bool = False,
     subtask: bool = False,
     language: bool = False,
 ) -> dict[str, dict[str, Any]]:
@@ -99,6 +101,7 @@ def dataset_features(
         environment_names: the values of the environment state, in order; no such column if there are none.
         effort_names: the joints' efforts, in order; likewise.
         wrench_names: forces and moments on the tool, in order; likewise.
+        expert: whether it is recorded what an expert would do, with the action's floats.
         subtask: whether the brain reports its subtask.
         language: whether the subtask is stored in LeRobot's language column, too.
     """
@@ -121,6 +124,8 @@ def dataset_features(
         features[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
     if effort_names:
         features[EFFORT] = _vector("float32", effort_names)
+    if expert:
+        features[EXPERT_ACTION] = _vector("float32", action_names)
     if wrench_names:
         features[WRENCH] = _vector("float32", wrench_names)
     if physics_names:

@@ -25,6 +25,7 @@ class LoaderConfig:
         selection: which of these episodes; None means all.
         intervention_weight: how often frames with an intervention are drawn, compared with others; 0 drops them.
             Held-out samples are not weighted.
+        expert_action: serve what the expert would have done, `expert.action`, as `action`.
         eval_split: share of the episodes that is held out, from 0 to below 1.
         hold_out: what `eval_split` is a share of: `episode` or `instruction`; see `split_episodes`.
         max_eval_samples: at most about this many held-out samples, the first of each task; 0 means all.
@@ -52,6 +53,7 @@ class LoaderConfig:
     episodes: Sequence[int] | None = None
     selection: EpisodeFilter | None = None
     intervention_weight: float = 1.0
+    expert_action: bool = False
     eval_split: float = 0.0
     hold_out: str = "episode"
     max_eval_samples: int = 0

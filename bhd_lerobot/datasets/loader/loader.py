@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from bhd_lerobot.datasets.format.features import ACTION, EXPERT_ACTION
 from bhd_lerobot.datasets.loader.batches import BatchLoader, LeRobotLoader, Loader
 from bhd_lerobot.datasets.loader.check import check
 from bhd_lerobot.datasets.loader.config import LoaderConfig
@@ -17,7 +18,7 @@ from bhd_lerobot.datasets.loader.selection import EpisodeFilter, intervention_we
 from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.loader.table import FrameTable, checked_episodes
 from bhd_lerobot.datasets.loader.table_dataset import TableDataset
-from bhd_lerobot.errors import ConfigError, MemoryBudgetError, UnsupportedDatasetError
+from bhd_lerobot.errors import ConfigError, DatasetError, MemoryBudgetError, UnsupportedDatasetError
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -93,6 +94,8 @@ def make_loader(
     weights = intervention_weights(meta, train, config.intervention_weight)
     if config.use_imagenet_stats:
         imagenet_stats(meta)
+    if config.expert_action:
+        expert_stats(meta)
     whole, message = _in_memory(meta, chosen, config)
     if message:
         report(message)
@@ -141,6 +144,7 @@ def _in_memory(
             tolerance_s=config.tolerance_s,
             video_backend=config.video_backend,
             keep=config.keep,
+            sources={ACTION: EXPERT_ACTION} if config.expert_action else None,
             return_uint8=config.return_uint8,
             meta=meta,
         )
@@ -167,6 +171,9 @@ def _lerobot_dataset(
         return_uint8=config.return_uint8,
     )
     dataset.meta.stats = meta.stats
+    if config.expert_action:
+        frames = dataset.hf_dataset.remove_columns(ACTION)
+        dataset.hf_dataset = frames.rename_column(EXPERT_ACTION, ACTION)
     return dataset
 
 
@@ -193,6 +200,21 @@ def _per_task(task_index: Tensor, limit: int) -> Tensor:
     tasks = torch.unique(task_index).tolist()
     each = max(1, limit // len(tasks))
     return torch.cat([(task_index == task).nonzero()[:each, 0] for task in tasks])
+
+
+def expert_stats(meta: Any) -> None:
+    """Put the statistics of what the expert would have done in place of those of what was done.
+
+    Raises:
+        DatasetError: that was not recorded.
+    """
+    if EXPERT_ACTION not in meta.features:
+        raise DatasetError(
+            f"{meta.root} has no column {EXPERT_ACTION!r}: what an expert would have done was not recorded. Record it "
+            "with --dataset.expert_action=true, or leave selection.expert_action false."
+        )
+    if meta.stats:
+        meta.stats[ACTION] = meta.stats[EXPERT_ACTION]
 
 
 def imagenet_stats(meta: Any) -> None:

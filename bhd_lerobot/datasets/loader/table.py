@@ -96,6 +96,7 @@ class FrameTable:
         meta_or_root: "LeRobotDatasetMetadata | Path | str",
         episodes: Sequence[int] | None = None,
         keys: Collection[str] | None = None,
+        sources: Mapping[str, str] | None = None,
     ) -> "FrameTable":
         """Read the data files of a dataset on this machine.
 
@@ -103,6 +104,7 @@ class FrameTable:
             meta_or_root: LeRobot's metadata, or the folder of the dataset.
             episodes: indices of the episodes to read; None reads all.
             keys: features to read besides LeRobot's index columns; None reads all. Videos are skipped.
+            sources: features whose values are read from another column of the same shape, by name.
 
         Raises:
             DatasetError: no dataset, no frame, an unknown feature or episode.
@@ -118,7 +120,7 @@ class FrameTable:
             for key, feature in meta.features.items()
             if feature["dtype"] != "video" and (keys is None or key in keys or key in DEFAULT_FEATURES)
         ]
-        return cls(meta, _read(meta, wanted, stored), stored)
+        return cls(meta, _read(meta, wanted, stored, sources or {}), stored)
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -191,7 +193,10 @@ def checked_episodes(meta: Any, episodes: Sequence[int] | None) -> list[int]:
     return wanted
 
 
-def _read(meta: "LeRobotDatasetMetadata", episodes: Sequence[int], keys: Sequence[str]) -> pa.Table:
+def _read(
+    meta: "LeRobotDatasetMetadata", episodes: Sequence[int], features: Sequence[str], sources: Mapping[str, str]
+) -> pa.Table:
+    keys = list(dict.fromkeys(sources.get(key, key) for key in features))
     chunks, files = meta.episodes["data/chunk_index"], meta.episodes["data/file_index"]
     slots = {(chunks[episode], files[episode]) for episode in episodes}
     paths = sorted(meta.root / meta.data_path.format(chunk_index=chunk, file_index=file) for chunk, file in slots)
@@ -216,7 +221,7 @@ def _read(meta: "LeRobotDatasetMetadata", episodes: Sequence[int], keys: Sequenc
     lost = np.setdiff1d(wanted, found)
     if len(lost):
         raise corrupt(meta.root / "data", f"episode {lost[0]} is in none of its files")
-    return table
+    return pa.table({key: table[sources.get(key, key)] for key in features})
 
 
 def _tensor(key: str, column: pa.ChunkedArray, shape: tuple[int, ...]) -> Tensor:

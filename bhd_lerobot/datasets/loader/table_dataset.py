@@ -42,6 +42,7 @@ class TableDataset:
         tolerance_s: float = 1e-4,
         video_backend: str | None = "pyav",
         keep: Collection[str] | None = None,
+        sources: Mapping[str, str] | None = None,
         revision: str | None = None,
         return_uint8: bool = False,
         meta: "LeRobotDatasetMetadata | None" = None,
@@ -57,6 +58,7 @@ class TableDataset:
             image_transforms: applied to the images of each sample.
             tolerance_s: by how much a video frame may miss its time [s].
             video_backend: LeRobot's decoder whose images are wanted.
+            sources: features whose values are another column's, by name.
             keep: features to serve besides LeRobot's index columns and `task`; None serves all. Cameras that are left
                 out are not decoded.
             revision: version of the dataset on the Hub.
@@ -79,7 +81,7 @@ class TableDataset:
         deltas = delta_indices(self.meta, delta_timestamps, tolerance_s, keep)
         check_memory(self.meta, wanted, cameras, budget_gib, keep)
         try:
-            self.table = FrameTable.open(self.meta, wanted, keep)
+            self.table = FrameTable.open(self.meta, wanted, keep, sources)
         except MemoryError as error:
             raise MemoryBudgetError(f"Memory ran out while the columns of {self.root} were read") from error
         self._frames = FrameCache(self.table, cameras, tolerance_s, video_backend or "pyav")

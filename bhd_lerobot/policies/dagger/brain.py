@@ -99,6 +99,7 @@ class DaggerBrain:
             )
         self.uses_images = learner.uses_images or expert.uses_images
         self.has_plan = expert.has_plan
+        self._advised: Array | None = None
         self._watches: list[Watch] = []
         self._collision: Watch | None = None
         self._hold: int | None = None
@@ -156,6 +157,7 @@ class DaggerBrain:
         running = np.ones(len(self._driving), np.bool_) if observation.running is None else observation.running
         wanted = self._ask_learner(observation, running)
         advised = None if self._goals else _setpoints(self.expert.act(observation), self.expert.name, "expert")
+        self._advised = advised
         self._decide(observation, wanted, advised, running)
         self._shown = self._driving & running
         if self._goals is not None:
@@ -163,6 +165,18 @@ class DaggerBrain:
         if advised is None:
             raise AssertionError("An expert that gives no goals gives setpoints.")
         return np.where(self._driving[:, None], advised, wanted)
+
+    @property
+    def gives_advice(self) -> bool:
+        """Whether `advice` knows what the expert would do."""
+        return self._goals is None
+
+    def advice(self) -> Array | None:
+        """Return what the expert would do in the frame that `act` decided last, shape (n, actions), whoever drives.
+
+        None for an expert that gives goals.
+        """
+        return self._advised
 
     def interventions(self) -> NDArray[np.bool_]:
         """Return which robots the expert drives, shape (n,)."""
