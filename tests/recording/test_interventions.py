@@ -9,7 +9,10 @@ import pytest
 
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.commands import Goals, Mixed
+from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.loader.loader import LoaderConfig, make_loader
+from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.policies.baselines import NoopConfig, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
@@ -305,3 +308,44 @@ def test_what_ends_an_episode_is_not_overwritten() -> None:
 )
 def test_spans(mask: list[int], expected: list[tuple[int, int]]) -> None:
     assert spans(np.array(mask, np.bool_)) == expected
+
+
+# --- what the expert would do ----------------------------------------------------------------------------------------
+
+
+def test_what_the_expert_would_do_is_recorded_in_every_frame_and_learned_from_in_place_of_what_was_done(
+    tmp_path: Path,
+) -> None:
+    driven, alone, both = tmp_path / "driven", tmp_path / "alone", tmp_path / "both"
+    run_record(driven, **AVOID, brain__patience_s=1, dataset__num_episodes=2, dataset__expert_action=True)
+    columns = {key: np.array(values) for key, values in data_columns(driven).items()}
+    advice, action = columns["expert.action"], columns["action"]
+    by_expert = columns["event"] == int(Event.INTERVENTION)
+    assert np.array_equal(advice[by_expert], action[by_expert])
+    assert (np.abs(advice - action)[~by_expert].max(axis=1) > 0.01).mean() > 0.5  # the learner knows nothing
+    # It is what the expert really does there: with it alone, the first frame of an episode begins alike.
+    options = {"brain__type": "gap_follower", "dataset__num_episodes": 2, "dataset__expert_action": True}
+    run_record(alone, **{key: value for key, value in AVOID.items() if not key.startswith("brain")}, **options)
+    rule = {key: np.array(values) for key, values in data_columns(alone).items()}
+    assert np.array_equal(rule["expert.action"], rule["action"])
+    assert np.array_equal(rule["action"][rule["frame_index"] == 0], advice[columns["frame_index"] == 0])
+    # Together they are one dataset, of which both loaders serve the expert's actions, with their statistics.
+    merge([driven, alone], both)
+    wanted = np.concatenate([advice, rule["action"]])
+    for budget in (4.0, 1e-4):
+        loading = LoaderConfig(
+            batch_size=7, expert_action=True, budget_gib=budget, delta_timestamps={"action": [0.0, 0.1]}
+        )
+        loaders = make_loader("t/t", loading, root=both, report=lambda _: None)
+        for batch in loaders.train:
+            assert np.array_equal(batch["action"][:, 0].numpy(), wanted[batch["index"].numpy()].astype(np.float32))
+        stats = loaders.dataset.meta.stats["action"]
+        assert np.allclose(stats["mean"], wanted.mean(axis=0), atol=1e-5)
+
+
+def test_who_is_no_expert_gives_no_advice(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"brain.type is 'dagger', with an expert that gives goals\. Use a rule"):
+        run_record(tmp_path / "goals", **REACH, dataset__expert_action=True)
+    run_record(tmp_path / "without", **AVOID, brain__patience_s=1, dataset__num_episodes=1)
+    with pytest.raises(DatasetError, match=r"has no column 'expert.action'.*--dataset.expert_action=true"):
+        make_loader("t/t", LoaderConfig(batch_size=7, expert_action=True), root=tmp_path / "without")
