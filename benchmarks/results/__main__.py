@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.results.adaptation import fine_tune
+from benchmarks.results.aggregation import aggregate
 from benchmarks.results.learning import avoid, pick, reach
 from benchmarks.results.page import write_page
 from benchmarks.results.runner import REPOSITORY, FailedError, Runner
@@ -18,6 +19,7 @@ from benchmarks.results.speed import navigate, speed
 # Name, title, and what runs the commands and fills the section.
 MEASURES = (
     ("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),
+    ("aggregate", "Avoid, by aggregation: the rule corrects its clone", aggregate),
     ("reach", "Reach: a UR5 brings its tool to a pose", reach),
     ("pick", "Pick, from state: a UR5 picks up what an instruction names", pick),
     ("fine_tune", "Fine-tune: 10 episodes of a shifted world", fine_tune),

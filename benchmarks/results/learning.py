@@ -13,7 +13,7 @@ from bhd_lerobot.evaluation.statistics import mean_difference, ratio_of_means
 EPISODES = 500
 TOOL = ("--robot.action_space=tool", "--robot.tool_pose=true")
 _ROAMING = ("gap_follower", "avoidance")
-_TRAIL = ("--task.trail=true",)
+TRAIL = ("--task.trail=true",)
 _PICK_EPISODES = 10_000
 _AVOID_TRAIN_S, _PPO_TRAIN_S, _PICK_TRAIN_S = 120, 1200, 3600
 _REACH_GOAL, _PICK_GOAL, _PPO_GOAL = 0.97, 0.85, 1.2
@@ -23,7 +23,7 @@ def avoid(run: Runner, section: Section) -> None:
     """Cloning rules, and reinforcement learning, on the avoid task."""
     record(run, "avoid_record", "turtlebot3_avoid", "avoid/data", episodes=200, options=("--seed=100",))
     seconds = train(run, "avoid_bc", "bc_turtlebot3_avoid", "avoid/bc", "avoid/data")
-    gap = ("--seed=100", "--brain.type=gap_follower", *_TRAIL)
+    gap = ("--seed=100", "--brain.type=gap_follower", *TRAIL)
     record(run, "avoid_gap_record", "turtlebot3_avoid", "avoid/gap_data", episodes=400, options=gap)
     train(run, "avoid_gap_bc", "bc_turtlebot3_avoid", "avoid/gap_bc", "avoid/gap_data")
     start = (
@@ -41,7 +41,7 @@ def avoid(run: Runner, section: Section) -> None:
         brains,
         rules=("gap_follower",),
         baseline="gap_follower",
-        options=_TRAIL,
+        options=TRAIL,
     )
     if _scores(with_trail, "gap_follower") != _scores(results, "gap_follower"):
         raise FailedError("A rule that does not use the trail did something else where the task reports it.")
@@ -55,13 +55,13 @@ def avoid(run: Runner, section: Section) -> None:
         brains,
         rules=("gap_follower",),
         baseline="gap_follower",
-        options=(*_TRAIL, "--robot.collision_monitor=true"),
+        options=(*TRAIL, "--robot.collision_monitor=true"),
     )
     for name in (*_ROAMING, "bc", *brains):
-        section.rows.append(_success_row(results, name))
+        section.rows.append(success_row(results, name))
         section.rows.append(Row(f"{name}: mean score", mean(results["brains"][name]["means"]["score"])))
     for name in ("gap_follower", *brains):
-        success = _success_row(monitored, name)
+        success = success_row(monitored, name)
         section.rows.append(replace(success, what=f"with the collision monitor, {success.what}"))
         score = mean(monitored["brains"][name]["means"]["score"])
         section.rows.append(Row(f"with the collision monitor, {name}: mean score", score))
@@ -113,7 +113,7 @@ def reach(run: Runner, section: Section) -> None:
         run, "reach_eval", "ur5_reach", {"bc": "reach/bc"}, rules=("reach",), baseline="reach", options=TOOL
     )
     for name in ("reach", "bc"):
-        section.rows.append(_success_row(results, name, _REACH_GOAL if name == "bc" else None))
+        section.rows.append(success_row(results, name, _REACH_GOAL if name == "bc" else None))
     section.rows.append(Row("bc: time of training", f"{seconds:.0f} s"))
 
 
@@ -123,7 +123,7 @@ def pick(run: Runner, section: Section) -> None:
     record(run, "pick_record", "ur5_pick", "pick/data", episodes=_PICK_EPISODES, options=options)
     seconds = train(run, "pick_bc", "bc_ur5_pick", "pick/bc", "pick/data")
     results = evaluate(run, "pick_eval", "ur5_pick", {"bc": "pick/bc"}, rules=("pick",), baseline="pick", options=TOOL)
-    section.rows.append(_success_row(results, "pick"))
+    section.rows.append(success_row(results, "pick"))
     success = results["brains"]["bc"]["success"]
     section.rows += [
         Row(
@@ -172,9 +172,10 @@ def evaluate(
     baseline: str,
     rules: Sequence[str] = (),
     options: Sequence[str] = (),
+    episodes: int = EPISODES,
 ) -> Any:
     """Evaluate checkpoints beside rules that the configuration names; return the results."""
-    episodes = 16 if run.is_short else EPISODES
+    episodes = 16 if run.is_short else episodes
     learned = [
         option
         for label, folder in brains.items()
@@ -210,7 +211,8 @@ def _failures(results: Any, name: str) -> int:
     return int(brain["episodes"] - brain["successes"])
 
 
-def _success_row(results: Any, name: str, goal: float | None = None) -> Row:
+def success_row(results: Any, name: str, goal: float | None = None) -> Row:
+    """Return the row of a brain's success."""
     brain = results["brains"][name]
     met = None if goal is None else brain["success"]["value"] >= goal
     what = f"{name}: success in {brain['episodes']}"

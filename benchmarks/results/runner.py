@@ -17,6 +17,7 @@ _MODULES = {
     "bhd-record": "bhd_lerobot.recording.record",
     "bhd-train": "bhd_lerobot.cli.train",
     "bhd-eval": "bhd_lerobot.evaluation.evaluate",
+    "bhd-data": "bhd_lerobot.cli.data.main",
 }
 
 
