@@ -21,7 +21,7 @@ MEASURES = (
     ("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),
     ("aggregate", "Avoid, by aggregation: the rule corrects its clone", aggregate),
     ("reach", "Reach: a UR5 brings its tool to a pose", reach),
-    ("pick", "Pick, from state: a UR5 picks up what an instruction names", pick),
+    ("pick", "Pick, from privileged state: a UR5 picks up what an instruction names", pick),
     ("fine_tune", "Fine-tune: 10 episodes of a shifted world", fine_tune),
     ("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),
     ("speed", "Speed", speed),

@@ -52,7 +52,7 @@ def aggregate(run: Runner, section: Section) -> None:
     seconds = sum(one.seconds for one in run.commands[:5])
     section.rows.append(Row("time from nothing to the first seed's policy", f"{seconds:.0f} s"))
     section.remarks.append(
-        f"The {len(SEEDS)} seeds are of the training; success from {min(rates):.1%} to {max(rates):.1%}. `clone` learned "
+        f"{len(SEEDS)} seeds of the training; success from {min(rates):.1%} to {max(rates):.1%}. `clone` learned "
         "from 400 episodes of `gap_follower` alone. It drove 200 more, in which the rule took over before collisions "
         "and said in every frame what it would do; the others learned that, from all 600."
     )

@@ -118,7 +118,7 @@ def reach(run: Runner, section: Section) -> None:
 
 
 def pick(run: Runner, section: Section) -> None:
-    """Cloning a rule on the pick task, from state."""
+    """Cloning a rule on the pick task, from privileged state."""
     options = (*TOOL, "--seed=100")
     record(run, "pick_record", "ur5_pick", "pick/data", episodes=_PICK_EPISODES, options=options)
     seconds = train(run, "pick_bc", "bc_ur5_pick", "pick/bc", "pick/data")
@@ -134,6 +134,10 @@ def pick(run: Runner, section: Section) -> None:
         ),
         Row("bc: time of training", f"{seconds:.0f} s", f"at most {_PICK_TRAIN_S} s", seconds <= _PICK_TRAIN_S),
     ]
+    section.remarks.append(
+        "Privileged state: both brains read where the objects are from the simulator, the policy with the one that the "
+        "instruction names in the first row and flagged. It has seen no image and read no word."
+    )
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------
