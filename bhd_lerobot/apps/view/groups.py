@@ -106,7 +106,8 @@ def sections(features: Mapping[str, Any], widths: Mapping[str, int], robot: str 
     add("Timing", list(_timing(widths)), is_open=True, kind="timing")
     if keys.REWARD in widths:
         add("Reward", [_plot("reward", "", [_line(keys.REWARD, 0, "reward")])], is_open=False)
-    for key, title in ((keys.ENVIRONMENT_STATE, "Environment state (privileged)"), (keys.PHYSICS_STATE, "Simulator state")):
+    privileged = (keys.ENVIRONMENT_STATE, "Environment state (privileged)"), (keys.PHYSICS_STATE, "Simulator state")
+    for key, title in privileged:
         if key in widths:
             add(title, list(_chunks(key, names(key), "")), is_open=False)
     for key in widths:

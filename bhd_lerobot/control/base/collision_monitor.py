@@ -66,13 +66,20 @@ class CollisionMonitor:
         self._seen_ns[ids] = -1
         self._age[ids] = self._oldest_ticks + 1
 
-    def see(self, ranges: NDArray[np.float64], stamp_ns: NDArray[np.int64], pose: NDArray[np.float64]) -> None:
+    def see(
+        self,
+        ranges: NDArray[np.float64],
+        stamp_ns: NDArray[np.int64],
+        pose: NDArray[np.float64],
+        age: NDArray[np.int64] | None = None,
+    ) -> None:
         """Take what was measured since the last tick.
 
         Args:
             ranges: the newest scan [m], shape (n, beams).
             stamp_ns: when it was taken: one that is not new is not taken again, shape (n,).
             pose: x, y [m] and yaw [rad] of the bases when it was taken, by odometry, shape (n, 3).
+            age: how many ticks ago that was, shape (n,); none if None.
         """
         self._age += 1
         new = stamp_ns != self._seen_ns
@@ -80,7 +87,7 @@ class CollisionMonitor:
             return
         for sim in np.flatnonzero(new):
             if np.isfinite(ranges[sim]).all():  # otherwise the last gets old, and the base stops
-                self._seen_ns[sim], self._age[sim] = stamp_ns[sim], 0
+                self._seen_ns[sim], self._age[sim] = stamp_ns[sim], 0 if age is None else age[sim]
                 self._keep(sim, ranges[sim], pose[sim])
         self._points, self._hidden = np.concatenate(self._near), np.concatenate(self._too_near)
         self._sims = np.repeat(np.arange(len(self._near)), [len(near) for near in self._near])

@@ -117,7 +117,7 @@ class BaseController(Controller):
         """Advance by one tick."""
         self.drive.update_odometry(reading.position)
         if self._monitor is not None:
-            self._monitor.see(reading.sensors[:, : self._monitor.beams], reading.sensors_ns, self._seen_from(reading))
+            self._watch(reading, self._monitor)
             self._settled = False  # the room that is left changes while commands stand
         if not self._settled:
             self._filter()
@@ -135,15 +135,17 @@ class BaseController(Controller):
         if self._ticks == self._next_look:
             self._look(reading.position)
 
-    def _seen_from(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return where the bases were when they measured what the sensors read, by odometry, shape (n, 3)."""
-        pose = self.drive.odometry
+    def _watch(self, reading: PlantReading, monitor: CollisionMonitor) -> None:
+        """Show the monitor the newest scans, from where the bases were when they took them."""
+        pose, ranges = self.drive.odometry, reading.sensors[:, : monitor.beams]
         if reading.stamp_ns is None:
-            return pose
+            monitor.see(ranges, reading.sensors_ns, pose)
+            return
         age = (reading.stamp_ns - reading.sensors_ns) / NANOSECONDS
         forward, turn = self.drive.twist_from_wheels(reading.velocity).T * age
         middle = pose[:, 2] - turn / 2
-        return pose - np.stack([forward * np.cos(middle), forward * np.sin(middle), turn], axis=1)
+        then = pose - np.stack([forward * np.cos(middle), forward * np.sin(middle), turn], axis=1)
+        monitor.see(ranges, reading.sensors_ns, then, np.rint(age / self._dt).astype(np.int64))
 
     def _look(self, position: NDArray[np.float64]) -> None:
         """Find bases with a wheel that does not turn as it is commanded to: it is blocked, or its encoder lies."""

@@ -1,6 +1,7 @@
 """What a base does that is told to drive into things, in a simulated world and with scans that fail."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -115,6 +116,27 @@ def test_without_scans_of_the_last_three_periods_it_stands_and_goes_on_with_the_
         rig.send(0.2)
         rig.tick(SCAN_TICKS)
         assert rig.command[0] == pytest.approx(0.2, abs=0.005)
+
+
+def test_scans_that_come_too_late_are_none_of_the_present() -> None:
+    for late, moves in ((0.4, True), (0.7, False)):
+        rig = watched()
+        read = rig.plant.read
+
+        def stamped(out: Any, read: Any = read, rig: support.Rig = rig) -> None:
+            read(out)
+            out.stamp_ns = np.array([10**12 + rig.now])
+
+        rig.plant.read = stamped  # type: ignore[method-assign]
+        rig.cerebellum.stamp_origin_ns = 10**12
+        for tick in range(100):
+            if tick % 20 == 0:
+                rig.cerebellum.reading.sensors[:] = 3.0
+                rig.cerebellum.reading.sensors_ns[:] = 10**12 + rig.now - round(late * 1e9)
+                rig.send(0.2)
+            rig.tick()
+        assert rig.mode == Mode.TRACKING
+        assert (rig.command[0] > 0.1) == moves
 
 
 def test_beside_an_obstacle_only_what_leads_nearer_is_taken_away() -> None:
