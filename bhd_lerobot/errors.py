@@ -27,6 +27,10 @@ class InstructionError(BhdError, ValueError):
     """An instruction that is not understood or fits no single object, or a plan that cannot be carried out."""
 
 
+class PerceptionError(BhdError):
+    """A camera shows nothing that can be used, or what it shows is too uncertain to act on."""
+
+
 class CommandRefusedError(BhdError):
     """The cerebellum refused a well-formed command, for example because the emergency stop is latched."""
 

@@ -30,6 +30,26 @@ OBJECT_FIELDS = (
 it is a box; its pose in the base frame [m, unit quaternion]; its measures [m]; its colour, 0 to 1."""
 
 
+
+@dataclass(frozen=True)
+class CameraView:
+    """Where a fixed camera stands, and what it sees: a pinhole without distortion, upright.
+
+    Attributes:
+        position: of its centre in the base frame [m].
+        target: a point in the middle of its image, in the base frame [m].
+        fovy: vertical field of view [deg].
+    """
+
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    fovy: float
+
+
+SCENE_CAMERA = CameraView((1.22, -0.62, 0.78), (0.37, 0.02, 0.15), 48.0)
+"""The camera `scene` beside the table, where a scene's `Variation` does not move it."""
+
+
 @dataclass(frozen=True)
 class TableObject:
     """One object that stands on the table.

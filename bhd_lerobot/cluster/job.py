@@ -21,7 +21,9 @@ from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Observation
-from bhd_lerobot.policies.learned.brain import LearnedBrainConfig, find_checkpoint
+from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
+from bhd_lerobot.policies.learned.checkpoint import find_checkpoint
+from bhd_lerobot.policies.perception.perceiver import PerceptionOptions
 from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
@@ -118,10 +120,11 @@ def unpacked(job: Job) -> Iterator[Any]:
             config.path = path
 
 
-def _learned(config: Any) -> Iterator[LearnedBrainConfig]:
+def _learned(config: Any) -> Iterator[LearnedBrainConfig | PerceptionOptions]:
     """Yield the trained policies in a brain's configuration, which may hold other brains."""
-    if isinstance(config, LearnedBrainConfig):
-        yield config
+    if isinstance(config, LearnedBrainConfig | PerceptionOptions):
+        if config.path:
+            yield config
     elif dataclasses.is_dataclass(config):
         for one in dataclasses.fields(config):
             yield from _learned(getattr(config, one.name))

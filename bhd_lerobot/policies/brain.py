@@ -105,10 +105,12 @@ class Brain(Protocol):
     name: str
     robot_kind: str
     """The robots that it is for: ``"base"``, ``"arm"``, or `ANY_ROBOT` if it finds out when it is bound."""
-    uses_images: bool
-    """Whether `act` uses the observation's images. If not, it is not kept waiting for them and may not get any."""
     has_plan: bool
     """Whether it works step by step, and `subtasks` and `plan` say what it does."""
+
+    @property
+    def uses_images(self) -> bool:
+        """Whether the next `act` uses the observation's images: if not, it does not wait for them and may get none."""
 
     def bind(self, robot: RobotFeatures) -> None:
         """Learn what robot it will drive.

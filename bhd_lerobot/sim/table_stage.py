@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Shape
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, SCENE_CAMERA, CameraView
 from bhd_lerobot.sim.backdrop import add_backdrop
 from bhd_lerobot.sim.engine import mujoco
 
@@ -21,6 +21,7 @@ PADS = ("pad_left", "pad_right")
 # the search for contacts. Below it they would touch it: a plane is solid all the way down.
 PARKED = tuple((3.0 * number, 0.0, 100.0) for number in range(MAX_OBJECTS))
 FLOOR = -0.75  # [m]
+_OVERVIEW = CameraView((1.75, -1.30, 0.95), (0.30, 0.0, 0.20), 29.0)
 _TABLE = (-0.35, 1.05, 0.70)  # edges behind and before the base, half the width [m]
 
 
@@ -35,11 +36,9 @@ def add_table_stage(spec: mujoco.MjSpec, arm: Arm, fixtures: Sequence[Shape] = (
     _add_room(spec)
     _add_table(spec)
     _add_lights(spec)
-    for name, position, target, fovy in (
-        ("scene", (1.22, -0.62, 0.78), (0.37, 0.02, 0.15), 48.0),
-        ("overview", (1.75, -1.30, 0.95), (0.30, 0.0, 0.20), 29.0),
-    ):
-        spec.worldbody.add_camera(name=name, pos=position, xyaxes=_towards(position, target), fovy=fovy)
+    for name, view in (("scene", SCENE_CAMERA), ("overview", _OVERVIEW)):
+        axes = _towards(view.position, view.target)
+        spec.worldbody.add_camera(name=name, pos=view.position, xyaxes=axes, fovy=view.fovy)
     for number in range(MAX_OBJECTS):
         _add_object(spec, number)
     _add_target(spec)

@@ -1,13 +1,23 @@
 """The brain that does what an instruction says: language to a plan of skills, skills to goals."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from bhd_lerobot.policies.brain import BrainConfig
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.control.commands import BrainCommand, CommandResult
+from bhd_lerobot.errors import PerceptionError
+from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures
 from bhd_lerobot.policies.language.instruction import RulePlanner
-from bhd_lerobot.policies.manipulation.grasp import SeenObject
-from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig, _Work
+from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject
+from bhd_lerobot.policies.manipulation.pick import MISSED, PickBrain, PickBrainConfig, Work
 from bhd_lerobot.policies.manipulation.skills import Plan, Planner, scene_object
+from bhd_lerobot.policies.perception.perceiver import PerceivedObject, Perceiver, PerceptionOptions
+
+_HOME_SPEED, _HOME_CHANGE = 1.5, 4.0  # [rad/s], [rad/s^2]
 
 
 @BrainConfig.register_subclass("language")
@@ -17,9 +27,26 @@ class LanguageBrainConfig(PickBrainConfig):
 
     Attributes:
         instruction: what to do, in English or Chinese; the task's instruction if empty.
+        perception: how it sees the objects; without, it asks the task, which in simulation knows the truth.
     """
 
     instruction: str = ""
+    perception: PerceptionOptions = field(default_factory=PerceptionOptions)
+
+
+@dataclass
+class _Sight:
+    """What was seen in one simulation.
+
+    Attributes:
+        objects: the objects, None until it is looked for them.
+        first: those that it saw first in this episode.
+        image: what the camera showed then; None once it has shown something else.
+    """
+
+    objects: list[PerceivedObject] | None = None
+    first: list[PerceivedObject] | None = None
+    image: NDArray[np.uint8] | None = None
 
 
 class LanguageBrain(PickBrain):
@@ -28,22 +55,134 @@ class LanguageBrain(PickBrain):
     It does not use which object the task marks. An instruction that it does not understand, or that fits no object
     or several, is not carried out: its subtask says why.
 
+    With `config.perception` it uses nothing that the task tells. It looks once before it moves; that the camera lives
+    it sees by the arm, which has moved before the tool goes down; and after a grasp that failed it goes home and looks
+    again. What it is not sure enough of, it does not touch.
+
     Args:
         config: the parameters.
         planner: what turns instructions into plans; the rules if None. A language model goes here.
+
+    Raises:
+        ConfigError: the perception's checkpoint cannot be used.
     """
 
     name = "language"
 
     def __init__(self, config: LanguageBrainConfig | None = None, planner: Planner | None = None) -> None:
-        super().__init__(config or LanguageBrainConfig())
+        self.settings = config or LanguageBrainConfig()
+        super().__init__(self.settings)
         self._planner = planner or RulePlanner()
+        self.perceiver = Perceiver(self.settings.perception) if self.settings.perception.path else None
+        self._sights: dict[int, _Sight] = {}
+
+    @property
+    def uses_images(self) -> bool:  # type: ignore[override]
+        """Whether it is about to look at something."""
+        if self.perceiver is None:
+            return False
+        return not self._sights or any(one.objects is None or one.image is not None for one in self._sights.values())
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
         """Take the instruction of the episode, or that of the configuration."""
-        config = self.config
-        own = config.instruction if isinstance(config, LanguageBrainConfig) else ""
-        super().begin_episode(sim, seed, own or instruction)
+        super().begin_episode(sim, seed, self.settings.instruction or instruction)
+        self._sights[sim] = _Sight()
 
-    def _make_plan(self, work: _Work, objects: Sequence[SeenObject]) -> Plan:
-        return self._planner.plan(work.instruction, [scene_object(item) for item in objects])
+    def plan(self, sim: int) -> dict[str, Any]:
+        """Return the plan of one simulation, how far it got, what was in the way, and what was seen first."""
+        plan = super().plan(sim)
+        if self.perceiver is not None:
+            plan["seen"] = [_plain(one) for one in self._sights[sim].first or ()]
+        return plan
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters, and which weights it sees with."""
+        values = super().parameters()
+        if self.perceiver is not None:
+            values["perception"] |= {"weights": self.perceiver.weights, "dataset": self.perceiver.dataset}
+        return values
+
+    def decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
+        """Return the next goal of the plan."""
+        if self.perceiver is not None and result is not None:
+            sight = self._sights[sim]
+            if sight.image is not None:
+                if np.array_equal(sight.image, seen.images[self.perceiver.camera][sim]):
+                    camera = self.perceiver.camera
+                    return self._give_up(sim, f"the camera {camera!r} shows the same image although the arm has moved")
+                sight.image = None
+        return super().decide(sim, seen, result)
+
+    def _find_objects(self, robot: RobotFeatures) -> None:
+        if self.perceiver is None:
+            super()._find_objects(robot)
+
+    def _objects(self, sim: int, seen: Observation) -> Sequence[SeenObject]:
+        if self.perceiver is None:
+            return super()._objects(sim, seen)
+        sight = self._sights[sim]
+        if sight.objects is None:
+            sight.objects = self.perceiver.look(seen.images, sim)
+            if sight.first is None:
+                sight.first, sight.image = sight.objects, seen.images[self.perceiver.camera][sim].copy()
+        return sight.objects
+
+    def _make_plan(self, work: Work, objects: Sequence[SeenObject]) -> Plan:
+        plan = self._planner.plan(work.instruction, [scene_object(item) for item in objects])
+        target = next(one for one in objects if one.index == plan.target)
+        if isinstance(target, PerceivedObject):
+            self._check(target)
+        return plan
+
+    def _check(self, target: PerceivedObject) -> None:
+        options, name = self.settings.perception, scene_object(target).name
+        if target.certainty < options.min_certainty:
+            raise PerceptionError(
+                f"It is not certain that there is a {name}: {target.certainty:.0%}, which is less than "
+                f"perception.min_certainty ({options.min_certainty:.0%})."
+            )
+        if target.error_90_m > options.max_error_m:
+            raise PerceptionError(
+                f"Where the {name} is, is known to {1000 * target.error_90_m:.0f} mm only, which is more than "
+                f"perception.max_error_m ({1000 * options.max_error_m:.0f} mm)."
+            )
+
+    def _choose_grasp(self, target: SeenObject, others: Sequence[SeenObject]) -> Grasp | None:
+        grasp = super()._choose_grasp(target, others)
+        if grasp is None or not isinstance(target, PerceivedObject):
+            return grasp
+        # The fingers need more room beside what is not known exactly.
+        return replace(grasp, opening=min(MAX_OPENING, grasp.opening + 2 * target.error_90_m))
+
+    def _is_lifted(self, opening: float, grasp: Grasp, target: SeenObject) -> bool:
+        if self.perceiver is None:
+            return super()._is_lifted(opening, grasp, target)
+        return opening >= grasp.width - MISSED  # what slipped out is not between the fingers
+
+    def _next(self, sim: int, target: SeenObject, objects: Sequence[SeenObject]) -> BrainCommand | None:
+        work = self._work[sim]
+        if self.perceiver is None or work.stage != "back":
+            return super()._next(sim, target, objects)
+        # The object may stand elsewhere now, and the arm hides it: go home, look again, and plan anew.
+        work.stage, work.plan, work.grasp, self._sights[sim].objects = "home", None, None, None
+        return BrainCommand(
+            self.new_id(sim, "home"),
+            joint_target=_HOME[:-1],
+            max_velocity=_HOME_SPEED,
+            max_acceleration=_HOME_CHANGE,
+        )
+
+
+_HOME = ur5().home
+
+
+def _plain(one: PerceivedObject) -> dict[str, Any]:
+    return {
+        "name": scene_object(one).name,
+        "position": [round(value, 5) for value in one.position],
+        "yaw": round(one.yaw, 4),
+        "size": [round(value, 4) for value in one.size],
+        "error_50_m": round(one.error_50_m, 5),
+        "error_90_m": round(one.error_90_m, 5),
+        "certainty": round(one.certainty, 4),
+    }

@@ -4,7 +4,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from hashlib import file_digest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Observation, RobotFeatures
-from bhd_lerobot.policies.learned.contract import WEIGHT_FILES, PolicyContract, find_checkpoint
+from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, weights_digest
+from bhd_lerobot.policies.learned.contract import PolicyContract
 
 if TYPE_CHECKING:
     from bhd_lerobot.policies.learned.inference import Rows
@@ -199,7 +199,7 @@ class LearnedBrain:
             "type": "learned",
             "path": self.config.path,
             "policy": self.loaded.kind,
-            "weights": self._digest,
+            "weights": self._weights,
             "n_action_steps": getattr(self.loaded.config, "n_action_steps", 1),
             "sample": self.config.sample,
             "stream": self.config.stream,
@@ -210,9 +210,8 @@ class LearnedBrain:
         }
 
     @cached_property
-    def _digest(self) -> str:
-        with (self.loaded.folder / WEIGHT_FILES[0]).open("rb") as file:
-            return f"sha256:{file_digest(file, 'sha256').hexdigest()}"
+    def _weights(self) -> str:
+        return weights_digest(self.loaded.folder)
 
     def _rows(self, observation: Observation) -> "Rows":
         """Return the policy's inputs of all simulations, shape (n, …)."""

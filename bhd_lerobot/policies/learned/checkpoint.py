@@ -1,6 +1,7 @@
 """Where a trained policy lies: in which folder of a run, or on the Hub."""
 
 import re
+from hashlib import file_digest
 from pathlib import Path
 
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
@@ -14,6 +15,12 @@ WEIGHT_FILES = ("model.safetensors", "adapter_model.safetensors")
 """LeRobot's and PEFT's names of a policy's weights."""
 
 _HUB_ID = re.compile(r"[\w][\w.-]*/[\w][\w.-]*")
+
+
+def weights_digest(folder: Path) -> str:
+    """Return which weights a checkpoint's folder holds: ``sha256:`` and the digest of their file."""
+    with (folder / WEIGHT_FILES[0]).open("rb") as file:
+        return f"sha256:{file_digest(file, 'sha256').hexdigest()}"
 
 
 def find_checkpoint(path: str | Path, revision: str | None = None) -> Path:

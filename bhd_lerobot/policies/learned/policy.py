@@ -26,6 +26,7 @@ from bhd_lerobot.plugins import load_plugins
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import CONFIG_FILE, camera_name
 from bhd_lerobot.policies.mlp import configuration_mlp  # noqa: F401 - registers bhd_mlp
+from bhd_lerobot.policies.perception import configuration_perception  # noqa: F401 - registers bhd_perception
 
 
 @dataclass(frozen=True)
@@ -75,12 +76,7 @@ def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = 
     Raises:
         ConfigError: the checkpoint cannot be loaded or does not fit, with the cause and the remedy.
     """
-    try:
-        is_there = is_torch_device_available(device)
-    except (ValueError, RuntimeError):
-        is_there = False
-    if not is_there:
-        raise ConfigError(f"brain.device is {device!r}, which this machine does not have. Set --brain.device=cpu.")
+    _check_device("brain.device", device)
     config = _config(folder, device)
     if n_action_steps is not None:
         _set_action_steps(config, n_action_steps)
@@ -91,6 +87,42 @@ def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = 
                 "again; if a LeRobot before 0.4 wrote it, convert it with LeRobot's migrate_policy_normalization.py."
             )
     check_checkpoint(folder)
+    policy, before, after = _load(folder, config, device)
+    return LoadedPolicy(folder, policy, before, after, *_inputs(config, before))
+
+
+def load_perception(folder: Path, device: str = "cpu") -> Any:
+    """Return the `bhd_perception` of a checkpoint, in evaluation mode.
+
+    Args:
+        folder: a checkpoint's folder `pretrained_model`.
+        device: where it runs.
+
+    Raises:
+        ConfigError: the checkpoint cannot be loaded, or is of a policy that gives actions.
+    """
+    _check_device("brain.perception.device", device)
+    config = _config(folder, device)
+    if config.type != "bhd_perception":
+        raise ConfigError(
+            f"brain.perception.path is {str(folder)!r}, a {config.type!r}; perception is a 'bhd_perception'. A policy "
+            "that gives actions is a brain of its own: --brain.path."
+        )
+    check_checkpoint(folder)
+    return _load(folder, config, device)[0]
+
+
+def _check_device(option: str, device: str) -> None:
+    try:
+        is_there = is_torch_device_available(device)
+    except (ValueError, RuntimeError):
+        is_there = False
+    if not is_there:
+        raise ConfigError(f"{option} is {device!r}, which this machine does not have. Set --{option}=cpu.")
+
+
+def _load(folder: Path, config: Any, device: str) -> tuple[Any, Any, Any]:
+    """Return policy, in evaluation mode, and processors."""
     try:
         # LeRobot prints where it loads from, and without `strict` it would go on with weights that are not there.
         with contextlib.redirect_stdout(io.StringIO()):
@@ -111,7 +143,7 @@ def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = 
             "interrupted while it was written or copied; use an earlier checkpoint of the run, or copy it again."
         ) from error
     policy.eval()
-    return LoadedPolicy(folder, policy, before, after, *_inputs(config, before))
+    return policy, before, after
 
 
 def _config(folder: Path, device: str) -> Any:

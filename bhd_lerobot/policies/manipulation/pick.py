@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.bodies.ur5 import MAX_OPENING
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
-from bhd_lerobot.errors import InstructionError
+from bhd_lerobot.errors import InstructionError, PerceptionError
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain, GoalBrainConfig
 from bhd_lerobot.policies.manipulation.grasp import (
@@ -24,7 +24,7 @@ from bhd_lerobot.policies.manipulation.grasp import (
 from bhd_lerobot.policies.manipulation.skills import Plan, Skill, make_plan, scene_object
 
 _SQUEEZE = 0.03  # [m] how far inside the object the fingers are sent: the gripper's force limit does the rest
-_MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers
+MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers
 _TRAVEL = 0.22  # [m] height of the tool above the table on free motions: the finger tips stay above every object
 _LIFTED = 0.05  # [m] an object that was lifted by less slipped out
 _POSITION = [OBJECT_FIELDS.index(axis) for axis in "xyz"]
@@ -51,7 +51,7 @@ class PickBrainConfig(GoalBrainConfig):
 
 
 @dataclass
-class _Work:
+class Work:
     """What is known and under way in one simulation."""
 
     instruction: str = ""
@@ -74,15 +74,18 @@ class PickBrain(GoalBrain):
 
     def __init__(self, config: PickBrainConfig | None = None) -> None:
         super().__init__(config or PickBrainConfig())
-        self._work: dict[int, _Work] = {}
+        self._work: dict[int, Work] = {}
         self._columns: NDArray[np.intp] = np.zeros(0, np.intp)
         self._opening = 0
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the objects and the gripper."""
+        self._find_objects(robot)
+        self._opening = int(find_columns(robot.observation_names, ["gripper.pos"], self.name, "observation")[0])
+
+    def _find_objects(self, robot: RobotFeatures) -> None:
         wanted = [f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS]
         self._columns = find_columns(robot.environment_names, wanted, self.name, "environment")
-        self._opening = int(find_columns(robot.observation_names, ["gripper.pos"], self.name, "observation")[0])
 
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the plan of one simulation, how far it got, and what was in the way."""
@@ -97,7 +100,7 @@ class PickBrain(GoalBrain):
             "problem": work.problem,
         }
 
-    def _make_plan(self, work: _Work, objects: Sequence[SeenObject]) -> Plan:
+    def _make_plan(self, work: Work, objects: Sequence[SeenObject]) -> Plan:
         """Return the plan for what is on the table.
 
         Raises:
@@ -113,19 +116,18 @@ class PickBrain(GoalBrain):
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
         """Take the instruction."""
-        self._work[sim] = _Work(instruction)
+        self._work[sim] = Work(instruction)
 
     def decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
         """Return the next goal of the plan."""
         work = self._work[sim]
-        objects = self._objects(sim, seen)
-        if work.plan is None:
-            try:
+        try:
+            objects = self._objects(sim, seen)
+            if work.plan is None:
                 work.plan = self._make_plan(work, objects)
-            except InstructionError as error:
-                return self._give_up(sim, str(error))
-            work.step = 1  # the object was located when the plan was made
-            work.stage = ""
+                work.step, work.stage = 1, ""  # the object was located when the plan was made
+        except (InstructionError, PerceptionError) as error:
+            return self._give_up(sim, str(error))
         target = next((item for item in objects if item.index == work.plan.target), None)
         if target is None:
             return self._give_up(sim, "the object is gone")
@@ -162,11 +164,15 @@ class PickBrain(GoalBrain):
         """Return the goal that brings the open gripper above the object."""
         work = self._work[sim]
         others = [item for item in objects if item.index != target.index]
-        work.grasp = plan_grasp(target, others, MAX_OPENING)
+        work.grasp = self._choose_grasp(target, others)
         if work.grasp is None:
             return self._give_up(sim, f"the {scene_object(target).name} does not fit between the fingers")
         work.attempts += 1
         return self._free(sim, "above", work.grasp, opening=work.grasp.opening)
+
+    def _choose_grasp(self, target: SeenObject, others: Sequence[SeenObject]) -> Grasp | None:
+        """Return how to grasp the object; None if it does not fit between the fingers."""
+        return plan_grasp(target, others, MAX_OPENING)
 
     def _carry_out(self, sim: int, skill: Skill, grasp: Grasp) -> BrainCommand | None:
         """Return the next goal of a skill that needs the grasp."""
@@ -216,11 +222,15 @@ class PickBrain(GoalBrain):
         if work.grasp is None:
             return ""
         opening = float(seen.state[sim, self._opening])
-        if work.stage == "close" and opening < work.grasp.width - _MISSED:
+        if work.stage == "close" and opening < work.grasp.width - MISSED:
             return f"the gripper closed to {opening * 1000:.0f} mm and holds nothing"
-        if work.stage == "lift" and target.position[2] < target.size[2] / 2 + _LIFTED:
+        if work.stage == "lift" and not self._is_lifted(opening, work.grasp, target):
             return "the object was not lifted"
         return ""
+
+    def _is_lifted(self, opening: float, grasp: Grasp, target: SeenObject) -> bool:
+        """Return whether the object came up with the gripper, whose fingers are this far apart [m]."""
+        return target.position[2] >= target.size[2] / 2 + _LIFTED
 
     def _give_up(self, sim: int, problem: str) -> BrainCommand | None:
         self._work[sim].problem = problem
@@ -249,7 +259,7 @@ class PickBrain(GoalBrain):
             max_acceleration=config.line_acceleration,
         )
 
-    def _objects(self, sim: int, seen: Observation) -> list[SeenObject]:
+    def _objects(self, sim: int, seen: Observation) -> Sequence[SeenObject]:
         if seen.environment_state is None:
             raise AssertionError("The brain was bound to the objects.")
         table = seen.environment_state[sim, self._columns].reshape(MAX_OBJECTS, len(OBJECT_FIELDS))

@@ -1,0 +1,200 @@
+"""Configuration of `bhd_perception`: an image in, the objects on the table out."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.optim import AdamWConfig, LRSchedulerConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
+
+from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS, SCENE_CAMERA, CameraView
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.perception.camera import Projection, Region
+
+STRIDE = 4  # [px] of the image for each cell of the grid that the network answers on
+LABELS = tuple(f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS)
+
+
+@PreTrainedConfig.register_subclass("bhd_perception")
+@dataclass
+class PerceptionConfig(PreTrainedConfig):
+    """Configuration of the policy type ``bhd_perception``.
+
+    It reads one image. The true poses in `observation.environment_state` are what it learns to say, never an input.
+
+    Attributes:
+        camera: name of the camera that it looks through.
+        camera_position: where that camera stands unless it is moved, x, y, z in the base frame [m].
+        camera_target: a point in the middle of its image, likewise.
+        camera_fovy: its vertical field of view [deg].
+        area: where objects stand, in the base frame: smallest x, smallest y, largest x, largest y [m].
+        object_height: the tallest object [m].
+        margin: by how much the camera may be moved, as a share of the image's width that is looked at around the area.
+        channels: of the network where the image is finest.
+        hidden: of the network where it is coarser.
+        context: numbers that describe the whole image: where the camera stands, and the light.
+        brightness: images are made brighter and darker by up to this share in training.
+        least_presence: probability from which on something counts as an object.
+        optimizer_lr: learning rate of AdamW.
+        optimizer_weight_decay: of weights.
+        optimizer_grad_clip_norm: largest norm of the gradient.
+        scheduler_warmup_steps: steps of the warm-up, after which the learning rate goes to 0 along a cosine.
+    """
+
+    camera: str = "scene"
+    camera_position: list[float] = field(default_factory=lambda: list(SCENE_CAMERA.position))
+    camera_target: list[float] = field(default_factory=lambda: list(SCENE_CAMERA.target))
+    camera_fovy: float = SCENE_CAMERA.fovy
+    area: list[float] = field(default_factory=lambda: [0.35, -0.30, 0.65, 0.30])
+    object_height: float = 0.13
+    margin: float = 0.06
+    channels: int = 32
+    hidden: int = 48
+    context: int = 64
+    brightness: float = 0.2
+    least_presence: float = 0.3
+
+    n_obs_steps: int = 1
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict.fromkeys(("VISUAL", "ENV", "STATE", "ACTION"), NormalizationMode.IDENTITY)
+    )
+    optimizer_lr: float = 2e-3
+    optimizer_weight_decay: float = 1e-4
+    optimizer_grad_clip_norm: float = 5.0
+    scheduler_warmup_steps: int = 250
+
+    # LeRobot's class says so as well, but without types.
+    input_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
+    output_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        super().__post_init__()
+        for name, count in (("camera_position", 3), ("camera_target", 3), ("area", 4)):
+            values = getattr(self, name)
+            if len(values) != count or not all(map(math.isfinite, values)):
+                raise ConfigError(f"policy.{name} is {values}; it must be {count} finite numbers [m].")
+        if not (self.area[0] < self.area[2] and self.area[1] < self.area[3]):
+            raise ConfigError(f"policy.area is {self.area}; it must be smallest x, smallest y, largest x, largest y.")
+        if self.camera_position[2] <= 0.0 or self.camera_target[:2] == self.camera_position[:2]:
+            raise ConfigError(
+                f"policy.camera_position is {self.camera_position} and policy.camera_target {self.camera_target}; the "
+                "camera must stand above the table, and not look straight down."
+            )
+        for name, low, high in (
+            ("camera_fovy", 0.0, 180.0),
+            ("object_height", 0.0, math.inf),
+            ("least_presence", 0.0, 1.0),
+        ):
+            if not low < getattr(self, name) < high:
+                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be between {low:g} and {high:g}.")
+        for name in ("margin", "brightness"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be from 0 to below 1.")
+        for name in ("channels", "hidden", "context"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least 1.")
+
+    @property
+    def image_key(self) -> str:
+        """The image's key in datasets and batches."""
+        return f"{OBS_IMAGES}.{self.camera}"
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the image [px]."""
+        _, height, width = (self.input_features or {})[self.image_key].shape
+        return int(width), int(height)
+
+    @property
+    def projection(self) -> Projection:
+        """The camera where it is not moved, with the size of its images."""
+        position, target = (tuple(values) for values in (self.camera_position, self.camera_target))
+        view = CameraView(position, target, self.camera_fovy)  # type: ignore[arg-type]
+        return Projection(view, *self.image_size)
+
+    @property
+    def region(self) -> Region:
+        """The part of the image in which objects may be.
+
+        Raises:
+            ConfigError: the camera sees nothing of the area.
+        """
+        x0, y0, x1, y1 = self.area
+        try:
+            return self.projection.region((x0, y0, 0.0), (x1, y1, self.object_height), self.margin, 2 * STRIDE)
+        except ValueError as error:
+            raise ConfigError(
+                f"policy.area is {self.area}, of which the camera at {self.camera_position} that looks at "
+                f"{self.camera_target} sees nothing."
+            ) from error
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """Only the present image."""
+        return None
+
+    @property
+    def action_delta_indices(self) -> None:
+        """No actions."""
+        return None
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """No rewards."""
+        return None
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        """Return AdamW."""
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig:
+        """Return a warm-up, and a cosine to 0."""
+        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+
+    def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
+        """Check that the dataset says where objects are; LeRobot's `make_policy` calls it.
+
+        Raises:
+            ConfigError: it does not.
+        """
+        names = (features.get(OBS_ENV_STATE) or {}).get("names") or []
+        if tuple(names) != LABELS:
+            raise ConfigError(
+                f"bhd_perception learns from the true poses of objects ({LABELS[0]}, {LABELS[1]}, …, {LABELS[-1]} in "
+                f"{OBS_ENV_STATE}), which this dataset does not have. Record the task 'pick' in simulation, with "
+                "--robot.camera=true."
+            )
+
+    def validate_features(self) -> None:
+        """Keep the image as input and the labels as output.
+
+        Raises:
+            ConfigError: the dataset lacks one of them.
+        """
+        known = {**(self.input_features or {}), **(self.output_features or {})}
+        cameras = [key for key, one in known.items() if one.type == FeatureType.VISUAL]
+        if self.image_key not in cameras:
+            raise ConfigError(
+                f"policy.camera is {self.camera!r}, and the dataset has no {self.image_key!r}. It has "
+                f"{', '.join(cameras) or 'no images'}. Record it with --robot.camera=true, or set --policy.camera."
+            )
+        if OBS_ENV_STATE not in known or tuple(known[OBS_ENV_STATE].shape) != (len(LABELS),):
+            raise ConfigError(
+                f"bhd_perception learns from {OBS_ENV_STATE} of {len(LABELS)} numbers, the true poses of objects, "
+                "which the dataset does not have. Record the task 'pick' in simulation."
+            )
+        self.input_features = {self.image_key: known[self.image_key]}
+        self.output_features = {OBS_ENV_STATE: known[OBS_ENV_STATE]}
+        _ = self.region

@@ -1,0 +1,350 @@
+"""`bhd_perception`: a small convolutional network that says what stands where on the table, and how sure it is.
+
+On a grid of cells of the image, each cell says whether an object's centre is near, and where that centre is in the base
+frame: the point of the table that the cell shows where the camera was not moved, plus what the network adds. What it
+adds may depend on the whole image, in which edges of the table and the arm's foot show how the camera was moved.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import OBS_ENV_STATE
+from torch import Tensor, nn
+from torch.nn import functional
+
+from bhd_lerobot.bodies.tabletop import COLOURS
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.perception.configuration_perception import STRIDE, PerceptionConfig
+from bhd_lerobot.policies.perception.labels import Labels
+
+_PLANE = 0.04  # [m] height of the plane that cells are projected to: about the middle of objects
+_SPREAD = 1.5  # [cells] standard deviation of the bump in the map of presence that an object's centre is to leave
+_NEAR = 0.3  # cells in which that bump is at least this high say where the object is
+_SHIFT, _ERROR, _SIZE = 0.05, 0.01, 0.07  # [m] what 1 means in the network's answers
+_LOG_ERROR = (-4.0, 3.0)
+_SAME = 0.05  # [m] an object that is found this near a true one is that one
+_TAIL = 0.9  # share of errors that is to lie within the radius that the calibration is done for
+_RADIUS = 3.889720169867429  # in units of the scale, within which a radius of density exp(-r) r lies with `_TAIL`
+_OUTPUTS = {
+    "presence": 1,
+    "shift": 3,
+    "log_error": 1,
+    "is_box": 1,
+    "colour": len(COLOURS),
+    "size": 3,
+    "yaw": 2,
+}
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What was found in one image, the surest first; k objects.
+
+    Attributes:
+        presence: probability that there is an object, shape (k,).
+        position: of its centre in the base frame [m], shape (k, 3).
+        scale: of the error in x and y: its radius r is expected with the density exp(-r / scale) r / scale² [m], shape
+            (k,).
+        is_box: probability that it is a box, shape (k,).
+        colour: probability of each of `COLOURS`, shape (k, colours).
+        size: length, width and height [m], shape (k, 3).
+        yaw: of a box, from -pi/2 to pi/2 [rad], shape (k,).
+    """
+
+    presence: Tensor
+    position: Tensor
+    scale: Tensor
+    is_box: Tensor
+    colour: Tensor
+    size: Tensor
+    yaw: Tensor
+
+
+class PerceptionPolicy(PreTrainedPolicy):
+    """The policy type ``bhd_perception``. It gives no actions; brains ask it for `detect`.
+
+    In evaluation mode, `forward` also calibrates: the stated errors are scaled so that of the errors on what was not
+    learned from, the wanted share lies within the stated radius (A. Angelopoulos and S. Bates, "A gentle introduction
+    to conformal prediction", 2021).
+
+    Args:
+        config: its shape and its features.
+        kwargs: what LeRobot passes to every policy; nothing of it is needed.
+    """
+
+    config_class = PerceptionConfig
+    name = "bhd_perception"
+    config: PerceptionConfig
+    factor: Tensor
+    _plane: Tensor
+
+    def __init__(self, config: PerceptionConfig, **kwargs: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        self._region = left, top, right, bottom = config.region
+        rows, columns = (bottom - top) // STRIDE, (right - left) // STRIDE
+        self.network = _Network(config, self._region)
+        row, column = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+        pixels = np.stack([left + STRIDE * (column + 0.5), top + STRIDE * (row + 0.5)], axis=-1)
+        plane = config.projection.on_plane(pixels, _PLANE)
+        self.register_buffer("_plane", torch.tensor(plane, dtype=torch.float32), persistent=False)
+        self.register_buffer("_pixels", torch.tensor(pixels, dtype=torch.float32), persistent=False)
+        # What stated errors are multiplied by; not a number until errors on held-out images are known.
+        self.register_buffer("factor", torch.tensor(math.nan))
+        self._ratios: list[Tensor] = []
+
+    def get_optim_params(self) -> list[dict[str, Any]]:
+        """Return the parameters in two groups: weights, and biases and scales, which do not decay."""
+        weights = [one for one in self.parameters() if one.requires_grad and one.ndim > 1]
+        others = [one for one in self.parameters() if one.requires_grad and one.ndim <= 1]
+        return [{"params": weights}, {"params": others, "weight_decay": 0.0}]
+
+    def reset(self) -> None:
+        """Forget nothing: every image is looked at by itself."""
+
+    # --- learning ----------------------------------------------------------------------------------------------------
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Return the loss of a batch, and its parts for the log.
+
+        Args:
+            batch: images of `config.image_key`, shape (batch, 3, height, width), 0 to 1; and
+                `observation.environment_state`.
+        """
+        image = self._image(batch)
+        labels = Labels.of(batch[OBS_ENV_STATE])
+        if self.training:
+            self._ratios.clear()
+            spread = self.config.brightness
+            factor = 1 + spread * (2 * torch.rand(len(image), 1, 1, 1, device=image.device) - 1)
+            image = (image * factor).clamp(0, 1)
+        answers = self._answers(image)
+        if not self.training:
+            self._calibrate(answers, labels)
+        heat, place = self._presence(labels)
+        certain = torch.sigmoid(answers["presence"]) - heat
+        # Nearly all cells are empty; what is answered right already counts little (T.-Y. Lin et al., "Focal loss", 2017).
+        presence = functional.binary_cross_entropy_with_logits(answers["presence"], heat, reduction="none")
+        presence = (presence * certain.abs()).sum((1, 2)).mean()
+        near = heat * (heat > _NEAR)
+        parts = self._errors(answers, labels.at(place))
+        means = {name: (part * near).sum() / near.sum().clamp_min(1.0) for name, part in parts.items()}
+        loss = 0.1 * presence + sum(_WEIGHTS[name] * value for name, value in means.items())
+        assert isinstance(loss, Tensor)
+        outputs = {name: float(value.detach()) for name, value in means.items() if name != "position"}
+        where = (self._at(answers) - labels.at(place).position)[..., :2].norm(dim=-1)
+        error = float(((where * near).sum() / near.sum().clamp_min(1.0)).detach())
+        return loss, {"presence": float(presence.detach()), **outputs, "error_mm": 1000 * error}
+
+    def _presence(self, labels: Labels) -> tuple[Tensor, Tensor]:
+        """Return how near every cell is to an object's centre, 0 to 1, and which object's, shape (batch, h, w)."""
+        seen = self.config.projection.pixels(labels.position.detach().cpu().numpy().astype(np.float64))
+        centre = torch.as_tensor(seen, dtype=torch.float32, device=self._plane.device)
+        apart = (self._pixels - centre[:, :, None, None]).square().sum(-1) / STRIDE**2
+        apart = apart.masked_fill(~labels.present[..., None, None], math.inf)
+        least, place = apart.min(1)
+        return torch.exp(-least / (2 * _SPREAD**2)), place
+
+    def _errors(self, answers: Mapping[str, Tensor], true: Labels) -> dict[str, Tensor]:
+        """Return the parts of the loss of every cell, as if each were near an object, shape (batch, h, w)."""
+        apart = self._at(answers) - true.position
+        scale = torch.exp(answers["log_error"].clamp(*_LOG_ERROR))
+        across = apart[..., :2].norm(dim=-1) / _ERROR
+        turn = torch.stack([torch.cos(2 * true.yaw), torch.sin(2 * true.yaw)], dim=-1)
+        entropy = functional.cross_entropy(answers["colour"].movedim(-1, 1), true.colour, reduction="none")
+        box = functional.binary_cross_entropy_with_logits(answers["is_box"], true.is_box, reduction="none")
+        size = answers["size"] - torch.log(true.size.clamp_min(1e-3) / _SIZE)
+        return {
+            "position": across / scale + 2 * scale.log() + 0.2 * apart[..., 2].abs() / _ERROR,
+            "is_box": box,
+            "colour": entropy,
+            "size": size.abs().sum(-1),
+            # A cup looks the same from all sides. With the absolute error nothing is learned for thousands of steps.
+            "yaw": (answers["yaw"] - turn).square().sum(-1) * true.is_box,
+        }
+
+    @torch.no_grad()
+    def _calibrate(self, answers: Mapping[str, Tensor], labels: Labels) -> None:
+        """Take the errors of a batch into account, together with those since the last step of training."""
+        for row, found in enumerate(self._found(answers, factor=1.0)):
+            true = labels.position[row][labels.present[row]]
+            if not len(true) or not len(found.presence):
+                continue
+            apart = torch.cdist(found.position[:, :2], true[:, :2]).min(dim=1).values
+            self._ratios.append((apart / found.scale)[apart < _SAME])
+        if self._ratios:
+            ratios = torch.cat(self._ratios)
+            # The quantile that also a further error stays below with this probability.
+            share = min(1.0, _TAIL * (1 + 1 / max(1, len(ratios))))
+            self.factor.copy_(torch.quantile(ratios, share) / _RADIUS)
+
+    # --- seeing ------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def detect(self, images: Tensor) -> list[Detections]:
+        """Return what is seen in images.
+
+        Args:
+            images: shape (batch, 3, height, width), 0 to 1.
+
+        Raises:
+            ConfigError: the policy was not calibrated.
+        """
+        if not bool(torch.isfinite(self.factor)):
+            raise ConfigError(
+                "This bhd_perception does not know how large its errors are: no held-out images were looked at in its "
+                "training. Train it with --dataset.eval_split=0.1 and --eval_steps=1000."
+            )
+        self.eval()
+        return self._found(self._answers(self._image({self.config.image_key: images})), float(self.factor))
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
+        """Raise an error: there are no actions.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError(
+            "bhd_perception sees objects and gives no actions. Use it in a brain: --brain.type=language "
+            "--brain.perception.path=CHECKPOINT."
+        )
+
+    def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
+        """Raise an error: there are no actions.
+
+        Raises:
+            ConfigError: always.
+        """
+        return self.predict_action_chunk(batch)
+
+    def _image(self, batch: Mapping[str, Tensor]) -> Tensor:
+        key, size = self.config.image_key, self.config.image_size
+        image = batch.get(key)
+        if image is None:
+            raise ConfigError(f"bhd_perception was trained with {key!r}, which is not in the batch.")
+        if tuple(image.shape[1:]) != (3, size[1], size[0]):
+            raise ConfigError(
+                f"bhd_perception was trained with images of {size[0]} x {size[1]} px; {key} has the shape "
+                f"{tuple(image.shape[1:])} (channels, height, width)."
+            )
+        return image
+
+    def _answers(self, image: Tensor) -> dict[str, Tensor]:
+        """Return the network's answers by name, shape (batch, h, w, …)."""
+        values = self.network(image).movedim(1, -1).split(list(_OUTPUTS.values()), dim=-1)
+        one = {name for name, width in _OUTPUTS.items() if width == 1}
+        return {
+            name: part[..., 0] if name in one else part for name, part in zip(_OUTPUTS, values, strict=True)
+        }
+
+    def _at(self, answers: Mapping[str, Tensor]) -> Tensor:
+        """Return where every cell says that the object near it is, in the base frame [m]."""
+        return self._plane + _SHIFT * answers["shift"]
+
+    def _found(self, answers: Mapping[str, Tensor], factor: float) -> list[Detections]:
+        presence = torch.sigmoid(answers["presence"])
+        highest = functional.max_pool2d(presence[:, None], 5, stride=1, padding=2)[:, 0]
+        is_peak = (presence == highest) & (presence > self.config.least_presence)
+        position = self._at(answers)
+        found = []
+        for image in range(len(presence)):
+            rows, columns = is_peak[image].nonzero(as_tuple=True)
+            order = presence[image, rows, columns].argsort(descending=True, stable=True)
+            cells = image, rows[order], columns[order]
+            yaw = answers["yaw"][cells]
+            one = Detections(
+                presence=presence[cells],
+                position=position[cells],
+                scale=factor * _ERROR * torch.exp(answers["log_error"][cells].clamp(*_LOG_ERROR)),
+                is_box=torch.sigmoid(answers["is_box"][cells]),
+                colour=torch.softmax(answers["colour"][cells], dim=-1),
+                size=_SIZE * torch.exp(answers["size"][cells]),
+                yaw=torch.atan2(yaw[:, 1], yaw[:, 0]) / 2,
+            )
+            found.append(_distinct(one))
+        return found
+
+
+_WEIGHTS = {"position": 1.0, "is_box": 1.0, "colour": 1.0, "size": 2.0, "yaw": 10.0}
+
+
+def _distinct(found: Detections) -> Detections:
+    """Leave out what is at the same place as something surer."""
+    apart = torch.cdist(found.position[:, :2], found.position[:, :2])
+    kept: list[int] = []
+    for row in range(len(apart)):
+        if not kept or float(apart[row, kept].min()) > _SAME / 2:
+            kept.append(row)
+    return Detections(*(getattr(found, name)[kept] for name in found.__dataclass_fields__))
+
+
+class _Network(nn.Module):
+    """From an image to the answers of the cells of a region, shape (batch, outputs, h, w)."""
+
+    def __init__(self, config: PerceptionConfig, region: tuple[int, int, int, int]) -> None:
+        super().__init__()
+        fine, coarse, context = config.channels, config.hidden, config.context
+        self._region = left, top, right, bottom = region
+        rows, columns = (bottom - top) // STRIDE, (right - left) // STRIDE
+        self.stem = nn.Sequential(_convolution(3, 16, 5, stride=2), _convolution(16, fine, 3, stride=2))
+        self.down = _convolution(fine + 2, coarse, 3, stride=2)
+        self.middle = nn.Sequential(_Residual(coarse, 1), _Residual(coarse, 2))
+        self.up = nn.Conv2d(coarse, fine, 1)
+        self.join = _convolution(2 * fine, fine, 3)
+        width, height = (math.ceil(size / 32) for size in config.image_size)
+        self.overview = nn.Sequential(
+            nn.AvgPool2d(2),
+            _convolution(3, 16, 5, stride=2),
+            _convolution(16, 24, 3, stride=2),
+            _convolution(24, 32, 3, stride=2),
+            _convolution(32, 32, 3, stride=2),
+            nn.Flatten(),
+            nn.Linear(32 * width * height, context),
+            nn.ReLU(),
+        )
+        self.to_coarse, self.to_fine = nn.Linear(context, 2 * coarse), nn.Linear(context, 2 * fine)
+        outputs = sum(_OUTPUTS.values())
+        self.answer = nn.Sequential(nn.Conv2d(fine, 64, 1), nn.ReLU(inplace=True), nn.Conv2d(64, outputs, 1))
+        y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
+        self.register_buffer("_place", torch.stack([x, y])[None], persistent=False)
+        self._place: Tensor
+
+    def forward(self, image: Tensor) -> Tensor:
+        left, top, right, bottom = self._region
+        whole = self.overview(image)
+        fine = self.stem(image[:, :, top:bottom, left:right])
+        coarse = self.down(torch.cat([fine, self._place.expand(len(image), -1, -1, -1)], dim=1))
+        coarse = self.up(self.middle(_modulated(coarse, self.to_coarse(whole))))
+        coarse = functional.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=False)
+        joined = self.join(torch.cat([fine, coarse], dim=1))
+        answers: Tensor = self.answer(_modulated(joined, self.to_fine(whole)))
+        return answers
+
+
+def _modulated(values: Tensor, by: Tensor) -> Tensor:
+    """Scale and shift channels (E. Perez et al., "FiLM", 2018)."""
+    scale, shift = by[:, :, None, None].chunk(2, dim=1)
+    return values * (1 + scale) + shift
+
+
+def _convolution(inputs: int, outputs: int, size: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, size, stride, dilation * (size // 2), dilation, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+    )
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int, dilation: int) -> None:
+        super().__init__()
+        self.first = _convolution(channels, channels, 3, dilation=dilation)
+        self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels))
+
+    def forward(self, values: Tensor) -> Tensor:
+        return functional.relu(values + self.second(self.first(values)))

@@ -1,0 +1,144 @@
+"""A trained `bhd_perception` as brains use it: an image in, objects with their errors out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bhd_lerobot.bodies.tabletop import COLOURS
+from bhd_lerobot.errors import ConfigError, PerceptionError
+from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, weights_digest
+from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.policies.manipulation.grasp import SeenObject
+
+if TYPE_CHECKING:
+    from bhd_lerobot.policies.perception.modeling_perception import Detections
+
+_RADIUS_50, _RADIUS_90 = 1.678346990016661, 3.889720169867429  # quantiles of a Gamma distribution of shape 2
+_DARK, _FLAT = 8, 3.0  # brightness of the brightest pixel, and standard deviation of all, of an image that shows something
+
+
+@dataclass
+class PerceptionOptions:
+    """How a brain sees.
+
+    Attributes:
+        path: the checkpoint of a `bhd_perception`; if nothing, objects are looked up in what the task tells, which in
+            simulation is the truth.
+        device: where it runs: `cpu`, `cuda`, …
+        max_error_m: an object whose place is not known better than this, with 90 % probability, is not grasped [m].
+        min_certainty: an object whose kind and colour are less certain than this is not grasped.
+    """
+
+    path: str = ""
+    device: str = "cpu"
+    max_error_m: float = 0.03
+    min_certainty: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0 < self.max_error_m < float("inf"):
+            raise ConfigError(f"brain.perception.max_error_m is {self.max_error_m}; it must be positive [m].")
+        if not 0 <= self.min_certainty < 1:
+            raise ConfigError(f"brain.perception.min_certainty is {self.min_certainty}; it must be from 0 to below 1.")
+
+
+@dataclass(frozen=True)
+class PerceivedObject(SeenObject):
+    """An object as a camera shows it.
+
+    Attributes:
+        error_50_m: radius around `position`, in x and y, within which it is with a probability of 50 % [m].
+        error_90_m: likewise 90 % [m].
+        certainty: probability that there is an object and that it has this kind and colour.
+    """
+
+    error_50_m: float = field(default=0.0, kw_only=True)
+    error_90_m: float = field(default=0.0, kw_only=True)
+    certainty: float = field(default=1.0, kw_only=True)
+
+
+class Perceiver:
+    """Finds objects in images.
+
+    Attributes:
+        camera: name of the camera that it looks through.
+        dataset: what it was trained on.
+        weights: which weights it has.
+
+    Args:
+        options: which checkpoint, and where it runs.
+
+    Raises:
+        ConfigError: the checkpoint cannot be used; the message says why.
+    """
+
+    def __init__(self, options: PerceptionOptions) -> None:
+        from bhd_lerobot.policies.learned.policy import load_perception
+
+        folder = find_checkpoint(options.path)
+        self.who = f"The perception {options.path!r}"
+        self.dataset = dict(PolicyContract.load(folder).dataset or {})
+        self.weights = weights_digest(folder)
+        self._policy = load_perception(folder, options.device)
+        self._device = options.device
+        self.camera: str = self._policy.config.camera
+
+    def look(self, images: Mapping[str, NDArray[np.uint8]], sim: int) -> list[PerceivedObject]:
+        """Return the objects that one robot's camera shows, the surest first.
+
+        Args:
+            images: by camera, shape (n, height, width, 3), RGB.
+            sim: the robot.
+
+        Raises:
+            ConfigError: there is no such camera, or its images have another size.
+            PerceptionError: the image shows nothing at all.
+        """
+        import torch
+
+        if self.camera not in images:
+            width, height = self._policy.config.image_size
+            raise ConfigError(
+                f"{self.who} looks through the camera {self.camera!r}, which this robot does not have. There is: "
+                f"{', '.join(images) or 'none'}. Set --robot.camera=true --robot.camera_width={width} "
+                f"--robot.camera_height={height}."
+            )
+        image = images[self.camera][sim]
+        width, height = self._policy.config.image_size
+        if image.shape != (height, width, 3):
+            raise ConfigError(
+                f"{self.who} was trained on images of {width} x {height} px; those of the camera {self.camera!r} are "
+                f"{image.shape[1]} x {image.shape[0]}. Set --robot.camera_width={width} --robot.camera_height={height}."
+            )
+        if int(image.max()) < _DARK or float(image.std()) < _FLAT:
+            raise PerceptionError(f"the camera {self.camera!r} shows nothing: its image has one colour only")
+        values = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].to(self._device).float() / 255
+        return _objects(self._policy.detect(values)[0])
+
+
+def _objects(found: "Detections") -> list[PerceivedObject]:
+    palette = list(COLOURS.values())
+    objects = []
+    for place in range(len(found.presence)):
+        share, colour = found.colour[place].max(0)
+        box = float(found.is_box[place])
+        length, width, height = found.size[place].tolist()
+        scale = float(found.scale[place])
+        is_box = box > 0.5
+        objects.append(
+            PerceivedObject(
+                index=place,
+                kind="box" if is_box else "cup",
+                position=tuple(found.position[place].tolist()),
+                yaw=float(found.yaw[place]) if is_box else 0.0,
+                size=(length, width, height) if is_box else ((length + width) / 2, (length + width) / 2, height),
+                colour=palette[int(colour)],
+                target=False,
+                error_50_m=_RADIUS_50 * scale,
+                error_90_m=_RADIUS_90 * scale,
+                certainty=float(found.presence[place]) * max(box, 1 - box) * float(share),
+            )
+        )
+    return objects
