@@ -30,7 +30,6 @@ OBJECT_FIELDS = (
 it is a box; its pose in the base frame [m, unit quaternion]; its measures [m]; its colour, 0 to 1."""
 
 
-
 @dataclass(frozen=True)
 class CameraView:
     """Where a fixed camera stands, and what it sees: a pinhole without distortion, upright.

@@ -26,7 +26,7 @@ from bhd_lerobot.evaluation.metrics import JerkMeasure
 from bhd_lerobot.evaluation.report import ReportInput, Video, write_report
 from bhd_lerobot.evaluation.results import EvalResults, summarise, write_json, write_table
 from bhd_lerobot.evaluation.run import BrainRun, prepare, run_episodes
-from bhd_lerobot.evaluation.text import number, percent
+from bhd_lerobot.evaluation.text import number, percent, perception_sentence
 from bhd_lerobot.recording.report import ESTOP_STATUS, FAULT_STATUS, print_refusals, progress_bars
 from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.host import Host, describe
@@ -63,6 +63,9 @@ def print_summary(console: Console, config: EvalConfig, result: "EvalResult") ->
             "\n".join(failures) or "none",
         )
     console.print(table)
+    for label, one in results.brains.items():
+        if one.perception is not None:
+            console.print(escape(f"{label}: {perception_sentence(one.perception)}"), soft_wrap=True)
     if result.estop is not None:
         console.print(f"[bold]Emergency stop ({escape(result.estop)}).[/bold] No further episode was begun.")
     if result.fault is not None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.evaluation.perception import measure_perception
 from bhd_lerobot.rollout.types import Episode
 
 LIMITS = tuple(limit.name.lower() for limit in Limit if limit.name)
@@ -92,6 +93,7 @@ class EpisodeMetrics:
         faults: 1 if a fault was latched in it, else 0.
         problem: why the brain gave up, in words, if it did and says so.
         details: further numbers of the task.
+        perception: how well the brain saw, see `measure_perception`; empty if it does not see for itself.
         initial_state: a digest of the simulator's complete state at the start, the same for all brains; empty without a
             simulator.
         digest: a digest of everything that was commanded and of every state of the physics.
@@ -118,6 +120,7 @@ class EpisodeMetrics:
     details: dict[str, float]
     initial_state: str
     digest: str
+    perception: dict[str, float] = field(default_factory=dict)
     wall: dict[str, float] = field(default_factory=dict)
 
     def plain(self) -> dict[str, Any]:
@@ -164,6 +167,7 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
         details=dict(outcome.details),
         initial_state=_digest(episode.initial_state) if episode.initial_state.size else "",
         digest=_digest(*(columns[key] for key in _REPEATED if key in columns)),
+        perception=measure_perception(episode),
         wall=_wall(episode),
     )
 

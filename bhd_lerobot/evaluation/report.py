@@ -91,6 +91,7 @@ def _sections(given: ReportInput) -> list[tuple[str, str, str]]:
         ("Summary", "summary", _summary(given)),
         ("Beside the baseline", "paired", _paired(given)),
         ("How episodes ended", "outcomes", _outcomes(given)),
+        ("What was seen", "perception", _perception(given)),
         ("Distributions", "distributions", _distributions(given)),
         ("Limits and stops", "safety", _safety(given)),
         ("From above", "trajectories", _trajectories(given)),
@@ -191,6 +192,36 @@ def _paired(given: ReportInput) -> str:
 
 def _outcomes(given: ReportInput) -> str:
     return chart(plots.outcome_bars(given.results.brains), "How the episodes of each brain ended")
+
+
+def _perception(given: ReportInput) -> str:
+    rows = []
+    for label, brain in given.results.brains.items():
+        one = brain.perception
+        if one is None:
+            continue
+        median, most, worst = (f"{1000 * value:.1f}" for value in one.error_m)
+        cells = [
+            cell(percent(one.chosen)),
+            cell(percent(one.wrong)),
+            f"{median}<br><span class='ci'>90 %: {most}, 99 %: {worst}</span>",
+            cell(percent(one.in_50)),
+            cell(percent(one.in_90)),
+            cell(percent(one.seen)),
+            cell(percent(one.named)),
+            str(one.phantoms),
+        ]
+        rows.append((label, cells))
+    if not rows:
+        return ""
+    head = ["chose an object", "the wrong one", "median error [mm]", "within its 50 % radius", "within its 90 % radius"]
+    head += ["objects seen", "kind and colour right", "objects that are none"]
+    note = (
+        "Of brains that see for themselves: what they said at the episode's start beside what was true then, in x and "
+        "y. A brain that knows how much it errs is within the radius that it states for 50 % in half of the episodes. "
+        "In brackets Wilson's 95 % intervals."
+    )
+    return table(head, rows) + f'<p class="note">{note}</p>'
 
 
 def _distributions(given: ReportInput) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 
 from bhd_lerobot.evaluation import statistics
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
+from bhd_lerobot.evaluation.perception import PerceptionSummary, summarise_perception
 from bhd_lerobot.evaluation.statistics import Discordance, Estimate
 
 MEANS = ("score", "reward", "length_s", "path_m", "jerk_mean", "jerk_max")
@@ -35,6 +36,7 @@ class BrainSummary:
         estops: episodes with an emergency stop.
         faults: episodes with a latched fault.
         frames: frames of all episodes.
+        perception: how well it saw; None if it does not see for itself.
     """
 
     brain: str
@@ -49,6 +51,7 @@ class BrainSummary:
     estops: int
     faults: int
     frames: int
+    perception: PerceptionSummary | None = None
 
 
 @dataclass(frozen=True)
@@ -163,6 +166,7 @@ def _brain(label: str, episodes: Sequence[EpisodeMetrics]) -> BrainSummary:
         estops=sum(episode.estops for episode in episodes),
         faults=sum(episode.faults for episode in episodes),
         frames=sum(episode.frames for episode in episodes),
+        perception=summarise_perception([episode.perception for episode in episodes]),
     )
 
 

@@ -2,6 +2,7 @@
 
 import math
 
+from bhd_lerobot.evaluation.perception import PerceptionSummary
 from bhd_lerobot.evaluation.results import EvalResults, PairedSummary
 from bhd_lerobot.evaluation.statistics import Estimate
 
@@ -62,3 +63,13 @@ def _direction(estimate: Estimate, above: str, below: str, neither: str) -> str:
     if estimate.low > 0:
         return above
     return below if estimate.high < 0 else neither
+
+
+def perception_sentence(one: PerceptionSummary) -> str:
+    """Return the summary in words."""
+    median, most, _ = (1000 * value for value in one.error_m)
+    return (
+        f"chose an object in {percent(one.chosen)} of {one.episodes} episodes, the wrong one in {percent(one.wrong)}; "
+        f"median error {median:.1f} mm, 90 % below {most:.1f} mm; within the radius stated for 90 % in "
+        f"{percent(one.in_90)}"
+    )

@@ -41,11 +41,13 @@ class _Sight:
     Attributes:
         objects: the objects, None until it is looked for them.
         first: those that it saw first in this episode.
+        chosen: which of them it went for, None if for none.
         image: what the camera showed then; None once it has shown something else.
     """
 
     objects: list[PerceivedObject] | None = None
     first: list[PerceivedObject] | None = None
+    chosen: int | None = None
     image: NDArray[np.uint8] | None = None
 
 
@@ -92,7 +94,8 @@ class LanguageBrain(PickBrain):
         """Return the plan of one simulation, how far it got, what was in the way, and what was seen first."""
         plan = super().plan(sim)
         if self.perceiver is not None:
-            plan["seen"] = [_plain(one) for one in self._sights[sim].first or ()]
+            sight = self._sights[sim]
+            plan |= {"seen": [_plain(one) for one in sight.first or ()], "chosen": sight.chosen}
         return plan
 
     def parameters(self) -> dict[str, Any]:
@@ -111,7 +114,11 @@ class LanguageBrain(PickBrain):
                     camera = self.perceiver.camera
                     return self._give_up(sim, f"the camera {camera!r} shows the same image although the arm has moved")
                 sight.image = None
-        return super().decide(sim, seen, result)
+        command = super().decide(sim, seen, result)
+        plan = self._work[sim].plan
+        if result is None and plan is not None:
+            self._sights[sim].chosen = plan.target
+        return command
 
     def _find_objects(self, robot: RobotFeatures) -> None:
         if self.perceiver is None:

@@ -10,7 +10,7 @@ from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 
-from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS, SCENE_CAMERA, CameraView
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, SCENE_CAMERA, CameraView
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.perception.camera import Projection, Region
 

@@ -16,7 +16,11 @@ def _columns(*names: str) -> slice:
     return slice(first, first + len(names))
 
 
-_POSITION, _SIZE, _COLOUR = _columns("x", "y", "z"), _columns("length", "width", "height"), _columns("red", "green", "blue")
+_POSITION, _SIZE, _COLOUR = (
+    _columns("x", "y", "z"),
+    _columns("length", "width", "height"),
+    _columns("red", "green", "blue"),
+)
 
 
 @dataclass(frozen=True)

@@ -128,7 +128,7 @@ class PerceptionPolicy(PreTrainedPolicy):
             self._calibrate(answers, labels)
         heat, place = self._presence(labels)
         certain = torch.sigmoid(answers["presence"]) - heat
-        # Nearly all cells are empty; what is answered right already counts little (T.-Y. Lin et al., "Focal loss", 2017).
+        # Nearly all cells are empty: what is answered right counts little (T.-Y. Lin et al., "Focal loss", 2017).
         presence = functional.binary_cross_entropy_with_logits(answers["presence"], heat, reduction="none")
         presence = (presence * certain.abs()).sum((1, 2)).mean()
         near = heat * (heat > _NEAR)
@@ -238,9 +238,7 @@ class PerceptionPolicy(PreTrainedPolicy):
         """Return the network's answers by name, shape (batch, h, w, …)."""
         values = self.network(image).movedim(1, -1).split(list(_OUTPUTS.values()), dim=-1)
         one = {name for name, width in _OUTPUTS.items() if width == 1}
-        return {
-            name: part[..., 0] if name in one else part for name, part in zip(_OUTPUTS, values, strict=True)
-        }
+        return {name: part[..., 0] if name in one else part for name, part in zip(_OUTPUTS, values, strict=True)}
 
     def _at(self, answers: Mapping[str, Tensor]) -> Tensor:
         """Return where every cell says that the object near it is, in the base frame [m]."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from bhd_lerobot.policies.perception.modeling_perception import Detections
 
 _RADIUS_50, _RADIUS_90 = 1.678346990016661, 3.889720169867429  # quantiles of a Gamma distribution of shape 2
-_DARK, _FLAT = 8, 3.0  # brightness of the brightest pixel, and standard deviation of all, of an image that shows something
+_DARK, _FLAT = 8, 3.0  # brightness of the brightest pixel, and standard deviation of all, below which nothing is shown
 
 
 @dataclass
