@@ -13,6 +13,7 @@ from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.plugins import BODIES
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig, RandomBrain, RandomConfig
+from bhd_lerobot.policies.blanked import BlankedBrain, BlankedConfig
 from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig
 from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
@@ -59,6 +60,18 @@ class _Dagger(DaggerBrain):
         )
 
 
+class _Blanked(BlankedBrain):
+    """A `blanked` brain, made of one of the brains below."""
+
+    def __init__(self, config: BlankedConfig) -> None:
+        super().__init__(config, make_brain(config.brain))
+
+    @staticmethod
+    def robot_of(config: BlankedConfig) -> str:
+        """Return the robot that the brain drives."""
+        return robot_of_brain(config.brain)
+
+
 ROBOTS: dict[type[RobotConfig], type[Simulation]] = {TurtleBot3Config: BaseSimulation, UR5Config: UR5Simulation}
 """The simulations of the robots, by configuration."""
 
@@ -72,6 +85,7 @@ TASKS: dict[type[TaskConfig], Callable[..., Task]] = {
 
 BRAINS: dict[type[BrainConfig], Callable[[Any], Brain]] = {
     AvoidanceConfig: AvoidanceBrain,
+    BlankedConfig: _Blanked,
     DaggerConfig: _Dagger,
     GapFollowerConfig: GapFollowerBrain,
     LanguageBrainConfig: LanguageBrain,

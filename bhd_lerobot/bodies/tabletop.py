@@ -65,6 +65,7 @@ class TableObject:
         mass: [kg].
         friction: sliding friction against table and fingers.
         shade: what is added to each of red, green and blue of the colour.
+        plain: without what others of its kind have: a cup's handle and dark mouth, a box's tape.
     """
 
     kind: Literal["cup", "box"]
@@ -78,6 +79,7 @@ class TableObject:
     mass: float = 0.2
     friction: float = 0.9
     shade: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    plain: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

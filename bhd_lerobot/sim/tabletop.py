@@ -158,11 +158,15 @@ class Tabletop:
         if thing.kind == "box":
             squares = (b * b + h * h, a * a + h * h, a * a + b * b)
             field["body_inertia"][sim, body] = np.multiply(squares, thing.mass / 3)
+        else:
+            across = thing.mass * (3 * a * a + 4 * h * h) / 12
+            field["body_inertia"][sim, body] = (across, across, thing.mass * a * a / 2)
+        if thing.plain:
+            return
+        if thing.kind == "box":
             tape = _Form("box", (a + 0.0003, 0.2 * b, h + 0.0003))
             self._geom(sim, geoms[1], tape, 0.55 + 0.45 * colour)
             return
-        across = thing.mass * (3 * a * a + 4 * h * h) / 12
-        field["body_inertia"][sim, body] = (across, across, thing.mass * a * a / 2)
         mouth = _Form("cylinder", (0.86 * a, 0.0004, 0), (0, 0, h))
         self._geom(sim, geoms[1], mouth, 0.22 * colour)
         thick, reach = 0.10 * a, 0.55 * a

@@ -29,6 +29,22 @@ INSTRUCTIONS = {
     "en": ("pick up the {}", "grab the {}", "lift the {}", "take the {}", "please pick up the {}"),
     "zh": ("拿起{}", "抓住{}", "请把桌上的{}拿起来"),
 }
+HELD_OUT_INSTRUCTIONS = {
+    "en": (
+        "could you lift the {} please",
+        "raise the {} from the table",
+        "robot, pick the {} up",
+        "grasp the {} on the table",
+        "hey, can you take the {}",
+    ),
+    "zh": ("能不能帮我拿起桌上的{}", "请抓起那个{}", "麻烦你把{}举起来"),
+}
+"""Other ways to ask: what learns to read from `INSTRUCTIONS` has seen none of them."""
+HELD_OUT_NAMES = (("red", "cup"), ("blue", "box"), ("yellow", "cup"), ("purple", "box"))
+"""Colour and kind that are left out together where `names` is `known`; each of the words occurs with others."""
+_WORDINGS = ("known", "held_out")
+_NAMES = ("any", "known", "held_out")
+_OBJECTS = ("known", "unseen")
 _ZH = {
     **{"red": "红色", "green": "绿色", "blue": "蓝色", "yellow": "黄色"},
     **{"orange": "橙色", "purple": "紫色", "white": "白色", "black": "黑色"},
@@ -48,6 +64,12 @@ class PickConfig(TaskConfig):
         min_objects: smallest number of objects on the table.
         max_objects: largest number of objects on the table.
         language: language of the instructions: ``"en"``, ``"zh"`` or ``"any"``.
+        wording: how it is asked: ``"known"``, or ``"held_out"`` for other sentences.
+        names: colours and kinds of the objects: ``"any"``; ``"known"``, which leaves four pairs of them out; or
+            ``"held_out"``, where it is asked for one of these four.
+        objects: ``"known"``; or ``"unseen"``: smaller and larger than those, without a cup's handle or a box's tape,
+            and of other shades.
+        swap: ask for another object of the same scene; two or more must be on the table.
         randomisation: how much one episode's world differs from the next.
     """
 
@@ -57,6 +79,10 @@ class PickConfig(TaskConfig):
     min_objects: int = 1
     max_objects: int = MAX_OBJECTS
     language: str = "en"
+    wording: str = "known"
+    names: str = "any"
+    objects: str = "known"
+    swap: bool = False
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
     def __post_init__(self) -> None:
@@ -66,8 +92,19 @@ class PickConfig(TaskConfig):
                 f"task.min_objects is {self.min_objects} and task.max_objects is {self.max_objects}; "
                 f"they must be between 1 and {MAX_OBJECTS}, in this order."
             )
-        if self.language not in (*INSTRUCTIONS, "any"):
-            raise ConfigError(unknown_name("task.language", self.language, (*INSTRUCTIONS, "any")))
+        for name, value, valid in (
+            ("language", self.language, (*INSTRUCTIONS, "any")),
+            ("wording", self.wording, _WORDINGS),
+            ("names", self.names, _NAMES),
+            ("objects", self.objects, _OBJECTS),
+        ):
+            if value not in valid:
+                raise ConfigError(unknown_name(f"task.{name}", value, valid))
+        if self.swap and self.min_objects < 2:
+            raise ConfigError(
+                f"task.swap is true and task.min_objects is {self.min_objects}; to ask for another object there must "
+                "be two. Set --task.min_objects=2."
+            )
 
 
 class PickTask(ArmTask):
@@ -107,16 +144,16 @@ class PickTask(ArmTask):
         config = self.config
         rng = np.random.default_rng(seed)
         count = int(rng.integers(config.min_objects, config.max_objects + 1))
-        # No two alike, so that colour and kind name one object.
-        names = [(colour, kind) for colour in COLOURS for kind in KINDS]
-        chosen = [names[index] for index in rng.choice(len(names), count, replace=False)]
+        chosen = _draw_names(config.names, count, rng)
         objects: list[TableObject] = []
         while len(objects) < count:
-            objects = _draw_objects(config.randomisation, chosen, rng)
-        objects = _target_first(objects, int(rng.integers(count)))
+            objects = _draw_objects(config, chosen, rng)
+        target = 0 if config.names == "held_out" else int(rng.integers(count))
+        objects = _target_first(objects, (target + config.swap) % count)
         languages = tuple(INSTRUCTIONS) if config.language == "any" else (config.language,)
         language = languages[int(rng.integers(len(languages)))]
-        phrase = INSTRUCTIONS[language][int(rng.integers(len(INSTRUCTIONS[language])))]
+        phrases = (INSTRUCTIONS if config.wording == "known" else HELD_OUT_INSTRUCTIONS)[language]
+        phrase = phrases[int(rng.integers(len(phrases)))]
         name = objects[0].name
         if language == "zh":
             name = _ZH[objects[0].colour] + _ZH[objects[0].kind]
@@ -229,20 +266,41 @@ def _target_first(objects: Sequence[TableObject], target: int) -> list[TableObje
     return [at, *sorted(others, key=lambda one: math.hypot(one.x - at.x, one.y - at.y))]
 
 
-def _draw_objects(
-    config: RandomisationConfig, names: Sequence[tuple[str, str]], rng: np.random.Generator
-) -> list[TableObject]:
+def _draw_names(which: str, count: int, rng: np.random.Generator) -> list[tuple[str, str]]:
+    """Return colour and kind of the objects, no two alike, so that they name one; a held-out one is the first."""
+    names: list[tuple[str, str]] = [(colour, kind) for colour in COLOURS for kind in KINDS]
+    first: list[tuple[str, str]] = []
+    if which == "known":
+        names = [name for name in names if name not in HELD_OUT_NAMES]
+    elif which == "held_out":
+        first = [HELD_OUT_NAMES[int(rng.integers(len(HELD_OUT_NAMES)))]]
+        names.remove(first[0])
+    return first + [names[index] for index in rng.choice(len(names), count - len(first), replace=False)]
+
+
+_KNOWN = {"cup": ((0.050, 0.068), (0.050, 0.068), (0.07, 0.12)), "box": ((0.045, 0.090), (0.035, 0.065), (0.05, 0.10))}
+"""Ranges of length, width and height [m]. One side of each fits between the fingers, also when it is made larger."""
+_UNSEEN = {
+    "cup": (((0.036, 0.044), (0.036, 0.044), (0.04, 0.06)), ((0.074, 0.076), (0.074, 0.076), (0.135, 0.15))),
+    "box": (((0.030, 0.040), (0.024, 0.031), (0.03, 0.044)), ((0.100, 0.130), (0.066, 0.074), (0.112, 0.13))),
+}
+"""Small ones and large ones outside of what `_KNOWN` and its randomisation reach."""
+_OTHER_SHADE = 0.11  # added to or taken from red, green and blue; more than the randomisation's `colour`
+
+
+def _draw_objects(task: PickConfig, names: Sequence[tuple[str, str]], rng: np.random.Generator) -> list[TableObject]:
     """Return objects of these colours and kinds that stand apart; fewer if the last found no place."""
     objects: list[TableObject] = []
+    unseen = task.objects == "unseen"
     for colour, kind in names:
-        change = draw_object_changes(config, rng)
-        # One side of each fits between the fingers, also when it is made larger.
-        if kind == "cup":
-            length = width = rng.uniform(0.050, 0.068)
-            height = rng.uniform(0.07, 0.12)
-        else:
-            length, width = rng.uniform(0.045, 0.090), rng.uniform(0.035, 0.065)
-            height = rng.uniform(0.05, 0.10)
+        change = draw_object_changes(task.randomisation, rng)
+        ranges = _KNOWN[kind]
+        if unseen:
+            ranges = _UNSEEN[kind][int(rng.integers(2))]
+            change |= {"size": (1.0, 1.0, 1.0), "shade": _other_shade(colour, rng)}
+        length = rng.uniform(*ranges[0])
+        width = length if kind == "cup" else rng.uniform(*ranges[1])
+        height = rng.uniform(*ranges[2])
         factor = change["size"]
         size_x, size_y = length / 2 * factor[0], min(width / 2 * factor[0 if kind == "cup" else 1], _WIDEST / 2)
         size_x = size_y if kind == "cup" else size_x
@@ -262,9 +320,20 @@ def _draw_objects(
                 mass=float(rng.uniform(0.08, 0.30) * change["mass"]),
                 friction=float(0.9 * change["friction"]),
                 shade=change["shade"],
+                plain=unseen,
             )
         )
     return objects
+
+
+def _other_shade(colour: str, rng: np.random.Generator) -> tuple[float, ...]:
+    """Return what makes a shade that the randomisation does not reach, and that still has the colour's name."""
+    own = np.array(COLOURS[colour])
+    while True:
+        shade = rng.choice((-_OTHER_SHADE, _OTHER_SHADE), 3)
+        seen = np.clip(own + shade, 0.0, 1.0)
+        if min(COLOURS, key=lambda name: float(np.linalg.norm(seen - COLOURS[name]))) == colour:
+            return tuple(shade.tolist())
 
 
 def _draw_place(radius: float, objects: Sequence[TableObject], rng: np.random.Generator) -> NDArray[np.float64] | None:

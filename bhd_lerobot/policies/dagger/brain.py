@@ -97,7 +97,6 @@ class DaggerBrain:
                 f"brain.disagreement compares setpoints, and the expert {expert.name!r} gives goals. Leave it out; "
                 "brain.collision_s, brain.stall_s and brain.patience_s say when it takes over."
             )
-        self.uses_images = learner.uses_images or expert.uses_images
         self.has_plan = expert.has_plan
         self._advised: Array | None = None
         self._watches: list[Watch] = []
@@ -108,6 +107,11 @@ class DaggerBrain:
         self._driven = np.zeros(0, np.int64)
         self._causes: list[str] = []
         self._shown: NDArray[np.bool_] = np.zeros(0, np.bool_)
+
+    @property
+    def uses_images(self) -> bool:
+        """Whether learner or expert is about to use images."""
+        return self.learner.uses_images or self.expert.uses_images
 
     def bind(self, robot: RobotFeatures) -> None:
         """Bind learner and expert, and find what is to be watched."""

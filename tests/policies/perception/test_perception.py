@@ -1,0 +1,258 @@
+"""`bhd_perception`: it learns, knows how much it errs, and refuses what it was not made for."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.utils.constants import OBS_ENV_STATE
+from torch import Tensor
+
+from bhd_lerobot.bodies.tabletop import COLOURS, SCENE_CAMERA
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.manipulation.grasp import read_objects
+from bhd_lerobot.policies.manipulation.skills import scene_object
+from bhd_lerobot.policies.perception.camera import Projection
+from bhd_lerobot.policies.perception.configuration_perception import LABELS, PerceptionConfig
+from bhd_lerobot.policies.perception.labels import Labels
+from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy
+from bhd_lerobot.tasks.pick import PickConfig, PickTask
+from bhd_lerobot.tasks.variation import RandomisationConfig
+from tests.cases import each_case
+
+WIDTH, HEIGHT = 160, 120
+STEPS = 300
+IMAGE = "observation.images.scene"
+FEATURES = {OBS_ENV_STATE: {"names": list(LABELS)}}
+SMALL = {"channels": 8, "hidden": 12, "context": 8, "device": "cpu", "brightness": 0.0}
+
+
+def config(**options: Any) -> PerceptionConfig:
+    made = PerceptionConfig(
+        input_features={
+            IMAGE: PolicyFeature(FeatureType.VISUAL, (3, HEIGHT, WIDTH)),
+            OBS_ENV_STATE: PolicyFeature(FeatureType.ENV, (len(LABELS),)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (14,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
+        **{**SMALL, **options},
+    )
+    made.set_dataset_feature_metadata(FEATURES)
+    return made
+
+
+def states(count: int, **options: Any) -> np.ndarray:
+    """Return what the pick task tells of different tables, shape (count, 80)."""
+    task = PickTask(PickConfig(**options), count, 25)
+    scenes = [task.sample(seed) for seed in range(count)]
+    task.begin(np.arange(count), scenes)
+    poses = np.zeros((count, 5, 7))
+    for row, scene in enumerate(scenes):
+        for place, one in enumerate(scene.objects):
+            turn = one.yaw / 2
+            poses[row, place] = one.x, one.y, one.height / 2, math.cos(turn), 0.0, 0.0, math.sin(turn)
+    truth: Any = SimpleNamespace(object_poses=poses)
+    return task.environment_state(truth)
+
+
+def painted(values: np.ndarray) -> Tensor:
+    """Return images with a spot of the object's colour where it is, shape (count, 3, height, width)."""
+    projection = Projection(SCENE_CAMERA, WIDTH, HEIGHT)
+    images = np.full((len(values), HEIGHT, WIDTH, 3), 0.6, np.float32)
+    row, column = np.mgrid[:HEIGHT, :WIDTH]
+    for image, table in zip(images, values, strict=True):
+        for one in read_objects(table.reshape(-1, 16)):
+            u, v = projection.pixels(np.array(one.position))
+            spot = np.hypot(column + 0.5 - u, row + 0.5 - v) < (5.0 if one.kind == "box" else 3.5)
+            image[spot] = one.colour
+    return torch.from_numpy(images.transpose(0, 3, 1, 2).copy())
+
+
+def batch(count: int = 16) -> dict[str, Tensor]:
+    values = states(count)
+    return {IMAGE: painted(values), OBS_ENV_STATE: torch.from_numpy(values).float()}
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def trained() -> PerceptionPolicy:
+    """A small network that learned from painted images, and was calibrated on others."""
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    policy = PerceptionPolicy(config(channels=16, hidden=16, context=8))
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), 5e-3)
+    scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
+    values = states(400, max_objects=2)
+    images, labels = painted(values), torch.from_numpy(values).float()
+    policy.train()
+    for step in range(STEPS):
+        rows = torch.arange(step * 16, step * 16 + 16) % 300
+        loss, _ = policy.forward({IMAGE: images[rows], OBS_ENV_STATE: labels[rows]})
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 5.0)
+        optimizer.step()
+        scheduler.step()
+    policy.eval()
+    with torch.no_grad():
+        policy.forward({IMAGE: images[300:350], OBS_ENV_STATE: labels[300:350]})
+    return policy
+
+
+# --- labels -----------------------------------------------------------------------------------------------------------
+
+
+def test_labels_are_what_the_brain_that_knows_the_truth_reads() -> None:
+    values = states(20, randomisation=RandomisationConfig(enabled=True))
+    labels = Labels.of(torch.from_numpy(values))
+    for row, table in enumerate(values):
+        true = read_objects(table.reshape(-1, 16))
+        assert [one.index for one in true] == labels.present[row].nonzero()[:, 0].tolist()
+        for one in true:
+            assert labels.position[row, one.index].tolist() == list(one.position)
+            assert labels.size[row, one.index].tolist() == list(one.size)
+            assert float(labels.yaw[row, one.index]) == pytest.approx(one.yaw)
+            assert bool(labels.is_box[row, one.index]) == (one.kind == "box")
+            assert list(COLOURS)[int(labels.colour[row, one.index])] == scene_object(one).colour
+
+
+def test_the_labels_of_cells_are_those_of_the_object_that_they_name() -> None:
+    labels = Labels.of(torch.from_numpy(states(3)))
+    places = torch.randint(0, 5, (3, 4, 6))
+    chosen = labels.at(places)
+    for index in np.ndindex(3, 4, 6):
+        assert torch.equal(chosen.position[index], labels.position[index[0], places[index]])
+        assert chosen.colour[index] == labels.colour[index[0], places[index]]
+
+
+# --- learning and seeing ----------------------------------------------------------------------------------------------
+
+
+def test_it_finds_what_it_was_not_shown(trained: PerceptionPolicy) -> None:
+    values = states(400, max_objects=2)[350:]
+    errors, objects = [], 0
+    for table, found in zip(values, trained.detect(painted(values)), strict=True):
+        for one in read_objects(table.reshape(-1, 16)):
+            objects += 1
+            apart = np.hypot(*(found.position[:, :2].numpy() - one.position[:2]).T)
+            if len(apart) and apart.min() < 0.04:
+                errors.append(apart.min())
+    assert len(errors) > 0.9 * objects
+    assert np.median(errors) < 0.012
+
+
+def test_its_stated_errors_are_as_large_as_its_errors(trained: PerceptionPolicy) -> None:
+    values = states(400, max_objects=2)[350:]
+    inside, looked = 0, 0
+    for table, found in zip(values, trained.detect(painted(values)), strict=True):
+        true = np.array([one.position[:2] for one in read_objects(table.reshape(-1, 16))])
+        for position, scale in zip(found.position[:, :2].numpy(), found.scale.tolist(), strict=True):
+            looked += 1
+            inside += np.hypot(*(true - position).T).min() <= 3.8897 * scale
+    assert inside / looked == pytest.approx(0.9, abs=0.09)
+
+
+def test_a_new_look_at_held_out_images_replaces_the_calibration(trained: PerceptionPolicy) -> None:
+    before = float(trained.factor)
+    given = batch(40)
+    with torch.no_grad():
+        trained.forward(given)
+        added = float(trained.factor)
+        trained.train()
+        trained.forward(given)  # a step of training: what was measured before it is of another network
+        trained.eval()
+        trained.forward(given)
+        alone = float(trained.factor)
+        trained.factor.fill_(before)
+    assert before > 0
+    assert len({before, added, alone}) == 3
+
+
+def test_without_held_out_images_it_refuses_to_see() -> None:
+    with pytest.raises(ConfigError, match="does not know how large its errors are.*eval_split"):
+        PerceptionPolicy(config()).detect(torch.zeros(1, 3, HEIGHT, WIDTH))
+
+
+def test_a_saved_one_sees_the_same(trained: PerceptionPolicy, tmp_path: Path) -> None:
+    images = painted(states(4))
+    trained.save_pretrained(tmp_path)
+    loaded = get_policy_class("bhd_perception").from_pretrained(str(tmp_path))
+    for one, other in zip(trained.detect(images), loaded.detect(images), strict=True):
+        assert torch.equal(one.position, other.position)
+        assert torch.equal(one.scale, other.scale)
+
+
+def test_nothing_is_normalised() -> None:
+    made = config()
+    PerceptionPolicy(made)
+    before, _ = make_pre_post_processors(made, dataset_stats={})
+    given = batch(2)
+    after = before(dict(given))
+    assert torch.equal(after[IMAGE], given[IMAGE])
+    assert torch.equal(after[OBS_ENV_STATE], given[OBS_ENV_STATE])
+
+
+def test_an_image_without_objects_is_learned_from_and_nothing_is_found_twice(trained: PerceptionPolicy) -> None:
+    loss, _ = (
+        PerceptionPolicy(config())
+        .train()
+        .forward({IMAGE: torch.full((2, 3, HEIGHT, WIDTH), 0.6), OBS_ENV_STATE: torch.zeros(2, len(LABELS))})
+    )
+    assert bool(torch.isfinite(loss))
+    for found in trained.detect(painted(states(40))):
+        apart = torch.cdist(found.position[:, :2], found.position[:, :2]) + torch.eye(len(found.presence))
+        assert not len(apart) or float(apart.min()) > 0.02
+
+
+# --- what it refuses --------------------------------------------------------------------------------------------------
+
+
+@each_case(
+    ("options", "message"),
+    [
+        ({"camera": "wrist"}, r"policy.camera is 'wrist', and the dataset has no .*It has observation.images.scene"),
+        ({"camera_position": [0.0, 0.0]}, "policy.camera_position is .* 3 finite numbers"),
+        ({"camera_position": [0.37, 0.02, 1.0], "camera_target": [0.37, 0.02, 0.0]}, "must stand above the table"),
+        ({"camera_fovy": 180.0}, "policy.camera_fovy is 180"),
+        ({"area": [0.6, -0.3, 0.4, 0.3]}, "policy.area is"),
+        ({"area": [5.0, 5.0, 5.1, 5.1]}, "sees nothing"),
+        ({"object_height": 0.0}, "policy.object_height is 0"),
+        ({"least_presence": 1.0}, "policy.least_presence is 1"),
+        ({"brightness": math.nan}, "policy.brightness is nan"),
+        ({"channels": 0}, "policy.channels is 0"),
+    ],
+)
+def test_configurations_that_cannot_be_honoured(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        PerceptionPolicy(config(**options))
+
+
+def test_a_dataset_without_true_poses_or_without_images() -> None:
+    with pytest.raises(ConfigError, match="true poses of objects.*Record the task 'pick'"):
+        config().set_dataset_feature_metadata({OBS_ENV_STATE: {"names": ["target_x"]}})
+    bare = PerceptionConfig(input_features={}, output_features={}, **SMALL)
+    with pytest.raises(ConfigError, match=r"It has no images. Record it with --robot.camera=true"):
+        PerceptionPolicy(bare)
+
+
+def test_images_of_another_size_and_calls_for_actions(trained: PerceptionPolicy) -> None:
+    with pytest.raises(ConfigError, match=r"images of 160 x 120 px; .* has the shape \(3, 60, 80\)"):
+        trained.detect(torch.zeros(1, 3, 60, 80))
+    with pytest.raises(ConfigError, match="not in the batch"):
+        trained.forward({OBS_ENV_STATE: torch.zeros(1, 80)})
+    with pytest.raises(ConfigError, match="gives no actions. Use it in a brain"):
+        trained.select_action({})
