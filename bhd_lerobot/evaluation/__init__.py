@@ -1,3 +1,14 @@
 """`bhd-eval`: brains on the same episodes, with intervals and a report."""
 
-__all__ = ["config", "evaluate", "metrics", "plots", "report", "results", "run", "statistics", "text"]
+__all__ = [
+    "config",
+    "evaluate",
+    "metrics",
+    "perception",
+    "plots",
+    "report",
+    "results",
+    "run",
+    "statistics",
+    "text",
+]

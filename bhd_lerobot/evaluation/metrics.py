@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.evaluation.perception import measure_perception
+from bhd_lerobot.policies.perception.assessment import assess
 from bhd_lerobot.rollout.types import Episode
 
 LIMITS = tuple(limit.name.lower() for limit in Limit if limit.name)
@@ -93,7 +93,7 @@ class EpisodeMetrics:
         faults: 1 if a fault was latched in it, else 0.
         problem: why the brain gave up, in words, if it did and says so.
         details: further numbers of the task.
-        perception: how well the brain saw, see `measure_perception`; empty if it does not see for itself.
+        perception: how well the brain saw, see `assess`; empty if it does not see for itself.
         initial_state: a digest of the simulator's complete state at the start, the same for all brains; empty without a
             simulator.
         digest: a digest of everything that was commanded and of every state of the physics.
@@ -145,7 +145,7 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
     """
     columns, outcome = episode.columns, episode.outcome
     lengths = jerk.lengths(columns[keys.APPLIED_ACTION], fps)
-    modes = columns[keys.MODE]
+    modes, states = columns[keys.MODE], columns.get(keys.ENVIRONMENT_STATE)
     return EpisodeMetrics(
         brain=brain,
         episode=episode.spec.index,
@@ -167,7 +167,7 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
         details=dict(outcome.details),
         initial_state=_digest(episode.initial_state) if episode.initial_state.size else "",
         digest=_digest(*(columns[key] for key in _REPEATED if key in columns)),
-        perception=measure_perception(episode),
+        perception=assess(episode.plan, states[0]) if states is not None else {},
         wall=_wall(episode),
     )
 

@@ -1,3 +1,14 @@
 """Brains: rules, planners and checkpoints."""
 
-__all__ = ["baselines", "brain", "dagger", "language", "learned", "manipulation", "mlp", "navigation"]
+__all__ = [
+    "baselines",
+    "blanked",
+    "brain",
+    "dagger",
+    "language",
+    "learned",
+    "manipulation",
+    "mlp",
+    "navigation",
+    "perception",
+]

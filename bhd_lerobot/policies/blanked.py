@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Brain, BrainConfig, DriverConfig, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Observation, RobotFeatures
 
 
 @BrainConfig.register_subclass("blanked")
@@ -43,10 +43,11 @@ class BlankedBrain:
     """
 
     name = "blanked"
+    robot_kind = ANY_ROBOT
 
     def __init__(self, config: BlankedConfig, brain: Brain) -> None:
         self.config, self._brain = config, brain
-        self.robot_kind, self.has_plan = brain.robot_kind, brain.has_plan
+        self.has_plan = brain.has_plan
 
     @property
     def uses_images(self) -> bool:

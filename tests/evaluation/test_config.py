@@ -98,6 +98,6 @@ def test_what_cannot_be_honoured_is_refused_by_name(arguments, message):
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_configurations_are_valid_and_compare_held_out_seeds(path):
     config = parse(EvalConfig, [f"--config_path={path}"])
-    assert len(config.brains) > 1
+    assert len(config.brains) > 1 or path.stem == "ur5_look", "perception is measured by itself"
     assert config.split == "held_out"
     assert config.reference in config.brains

@@ -136,9 +136,9 @@ class LanguageBrain(PickBrain):
 
     def _make_plan(self, work: Work, objects: Sequence[SeenObject]) -> Plan:
         plan = self._planner.plan(work.instruction, [scene_object(item) for item in objects])
-        target = next(one for one in objects if one.index == plan.target)
-        if isinstance(target, PerceivedObject):
-            self._check(target)
+        for one in objects:
+            if one.index == plan.target and isinstance(one, PerceivedObject):
+                self._check(one)
         return plan
 
     def _check(self, target: PerceivedObject) -> None:

@@ -26,7 +26,6 @@ from bhd_lerobot.plugins import load_plugins
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import CONFIG_FILE, camera_name
 from bhd_lerobot.policies.mlp import configuration_mlp  # noqa: F401 - registers bhd_mlp
-from bhd_lerobot.policies.perception import configuration_perception  # noqa: F401 - registers bhd_perception
 
 
 @dataclass(frozen=True)

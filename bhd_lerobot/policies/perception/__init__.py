@@ -1,3 +1,11 @@
 """Eyes: from a camera's image to the objects on the table, with how sure that is."""
 
-__all__ = ["camera", "configuration_perception", "labels", "modeling_perception", "perceiver", "processor_perception"]
+__all__ = [
+    "assessment",
+    "camera",
+    "configuration_perception",
+    "labels",
+    "modeling_perception",
+    "perceiver",
+    "processor_perception",
+]

@@ -183,7 +183,7 @@ def test_a_new_look_at_held_out_images_replaces_the_calibration(trained: Percept
 
 
 def test_without_held_out_images_it_refuses_to_see() -> None:
-    with pytest.raises(ConfigError, match="does not know how large its errors are.*eval_split"):
+    with pytest.raises(ConfigError, match=r"does not know how large its errors are.*eval_split"):
         PerceptionPolicy(config()).detect(torch.zeros(1, 3, HEIGHT, WIDTH))
 
 
@@ -242,7 +242,7 @@ def test_configurations_that_cannot_be_honoured(options: dict[str, Any], message
 
 
 def test_a_dataset_without_true_poses_or_without_images() -> None:
-    with pytest.raises(ConfigError, match="true poses of objects.*Record the task 'pick'"):
+    with pytest.raises(ConfigError, match=r"true poses of objects.*Record the task 'pick'"):
         config().set_dataset_feature_metadata({OBS_ENV_STATE: {"names": ["target_x"]}})
     bare = PerceptionConfig(input_features={}, output_features={}, **SMALL)
     with pytest.raises(ConfigError, match=r"It has no images. Record it with --robot.camera=true"):
@@ -254,5 +254,5 @@ def test_images_of_another_size_and_calls_for_actions(trained: PerceptionPolicy)
         trained.detect(torch.zeros(1, 3, 60, 80))
     with pytest.raises(ConfigError, match="not in the batch"):
         trained.forward({OBS_ENV_STATE: torch.zeros(1, 80)})
-    with pytest.raises(ConfigError, match="gives no actions. Use it in a brain"):
+    with pytest.raises(ConfigError, match=r"gives no actions\. Use it in a brain"):
         trained.select_action({})

@@ -1,0 +1,225 @@
+"""The language brain that sees for itself: what it acts on, what it does not, and what it says when it cannot see."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bhd_lerobot.bodies.tabletop import COLOURS, TableObject
+from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
+from bhd_lerobot.errors import ConfigError, PerceptionError
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
+from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
+from bhd_lerobot.policies.perception.perceiver import PerceivedObject, PerceptionOptions
+from tests.cases import each_case
+from tests.policies.arm_desk import BOX, CUP, OBSERVED
+
+
+def seen(thing: TableObject, index: int, *, off: float = 0.0, error: float = 0.005, certainty: float = 0.95) -> Any:
+    """Return how a camera shows an object, `off` beside where it is [m]."""
+    return PerceivedObject(
+        index=index,
+        kind=thing.kind,
+        position=(thing.x + off, thing.y, thing.height / 2),
+        yaw=thing.yaw,
+        size=(2 * thing.size_x, 2 * thing.size_y, thing.height),
+        colour=COLOURS[thing.colour],
+        target=False,
+        error_50_m=error / 2,
+        error_90_m=error,
+        certainty=certainty,
+    )
+
+
+class Eyes:
+    """Sees what a test says; every look may show something else."""
+
+    camera = "scene"
+    weights, dataset = "sha256:0", {"repo_id": "test"}
+
+    def __init__(self, *looks: Any) -> None:
+        self.looks, self.count = list(looks), 0
+
+    def look(self, images: dict[str, np.ndarray], sim: int) -> list[PerceivedObject]:
+        assert images[self.camera].shape == (1, 8, 8, 3)
+        shown = self.looks[min(self.count, len(self.looks) - 1)]
+        self.count += 1
+        if isinstance(shown, Exception):
+            raise shown
+        return list(shown)
+
+
+class Table:
+    """One arm, its brain, and a camera. Reading what the task tells fails."""
+
+    def __init__(self, *looks: Any, instruction: str = "pick up the red cup", frozen: bool = False, **options: Any):
+        config = LanguageBrainConfig(perception=PerceptionOptions(**options))
+        self.brain = LanguageBrain(config)
+        self.eyes = Eyes(*looks)
+        self.brain.perceiver = self.eyes  # type: ignore[assignment]
+        self.brain.bind(RobotFeatures(OBSERVED, OBSERVED, 25, ()))
+        assert self.brain.uses_images, "it looks before it does anything"
+        self.brain.reset(np.array([0]), [0], 1, [instruction])
+        self.given: list[BrainCommand] = []
+        self.opening, self.frozen, self.images_wanted = MAX_OPENING, frozen, []
+        self._random = np.random.default_rng(0)
+        self._image = self._random.integers(0, 255, (1, 8, 8, 3), np.uint8)
+
+    def frame(self, result: CommandResult | None = None) -> BrainCommand | None:
+        """Let the brain act; images are there if it asked for them."""
+        if not self.frozen:
+            self._image = self._random.integers(0, 255, (1, 8, 8, 3), np.uint8)
+        wanted = self.brain.uses_images
+        self.images_wanted.append(wanted)
+        results = {0: [result]} if result else {}
+        state = np.array([[0.0, self.opening]])
+        goals = self.brain.act(Observation(OBSERVED, state, {"scene": self._image} if wanted else {}, None, results))
+        assert isinstance(goals, Goals)
+        for command in goals.commands.get(0, []):
+            self.given.append(command)
+            return command
+        return None
+
+    def end(self, success: bool = True, message: str = "") -> BrainCommand | None:
+        code = ResultCode.SUCCEEDED if success else ResultCode.PATH_TOLERANCE
+        return self.frame(CommandResult(self.given[-1].task_id, success, code, message))
+
+    @property
+    def steps(self) -> list[str]:
+        return [one.task_id.split("-", 1)[1] for one in self.given]
+
+    @property
+    def problem(self) -> str:
+        return str(self.brain.plan(0)["problem"])
+
+
+BOTH = (seen(CUP, 0), seen(BOX, 1))
+
+
+@each_case(
+    ("instruction", "meant"), [("pick up the red cup", CUP), ("拿起蓝色盒子", BOX), ("take the thing on the left", BOX)]
+)
+def test_it_goes_where_it_sees_what_is_meant_and_needs_nothing_that_the_task_tells(
+    instruction: str, meant: TableObject
+) -> None:
+    table = Table([seen(CUP, 0, off=0.01), seen(BOX, 1, off=0.01)], instruction=instruction)
+    goal = table.frame()
+    assert goal is not None
+    assert goal.target_pose is not None
+    assert goal.target_pose.position[:2] == pytest.approx((meant.x + 0.01, meant.y))
+    table.opening = 2 * meant.size_y
+    while table.end() is not None:
+        pass
+    assert table.steps == ["above", "down", "close", "lift"]
+    assert table.eyes.count == 1
+    plan = table.brain.plan(0)
+    assert plan["seen"][plan["chosen"]]["name"] == meant.name
+
+
+def test_it_asks_for_images_only_while_it_looks_and_until_the_camera_has_shown_that_it_lives() -> None:
+    table = Table(BOTH)
+    table.frame()
+    table.opening = 0.06
+    while table.end() is not None:
+        pass
+    assert table.images_wanted == [True, True, False, False, False]
+
+
+def test_the_fingers_open_wider_for_what_is_known_less_exactly() -> None:
+    openings = []
+    for error in (0.0, 0.004, 0.025):
+        table = Table([seen(CUP, 0, error=error)])
+        table.frame()
+        openings.append(table.given[0].gripper)
+    assert openings[1] == pytest.approx(min(MAX_OPENING, openings[0] + 0.008))
+    assert openings[2] == MAX_OPENING
+
+
+@each_case(
+    ("looks", "options", "problem"),
+    [
+        ([PerceptionError("the camera 'scene' shows nothing")], {}, "the camera 'scene' shows nothing"),
+        ([()], {}, "Nothing on the table is 'red cup'"),
+        ([(seen(BOX, 0),)], {}, "Nothing on the table is 'red cup'. On the table: blue box"),
+        ([(seen(CUP, 0), seen(CUP, 1, off=0.2))], {}, "fits 2 objects"),
+        ([(seen(CUP, 0, certainty=0.4),)], {}, "not certain that there is a red cup: 40%"),
+        ([(seen(CUP, 0, error=0.04),)], {}, "known to 40 mm only"),
+        ([(seen(CUP, 0, error=0.01),)], {"max_error_m": 0.005}, "known to 10 mm only"),
+    ],
+)
+def test_what_it_does_not_see_or_not_surely_enough_it_does_not_touch(
+    looks: list[Any], options: dict[str, Any], problem: str
+) -> None:
+    table = Table(*looks, **options)
+    assert table.frame() is None
+    assert problem in table.problem
+    assert table.brain.subtasks()[0].startswith("cannot: ")
+    assert table.brain.plan(0)["chosen"] is None
+
+
+def test_with_a_camera_that_does_not_change_while_the_arm_moves_it_does_not_go_down() -> None:
+    table = Table(BOTH, frozen=True)
+    assert table.frame() is not None
+    assert table.end() is None
+    assert table.steps == ["above"]
+    assert "shows the same image although the arm has moved" in table.problem
+
+
+def test_after_a_miss_it_goes_home_and_looks_again() -> None:
+    """The object stands elsewhere the second time, and under another number."""
+    table = Table(BOTH, (seen(BOX, 0), seen(CUP, 1, off=0.05)))
+    table.frame()
+    table.end()
+    table.end()
+    table.opening = 0.0  # closed on nothing
+    assert table.end() is not None
+    assert table.steps[-1] == "back"
+    home = table.end()
+    assert home is not None
+    assert home.joint_target == ur5().home[:-1]
+    again = table.end()
+    assert again is not None
+    assert again.target_pose is not None
+    assert again.target_pose.position[:2] == pytest.approx((CUP.x + 0.05, CUP.y))
+    assert table.eyes.count == 2
+    table.end()
+    table.opening = 2 * CUP.size_x
+    table.end()
+    table.end()
+    assert table.steps[-1] == "lift"
+    plan = table.brain.plan(0)
+    assert plan["chosen"] == 0, "what is evaluated is the first look"
+    assert plan["seen"][0]["position"][0] == pytest.approx(CUP.x)
+
+
+def test_what_slips_out_while_it_is_lifted_is_noticed_by_the_fingers() -> None:
+    table = Table(BOTH)
+    table.frame()
+    table.end()
+    table.end()
+    table.opening = 2 * CUP.size_x
+    table.end()
+    table.opening = 0.0
+    table.end()
+    assert table.steps[-2:] == ["lift", "back"]
+    assert table.problem == "the object was not lifted"
+
+
+def test_it_says_which_weights_it_sees_with() -> None:
+    table = Table(BOTH)
+    assert table.brain.parameters()["perception"]["weights"] == "sha256:0"
+    assert "weights" not in LanguageBrain().parameters()["perception"]
+
+
+@each_case(
+    ("options", "message"),
+    [
+        ({"max_error_m": 0.0}, "max_error_m is 0.0; it must be positive"),
+        ({"max_error_m": float("nan")}, "max_error_m is nan"),
+        ({"min_certainty": 1.0}, "min_certainty is 1.0; it must be from 0 to below 1"),
+    ],
+)
+def test_options_that_cannot_be_honoured(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        PerceptionOptions(**options)
