@@ -27,7 +27,7 @@ _SPREAD = 1.5  # [cells] standard deviation of the bump in the map of presence t
 _NEAR = 0.3  # cells in which that bump is at least this high say where the object is
 _SHIFT, _ERROR, _SIZE = 0.05, 0.01, 0.07  # [m] what 1 means in the network's answers
 _LOG_ERROR = (-4.0, 3.0)
-_SAME = 0.05  # [m] an object that is found this near a true one is that one
+_DISTINCT = 0.025  # [m] what is found nearer to something surer is that
 _TAIL = 0.9  # share of errors that is to lie within the radius that the calibration is done for
 _RADIUS = 3.889720169867429  # in units of the scale, within which a radius of density exp(-r) r lies with `_TAIL`
 _OUTPUTS = {
@@ -176,7 +176,7 @@ class PerceptionPolicy(PreTrainedPolicy):
             if not len(true) or not len(found.presence):
                 continue
             apart = torch.cdist(found.position[:, :2], true[:, :2]).min(dim=1).values
-            self._ratios.append((apart / found.scale)[apart < _SAME])
+            self._ratios.append(apart / found.scale)
         if self._ratios:
             ratios = torch.cat(self._ratios)
             # The quantile that also a further error stays below with this probability.
@@ -197,8 +197,9 @@ class PerceptionPolicy(PreTrainedPolicy):
         """
         if not bool(torch.isfinite(self.factor)):
             raise ConfigError(
-                "This bhd_perception does not know how large its errors are: no held-out images were looked at in its "
-                "training. Train it with --dataset.eval_split=0.1 and --eval_steps=1000."
+                "This bhd_perception does not know how large its errors are: in its training it looked at no held-out "
+                "images, or found nothing in them. Train it with --dataset.eval_split=0.05 and --eval_steps=2000, and "
+                "long enough."
             )
         self.eval()
         return self._found(self._answers(self._image({self.config.image_key: images})), float(self.factor))
@@ -276,7 +277,7 @@ def _distinct(found: Detections) -> Detections:
     apart = torch.cdist(found.position[:, :2], found.position[:, :2])
     kept: list[int] = []
     for row in range(len(apart)):
-        if not kept or float(apart[row, kept].min()) > _SAME / 2:
+        if not kept or float(apart[row, kept].min()) > _DISTINCT:
             kept.append(row)
     return Detections(*(getattr(found, name)[kept] for name in found.__dataclass_fields__))
 

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from bhd_lerobot.policies.perception.modeling_perception import Detections
 
 _RADIUS_50, _RADIUS_90 = 1.678346990016661, 3.889720169867429  # quantiles of a Gamma distribution of shape 2
-_DARK, _FLAT = 8, 3.0  # brightness of the brightest pixel, and standard deviation of all, below which nothing is shown
+# Brightness of the brightest pixel, and the colours' standard deviation over the image, below which nothing is shown.
+_DARK, _FLAT = 8, 3.0
 
 
 @dataclass
@@ -113,7 +114,7 @@ class Perceiver:
                 f"{self.who} was trained on images of {width} x {height} px; those of the camera {self.camera!r} are "
                 f"{image.shape[1]} x {image.shape[0]}. Set --robot.camera_width={width} --robot.camera_height={height}."
             )
-        if int(image.max()) < _DARK or float(image.std()) < _FLAT:
+        if int(image.max()) < _DARK or float(image.std(axis=(0, 1)).max()) < _FLAT:
             raise PerceptionError(f"the camera {self.camera!r} shows nothing: its image has one colour only")
         values = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].to(self._device).float() / 255
         return _objects(self._policy.detect(values)[0])
