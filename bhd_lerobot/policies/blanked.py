@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Looking, Observation, RobotFeatures
 
 
 @BrainConfig.register_subclass("blanked")
@@ -48,6 +48,8 @@ class BlankedBrain:
     def __init__(self, config: BlankedConfig, brain: Brain) -> None:
         self.config, self._brain = config, brain
         self.has_plan = brain.has_plan
+        if isinstance(brain, Looking):
+            self.looks = brain.looks
 
     @property
     def uses_images(self) -> bool:

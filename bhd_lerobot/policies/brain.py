@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import draccus
 import numpy as np
@@ -173,6 +173,14 @@ class ConfiguredBrain:
     def parameters(self) -> dict[str, Any]:
         """Return the type and the parameters."""
         return {"type": self.name, **asdict(self.config)}
+
+
+@runtime_checkable
+class Looking(Protocol):
+    """A brain that does not look in every frame, nor in all simulations at a time."""
+
+    def looks(self) -> NDArray[np.bool_]:
+        """Return in which simulations the next `act` uses images, shape (n,); in the others it may get black ones."""
 
 
 class Intervening(Protocol):

@@ -13,7 +13,7 @@ from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.timing import TimingStatistics, TimingSummary
 from bhd_lerobot.control.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, Looking, Observation, RobotFeatures
 from bhd_lerobot.robots.faults import add_faults
 from bhd_lerobot.robots.host.host import FrameReport, Host
 from bhd_lerobot.rollout.drivers import DriverLog, flagged
@@ -167,12 +167,19 @@ class EpisodeLoop:
         self.marks.begin(ids)
         self._truth = None
 
+    def _looks(self) -> NDArray[np.bool_]:
+        """Return in which simulations the brain is about to use images, shape (n,)."""
+        brain, n = self.brain, self.simulation.n
+        if not brain.uses_images:
+            return np.zeros(n, np.bool_)
+        return brain.looks() if isinstance(brain, Looking) else np.ones(n, np.bool_)
+
     def _frame(self) -> list[tuple[int, Event]]:
         """Run one frame of all running simulations; return those that ended, and why."""
         simulation, task, brain = self.simulation, self.task, self.brain
         frame = simulation.observe()
         state = frame.state.astype(np.float32)
-        images = self._images.order_all(self.observer, wanted=brain.uses_images)
+        images = self._images.order_all(self.observer, self._looks())
         values: dict[str, NDArray] = {}
         environment = None
         if task.environment_names:

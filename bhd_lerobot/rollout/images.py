@@ -32,26 +32,28 @@ class EpisodeImages:
         self.sinks: list[Any] = [None] * simulation.n
         self._pending: list[list[futures.Future[Image]]] = [[] for _ in range(simulation.n)]
 
-    def order_all(self, observer: Observer | None, *, wanted: bool) -> dict[str, Image]:
-        """Order the images of the running simulations; return them if they are wanted.
+    def order_all(self, observer: Observer | None, wanted: NDArray[np.bool_]) -> dict[str, Image]:
+        """Order the images of the running simulations that anybody looks at; return those that are wanted.
 
         A brain that does not use images does not wait for them: they are made while the frame goes on.
 
         Args:
             observer: is shown them, too.
-            wanted: whether to wait for them.
+            wanted: of which simulations to wait for them, shape (n,); the images of others are black.
         """
         simulation, cameras = self._simulation, self._simulation.camera_names
         images: dict[str, Image] = {}
         running = np.flatnonzero(simulation.running).tolist() if cameras else []
         for sim in running:
-            self.order(sim, observer)
-        if wanted:
+            if wanted[sim] or observer is not None or self.sinks[sim] is not None:
+                self.order(sim, observer)
+        if wanted.any():
             height, width = simulation.config.camera_height, simulation.config.camera_width
             images = {camera: np.zeros((simulation.n, height, width, 3), np.uint8) for camera in cameras}
             for sim in running:
-                for camera, image in zip(cameras, self._pending[sim][-len(cameras) :], strict=True):
-                    images[camera][sim] = image.result()
+                if wanted[sim]:
+                    for camera, image in zip(cameras, self._pending[sim][-len(cameras) :], strict=True):
+                        images[camera][sim] = image.result()
         # What went wrong in the making of an image ends the run now, not at the end of the episode.
         for waiting in self._pending:
             while waiting and waiting[0].done():

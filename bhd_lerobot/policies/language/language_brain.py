@@ -1,6 +1,7 @@
 """The brain that does what an instruction says: language to a plan of skills, skills to goals."""
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -9,15 +10,16 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult
-from bhd_lerobot.errors import PerceptionError
+from bhd_lerobot.errors import InstructionError, PerceptionError
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures
 from bhd_lerobot.policies.language.instruction import RulePlanner
 from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject
-from bhd_lerobot.policies.manipulation.pick import MISSED, PickBrain, PickBrainConfig, Work
+from bhd_lerobot.policies.manipulation.pick import SQUEEZE, PickBrain, PickBrainConfig
 from bhd_lerobot.policies.manipulation.skills import Plan, Planner, scene_object
 from bhd_lerobot.policies.perception.perceiver import PerceivedObject, Perceiver, PerceptionOptions
 
 _HOME_SPEED, _HOME_CHANGE = 1.5, 4.0  # [rad/s], [rad/s^2]
+_CLOSED = 0.006  # [m] fingers that are this near to where they were sent came there
 
 
 @BrainConfig.register_subclass("language")
@@ -45,8 +47,8 @@ class _Sight:
         image: what the camera showed then; None once it has shown something else.
     """
 
-    objects: list[PerceivedObject] | None = None
-    first: list[PerceivedObject] | None = None
+    objects: Sequence[SeenObject] | None = None
+    first: Sequence[PerceivedObject] | None = None
     chosen: int | None = None
     image: NDArray[np.uint8] | None = None
 
@@ -81,9 +83,15 @@ class LanguageBrain(PickBrain):
     @property
     def uses_images(self) -> bool:  # type: ignore[override]
         """Whether it is about to look at something."""
-        if self.perceiver is None:
-            return False
-        return not self._sights or any(one.objects is None or one.image is not None for one in self._sights.values())
+        return self.perceiver is not None and (not self._sights or bool(self.looks().any()))
+
+    def looks(self) -> NDArray[np.bool_]:
+        """Return in which simulations it is about to look at something, shape (n,)."""
+        return np.array([self._is_looking(sim) for sim in range(len(self._pending))], np.bool_)
+
+    def _is_looking(self, sim: int) -> bool:
+        sight = self._sights.get(sim)
+        return sight is not None and not self._done[sim] and (sight.objects is None or sight.image is not None)
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
         """Take the instruction of the episode, or that of the configuration."""
@@ -129,17 +137,34 @@ class LanguageBrain(PickBrain):
             return super()._objects(sim, seen)
         sight = self._sights[sim]
         if sight.objects is None:
-            sight.objects = self.perceiver.look(seen.images, sim)
+            found = self.perceiver.look(seen.images, sim)
+            sight.objects = found
             if sight.first is None:
-                sight.first, sight.image = sight.objects, seen.images[self.perceiver.camera][sim].copy()
+                sight.first, sight.image = found, seen.images[self.perceiver.camera][sim].copy()
         return sight.objects
 
-    def _make_plan(self, work: Work, objects: Sequence[SeenObject]) -> Plan:
-        plan = self._planner.plan(work.instruction, [scene_object(item) for item in objects])
+    def _make_plan(self, sim: int, objects: Sequence[SeenObject]) -> tuple[Plan, Sequence[SeenObject]]:
+        """Return the plan for what is on the table, and what it takes the objects for.
+
+        Who asks for a thing knows that it is there. Where what is seen fits nothing or too much, one object is taken
+        for what it may be instead, the likeliest such change first.
+        """
+        instruction = self._work[sim].instruction
+        try:
+            plan = self._planner.plan(instruction, [scene_object(item) for item in objects])
+        except InstructionError as error:
+            for others in _otherwise(objects):
+                with contextlib.suppress(InstructionError):
+                    plan, objects = self._planner.plan(instruction, [scene_object(one) for one in others]), others
+                    break
+            else:
+                raise error
         for one in objects:
             if one.index == plan.target and isinstance(one, PerceivedObject):
                 self._check(one)
-        return plan
+        if self.perceiver is not None:
+            self._sights[sim].objects = objects
+        return plan, objects
 
     def _check(self, target: PerceivedObject) -> None:
         options, name = self.settings.perception, scene_object(target).name
@@ -161,10 +186,16 @@ class LanguageBrain(PickBrain):
         # The fingers need more room beside what is not known exactly.
         return replace(grasp, opening=min(MAX_OPENING, grasp.opening + 2 * target.error_90_m))
 
+    def _is_held(self, opening: float, grasp: Grasp) -> bool:
+        if self.perceiver is None:
+            return super()._is_held(opening, grasp)
+        # Its width is not known exactly: nothing is held if the fingers came to where they were sent.
+        return opening >= grasp.width - SQUEEZE + _CLOSED
+
     def _is_lifted(self, opening: float, grasp: Grasp, target: SeenObject) -> bool:
         if self.perceiver is None:
             return super()._is_lifted(opening, grasp, target)
-        return opening >= grasp.width - MISSED  # what slipped out is not between the fingers
+        return self._is_held(opening, grasp)  # what slipped out is not between the fingers
 
     def _next(self, sim: int, target: SeenObject, objects: Sequence[SeenObject]) -> BrainCommand | None:
         work = self._work[sim]
@@ -181,6 +212,18 @@ class LanguageBrain(PickBrain):
 
 
 _HOME = ur5().home
+
+
+def _otherwise(objects: Sequence[SeenObject]) -> Iterator[Sequence[SeenObject]]:
+    """Yield the objects with one of them as what it may be instead, the likeliest first."""
+    changes = [
+        (other.certainty / max(one.certainty, 1e-9), place, other)
+        for place, one in enumerate(objects)
+        if isinstance(one, PerceivedObject)
+        for other in one.alternatives
+    ]
+    for _, place, other in sorted(changes, key=lambda change: -change[0]):
+        yield [*objects[:place], other, *objects[place + 1 :]]
 
 
 def _plain(one: PerceivedObject) -> dict[str, Any]:

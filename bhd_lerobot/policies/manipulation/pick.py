@@ -23,8 +23,8 @@ from bhd_lerobot.policies.manipulation.grasp import (
 )
 from bhd_lerobot.policies.manipulation.skills import Plan, Skill, make_plan, scene_object
 
-_SQUEEZE = 0.03  # [m] how far inside the object the fingers are sent: the gripper's force limit does the rest
-MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers
+SQUEEZE = 0.03  # [m] how far inside the object the fingers are sent: the gripper's force limit does the rest
+_MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers
 _TRAVEL = 0.22  # [m] height of the tool above the table on free motions: the finger tips stay above every object
 _LIFTED = 0.05  # [m] an object that was lifted by less slipped out
 _POSITION = [OBJECT_FIELDS.index(axis) for axis in "xyz"]
@@ -100,8 +100,8 @@ class PickBrain(GoalBrain):
             "problem": work.problem,
         }
 
-    def _make_plan(self, work: Work, objects: Sequence[SeenObject]) -> Plan:
-        """Return the plan for what is on the table.
+    def _make_plan(self, sim: int, objects: Sequence[SeenObject]) -> tuple[Plan, Sequence[SeenObject]]:
+        """Return the plan for what is on the table, and what it takes the objects for.
 
         Raises:
             InstructionError: there is none.
@@ -109,7 +109,7 @@ class PickBrain(GoalBrain):
         for item in objects:
             if item.target:
                 skills = (Skill.LOCATE, Skill.APPROACH, Skill.GRASP, Skill.LIFT, Skill.HOLD)
-                return make_plan(work.instruction, scene_object(item), skills)
+                return make_plan(self._work[sim].instruction, scene_object(item), skills), objects
         raise InstructionError("No object on the table is the one that the task is about.")
 
     # --- from one goal to the next -----------------------------------------------------------------------------------
@@ -124,7 +124,7 @@ class PickBrain(GoalBrain):
         try:
             objects = self._objects(sim, seen)
             if work.plan is None:
-                work.plan = self._make_plan(work, objects)
+                work.plan, objects = self._make_plan(sim, objects)
                 work.step, work.stage = 1, ""  # the object was located when the plan was made
         except (InstructionError, PerceptionError) as error:
             return self._give_up(sim, str(error))
@@ -182,7 +182,7 @@ class PickBrain(GoalBrain):
             command = self._line(sim, "down", grasp, grasp.z)
         elif skill == Skill.GRASP:
             work.stage = "close"
-            command = BrainCommand(self.new_id(sim, "close"), gripper=max(0.0, grasp.width - _SQUEEZE))
+            command = BrainCommand(self.new_id(sim, "close"), gripper=max(0.0, grasp.width - SQUEEZE))
         elif skill == Skill.LIFT:
             command = self._line(sim, "lift", grasp, grasp.z + config.lift_m)
         elif skill == Skill.HAND_OVER:
@@ -222,11 +222,15 @@ class PickBrain(GoalBrain):
         if work.grasp is None:
             return ""
         opening = float(seen.state[sim, self._opening])
-        if work.stage == "close" and opening < work.grasp.width - MISSED:
+        if work.stage == "close" and not self._is_held(opening, work.grasp):
             return f"the gripper closed to {opening * 1000:.0f} mm and holds nothing"
         if work.stage == "lift" and not self._is_lifted(opening, work.grasp, target):
             return "the object was not lifted"
         return ""
+
+    def _is_held(self, opening: float, grasp: Grasp) -> bool:
+        """Return whether something is between the fingers, which were closed and are this far apart [m]."""
+        return opening >= grasp.width - _MISSED
 
     def _is_lifted(self, opening: float, grasp: Grasp, target: SeenObject) -> bool:
         """Return whether the object came up with the gripper, whose fingers are this far apart [m]."""

@@ -1,8 +1,8 @@
 """A trained `bhd_perception` as brains use it: an image in, objects with their errors out."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +31,13 @@ class PerceptionOptions:
             simulation is the truth.
         device: where it runs: `cpu`, `cuda`, …
         max_error_m: an object whose place is not known better than this, with 90 % probability, is not grasped [m].
-        min_certainty: an object whose kind and colour are less certain than this is not grasped.
+        min_certainty: nothing is taken for an object of a kind and colour that is less certain than this.
     """
 
     path: str = ""
     device: str = "cpu"
     max_error_m: float = 0.03
-    min_certainty: float = 0.5
+    min_certainty: float = 0.1
 
     def __post_init__(self) -> None:
         if not 0 < self.max_error_m < float("inf"):
@@ -54,11 +54,13 @@ class PerceivedObject(SeenObject):
         error_50_m: radius around `position`, in x and y, within which it is with a probability of 50 % [m].
         error_90_m: likewise 90 % [m].
         certainty: probability that there is an object and that it has this kind and colour.
+        alternatives: what it may be instead, the likeliest first.
     """
 
     error_50_m: float = field(default=0.0, kw_only=True)
     error_90_m: float = field(default=0.0, kw_only=True)
     certainty: float = field(default=1.0, kw_only=True)
+    alternatives: tuple["PerceivedObject", ...] = field(default=(), kw_only=True)
 
 
 class Perceiver:
@@ -84,7 +86,7 @@ class Perceiver:
         self.dataset = dict(PolicyContract.load(folder).dataset or {})
         self.weights = weights_digest(folder)
         self._policy = load_perception(folder, options.device)
-        self._device = options.device
+        self._device, self._least = options.device, options.min_certainty
         self.camera: str = self._policy.config.camera
 
     def look(self, images: Mapping[str, NDArray[np.uint8]], sim: int) -> list[PerceivedObject]:
@@ -117,30 +119,43 @@ class Perceiver:
         if int(image.max()) < _DARK or float(image.std(axis=(0, 1)).max()) < _FLAT:
             raise PerceptionError(f"the camera {self.camera!r} shows nothing: its image has one colour only")
         values = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].to(self._device).float() / 255
-        return _objects(self._policy.detect(values)[0])
+        return _objects(self._policy.detect(values)[0], self._least)
 
 
-def _objects(found: "Detections") -> list[PerceivedObject]:
-    palette = list(COLOURS.values())
+def _objects(found: "Detections", least: float) -> list[PerceivedObject]:
+    """Return what was found, each as what it most likely is, with the alternatives that are at least so certain."""
     objects = []
     for place in range(len(found.presence)):
-        share, colour = found.colour[place].max(0)
         box = float(found.is_box[place])
-        length, width, height = found.size[place].tolist()
-        scale = float(found.scale[place])
-        is_box = box > 0.5
-        objects.append(
-            PerceivedObject(
-                index=place,
-                kind="box" if is_box else "cup",
-                position=tuple(found.position[place].tolist()),
-                yaw=float(found.yaw[place]) if is_box else 0.0,
-                size=(length, width, height) if is_box else ((length + width) / 2, (length + width) / 2, height),
-                colour=palette[int(colour)],
-                target=False,
-                error_50_m=_RADIUS_50 * scale,
-                error_90_m=_RADIUS_90 * scale,
-                certainty=float(found.presence[place]) * max(box, 1 - box) * float(share),
-            )
-        )
+        kinds: tuple[tuple[Literal["cup", "box"], float], ...] = (("box", box), ("cup", 1 - box))
+        names = [
+            (float(found.presence[place]) * likely * share, kind, colour)
+            for kind, likely in kinds
+            for colour, share in zip(COLOURS.values(), found.colour[place].tolist(), strict=True)
+        ]
+        first, *others = [_object(found, place, *name) for name in sorted(names, reverse=True)]
+        likely_others = tuple(one for one in others if one.certainty >= least)
+        objects.append(replace(first, alternatives=likely_others))
     return objects
+
+
+def _object(
+    found: "Detections", place: int, certainty: float, kind: Literal["cup", "box"], colour: tuple[float, float, float]
+) -> PerceivedObject:
+    length, width, height = found.size[place].tolist()
+    if kind == "cup":
+        length = width = (length + width) / 2
+    x, y, z = found.position[place].tolist()
+    scale = float(found.scale[place])
+    return PerceivedObject(
+        index=place,
+        kind=kind,
+        position=(x, y, z),
+        yaw=float(found.yaw[place]) if kind == "box" else 0.0,
+        size=(length, width, height),
+        colour=colour,
+        target=False,
+        error_50_m=_RADIUS_50 * scale,
+        error_90_m=_RADIUS_90 * scale,
+        certainty=certainty,
+    )

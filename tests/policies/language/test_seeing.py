@@ -1,5 +1,6 @@
 """The language brain that sees for itself: what it acts on, what it does not, and what it says when it cannot see."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -143,7 +144,7 @@ def test_the_fingers_open_wider_for_what_is_known_less_exactly() -> None:
         ([()], {}, "Nothing on the table is 'red cup'"),
         ([(seen(BOX, 0),)], {}, "Nothing on the table is 'red cup'. On the table: blue box"),
         ([(seen(CUP, 0), seen(CUP, 1, off=0.2))], {}, "fits 2 objects"),
-        ([(seen(CUP, 0, certainty=0.4),)], {}, "not certain that there is a red cup: 40%"),
+        ([(seen(CUP, 0, certainty=0.4),)], {"min_certainty": 0.5}, "not certain that there is a red cup: 40%"),
         ([(seen(CUP, 0, error=0.04),)], {}, "known to 40 mm only"),
         ([(seen(CUP, 0, error=0.01),)], {"max_error_m": 0.005}, "known to 10 mm only"),
     ],
@@ -210,6 +211,28 @@ def test_it_says_which_weights_it_sees_with() -> None:
     table = Table(BOTH)
     assert table.brain.parameters()["perception"]["weights"] == "sha256:0"
     assert "weights" not in LanguageBrain().parameters()["perception"]
+
+
+def test_what_was_taken_for_something_else_is_what_was_asked_for_if_it_may_be_that() -> None:
+    """A red cup is asked for, and seen are a box and a cup that may be red ones: the likelier of the two it is."""
+    red = TableObject("box", "red", BOX.size_x, BOX.size_y, BOX.height, BOX.x, BOX.y)
+    unlikely = dataclasses.replace(seen(red, 0, certainty=0.8), alternatives=(seen(CUP, 0, off=0.3, certainty=0.1),))
+    orange = TableObject("cup", "orange", CUP.size_x, CUP.size_y, CUP.height, CUP.x, CUP.y)
+    likely = dataclasses.replace(seen(orange, 1, certainty=0.5), alternatives=(seen(CUP, 1, certainty=0.3),))
+    table = Table([unlikely, likely])
+    goal = table.frame()
+    assert goal is not None
+    assert goal.target_pose is not None
+    assert goal.target_pose.position[:2] == pytest.approx((CUP.x, CUP.y))
+    assert table.brain.subtasks()[0] == "move the gripper to the red cup"
+    assert Table([unlikely, likely], instruction="pick up the green cup").frame() is None
+
+
+def test_a_brain_that_gave_up_looks_no_more() -> None:
+    table = Table(PerceptionError("the camera 'scene' shows nothing"))
+    assert table.brain.looks().tolist() == [True]
+    table.frame()
+    assert table.brain.looks().tolist() == [False]
 
 
 @each_case(
