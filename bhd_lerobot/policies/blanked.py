@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Looking, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import ANY_ROBOT, Brain, BrainConfig, DriverConfig, Observation, RobotFeatures
 
 
 @BrainConfig.register_subclass("blanked")
@@ -48,12 +48,12 @@ class BlankedBrain:
     def __init__(self, config: BlankedConfig, brain: Brain) -> None:
         self.config, self._brain = config, brain
         self.has_plan = brain.has_plan
-        if isinstance(brain, Looking):
+        if hasattr(brain, "looks"):
             self.looks = brain.looks
 
     @property
     def uses_images(self) -> bool:
-        """Whether the brain is about to use images."""
+        """Whether the brain uses images."""
         return self._brain.uses_images
 
     def bind(self, robot: RobotFeatures) -> None:

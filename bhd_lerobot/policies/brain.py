@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import draccus
 import numpy as np
@@ -110,7 +110,7 @@ class Brain(Protocol):
 
     @property
     def uses_images(self) -> bool:
-        """Whether the next `act` uses the observation's images: if not, it does not wait for them and may get none."""
+        """Whether `act` uses the observation's images. If not, it is not kept waiting for them and may get none."""
 
     def bind(self, robot: RobotFeatures) -> None:
         """Learn what robot it will drive.
@@ -175,12 +175,15 @@ class ConfiguredBrain:
         return {"type": self.name, **asdict(self.config)}
 
 
-@runtime_checkable
 class Looking(Protocol):
     """A brain that does not look in every frame, nor in all simulations at a time."""
 
-    def looks(self) -> NDArray[np.bool_]:
-        """Return in which simulations the next `act` uses images, shape (n,); in the others it may get black ones."""
+    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+        """Return in which simulations the next `act` uses images, shape (n,); in the others it may get black ones.
+
+        Args:
+            results: what the next observation will have as its results.
+        """
 
 
 class Intervening(Protocol):

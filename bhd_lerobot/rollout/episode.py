@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,10 +169,10 @@ class EpisodeLoop:
 
     def _looks(self) -> NDArray[np.bool_]:
         """Return in which simulations the brain is about to use images, shape (n,)."""
-        brain, n = self.brain, self.simulation.n
-        if not brain.uses_images:
-            return np.zeros(n, np.bool_)
-        return brain.looks() if isinstance(brain, Looking) else np.ones(n, np.bool_)
+        looks = getattr(self.brain, "looks", None)  # `isinstance` does not see through a `TimedBrain`
+        if self.brain.uses_images and looks is not None:
+            return cast(Looking, self.brain).looks(self._results)
+        return np.full(self.simulation.n, self.brain.uses_images)
 
     def _frame(self) -> list[tuple[int, Event]]:
         """Run one frame of all running simulations; return those that ended, and why."""

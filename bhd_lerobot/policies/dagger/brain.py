@@ -110,7 +110,7 @@ class DaggerBrain:
 
     @property
     def uses_images(self) -> bool:
-        """Whether learner or expert is about to use images."""
+        """Whether learner or expert uses images."""
         return self.learner.uses_images or self.expert.uses_images
 
     def bind(self, robot: RobotFeatures) -> None:

@@ -1,7 +1,7 @@
 """The brain that does what an instruction says: language to a plan of skills, skills to goals."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -82,16 +82,19 @@ class LanguageBrain(PickBrain):
 
     @property
     def uses_images(self) -> bool:  # type: ignore[override]
-        """Whether it is about to look at something."""
-        return self.perceiver is not None and (not self._sights or bool(self.looks().any()))
+        """Whether it sees for itself."""
+        return self.perceiver is not None
 
-    def looks(self) -> NDArray[np.bool_]:
+    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return in which simulations it is about to look at something, shape (n,)."""
-        return np.array([self._is_looking(sim) for sim in range(len(self._pending))], np.bool_)
+        return np.array([self._is_looking(sim, results.get(sim, ())) for sim in range(len(self._pending))], np.bool_)
 
-    def _is_looking(self, sim: int) -> bool:
-        sight = self._sights.get(sim)
-        return sight is not None and not self._done[sim] and (sight.objects is None or sight.image is not None)
+    def _is_looking(self, sim: int, results: Sequence[CommandResult]) -> bool:
+        sight, pending = self._sights.get(sim), self._pending[sim]
+        if self.perceiver is None or sight is None or self._done[sim]:
+            return False
+        decides = pending is None or any(result.task_id == pending for result in results)
+        return decides and (sight.objects is None or sight.image is not None)
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
         """Take the instruction of the episode, or that of the configuration."""
