@@ -22,6 +22,10 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 }
 KINDS: tuple[Literal["cup", "box"], ...] = ("cup", "box")
 
+STYLES = ("usual", "plain", "other")
+"""How objects look: ``usual``: a cup with a handle and a dark mouth, a box with a light tape along it; ``plain``:
+neither; ``other``: a cup with a lid and a knob, a box with a dark band across it."""
+
 OBJECT_FIELDS = (
     *("present", "target", "box", "x", "y", "z", "qw", "qx", "qy", "qz"),
     *("length", "width", "height", "red", "green", "blue"),
@@ -65,7 +69,7 @@ class TableObject:
         mass: [kg].
         friction: sliding friction against table and fingers.
         shade: what is added to each of red, green and blue of the colour.
-        plain: without what others of its kind have: a cup's handle and dark mouth, a box's tape.
+        style: one of `STYLES`.
     """
 
     kind: Literal["cup", "box"]
@@ -79,13 +83,15 @@ class TableObject:
     mass: float = 0.2
     friction: float = 0.9
     shade: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    plain: bool = False
+    style: str = "usual"
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ConfigError(unknown_name("kind of object", self.kind, KINDS))
         if self.colour not in COLOURS:
             raise ConfigError(unknown_name("colour", self.colour, COLOURS))
+        if self.style not in STYLES:
+            raise ConfigError(unknown_name("style of object", self.style, STYLES))
         for name in ("size_x", "size_y", "height", "mass", "friction"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"{name} of a {self.colour} {self.kind} is {getattr(self, name)}; it must be > 0.")

@@ -161,7 +161,10 @@ class Tabletop:
         else:
             across = thing.mass * (3 * a * a + 4 * h * h) / 12
             field["body_inertia"][sim, body] = (across, across, thing.mass * a * a / 2)
-        if thing.plain:
+        if thing.style == "plain":
+            return
+        if thing.style == "other":
+            self._other(sim, thing, geoms, colour)
             return
         if thing.kind == "box":
             tape = _Form("box", (a + 0.0003, 0.2 * b, h + 0.0003))
@@ -175,6 +178,15 @@ class Tabletop:
             self._geom(sim, geom, bar, colour)
         grip = _Form("capsule", (thick, 0.45 * h, 0), (a + reach - thick / 2, 0, 0.05 * h))
         self._geom(sim, geoms[4], grip, colour)
+
+    def _other(self, sim: int, thing: TableObject, geoms: list[int], colour: NDArray[np.float64]) -> None:
+        """Add a band across a box, or a lid with a knob to a cup."""
+        a, b, h = thing.size_x, thing.size_y, thing.height / 2
+        if thing.kind == "box":
+            self._geom(sim, geoms[1], _Form("box", (0.25 * a, b + 0.0003, h + 0.0003)), 0.3 * colour)
+            return
+        self._geom(sim, geoms[1], _Form("cylinder", (1.06 * a, 0.003, 0), (0, 0, h - 0.002)), 0.4 + 0.6 * colour)
+        self._geom(sim, geoms[2], _Form("capsule", (0.15 * a, 0.004, 0), (0, 0, h + 0.004)), 0.3 * colour)
 
     def _geom(self, sim: int, geom: int, form: _Form, colour: NDArray[np.float64], *, group: int = _SEEN) -> None:
         field, (radius, half, _) = self._field, form.size

@@ -67,8 +67,7 @@ class PickConfig(TaskConfig):
         wording: how it is asked: ``"known"``, or ``"held_out"`` for other sentences.
         names: colours and kinds of the objects: ``"any"``; ``"known"``, which leaves four pairs of them out; or
             ``"held_out"``, where it is asked for one of these four.
-        objects: ``"known"``; or ``"unseen"``: smaller and larger than those, without a cup's handle or a box's tape,
-            and of other shades.
+        objects: ``"known"``; or ``"unseen"``: smaller and larger than those, of another style and of other shades.
         swap: ask for another object of the same scene; two or more must be on the table.
         randomisation: how much one episode's world differs from the next.
     """
@@ -320,7 +319,7 @@ def _draw_objects(task: PickConfig, names: Sequence[tuple[str, str]], rng: np.ra
                 mass=float(rng.uniform(0.08, 0.30) * change["mass"]),
                 friction=float(0.9 * change["friction"]),
                 shade=change["shade"],
-                plain=unseen,
+                style="other" if unseen else "plain" if change["plain"] else "usual",
             )
         )
     return objects

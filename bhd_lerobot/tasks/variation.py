@@ -22,6 +22,7 @@ class RandomisationConfig:
         friction: an object's friction is multiplied by up to 1 + this, or divided by it; so is that of the fingers.
         size: an object's measures are multiplied by 1 - this to 1 + this.
         colour: up to this is added to or taken from each of an object's red, green and blue.
+        plain: probability that an object lacks what others of its kind have: a cup its handle, a box its tape.
         light: brightness is multiplied by 1 - this to 1 + this.
         light_direction: up to this is added to x and y of the main light's direction.
         camera_m: up to this is added to each coordinate of the scene camera's position [m].
@@ -39,6 +40,7 @@ class RandomisationConfig:
     friction: float = 0.25
     size: float = 0.1
     colour: float = 0.08
+    plain: float = 0.0
     light: float = 0.4
     light_direction: float = 0.3
     camera_m: float = 0.02
@@ -65,6 +67,8 @@ class RandomisationConfig:
                 f"randomisation.latency_min_s is {self.latency_min_s}; it must be at most randomisation.latency_s, "
                 f"which is {self.latency_s}."
             )
+        if self.plain > 1:
+            raise ConfigError(f"randomisation.plain is {self.plain}; it is a probability, at most 1.")
         for name in ("size", "light"):
             if getattr(self, name) >= 1:
                 raise ConfigError(f"randomisation.{name} is {getattr(self, name)}; it must be below 1.")
@@ -94,14 +98,16 @@ def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Var
 
 
 def draw_object_changes(config: RandomisationConfig, rng: np.random.Generator) -> dict[str, Any]:
-    """Return the factors `mass`, `friction` and `size`, and the `shade`, of one object."""
+    """Return the factors `mass`, `friction` and `size`, the `shade`, and whether it is `plain`, of one object."""
     if not config.enabled:
-        return {"mass": 1.0, "friction": 1.0, "size": (1.0, 1.0, 1.0), "shade": (0.0, 0.0, 0.0)}
+        return {"mass": 1.0, "friction": 1.0, "size": (1.0, 1.0, 1.0), "shade": (0.0, 0.0, 0.0), "plain": False}
     return {
         "mass": _factor(config.mass, rng),
         "friction": _factor(config.friction, rng),
         "size": _floats(rng.uniform(1 - config.size, 1 + config.size, 3)),
         "shade": _floats(rng.uniform(-1, 1, 3) * config.colour),
+        # Where nothing is plain, nothing is drawn: worlds stay what they were before this option.
+        "plain": config.plain > 0 and bool(rng.random() < config.plain),
     }
 
 

@@ -19,6 +19,8 @@ from bhd_lerobot.policies.manipulation.skills import Plan, Planner, scene_object
 from bhd_lerobot.policies.perception.perceiver import PerceivedObject, Perceiver, PerceptionOptions
 
 _HOME_SPEED, _HOME_CHANGE = 1.5, 4.0  # [rad/s], [rad/s^2]
+_WIDER = 0.008  # [m] by which sizes are seen wrongly
+_FIT = 0.009  # [m] by which the gripper opens wider than what fits between the fingers
 _CLOSED = 0.006  # [m] fingers that are this near to where they were sent came there
 
 
@@ -184,8 +186,16 @@ class LanguageBrain(PickBrain):
 
     def _choose_grasp(self, target: SeenObject, others: Sequence[SeenObject]) -> Grasp | None:
         grasp = super()._choose_grasp(target, others)
-        if grasp is None or not isinstance(target, PerceivedObject):
+        if not isinstance(target, PerceivedObject):
             return grasp
+        if grasp is None:  # what seems a little too wide may fit after all
+            length, width, height = target.size
+            least = min(length, width)
+            if least < MAX_OPENING + _WIDER:
+                factor = (MAX_OPENING - _FIT) / least
+                grasp = super()._choose_grasp(replace(target, size=(factor * length, factor * width, height)), others)
+        if grasp is None:
+            return None
         # The fingers need more room beside what is not known exactly.
         return replace(grasp, opening=min(MAX_OPENING, grasp.opening + 2 * target.error_90_m))
 

@@ -45,7 +45,7 @@ def test_an_object_is_rendered_where_the_projection_says() -> None:
     table.world.forward()
     empty = camera.render(0, "scene").astype(int)
     for x, y in ((0.38, -0.25), (0.5, 0.0), (0.62, 0.27)):
-        thing = TableObject("box", "blue", 0.02, 0.02, 0.04, x, y, plain=True)
+        thing = TableObject("box", "blue", 0.02, 0.02, 0.04, x, y, style="plain")
         table.place([TableScene("test", (thing,), ur5().home)])
         table.world.forward()
         row, column = np.nonzero(np.abs(camera.render(0, "scene").astype(int) - empty).sum(axis=-1) > 60)
