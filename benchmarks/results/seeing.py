@@ -1,0 +1,101 @@
+"""The section about seeing: an instruction carried out with nothing but the scene camera, from three training seeds."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from benchmarks.results.learning import record, success_row, train
+from benchmarks.results.runner import Runner
+from benchmarks.results.section import Row, Section, rate
+
+EPISODES, SEEDS = 500, (0, 1, 2)
+_ANY = "--task.language=any"
+_VARIED = "--task.randomisation.enabled=true"
+# Name, options of the task, and the success that is to be reached with 95 % confidence.
+_WORLDS: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
+    ("the world as it is", (_ANY,), 0.9),
+    ("randomised light, colours, sizes, camera", (_ANY, _VARIED), 0.8),
+    ("objects that it has not seen", (_ANY, _VARIED, "--task.objects=unseen"), 0.7),
+    ("other sentences", (_ANY, "--task.wording=held_out"), None),
+    ("pairs of colour and kind", (_ANY, "--task.names=held_out"), None),
+    ("the same scenes, two or more objects", (_ANY, "--task.min_objects=2"), None),
+    ("the same scenes, another object is asked for", (_ANY, "--task.min_objects=2", "--task.swap=true"), 0.95),
+)
+_BLANKED = 100  # episodes of the brains that are deaf or blind: none of them succeeds
+
+
+def see(run: Runner, section: Section) -> None:
+    """Learn to see tables, and pick what an instruction names from what is seen."""
+    record(run, "see_record", "ur5_look", "see/tables", episodes=9000, options=("--seed=11",))
+    for seed in SEEDS:
+        train(run, f"see_train_{seed}", "perception_ur5", _folder(seed), "see/tables", options=(f"--seed={seed}",))
+    looks = _evaluate(run, "see_look", "ur5_look", _seeing(run), ())
+    for name in _names():
+        _perceived(section, name, looks["brains"][name]["perception"])
+    for number, (what, options, goal) in enumerate(_WORLDS):
+        results = _evaluate(run, f"see_{number}", "ur5_pick", _seeing(run), options)
+        for name in _names():
+            row, low = success_row(results, name), results["brains"][name]["success"]["low"]
+            words = "" if goal is None else f"lower end at least {goal:.0%}"
+            section.rows.append(Row(f"{what}: {row.what}", row.value, words, None if goal is None else low >= goal))
+    blanked = []
+    for name, sense in (("deaf", "instruction"), ("blind", "images")):
+        inner = (f"--brains.{name}.brain.type=language", f"--brains.{name}.brain.perception.path={_path(run, 0)}")
+        blanked += [f"--brains.{name}.type=blanked", f"--brains.{name}.{sense}=true", *inner]
+    results = _evaluate(run, "see_blanked", "ur5_pick", blanked, (_ANY,), names=("deaf", "blind"), episodes=_BLANKED)
+    section.rows += [success_row(results, name) for name in ("deaf", "blind")]
+    section.rows.append(
+        Row("time from nothing to the first seed", f"{sum(one.seconds for one in run.commands[:2]):.0f} s")
+    )
+    section.remarks.append(
+        f"{len(SEEDS)} seeds of the training. The brain `language` sees with the checkpoint and gets nothing else of "
+        "the objects; the skill `pick` does the rest. A deaf brain gets an empty instruction, a blind one black "
+        "images: both refuse, and say why. What was learned from has no object of the style of those that it has not "
+        "seen, and none of their sizes and shades (`bhd_lerobot/tasks/pick.py`)."
+    )
+
+
+def _perceived(section: Section, name: str, saw: Any) -> None:
+    median, most, _ = (1000 * value for value in saw["error_m"])
+    what = f"{name}: in {saw['episodes']} tables, randomised"
+    section.rows += [
+        Row(f"{what}: error of what was asked for", f"median {median:.1f} mm, 90 % below {most:.1f} mm"),
+        Row(f"{what}: wrong object", rate(saw["wrong"], {})),
+        Row(f"{what}: within the radius stated for 90 %", rate(saw["in_90"], {})),
+    ]
+
+
+def _evaluate(
+    run: Runner,
+    name: str,
+    config: str,
+    brains: Sequence[str],
+    options: Sequence[str],
+    *,
+    names: Sequence[str] = (),
+    episodes: int = EPISODES,
+) -> Any:
+    only = ",".join(names or _names())
+    command = ["bhd-eval", f"--config_path=configs/eval/{config}.yaml", "--robot.camera=true", *brains, *options]
+    command += [f"--only=[{only}]", f"--n_episodes={16 if run.is_short else episodes}", "--videos=0"]
+    run.run(name, [*command, f"--output_dir={run.path(name)}"])
+    return run.read(name, "results.json")
+
+
+def _names() -> list[str]:
+    return [f"seed_{seed}" for seed in SEEDS]
+
+
+def _seeing(run: Runner) -> list[str]:
+    return [
+        option
+        for seed, name in zip(SEEDS, _names(), strict=True)
+        for option in (f"--brains.{name}.type=language", f"--brains.{name}.perception.path={_path(run, seed)}")
+    ]
+
+
+def _path(run: Runner, seed: int) -> str:
+    return str(run.path(_folder(seed)))
+
+
+def _folder(seed: int) -> str:
+    return f"see/seed_{seed}"
