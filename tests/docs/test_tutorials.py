@@ -13,11 +13,24 @@ TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 SHOWN = {
     "record_and_look": ["400 frames in 4 episodes", "valid, no errors", "identical in 100 frames"],
     "train_and_evaluate": [" of 3 episodes succeeded", "step   20", "difference: "],
+    "cameras": ["12 tables in", "found what was asked for: ", "rule: 2 of 2"],
     "from_a_ros2_bag": ["control.applied_action", "valid, no errors"],
     "your_own": ["4 of 4 episodes succeeded", "gap_follower 4 of 4"],
 }
 # The short form of what takes longer than a few seconds.
 SHORTER = {
+    "cameras": {
+        '"num_episodes": 1500': '"num_episodes": 12',
+        '"camera_width": 320, "camera_height": 240': '"camera_width": 96, "camera_height": 72',
+        '"eval_split": 0.05': '"eval_split": 0.25',
+        '{"type": "bhd_perception"}': '{"type": "bhd_perception", "channels": 8, "hidden": 8, "context": 8}',
+        "batch_size=32": "batch_size=4",
+        "steps=1200": "steps=4",
+        "eval_steps=600": "eval_steps=4",
+        "n_episodes=200": "n_episodes=4",
+        "n_episodes=20,": "n_episodes=2,",
+        "videos=1,": "videos=0,",
+    },
     "train_and_evaluate": {
         '"num_episodes": 8}': '"num_episodes": 3, "episode_time_s": 20}',
         "n_envs=8": "n_envs=3",
