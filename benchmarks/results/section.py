@@ -58,8 +58,10 @@ class Section:
         return lines
 
 
-def rate(estimate: Mapping[str, float], outcomes: Mapping[str, int]) -> str:
-    """Return a rate with its interval, and how the episodes ended that were no success."""
+def rate(estimate: Mapping[str, float | None], outcomes: Mapping[str, int]) -> str:
+    """Return a rate with its interval, and how the episodes ended that were no success; a dash for one of nothing."""
+    if estimate["value"] is None:
+        return "–"
     text = f"{estimate['value']:.1%} ({estimate['low']:.1%} to {estimate['high']:.1%})"
     causes = ", ".join(f"{count} {cause}" for cause, count in outcomes.items() if cause != "success")
     return f"{text}; {causes}" if causes else text

@@ -1,5 +1,6 @@
 """The section about seeing: an instruction carried out with nothing but the scene camera, from three training seeds."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -55,7 +56,7 @@ def see(run: Runner, section: Section) -> None:
 
 
 def _perceived(section: Section, name: str, saw: Any) -> None:
-    median, most, _ = (1000 * value for value in saw["error_m"])
+    median, most, _ = (1000 * (math.nan if value is None else value) for value in saw["error_m"])
     what = f"{name}: in {saw['episodes']} tables, randomised"
     section.rows += [
         Row(f"{what}: error of what was asked for", f"median {median:.1f} mm, 90 % below {most:.1f} mm"),

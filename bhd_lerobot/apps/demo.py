@@ -19,7 +19,7 @@ from bhd_lerobot.command_line import Parser, exit_status
 from bhd_lerobot.errors import BhdError, ConfigError, counted
 from bhd_lerobot.evaluation import evaluate
 from bhd_lerobot.evaluation.config import EvalConfig
-from bhd_lerobot.evaluation.text import sentences
+from bhd_lerobot.evaluation.text import perception_sentence, sentences
 from bhd_lerobot.recording import record
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout import replay
@@ -54,6 +54,8 @@ class Lesson:
         seed: every episode's seed follows from this.
         options: of `bhd-record`, besides.
         video: whether the first episode gets a video, where images can be rendered.
+        network: type of the policy that is trained.
+        batch: samples in a step of the training.
         policy: options of `bhd-train`; nothing is trained if there are none.
         steps: of the training; a number of steps, not a time, so that the same comes out on any day.
         early_steps: step of another checkpoint that is compared, too; none if 0.
@@ -71,6 +73,8 @@ class Lesson:
     seed: int
     options: tuple[str, ...] = ()
     video: bool = True
+    network: str = "bhd_mlp"
+    batch: int = 256
     policy: tuple[str, ...] = ()
     steps: int = 1500
     early_steps: int = 0
@@ -101,17 +105,18 @@ class Lesson:
             f"--dataset.root={folder / 'dataset'}",
             "--dataset.eval_split=0.05",
             f"--output_dir={folder / 'train'}",
-            "--policy.type=bhd_mlp",
+            f"--policy.type={self.network}",
             "--policy.device=cpu",
             *self.policy,
-            "--batch_size=256",
+            f"--batch_size={self.batch}",
             f"--steps={self.steps}",
             f"--log_freq={max(self.steps // 30, 1)}",
             f"--eval_steps={max(self.steps // 5, 1)}",
             f"--save_freq={self.early_steps}",
             "--env_eval_freq=0",
             "--seed=0",
-            "--threads=1",  # a second one gains little with so small a network, and loses on a busy machine
+            # A second one gains little with so small a network, and loses on a busy machine.
+            *(("--threads=1",) if self.network == "bhd_mlp" else ()),
         ]
 
     def eval_options(self, folder: Path, checkpoint: Path, videos: int | None) -> list[str]:
@@ -195,6 +200,22 @@ REACH = Lesson(
     recipe="configs/train/bc_ur5_reach.yaml",
 )
 LESSONS = (AVOID, REACH, PICK)
+SEE = Lesson(
+    name="ur5_see",
+    what="tables with cups and boxes, each an image and the true poses of its objects",
+    world=("--robot.type=ur5", "--robot.camera=true", "--robot.camera_width=160", "--robot.camera_height=120"),
+    brain="noop",
+    episodes=600,
+    seed=3,
+    options=("--task.type=pick", "--task.duration_s=0.04"),
+    video=False,
+    network="bhd_perception",
+    policy=("--policy.optimizer_lr=3e-3", "--policy.scheduler_warmup_steps=50"),
+    batch=32,
+    steps=600,
+    trials=12,
+    recipe="configs/train/perception_ur5.yaml",
+)
 
 
 class StoppedError(BhdError):
@@ -237,11 +258,18 @@ class Demo:
         self._head("3. Train: a small network imitates each rule, from the dataset alone")
         trained = [(lesson, self._train(lesson)) for lesson in LESSONS if lesson.policy]
         self._head("4. Evaluate: the network beside the rule, in scenes that it was not trained on")
-        return [self._evaluate(lesson, checkpoint) for lesson, checkpoint in trained]
+        reports = [self._evaluate(lesson, checkpoint) for lesson, checkpoint in trained]
+        self._head(
+            "5. See: a network learns what a camera shows, and the arm picks up what it sees and a sentence names"
+        )
+        if not self._can_render:
+            self._print(f"left out: images cannot be rendered here; {self.folder / LOG} has the reason")
+            return reports
+        return [*reports, self._see(SEE)]
 
     def files(self) -> list[Path]:
         """Return what there is to see."""
-        folders = [self.folder / lesson.name for lesson in LESSONS]
+        folders = [self.folder / lesson.name for lesson in (*LESSONS, SEE)]
         return [path for folder in folders for name in _SHOWN for path in sorted(folder.glob(name))]
 
     def _record(self, lesson: Lesson) -> None:
@@ -286,17 +314,49 @@ class Demo:
         return result.checkpoint
 
     def _evaluate(self, lesson: Lesson, checkpoint: Path) -> Path:
-        # Two videos of each brain would take too long; where there can be none, the report has the reason.
-        pick = LESSONS[-1]
-        can_render = (self.folder / pick.name / "record/episode.mp4").exists()
-        videos = (1 if can_render else None) if pick.video else 0
-        options = lesson.eval_options(self.folder / lesson.name, checkpoint, videos)
+        options = lesson.eval_options(self.folder / lesson.name, checkpoint, self._videos)
         with self._step(lesson, f"evaluates on {lesson.trials} episodes") as lines:
             result = evaluate.evaluate(parse(EvalConfig, options), self._log)
             _check(result.exit_status)
             lines += [f"{lesson.what}, on {lesson.trials} held-out episodes", *sentences(result.results)]
             lines.append(f"score: {lesson.score}. Training in full: {lesson.recipe}, docs/how_to/training.md")
         return result.report
+
+    def _see(self, lesson: Lesson) -> Path:
+        """Learn to see from tables, and carry out sentences with nothing else of the objects than the image."""
+        self._record(lesson)
+        checkpoint = self._train(lesson)
+        options = [
+            *lesson.world,
+            "--task.type=pick",
+            "--task.language=any",
+            "--brains.rule.type=language",
+            "--brains.seeing.type=language",
+            f"--brains.seeing.perception.path={checkpoint}",
+            f"--n_episodes={lesson.trials}",
+            f"--n_envs={lesson.trials}",
+            "--baseline=rule",
+            f"--videos={self._videos}",
+            f"--output_dir={self.folder / lesson.name / 'eval'}",
+        ]
+        with self._step(lesson, f"evaluates on {lesson.trials} episodes") as lines:
+            result = evaluate.evaluate(parse(EvalConfig, options), self._log)
+            _check(result.exit_status)
+            saw = result.results.brains["seeing"].perception
+            assert saw is not None
+            lines += ["a UR5 picks up what an instruction names; seeing is told nothing of the objects"]
+            lines += [*sentences(result.results), f"seeing {perception_sentence(saw)}"]
+            lines.append(f"Training in full: {lesson.recipe}, docs/tutorials/cameras.md")
+        return result.report
+
+    @property
+    def _can_render(self) -> bool:
+        return (self.folder / PICK.name / "record/episode.mp4").exists()
+
+    @property
+    def _videos(self) -> int | None:
+        # Two videos of each brain would take too long; where there can be none, the report has the reason.
+        return (1 if self._can_render else None) if LESSONS[-1].video else 0
 
     def _head(self, text: str) -> None:
         self._console.print(f"\n[bold]{escape(text)}[/bold]", soft_wrap=True, highlight=False)

@@ -67,9 +67,11 @@ def _direction(estimate: Estimate, above: str, below: str, neither: str) -> str:
 
 def perception_sentence(one: PerceptionSummary) -> str:
     """Return the summary in words."""
+    chose = f"chose an object in {percent(one.chosen)} of {one.episodes} episodes"
+    if one.chosen.value == 0:
+        return chose
     median, most, _ = (1000 * value for value in one.error_m)
     return (
-        f"chose an object in {percent(one.chosen)} of {one.episodes} episodes, the wrong one in {percent(one.wrong)}; "
-        f"median error {median:.1f} mm, 90 % below {most:.1f} mm; within the radius stated for 90 % in "
-        f"{percent(one.in_90)}"
+        f"{chose}, the wrong one in {percent(one.wrong)}; median error {median:.1f} mm, 90 % below {most:.1f} mm; "
+        f"within the radius stated for 90 % in {percent(one.in_90)}"
     )

@@ -45,6 +45,7 @@ HELD_OUT_NAMES = (("red", "cup"), ("blue", "box"), ("yellow", "cup"), ("purple",
 _WORDINGS = ("known", "held_out")
 _NAMES = ("any", "known", "held_out")
 _OBJECTS = ("known", "unseen")
+_ORDERS = ("target", "random")
 _ZH = {
     **{"red": "红色", "green": "绿色", "blue": "蓝色", "yellow": "黄色"},
     **{"orange": "橙色", "purple": "紫色", "white": "白色", "black": "黑色"},
@@ -68,6 +69,8 @@ class PickConfig(TaskConfig):
         names: colours and kinds of the objects: ``"any"``; ``"known"``, which leaves four pairs of them out; or
             ``"held_out"``, where it is asked for one of these four.
         objects: ``"known"``; or ``"unseen"``: smaller and larger than those, of another style and of other shades.
+        order: of the objects in what the task tells: ``"target"``: the target first, then the nearest to it; or
+            ``"random"``, where only the column `target` tells which it is.
         swap: ask for another object of the same scene; two or more must be on the table.
         randomisation: how much one episode's world differs from the next.
     """
@@ -81,6 +84,7 @@ class PickConfig(TaskConfig):
     wording: str = "known"
     names: str = "any"
     objects: str = "known"
+    order: str = "target"
     swap: bool = False
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
@@ -96,6 +100,7 @@ class PickConfig(TaskConfig):
             ("wording", self.wording, _WORDINGS),
             ("names", self.names, _NAMES),
             ("objects", self.objects, _OBJECTS),
+            ("order", self.order, _ORDERS),
         ):
             if value not in valid:
                 raise ConfigError(unknown_name(f"task.{name}", value, valid))
@@ -156,13 +161,15 @@ class PickTask(ArmTask):
         name = objects[0].name
         if language == "zh":
             name = _ZH[objects[0].colour] + _ZH[objects[0].kind]
+        variation = draw_variation(config.randomisation, rng)
+        places = [int(place) for place in rng.permutation(count)] if config.order == "random" else range(count)
         return TableScene(
             name="pick",
-            objects=tuple(objects),
+            objects=tuple(objects[place] for place in places),
             posture=_HOME,
-            target_object=0,
+            target_object=places.index(0),
             instruction=phrase.format(name),
-            variation=draw_variation(config.randomisation, rng),
+            variation=variation,
         )
 
     def instruction(self, scene: TableScene) -> str:

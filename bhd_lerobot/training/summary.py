@@ -68,7 +68,8 @@ def print_summary(console: Console, config: BhdTrainConfig, result: "TrainResult
         if result.checkpoint is not None:
             lines.append(f"  {resume_command(result.checkpoint)}")
     elif result.checkpoint is not None:
-        lines += how_to_evaluate(result.contract, str(result.checkpoint))
+        kind = "" if config.policy is None else config.policy.type
+        lines += how_to_evaluate(result.contract, str(result.checkpoint), kind)
     for line in lines:
         console.print(escape(line), soft_wrap=True, highlight=False)
 
@@ -79,8 +80,8 @@ def _course(losses: Sequence[float]) -> str:
     return f"{losses[0]:.4g} at first, {losses[-1]:.4g} at the end"
 
 
-def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
-    """Return a line and a command that evaluate a checkpoint on held-out episodes of its task.
+def how_to_evaluate(contract: PolicyContract, checkpoint: str, kind: str = "") -> list[str]:
+    """Return a line and a command that evaluate a checkpoint of a type of policy on held-out episodes of its task.
 
     The command names the options of robot and task that are not at their defaults: with others the observations or
     actions do not fit. A dataset that another program recorded does not say its task; then it is one of the robot's.
@@ -101,10 +102,11 @@ def how_to_evaluate(contract: PolicyContract, checkpoint: str) -> list[str]:
         text = f"Its task {task!r} is of a plug-in that is not installed. Evaluate it, with the plug-in's module, with:"
         usual = dict.fromkeys(key for key in found if key != "type")
         module = " --task.discover_packages_path=MODULE"
+    brain = "type=language --brain.perception.path" if kind == "bhd_perception" else "path"
     options = _options("robot", contract.robot or {}, describe(kinds[contract.robot_type]()))
     command = (
         f"bhd-eval{module} --robot.type={contract.robot_type}{options} --task.type={task}"
-        f"{_options('task', found, usual)} --brain.path={quoted(path)}"
+        f"{_options('task', found, usual)} --brain.{brain}={quoted(path)}"
     )
     return [text, f"  {command}"]
 

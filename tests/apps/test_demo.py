@@ -10,12 +10,16 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
 from bhd_lerobot.apps import demo
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.signals import StopRequest
+from bhd_lerobot.sim.camera import Camera
+from bhd_lerobot.sim.world import World
 from bhd_lerobot.training.arguments import parse_train
 from tests.cases import each_case
 
@@ -34,6 +38,26 @@ REACH = replace(
     world=(*demo.REACH.world, "--threads=1"),
 )
 PICK = replace(demo.PICK, episodes=1, video=False, options=("--threads=1",))
+SEE = replace(
+    demo.SEE,
+    episodes=12,
+    batch=4,
+    steps=2,
+    trials=1,
+    world=("--robot.type=ur5", "--robot.camera=true", "--robot.camera_width=96", "--robot.camera_height=72"),
+    policy=("--policy.channels=4", "--policy.hidden=4", "--policy.context=4"),
+)
+
+
+def _can_render() -> bool:
+    try:
+        Camera(World(turtlebot3_burger(), 1), 32, 24).close()
+    except RenderingError:
+        return False
+    return True
+
+
+CAN_RENDER = _can_render()
 
 
 @pytest.fixture
@@ -48,6 +72,8 @@ def done(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demo, "LESSONS", (AVOID, REACH, PICK))
+        patch.setattr(demo, "SEE", SEE)
+        patch.setattr(demo.Demo, "_can_render", CAN_RENDER)  # whether there is a video says it otherwise
         patch.setenv("COLUMNS", "160")
         printed: list[str] = []
         patch.setattr("sys.stdout", _Kept(printed))
@@ -69,8 +95,9 @@ class _Kept:
 
 def test_the_last_lines_are_a_report_of_each_robot(done):
     folder, printed = done
-    last = [Path(line) for line in printed.rstrip().splitlines()[-2:]]
-    assert last == [folder / name / "eval" / "report.html" for name in ("turtlebot3_avoid", "ur5_reach")]
+    names = ("turtlebot3_avoid", "ur5_reach", *(("ur5_see",) if CAN_RENDER else ()))
+    last = [Path(line) for line in printed.rstrip().splitlines()[-len(names) :]]
+    assert last == [folder / name / "eval" / "report.html" for name in names]
     assert all(path.read_text(encoding="utf-8").rstrip().endswith("</html>") for path in last)
 
 
@@ -114,6 +141,17 @@ def test_what_is_printed_of_an_evaluation_is_what_was_measured(done):
         for brain in brains:
             found = results["brains"][brain]
             assert f"{brain} succeeded in {found['successes']} of {found['episodes']} episodes" in printed
+
+
+def test_the_last_step_is_a_network_that_sees(done):
+    folder, printed = done
+    if not CAN_RENDER:
+        assert "left out: images cannot be rendered here" in printed
+        return
+    results = json.loads((folder / "ur5_see/eval/results.json").read_text())
+    assert list(results["brains"]) == ["rule", "seeing"]
+    assert results["brains"]["seeing"]["perception"]["episodes"] == 1
+    assert "seeing chose an object in" in printed
 
 
 def test_replays_are_the_recorded_ones(done):

@@ -9,13 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene, Variation
+from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.language.instruction import RulePlanner
+from bhd_lerobot.policies.language.instruction import RulePlanner, parse
 from bhd_lerobot.policies.manipulation.grasp import plan_grasp, read_objects
 from bhd_lerobot.policies.manipulation.skills import scene_object
-from bhd_lerobot.tasks.pick import PickConfig, PickTask
+from bhd_lerobot.tasks.pick import (
+    HELD_OUT_INSTRUCTIONS,
+    HELD_OUT_NAMES,
+    INSTRUCTIONS,
+    PickConfig,
+    PickTask,
+)
 from bhd_lerobot.tasks.task import ArmTruth, Event
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
@@ -382,3 +388,82 @@ def test_an_impossible_number_of_objects_is_refused(least: int, most: int) -> No
 def test_an_unknown_language_is_an_error_with_the_valid_ones() -> None:
     with pytest.raises(ConfigError, match=r"task.language 'de'.*Valid: any, en, zh"):
         PickConfig(language="de")
+
+
+# --- what is held out, and what is asked for --------------------------------------------------------------------------
+
+
+def scenes(count: int = 60, **options) -> list[TableScene]:
+    task = PickTask(PickConfig(**options), 1, FPS)
+    return [task.sample(seed) for seed in range(count)]
+
+
+def test_another_order_is_the_same_table_and_the_target_is_anywhere() -> None:
+    usual, other = scenes(), scenes(order="random")
+    for one, shuffled in zip(usual, other, strict=True):
+        assert set(one.objects) == set(shuffled.objects)
+        assert one.objects[one.target_object] == shuffled.objects[shuffled.target_object]
+        assert (one.instruction, one.variation) == (shuffled.instruction, shuffled.variation)
+    assert {scene.target_object for scene in usual} == {0}
+    assert {scene.target_object for scene in other} == set(range(5))
+
+
+def test_a_swap_asks_for_another_object_of_the_same_table() -> None:
+    for one, other in zip(scenes(min_objects=2), scenes(min_objects=2, swap=True), strict=True):
+        assert set(one.objects) == set(other.objects)
+        before, after = one.objects[one.target_object], other.objects[other.target_object]
+        assert before.name != after.name
+        assert before.name in one.instruction
+        assert after.name in other.instruction
+    with pytest.raises(ConfigError, match=r"task.swap is true and task.min_objects is 1"):
+        PickConfig(swap=True)
+
+
+def test_names_that_are_held_out_occur_there_only_and_each_of_their_words_elsewhere() -> None:
+    known = {(one.colour, one.kind) for scene in scenes(200, names="known") for one in scene.objects}
+    assert not known & set(HELD_OUT_NAMES)
+    assert len(known) == 12
+    assert {colour for colour, _ in known} >= {colour for colour, _ in HELD_OUT_NAMES}
+    asked = [scene.objects[scene.target_object] for scene in scenes(200, names="held_out")]
+    assert {(one.colour, one.kind) for one in asked} == set(HELD_OUT_NAMES)
+
+
+def test_sentences_that_are_held_out_are_others_and_the_rules_understand_them() -> None:
+    known = {scene.instruction.replace(scene.objects[0].name, "{}") for scene in scenes(200)}
+    held_out = scenes(200, wording="held_out", language="any")
+    assert not known & {scene.instruction.replace(scene.objects[0].name, "{}") for scene in held_out}
+    assert not set(INSTRUCTIONS["zh"]) & set(HELD_OUT_INSTRUCTIONS["zh"])
+    for scene in held_out:
+        request = parse(scene.instruction)
+        assert (request.what.colour, request.what.kind) == (scene.objects[0].colour, scene.objects[0].kind)
+
+
+def test_objects_that_were_not_seen_are_of_no_size_style_or_shade_that_was() -> None:
+    varied = RandomisationConfig(enabled=True, plain=0.4)
+    known = [one for scene in scenes(400, randomisation=varied) for one in scene.objects]
+    unseen = [one for scene in scenes(100, randomisation=varied, objects="unseen") for one in scene.objects]
+    assert {one.style for one in known} == {"usual", "plain"}
+    assert {one.style for one in unseen} == {"other"}
+    for kind in KINDS:
+        heights = [one.height for one in known if one.kind == kind]
+        assert all(not min(heights) <= one.height <= max(heights) for one in unseen if one.kind == kind)
+    shades = max(abs(value) for one in known for value in one.shade)
+    assert all(min(map(abs, one.shade)) > shades for one in unseen)
+    for one in unseen:
+        assert 2 * min(one.size_x, one.size_y) <= 0.076, "it fits between the fingers"
+        seen = np.clip(np.add(COLOURS[one.colour], one.shade), 0, 1)
+        assert min(COLOURS, key=lambda name: math.dist(seen, COLOURS[name])) == one.colour
+
+
+@each_case(
+    ("options", "message"),
+    [
+        ({"wording": "other"}, r"task.wording.*Valid: held_out, known"),
+        ({"names": "some"}, r"task.names.*Valid: any, held_out, known"),
+        ({"objects": "new"}, r"task.objects.*Valid: known, unseen"),
+        ({"order": "none"}, r"task.order.*Valid: random, target"),
+    ],
+)
+def test_what_is_held_out_is_named(options: dict[str, str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        PickConfig(**options)
