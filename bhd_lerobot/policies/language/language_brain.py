@@ -13,13 +13,14 @@ from bhd_lerobot.control.commands import BrainCommand, CommandResult
 from bhd_lerobot.errors import InstructionError, PerceptionError
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures
 from bhd_lerobot.policies.language.instruction import RulePlanner
-from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject
+from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject, plan_grasp
 from bhd_lerobot.policies.manipulation.pick import SQUEEZE, PickBrain, PickBrainConfig
 from bhd_lerobot.policies.manipulation.skills import Plan, Planner, scene_object
 from bhd_lerobot.policies.perception.perceiver import PerceivedObject, Perceiver, PerceptionOptions
 
 _HOME_SPEED, _HOME_CHANGE = 1.5, 4.0  # [rad/s], [rad/s^2]
 _WIDER = 0.008  # [m] by which sizes are seen wrongly
+_ROOM = 0.01  # [m] beside the fingers that is enough
 _FIT = 0.009  # [m] by which the gripper opens wider than what fits between the fingers
 _CLOSED = 0.006  # [m] fingers that are this near to where they were sent came there
 
@@ -185,19 +186,23 @@ class LanguageBrain(PickBrain):
             )
 
     def _choose_grasp(self, target: SeenObject, others: Sequence[SeenObject]) -> Grasp | None:
-        grasp = super()._choose_grasp(target, others)
         if not isinstance(target, PerceivedObject):
-            return grasp
+            return super()._choose_grasp(target, others)
+        grasp = super()._choose_grasp(target, others)
+        # A side that leaves room for errors, unless other objects are in the way there.
+        careful = plan_grasp(target, others, MAX_OPENING - 2 * _WIDER)
+        if careful is not None and grasp is not None and careful.room >= min(grasp.room, _ROOM):
+            grasp = careful
         if grasp is None:  # what seems a little too wide may fit after all
             length, width, height = target.size
             least = min(length, width)
             if least < MAX_OPENING + _WIDER:
                 factor = (MAX_OPENING - _FIT) / least
                 grasp = super()._choose_grasp(replace(target, size=(factor * length, factor * width, height)), others)
-        if grasp is None:
-            return None
         # The fingers need more room beside what is not known exactly.
-        return replace(grasp, opening=min(MAX_OPENING, grasp.opening + 2 * target.error_90_m))
+        return (
+            None if grasp is None else replace(grasp, opening=min(MAX_OPENING, grasp.opening + 2 * target.error_90_m))
+        )
 
     def _is_held(self, opening: float, grasp: Grasp) -> bool:
         if self.perceiver is None:

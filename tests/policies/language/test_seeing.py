@@ -138,6 +138,27 @@ def test_the_fingers_open_wider_for_what_is_known_less_exactly() -> None:
     assert openings[2] == MAX_OPENING
 
 
+def test_it_takes_the_side_of_a_box_that_leaves_room_for_errors_unless_something_is_in_the_way() -> None:
+    narrow, wide = 0.05, 0.074
+    for yaw in np.linspace(-1.5, 1.5, 13):
+        box = TableObject("box", "red", wide / 2, narrow / 2, 0.06, 0.5, 0.0, yaw=float(yaw))
+        across = np.array(
+            [-np.sin(yaw), np.cos(yaw)]
+        )  # the direction in which the fingers stand beside the narrow side
+        blocked = [
+            TableObject("cup", "blue", 0.03, 0.03, 0.1, 0.5 + sign * 0.085 * across[0], sign * 0.085 * across[1])
+            for sign in (-1, 1)
+        ]
+        for others, width in (([], narrow), (blocked, wide)):
+            objects = [seen(thing, number) for number, thing in enumerate([box, *others])]
+            table = Table(objects, instruction="pick up the red box")
+            table.frame()
+            table.end()
+            closing = table.end()
+            assert closing is not None
+            assert closing.gripper == pytest.approx(width - 0.03)
+
+
 @each_case(
     ("looks", "options", "problem"),
     [
