@@ -164,6 +164,7 @@ class TableScene:
             None. It is drawn, and touches nothing.
         instruction: what a person would ask for.
         variation: how this world differs from the nominal one.
+        report_seed: of the noise on what the task tells, where there is any.
     """
 
     name: str
@@ -173,6 +174,7 @@ class TableScene:
     target_pose: tuple[float, ...] | None = None
     instruction: str = ""
     variation: Variation = field(default_factory=Variation)
+    report_seed: int = 0
 
     def __post_init__(self) -> None:
         if len(self.objects) > MAX_OBJECTS:

@@ -1,6 +1,7 @@
 """Pick up the object that the instruction names, and no other."""
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -12,7 +13,7 @@ from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIEL
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.errors import ConfigError, check_positive, unknown_name
 from bhd_lerobot.tasks.task import ArmTask, ArmTruth, Event, Outcome, TaskConfig
-from bhd_lerobot.tasks.variation import RandomisationConfig, draw_object_changes, draw_variation
+from bhd_lerobot.tasks.variation import RandomisationConfig, ReportConfig, draw_object_changes, draw_variation
 
 # Where objects stand, in the base frame [m]: what a tool that points down reaches with room to spare.
 _AREA = np.array([[0.35, -0.30], [0.65, 0.30]])
@@ -73,6 +74,7 @@ class PickConfig(TaskConfig):
             ``"random"``, where only the column `target` tells which it is.
         swap: ask for another object of the same scene; two or more must be on the table.
         randomisation: how much one episode's world differs from the next.
+        report: what is wrong with what the task tells of the objects.
     """
 
     duration_s: float = 20.0
@@ -87,6 +89,7 @@ class PickConfig(TaskConfig):
     order: str = "target"
     swap: bool = False
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
 
     def __post_init__(self) -> None:
         check_positive("task", self, ("duration_s", "lift_m", "hold_s"))
@@ -138,6 +141,7 @@ class PickTask(ArmTask):
         self._start = np.zeros((n, MAX_OBJECTS))  # height of the objects' centres at the start [m]
         self._fixed = np.zeros((n, MAX_OBJECTS, len(OBJECT_FIELDS)))
         self._camera_error = np.zeros((n, 1, 3))
+        self._reports = _Reports(config.report, n, fps)
         self._best, self._height = np.zeros(n), np.zeros(n)
         self._held = np.zeros(n, np.int64)
 
@@ -162,6 +166,7 @@ class PickTask(ArmTask):
         if language == "zh":
             name = _ZH[objects[0].colour] + _ZH[objects[0].kind]
         variation = draw_variation(config.randomisation, rng)
+        report_seed = 0 if config.report.is_exact else int(rng.integers(2**31))
         places = [int(place) for place in rng.permutation(count)] if config.order == "random" else range(count)
         return TableScene(
             name="pick",
@@ -170,6 +175,7 @@ class PickTask(ArmTask):
             target_object=places.index(0),
             instruction=phrase.format(name),
             variation=variation,
+            report_seed=report_seed,
         )
 
     def instruction(self, scene: TableScene) -> str:
@@ -182,6 +188,7 @@ class PickTask(ArmTask):
             if scene.target_object is None:
                 raise ConfigError(f"The scene {scene.name!r} names no object to pick up.")
             self._target[sim] = scene.target_object
+            self._reports.begin(sim, scene.report_seed)
             self._camera_error[sim] = scene.variation.camera_error
             self._present[sim] = np.arange(MAX_OBJECTS) < len(scene.objects)
             self._fixed[sim], self._start[sim] = 0.0, 0.0
@@ -201,12 +208,12 @@ class PickTask(ArmTask):
         The first is the target; the others follow, at the start the nearest to it first.
         Of each: whether there is one, whether it is the target, whether it is a box; its pose in the base frame
         (x, y, z [m], quaternion wxyz); length, width and height [m]; red, green and blue. Zeros, and the identity, for
-        places without one.
+        places without one. `config.report` says what is wrong with it; then call it once a frame.
         """
         state = self._fixed.copy()
         state[self._present, 3:10] = truth.object_poses[self._present]
         state[:, :, 3:6] += self._camera_error * self._present[:, :, None]
-        return state.reshape(len(state), -1)
+        return self._reports.told(state).reshape(len(state), -1)
 
     # --- judging -----------------------------------------------------------------------------------------------------
 
@@ -258,6 +265,41 @@ class PickTask(ArmTask):
         return 0.9 * np.minimum(np.maximum(height, 0.0) / self.config.lift_m, 1.0)
 
 
+class _Reports:
+    """What the task tells of the objects, with noise, late and with gaps.
+
+    Args:
+        config: what is wrong.
+        n: number of simulations.
+        fps: frames a second [Hz].
+    """
+
+    def __init__(self, config: ReportConfig, n: int, fps: int) -> None:
+        self._config = config
+        self._rngs = [np.random.default_rng(0)] * n
+        self._past: list[deque[NDArray[np.float64]]] = [deque(maxlen=1 + round(config.delay_s * fps)) for _ in range(n)]
+
+    def begin(self, sim: int, seed: int) -> None:
+        """Start an episode in one simulation."""
+        self._rngs[sim] = np.random.default_rng(seed)
+        self._past[sim].clear()
+
+    def told(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what is told where this is so, shape (n, places, fields)."""
+        config = self._config
+        if config.is_exact:
+            return state
+        for sim, past in enumerate(self._past):
+            past.append(state[sim].copy())
+            told = past[0].copy()  # at an episode's start, what was so then
+            rng, present = self._rngs[sim], told[:, 0] > 0
+            told[:, 3:6] += config.noise_m * rng.standard_normal((len(told), 3)) * present[:, None]
+            told[rng.random(len(told)) < config.dropout] = _NOTHING
+            state[sim] = told
+        return state
+
+
+_NOTHING = np.array([float(name == "qw") for name in OBJECT_FIELDS])  # zeros, and the identity
 _HOME = ur5().home
 
 
