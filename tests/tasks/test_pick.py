@@ -470,7 +470,7 @@ def test_what_is_held_out_is_named(options: dict[str, str], message: str) -> Non
         PickConfig(**options)
 
 
-# --- what is wrong with what it tells -----------------------------------------------------------------------------------
+# --- what is wrong with what it tells ---------------------------------------------------------------------------------
 
 
 def told(frames: int, **report) -> tuple[np.ndarray, np.ndarray]:
