@@ -276,7 +276,9 @@ class Demo:
         folder = self.folder / lesson.name
         with self._step(lesson, f"records {counted(lesson.episodes, 'episode')}") as lines:
             result = record.record(parse(RecordConfig, lesson.record_options(folder)), self._log)
-            counts = f"{counted(result.recorded, 'episode')}, {result.frames:,} frames, {result.successes} successes"
+            counts = f"{counted(result.recorded, 'episode')}, {result.frames:,} frames"
+            if lesson.brain != "noop":
+                counts += f", {result.successes} successes"
             lines.append(f"{lesson.what}; {counts}")
             _check(result.exit_status)
             if lesson.video and not (folder / "record/episode.mp4").exists():
