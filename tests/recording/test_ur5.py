@@ -193,7 +193,10 @@ def test_cameras_are_recorded(tmp_path):
     ("change", "message"),
     [
         ({"task__type": "avoid", "brain__type": "avoidance"}, "is for robot.type = 'turtlebot3'"),
-        ({"brain__type": "gap_follower"}, "Brains for it: blanked, dagger, language, learned, noop, pick, random, reach"),
+        (
+            {"brain__type": "gap_follower"},
+            "Brains for it: blanked, dagger, language, learned, noop, pick, random, reach",
+        ),
         ({"brain__type": "reach"}, "target_x"),
         ({"task__max_objects": 6}, "max_objects is 6"),
         ({"task__language": "fr"}, "task.language"),
