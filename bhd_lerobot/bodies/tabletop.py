@@ -22,9 +22,10 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 }
 KINDS: tuple[Literal["cup", "box"], ...] = ("cup", "box")
 
-STYLES = ("usual", "plain", "other")
+STYLES = ("usual", "plain", "marked", "other")
 """How objects look: ``usual``: a cup with a handle and a dark mouth, a box with a light tape along it; ``plain``:
-neither; ``other``: a cup with a lid and a knob, a box with a dark band across it."""
+neither; ``marked``: instead a stripe around it and a patch on its top; ``other``: a cup with a lid and a knob, a box
+with a dark band across it."""
 
 OBJECT_FIELDS = (
     *("present", "target", "box", "x", "y", "z", "qw", "qx", "qy", "qz"),
@@ -70,6 +71,9 @@ class TableObject:
         friction: sliding friction against table and fingers.
         shade: what is added to each of red, green and blue of the colour.
         style: one of `STYLES`.
+        marks: of a ``marked`` one: how high the middle of its stripe is and how broad the stripe, as shares of the
+            height; how light the stripe is, from -1 (dark) over 0 (the object's colour) to 1 (white); the share of the
+            top that the patch covers along each of its sides; and how light the patch is.
     """
 
     kind: Literal["cup", "box"]
@@ -84,6 +88,7 @@ class TableObject:
     friction: float = 0.9
     shade: tuple[float, float, float] = (0.0, 0.0, 0.0)
     style: str = "usual"
+    marks: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -92,6 +97,8 @@ class TableObject:
             raise ConfigError(unknown_name("colour", self.colour, COLOURS))
         if self.style not in STYLES:
             raise ConfigError(unknown_name("style of object", self.style, STYLES))
+        if len(self.marks) != (5 if self.style == "marked" else 0):
+            raise ConfigError(f"marks of a {self.colour} {self.kind} in the style {self.style!r} are {self.marks}.")
         for name in ("size_x", "size_y", "height", "mass", "friction"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"{name} of a {self.colour} {self.kind} is {getattr(self, name)}; it must be > 0.")

@@ -163,8 +163,8 @@ class Tabletop:
             field["body_inertia"][sim, body] = (across, across, thing.mass * a * a / 2)
         if thing.style == "plain":
             return
-        if thing.style == "other":
-            self._other(sim, thing, geoms, colour)
+        if thing.style in ("marked", "other"):
+            (self._marked if thing.style == "marked" else self._other)(sim, thing, geoms, colour)
             return
         if thing.kind == "box":
             tape = _Form("box", (a + 0.0003, 0.2 * b, h + 0.0003))
@@ -178,6 +178,18 @@ class Tabletop:
             self._geom(sim, geom, bar, colour)
         grip = _Form("capsule", (thick, 0.45 * h, 0), (a + reach - thick / 2, 0, 0.05 * h))
         self._geom(sim, geoms[4], grip, colour)
+
+    def _marked(self, sim: int, thing: TableObject, geoms: list[int], colour: NDArray[np.float64]) -> None:
+        """Add a stripe around an object, and a patch on its top."""
+        a, b, h = thing.size_x, thing.size_y, thing.height / 2
+        middle, broad, stripe, share, patch = thing.marks
+        middle, broad = (2 * middle - 1) * h, broad * h
+        for geom, across, thick, z, tint in (
+            (geoms[1], (a + 0.0003, b + 0.0003), broad, middle, stripe),
+            (geoms[2], (share * a, share * b), 0.0004, h, patch),
+        ):
+            solid = ("box", (*across, thick)) if thing.kind == "box" else ("cylinder", (across[0], thick, 0))
+            self._geom(sim, geom, _Form(*solid, (0, 0, z)), _tinted(colour, tint))
 
     def _other(self, sim: int, thing: TableObject, geoms: list[int], colour: NDArray[np.float64]) -> None:
         """Add a band across a box, or a lid with a knob to a cup."""
@@ -245,6 +257,11 @@ class Tabletop:
         """Whether a link of the arm other than the gripper touches an object, shape (n,)."""
         # Whatever the arm touches is the table, itself or an object. The counts are whole numbers: their sum is exact.
         return self._any > self._table + self._self + self._grip.sum(axis=1)
+
+
+def _tinted(colour: NDArray[np.float64], tint: float) -> NDArray[np.float64]:
+    """Return a lighter or darker colour; at 1 white, at -1 a fifth as bright."""
+    return colour + tint * (1 - colour) if tint > 0 else colour * (1 + 0.8 * tint)
 
 
 def _turned(quaternion: NDArray[np.float64], turn: tuple[float, float, float]) -> NDArray[np.float64]:

@@ -345,7 +345,7 @@ def _draw_objects(task: PickConfig, names: Sequence[tuple[str, str]], rng: np.ra
         ranges = _KNOWN[kind]
         if unseen:
             ranges = _UNSEEN[kind][int(rng.integers(2))]
-            change |= {"size": (1.0, 1.0, 1.0), "shade": _other_shade(colour, rng)}
+            change |= {"size": (1.0, 1.0, 1.0), "shade": _other_shade(colour, rng), "style": "other", "marks": ()}
         length = rng.uniform(*ranges[0])
         width = length if kind == "cup" else rng.uniform(*ranges[1])
         height = rng.uniform(*ranges[2])
@@ -368,7 +368,8 @@ def _draw_objects(task: PickConfig, names: Sequence[tuple[str, str]], rng: np.ra
                 mass=float(rng.uniform(0.08, 0.30) * change["mass"]),
                 friction=float(0.9 * change["friction"]),
                 shade=change["shade"],
-                style="other" if unseen else "plain" if change["plain"] else "usual",
+                style=change["style"],
+                marks=change["marks"],
             )
         )
     return objects

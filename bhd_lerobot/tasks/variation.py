@@ -23,6 +23,7 @@ class RandomisationConfig:
         size: an object's measures are multiplied by 1 - this to 1 + this.
         colour: up to this is added to or taken from each of an object's red, green and blue.
         plain: probability that an object lacks what others of its kind have: a cup its handle, a box its tape.
+        marked: probability that it has neither of these, but a stripe around it and a patch on its top, light or dark.
         light: brightness is multiplied by 1 - this to 1 + this.
         light_direction: up to this is added to x and y of the main light's direction.
         camera_m: up to this is added to each coordinate of the scene camera's position [m].
@@ -41,6 +42,7 @@ class RandomisationConfig:
     size: float = 0.1
     colour: float = 0.08
     plain: float = 0.0
+    marked: float = 0.0
     light: float = 0.4
     light_direction: float = 0.3
     camera_m: float = 0.02
@@ -67,8 +69,11 @@ class RandomisationConfig:
                 f"randomisation.latency_min_s is {self.latency_min_s}; it must be at most randomisation.latency_s, "
                 f"which is {self.latency_s}."
             )
-        if self.plain > 1:
-            raise ConfigError(f"randomisation.plain is {self.plain}; it is a probability, at most 1.")
+        if self.plain + self.marked > 1:
+            raise ConfigError(
+                f"randomisation.plain is {self.plain} and randomisation.marked {self.marked}; they are probabilities, "
+                "together at most 1."
+            )
         for name in ("size", "light"):
             if getattr(self, name) >= 1:
                 raise ConfigError(f"randomisation.{name} is {getattr(self, name)}; it must be below 1.")
@@ -125,17 +130,26 @@ def draw_variation(config: RandomisationConfig, rng: np.random.Generator) -> Var
 
 
 def draw_object_changes(config: RandomisationConfig, rng: np.random.Generator) -> dict[str, Any]:
-    """Return the factors `mass`, `friction` and `size`, the `shade`, and whether it is `plain`, of one object."""
+    """Return the factors `mass`, `friction` and `size`, the `shade`, the `style` and the `marks` of one object."""
+    looks = {"style": "usual", "marks": ()}
     if not config.enabled:
-        return {"mass": 1.0, "friction": 1.0, "size": (1.0, 1.0, 1.0), "shade": (0.0, 0.0, 0.0), "plain": False}
-    return {
+        return {"mass": 1.0, "friction": 1.0, "size": (1.0, 1.0, 1.0), "shade": (0.0, 0.0, 0.0), **looks}
+    changes = {
         "mass": _factor(config.mass, rng),
         "friction": _factor(config.friction, rng),
         "size": _floats(rng.uniform(1 - config.size, 1 + config.size, 3)),
         "shade": _floats(rng.uniform(-1, 1, 3) * config.colour),
-        # Where nothing is plain, nothing is drawn: worlds stay what they were before this option.
-        "plain": config.plain > 0 and bool(rng.random() < config.plain),
     }
+    # Where all look as usual, nothing is drawn: worlds stay what they were before these options.
+    if config.plain + config.marked > 0:
+        drawn = float(rng.random())
+        looks["style"] = (
+            "plain" if drawn < config.plain else "marked" if drawn < config.plain + config.marked else "usual"
+        )
+    if looks["style"] == "marked":
+        middle, broad, share = rng.uniform(0.2, 0.8), rng.uniform(0.05, 0.2), rng.uniform(0.3, 0.95)
+        looks["marks"] = _floats((middle, broad, rng.uniform(-1, 1), share, rng.uniform(-1, 1)))
+    return {**changes, **looks}
 
 
 def _factor(spread: float, rng: np.random.Generator) -> float:

@@ -38,7 +38,14 @@ def test_off_is_exactly_nominal_and_draws_nothing() -> None:
     wild = RandomisationConfig(enabled=False, mass=9.0, latency_s=0.05)
     assert draw_variation(wild, rng) == Variation()
     changes = draw_object_changes(wild, rng)
-    assert changes == {"mass": 1.0, "friction": 1.0, "size": (1.0, 1.0, 1.0), "shade": (0.0, 0.0, 0.0), "plain": False}
+    assert changes == {
+        "mass": 1.0,
+        "friction": 1.0,
+        "size": (1.0, 1.0, 1.0),
+        "shade": (0.0, 0.0, 0.0),
+        "style": "usual",
+        "marks": (),
+    }
     assert rng.random() == untouched.random()
 
 
@@ -46,7 +53,14 @@ def test_on_with_ranges_of_nothing_is_nominal_too() -> None:
     nothing = RandomisationConfig(enabled=True, **dict.fromkeys(RANGES, 0.0))
     assert draw_variation(nothing, np.random.default_rng(0)) == Variation()
     changes = draw_object_changes(nothing, np.random.default_rng(0))
-    assert changes == {"mass": 1.0, "friction": 1.0, "size": (1.0, 1.0, 1.0), "shade": (0.0, 0.0, 0.0), "plain": False}
+    assert changes == {
+        "mass": 1.0,
+        "friction": 1.0,
+        "size": (1.0, 1.0, 1.0),
+        "shade": (0.0, 0.0, 0.0),
+        "style": "usual",
+        "marks": (),
+    }
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 0.99), st.floats(0, 2), st.floats(0, 0.05))

@@ -116,17 +116,17 @@ class PerceptionPolicy(PreTrainedPolicy):
             batch: images of `config.image_key`, shape (batch, 3, height, width), 0 to 1; and
                 `observation.environment_state`.
         """
-        image = self._image(batch)
+        image = self.checked(batch)
         labels = Labels.of(batch[OBS_ENV_STATE])
         if self.training:
             self._ratios.clear()
             spread = self.config.brightness
             factor = 1 + spread * (2 * torch.rand(len(image), 1, 1, 1, device=image.device) - 1)
             image = (image * factor).clamp(0, 1)
-        answers = self._answers(image)
+        _, answers = self.look(image)
         if not self.training:
             self._calibrate(answers, labels)
-        heat, place = self._presence(labels)
+        heat, place = self.nearness(labels)
         certain = torch.sigmoid(answers["presence"]) - heat
         # Nearly all cells are empty: what is answered right counts little (T.-Y. Lin et al., "Focal loss", 2017).
         presence = functional.binary_cross_entropy_with_logits(answers["presence"], heat, reduction="none")
@@ -137,11 +137,11 @@ class PerceptionPolicy(PreTrainedPolicy):
         loss = 0.1 * presence + sum(_WEIGHTS[name] * value for name, value in means.items())
         assert isinstance(loss, Tensor)
         outputs = {name: float(value.detach()) for name, value in means.items() if name != "position"}
-        where = (self._at(answers) - labels.at(place).position)[..., :2].norm(dim=-1)
+        where = (self.places(answers) - labels.at(place).position)[..., :2].norm(dim=-1)
         error = float(((where * near).sum() / near.sum().clamp_min(1.0)).detach())
         return loss, {"presence": float(presence.detach()), **outputs, "error_mm": 1000 * error}
 
-    def _presence(self, labels: Labels) -> tuple[Tensor, Tensor]:
+    def nearness(self, labels: Labels) -> tuple[Tensor, Tensor]:
         """Return how near every cell is to an object's centre, 0 to 1, and which object's, shape (batch, h, w)."""
         seen = self.config.projection.pixels(labels.position.detach().cpu().numpy().astype(np.float64))
         centre = torch.as_tensor(seen, dtype=torch.float32, device=self._plane.device)
@@ -152,7 +152,7 @@ class PerceptionPolicy(PreTrainedPolicy):
 
     def _errors(self, answers: Mapping[str, Tensor], true: Labels) -> dict[str, Tensor]:
         """Return the parts of the loss of every cell, as if each were near an object, shape (batch, h, w)."""
-        apart = self._at(answers) - true.position
+        apart = self.places(answers) - true.position
         scale = torch.exp(answers["log_error"].clamp(*_LOG_ERROR))
         across = apart[..., :2].norm(dim=-1) / _ERROR
         turn = torch.stack([torch.cos(2 * true.yaw), torch.sin(2 * true.yaw)], dim=-1)
@@ -202,7 +202,7 @@ class PerceptionPolicy(PreTrainedPolicy):
                 "long enough."
             )
         self.eval()
-        return self._found(self._answers(self._image({self.config.image_key: images})), float(self.factor))
+        return self._found(self.look(self.checked({self.config.image_key: images}))[1], float(self.factor))
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
         """Raise an error: there are no actions.
@@ -223,33 +223,50 @@ class PerceptionPolicy(PreTrainedPolicy):
         """
         return self.predict_action_chunk(batch)
 
-    def _image(self, batch: Mapping[str, Tensor]) -> Tensor:
+    def checked(self, batch: Mapping[str, Tensor]) -> Tensor:
+        """Return the images of a batch.
+
+        Raises:
+            ConfigError: they are missing, or of another size than those that it was trained on.
+        """
         key, size = self.config.image_key, self.config.image_size
         image = batch.get(key)
         if image is None:
-            raise ConfigError(f"bhd_perception was trained with {key!r}, which is not in the batch.")
+            raise ConfigError(f"{self.config.type} was trained with {key!r}, which is not in the batch.")
         if tuple(image.shape[1:]) != (3, size[1], size[0]):
             raise ConfigError(
-                f"bhd_perception was trained with images of {size[0]} x {size[1]} px; {key} has the shape "
+                f"{self.config.type} was trained with images of {size[0]} x {size[1]} px; {key} has the shape "
                 f"{tuple(image.shape[1:])} (channels, height, width)."
             )
         return image
 
-    def _answers(self, image: Tensor) -> dict[str, Tensor]:
-        """Return the network's answers by name, shape (batch, h, w, …)."""
-        values = self.network(image).movedim(1, -1).split(list(_OUTPUTS.values()), dim=-1)
-        one = {name for name, width in _OUTPUTS.items() if width == 1}
-        return {name: part[..., 0] if name in one else part for name, part in zip(_OUTPUTS, values, strict=True)}
+    def look(self, image: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return what the network makes of images, cell by cell.
 
-    def _at(self, answers: Mapping[str, Tensor]) -> Tensor:
-        """Return where every cell says that the object near it is, in the base frame [m]."""
+        Args:
+            image: shape (batch, 3, height, width), 0 to 1.
+
+        Returns:
+            features that it answers from, shape (batch, `config.channels`, h, w); and its answers by name, shape
+            (batch, h, w) or (batch, h, w, numbers): logits of `presence`, `is_box` and `colour`; `shift`, `log_error`,
+            `size` and `yaw` as the loss takes them.
+        """
+        features = self.network(image)
+        values = self.network.answer(features).movedim(1, -1).split(list(_OUTPUTS.values()), dim=-1)
+        one = {name for name, width in _OUTPUTS.items() if width == 1}
+        return features, {
+            name: part[..., 0] if name in one else part for name, part in zip(_OUTPUTS, values, strict=True)
+        }
+
+    def places(self, answers: Mapping[str, Tensor]) -> Tensor:
+        """Return where every cell says that the object near it is, in the base frame [m], shape (batch, h, w, 3)."""
         return self._plane + _SHIFT * answers["shift"]
 
     def _found(self, answers: Mapping[str, Tensor], factor: float) -> list[Detections]:
         presence = torch.sigmoid(answers["presence"])
         highest = functional.max_pool2d(presence[:, None], 5, stride=1, padding=2)[:, 0]
         is_peak = (presence == highest) & (presence > self.config.least_presence)
-        position = self._at(answers)
+        position = self.places(answers)
         found = []
         for image in range(len(presence)):
             rows, columns = is_peak[image].nonzero(as_tuple=True)
@@ -283,7 +300,7 @@ def _distinct(found: Detections) -> Detections:
 
 
 class _Network(nn.Module):
-    """From an image to the answers of the cells of a region, shape (batch, outputs, h, w)."""
+    """From an image to features of the cells of a region, shape (batch, channels, h, w), and from those to answers."""
 
     def __init__(self, config: PerceptionConfig, region: tuple[int, int, int, int]) -> None:
         super().__init__()
@@ -321,8 +338,7 @@ class _Network(nn.Module):
         coarse = self.up(self.middle(_modulated(coarse, self.to_coarse(whole))))
         coarse = functional.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=False)
         joined = self.join(torch.cat([fine, coarse], dim=1))
-        answers: Tensor = self.answer(_modulated(joined, self.to_fine(whole)))
-        return answers
+        return _modulated(joined, self.to_fine(whole))
 
 
 def _modulated(values: Tensor, by: Tensor) -> Tensor:
