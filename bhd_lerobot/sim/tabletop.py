@@ -188,8 +188,9 @@ class Tabletop:
             (geoms[1], (a + 0.0003, b + 0.0003), broad, middle, stripe),
             (geoms[2], (share * a, share * b), 0.0004, h, patch),
         ):
-            solid = ("box", (*across, thick)) if thing.kind == "box" else ("cylinder", (across[0], thick, 0))
-            self._geom(sim, geom, _Form(*solid, (0, 0, z)), _tinted(colour, tint))
+            size = (*across, thick) if thing.kind == "box" else (across[0], thick, 0.0)
+            kind = "box" if thing.kind == "box" else "cylinder"
+            self._geom(sim, geom, _Form(kind, size, (0, 0, z)), _tinted(colour, tint))
 
     def _other(self, sim: int, thing: TableObject, geoms: list[int], colour: NDArray[np.float64]) -> None:
         """Add a band across a box, or a lid with a knob to a cup."""

@@ -1,7 +1,7 @@
 """The brain `learned`: any trained LeRobot policy, with the processors that were saved with it."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import Chunk
+from bhd_lerobot.control.commands import Chunk, CommandResult
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.brain import ANY_ROBOT, BrainConfig, Observation, RobotFeatures
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, weights_digest
@@ -171,8 +171,8 @@ class LearnedBrain:
         """
         n = len(self._next)
         running = np.arange(n) if observation.running is None else np.flatnonzero(observation.running)
-        rows = self._remember(self._rows(observation), running)
         ids = running[self._next[running] >= self.inference.steps]
+        rows = self._remember(self._rows(observation, bool(self.looks({})[running].any())), running)
         if len(ids):
             self._store(ids, self.inference.infer(ids, {key: values[ids] for key, values in rows.items()}), rows)
         if self.config.stream:
@@ -213,8 +213,15 @@ class LearnedBrain:
     def _weights(self) -> str:
         return weights_digest(self.loaded.folder)
 
-    def _rows(self, observation: Observation) -> "Rows":
-        """Return the policy's inputs of all simulations, shape (n, …)."""
+    def looks(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
+        """Return in which simulations the policy is about to use images, shape (n,)."""
+        if self._history_length > 1:
+            return np.full(len(self._next), self.uses_images)
+        is_due = self._next >= self.inference.steps
+        return self.uses_images & (is_due & (self._frame == 0) if self.inference.looks_once else is_due)
+
+    def _rows(self, observation: Observation, is_looking: bool) -> "Rows":
+        """Return the policy's inputs of all simulations, shape (n, …); images if it looks."""
         rows: Rows = {}
         for key in self.loaded.inputs:
             if key == _STATE:
@@ -223,7 +230,7 @@ class LearnedBrain:
                 if observation.environment_state is None:
                     raise AssertionError("The brain was bound to a task that tells something.")
                 rows[key] = observation.environment_state.astype(np.float32)
-            else:
+            elif is_looking:
                 rows[key] = self._image(observation, self.loaded.cameras[key], key)
         return rows
 

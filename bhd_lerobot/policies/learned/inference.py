@@ -24,9 +24,11 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.policy import LoadedPolicy, torch_device
 from bhd_lerobot.policies.mlp.scan_mlp import ScanProcessorStep
 from bhd_lerobot.policies.mlp.yaw_mlp import YawProcessorStep
+from bhd_lerobot.policies.pixels.processor_pixels import InstructionProcessorStep
 
 type Rows = dict[str, NDArray]
-"""Observations of some simulations: by key, shape (simulations, frames, …), oldest first; images uint8 (…, h, w, 3)."""
+"""Observations of some simulations: by key, shape (simulations, frames, …), oldest first; images uint8 (…, h, w, 3).
+Images are missing where they are not looked at."""
 
 # Steps that treat every number by itself, so that a batch, a history or a chunk may go through them in one piece.
 _ELEMENTWISE = (
@@ -37,6 +39,7 @@ _ELEMENTWISE = (
     UnnormalizerProcessorStep,
     ScanProcessorStep,
     YawProcessorStep,
+    InstructionProcessorStep,
 )
 _SMALL = 2_000_000  # parameters; below, a second thread costs more than it does
 _BLOCK, _BLOCK_LARGE = 64, 8
@@ -49,6 +52,8 @@ class Inference(Protocol):
     """Which frames `infer` needs, oldest first, the present one being 0."""
     steps: int
     """How many actions of a chunk are carried out."""
+    looks_once: bool
+    """Whether it uses the images of an episode's first frame only."""
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str]) -> None:
         """Start episodes in some of n simulations; a seed and an instruction for each of them."""
@@ -74,16 +79,16 @@ def make_inference(loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: 
     if threads is None and sum(p.numel() for p in loaded.policy.parameters()) < _SMALL:
         threads = 1
     is_plain = all(isinstance(step, _ELEMENTWISE) for step in (*loaded.before.steps, *loaded.after.steps))
-    if is_plain and loaded.kind in ("bhd_mlp", "act", "diffusion"):
+    if is_plain and loaded.kind in ("bhd_mlp", "bhd_pixels", "act", "diffusion"):
         return BatchedInference(loaded, sample=sample, exact=exact, threads=threads)
     return StockInference(loaded, threads=threads)
 
 
 class BatchedInference:
-    """One forward pass for all simulations that need one: `bhd_mlp`, ACT and Diffusion.
+    """One forward pass for all simulations that need one: `bhd_mlp`, `bhd_pixels`, ACT and Diffusion.
 
     The policy keeps nothing between two calls: histories and chunks belong to the caller, the averages of ACT's
-    temporal ensembling and the random numbers to each simulation.
+    temporal ensembling, what `bhd_pixels` saw first and the random numbers to each simulation.
 
     Simulations go through the network in blocks of a fixed size, because the last bits of a matrix product depend on
     how many rows it has. So an episode's actions do not depend on what is beside it; alone (n = 1), or with `exact`,
@@ -101,19 +106,24 @@ class BatchedInference:
         config, self._kind = loaded.config, loaded.kind
         self._sample = self._kind == "bhd_mlp" and (sample or config.sample)
         self.steps = int(config.n_action_steps)
-        self.frames = tuple(config.observation_delta_indices or (0,))
+        self.looks_once = self._kind == "bhd_pixels"
+        self.frames = (0,) if self.looks_once else tuple(config.observation_delta_indices or (0,))
         self._device = torch_device(loaded)
         self._block = 1
         coefficient = getattr(config, "temporal_ensemble_coeff", None)
         self._coefficient: float | None = None if self._kind != "act" else coefficient
         self._ensemblers: dict[int, ACTTemporalEnsembler] = {}
         self._generators: dict[int, torch.Generator] = {}
+        self._instructions: dict[int, str] = {}
+        self._seen: dict[int, Tensor] = {}
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str]) -> None:
-        """Start episodes: new random numbers, and no average yet."""
-        large = self._kind != "bhd_mlp"
+        """Start episodes: new random numbers, no average yet, and nothing seen."""
+        large = self._kind in ("act", "diffusion")
         self._block = 1 if n == 1 or self._exact else _BLOCK_LARGE if large else _BLOCK
-        for sim, seed in zip(ids.tolist(), seeds, strict=True):
+        for i, (sim, seed) in enumerate(zip(ids.tolist(), seeds, strict=True)):
+            self._instructions[sim] = instructions[i] if i < len(instructions) else ""
+            self._seen.pop(sim, None)
             self._generators[sim] = torch.Generator(self._device).manual_seed(seed)
             if self._coefficient is not None:
                 self._ensemblers[sim] = ACTTemporalEnsembler(self._coefficient, self.loaded.config.chunk_size)
@@ -125,7 +135,11 @@ class BatchedInference:
             for start in range(0, len(ids), self._block):
                 sims = ids[start : start + self._block].tolist()
                 block = {key: _filled(values[start : start + self._block], self._block) for key, values in rows.items()}
-                chunk = self.loaded.after(self._predict(sims, self.loaded.before(self._batch(block))))
+                batch = self._batch(block)
+                if self._kind == "bhd_pixels":
+                    texts = [self._instructions[sim] for sim in sims]
+                    batch["task"] = texts + texts[:1] * (self._block - len(texts))
+                chunk = self.loaded.after(self._predict(sims, self.loaded.before(batch)))
                 chunks.append(chunk[: len(sims)].to("cpu", torch.float32).numpy())
         return np.concatenate(chunks)
 
@@ -146,6 +160,13 @@ class BatchedInference:
             if not self._sample:
                 return policy.predict_action_chunk(batch)
             return policy.predict_action_chunk(batch, noise=self._noise(sims, self.loaded.config.chunk_size))
+        if self._kind == "bhd_pixels":
+            new = [row for row, sim in enumerate(sims) if sim not in self._seen]
+            if new:
+                seen = policy.see(batch)
+                self._seen |= {sims[row]: seen[row] for row in new}
+            rows = [self._seen[sim] for sim in sims]
+            return policy.act(torch.stack(rows + rows[:1] * (self._block - len(rows))), batch)
         chunk = policy.predict_action_chunk(batch)
         if self._coefficient is None:
             return chunk
@@ -191,6 +212,7 @@ class StockInference:
 
     frames: tuple[int, ...] = (0,)
     steps: int = 1
+    looks_once = False
 
     def __init__(self, loaded: LoadedPolicy, *, threads: int | None) -> None:
         self.loaded, self._threads = loaded, threads

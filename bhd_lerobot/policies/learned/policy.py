@@ -90,12 +90,13 @@ def load_policy(folder: Path, device: str = "cpu", n_action_steps: int | None = 
     return LoadedPolicy(folder, policy, before, after, *_inputs(config, before))
 
 
-def load_perception(folder: Path, device: str = "cpu") -> Any:
+def load_perception(folder: Path, device: str = "cpu", option: str = "brain.perception.path") -> Any:
     """Return the `bhd_perception` of a checkpoint, in evaluation mode.
 
     Args:
         folder: a checkpoint's folder `pretrained_model`.
         device: where it runs.
+        option: that named the checkpoint, for messages.
 
     Raises:
         ConfigError: the checkpoint cannot be loaded, or is of a policy that gives actions.
@@ -104,7 +105,7 @@ def load_perception(folder: Path, device: str = "cpu") -> Any:
     config = _config(folder, device)
     if config.type != "bhd_perception":
         raise ConfigError(
-            f"brain.perception.path is {str(folder)!r}, a {config.type!r}; perception is a 'bhd_perception'. A policy "
+            f"{option} is {str(folder)!r}, a {config.type!r}; perception is a 'bhd_perception'. A policy "
             "that gives actions is a brain of its own: --brain.path."
         )
     check_checkpoint(folder)

@@ -82,8 +82,12 @@ def _names(features: Mapping[str, Mapping[str, Any]], key: str) -> list[str]:
     return list(known) if isinstance(known, list | tuple) else []
 
 
-def _matching(patterns: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return the columns whose names match a pattern.
+def matching_columns(patterns: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Return the columns of `observation.state` whose names match a pattern.
+
+    Args:
+        patterns: of `policy.ignore`.
+        names: of all columns.
 
     Raises:
         ConfigError: a pattern matches none.
@@ -280,7 +284,7 @@ class MlpConfig(PreTrainedConfig):
             self.state_quaternions = quaternion_columns(names)
             self.environment_quaternions = quaternion_columns(_names(features, OBS_ENV_STATE))
         if self.ignore and not self.ignored_columns:
-            self.ignored_columns = _matching(self.ignore, names)
+            self.ignored_columns = matching_columns(self.ignore, names)
         if not self.scan.is_used or self.scan.beams:
             return
         columns = [i for i, name in enumerate(names) if name.startswith("scan_") and name.endswith(".pos")]

@@ -32,9 +32,7 @@ def make_bhd_mlp_pre_post_processors(
     Raises:
         ConfigError: the configuration treats beams and does not know yet where they are.
     """
-    stats = (
-        None if dataset_stats is None else {key: _floored(one, config.min_std) for key, one in dataset_stats.items()}
-    )
+    stats = floored(dataset_stats, config.min_std)
     steps = make_default_policy_processor_steps(config, stats, normalizer_device=config.device)
     before = [steps.rename_observations, steps.add_batch_dim, steps.to_device]
     if config.scan.is_used and config.scan.transform != "none":
@@ -48,6 +46,11 @@ def make_bhd_mlp_pre_post_processors(
     return make_policy_processor_pipelines([*before, steps.normalize], [steps.unnormalize, steps.to_cpu])
 
 
-def _floored(stats: dict[str, Tensor], least: float) -> dict[str, Tensor]:
-    """Return a feature's statistics with no standard deviation below the least; theirs are not changed."""
-    return {name: torch.as_tensor(value).clamp(min=least) if name == "std" else value for name, value in stats.items()}
+def floored(stats: dict[str, dict[str, Tensor]] | None, least: float) -> dict[str, dict[str, Tensor]] | None:
+    """Return features' statistics with no standard deviation below the least; those that were given are not changed."""
+    if stats is None:
+        return None
+    return {
+        key: {name: torch.as_tensor(value).clamp(min=least) if name == "std" else value for name, value in one.items()}
+        for key, one in stats.items()
+    }

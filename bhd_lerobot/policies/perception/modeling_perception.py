@@ -80,6 +80,8 @@ class PerceptionPolicy(PreTrainedPolicy):
     config_class = PerceptionConfig
     name = "bhd_perception"
     config: PerceptionConfig
+    answer_size = sum(_OUTPUTS.values())
+    """Numbers that it says of every cell."""
     factor: Tensor
     _plane: Tensor
 

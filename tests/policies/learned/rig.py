@@ -16,6 +16,8 @@ from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
+from bhd_lerobot.policies.perception.configuration_perception import LABELS
+from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
 
 STATE = ("x.vel", "theta.vel", *(f"scan_{i:03}.pos" for i in range(12)))
 ENVIRONMENT = ("goal_x", "goal_y")
@@ -62,7 +64,9 @@ KINDS: dict[str, tuple[type, dict[str, Any]]] = {
     "diffusion": (DiffusionConfig, _SMALL_DIFFUSION),
     "diffusion_ddim": (DiffusionConfig, {**_SMALL_DIFFUSION, "noise_scheduler_type": "DDIM"}),
     "diffusion_image": (DiffusionConfig, _SMALL_DIFFUSION),
+    "pixels_image": (PixelsConfig, {"hidden_dims": [32], "chunk_size": 6, "n_action_steps": 3, "camera": "front"}),
 }
+INSTRUCTION = "drive"
 
 
 def save_policy(folder: Path, kind: str = "mlp", **overrides: Any) -> Path:
@@ -77,12 +81,12 @@ def save_policy(folder: Path, kind: str = "mlp", **overrides: Any) -> Path:
     }
     if kind.endswith("_image"):
         inputs["observation.images.front"] = PolicyFeature(FeatureType.VISUAL, (3, *IMAGE[:2]))
-    config: Any = config_class(
-        device="cpu",
-        input_features=inputs,
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (len(ACTIONS),))},
-        **options,
-    )
+    outputs = {"action": PolicyFeature(FeatureType.ACTION, (len(ACTIONS),))}
+    if kind == "pixels_image":
+        del inputs["observation.environment_state"]
+        outputs["observation.environment_state"] = PolicyFeature(FeatureType.ENV, (len(LABELS),))
+        options["ignored_columns"] = [0, 1]
+    config: Any = config_class(device="cpu", input_features=inputs, output_features=outputs, **options)
     if isinstance(config, MlpConfig):
         config.set_dataset_feature_metadata({"observation.state": {"names": list(STATE)}})
     torch.manual_seed(7)
@@ -135,7 +139,7 @@ class Stock:
         if seen.images:
             raw["pixels"] = {name: image[sim : sim + 1] for name, image in seen.images.items()}
         batch = preprocess_observation(raw)
-        batch["task"] = ["drive"]
+        batch["task"] = [INSTRUCTION]
         with torch.inference_mode():
             return self.after(self.policy.select_action(self.before(batch))).numpy()[0]
 

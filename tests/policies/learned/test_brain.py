@@ -12,7 +12,7 @@ from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.learned.brain import LearnedBrain
 from bhd_lerobot.policies.learned.inference import StockInference
-from tests.policies.learned.rig import ACTIONS, KINDS, Stock, make_brain, observations, save_policy
+from tests.policies.learned.rig import ACTIONS, INSTRUCTION, KINDS, Stock, make_brain, observations, save_policy
 
 FRAMES = 11
 
@@ -33,7 +33,7 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def drive(brain: LearnedBrain, seen: list[Observation], seeds: list[int]) -> NDArray[np.float64]:
     """Return the actions of one episode of every simulation, shape (frames, n, actions)."""
-    brain.reset(np.arange(len(seeds)), seeds, len(seeds))
+    brain.reset(np.arange(len(seeds)), seeds, len(seeds), [INSTRUCTION] * len(seeds))
     actions = []
     for one in seen:
         action = brain.act(one)
@@ -54,7 +54,7 @@ def test_alone_its_actions_are_those_of_lerobot_to_the_bit(checkpoints: dict[str
         assert len(np.unique(actions, axis=0)) == FRAMES  # something was there to compare
 
 
-@pytest.mark.parametrize("kind", ["mlp_history", "act_average", "diffusion", "mlp_sample"])
+@pytest.mark.parametrize("kind", ["mlp_history", "act_average", "diffusion", "mlp_sample", "pixels_image"])
 def test_any_policy_runs_as_copies_with_the_actions_of_lerobot(checkpoints: dict[str, Path], kind: str) -> None:
     brain, stock = make_brain(checkpoints[kind]), Stock(checkpoints[kind])
     brain.inference = StockInference(brain.loaded, threads=None)
@@ -78,7 +78,7 @@ def test_an_episode_does_not_feel_the_others(checkpoints: dict[str, Path], kind:
     together = drive(brain, list(observations(n, FRAMES)), list(range(n)))[:, sim]
     # the others see something else, begin anew in between, pause, and it is one of six
     mine = [(one.state[sim], one.environment_state[sim], one.images["front"][sim]) for one in observations(n, FRAMES)]
-    brain.reset(np.arange(6), [90, sim, 92, 93, 94, 95], 6)
+    brain.reset(np.arange(6), [90, sim, 92, 93, 94, 95], 6, [INSTRUCTION] * 6)
     other = []
     for frame, one in enumerate(observations(6, FRAMES, seed=99)):
         if frame in (2, 7):
@@ -173,6 +173,24 @@ def test_what_is_recorded_names_the_weights(checkpoints: dict[str, Path]) -> Non
     assert parameters["weights"].startswith("sha256:")
     assert (parameters["type"], parameters["policy"], parameters["n_action_steps"]) == ("learned", "bhd_mlp", 3)
     assert parameters["weights"] != make_brain(checkpoints["act"]).parameters()["weights"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "frames"), [("pixels_image", {0}), ("act_image", {0, 3, 6}), ("diffusion_image", set(range(8)))]
+)
+def test_images_that_it_does_not_look_at_need_not_be_there(
+    checkpoints: dict[str, Path], kind: str, frames: set[int]
+) -> None:
+    brain, seen = make_brain(checkpoints[kind]), list(observations(3, 8))
+    wanted = drive(brain, seen, [0, 1, 2])
+    brain.reset(np.arange(3), [0, 1, 2], 3, [INSTRUCTION] * 3)
+    running = np.array([True, True, False])  # the third begins later
+    for frame, one in enumerate(seen):
+        looks = brain.looks({})
+        assert looks.tolist() == [frame in frames, frame in frames, True]
+        images = one.images if frame in frames else {}
+        action = brain.act(Observation(one.names, one.state, images, one.environment_state, running=running))
+        assert np.array_equal(np.asarray(action)[:2], wanted[frame, :2])
 
 
 def test_it_needs_images_only_if_the_policy_does(checkpoints: dict[str, Path]) -> None:

@@ -1,0 +1,130 @@
+"""Configuration of `bhd_pixels`: an episode's first image, an instruction and the robot's state in, actions out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.mlp.configuration_mlp import matching_columns
+from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
+
+FIRST = -100_000
+"""Frames back in time: before every episode, where datasets give the first frame."""
+
+
+@PreTrainedConfig.register_subclass("bhd_pixels")
+@dataclass
+class PixelsConfig(PerceptionConfig):
+    """Configuration of the policy type ``bhd_pixels``.
+
+    It sees by the network of ``bhd_perception``, whose options it has, too. The true poses in
+    `observation.environment_state` are needed to learn, never to act.
+
+    Attributes:
+        perception: a checkpoint of ``bhd_perception`` whose weights the learning begins with; without one it begins
+            from nothing.
+        freeze: do not change these weights: every first image is then looked at once in a training.
+        chunk_size: actions that it predicts, one a frame.
+        n_action_steps: how many of them are carried out before it predicts again.
+        longest_instruction: bytes of the longest instruction, in UTF-8.
+        text_dim: numbers that an instruction becomes.
+        n_heads: places of the image, beside the one of what is named, that actions may depend on.
+        hidden_dims: widths of the layers that predict actions.
+        ignore: numbers of `observation.state` that it does not look at, by name or pattern, as in ``bhd_mlp``.
+        ignored_columns: their columns; found by their names.
+        min_std: least standard deviation that a number of the state or an action is divided by, in its own unit.
+        pointing_weight: of the loss of where it looks: at what the instruction names.
+        perception_weight: of the loss of ``bhd_perception``, where its weights are learned as well.
+    """
+
+    perception: str | None = None
+    freeze: bool = True
+    chunk_size: int = 8
+    n_action_steps: int = 8
+    longest_instruction: int = 128
+    text_dim: int = 64
+    n_heads: int = 4
+    hidden_dims: list[int] = field(default_factory=lambda: [512, 512, 512])
+    ignore: list[str] = field(default_factory=lambda: ["*.vel"])
+    ignored_columns: list[int] = field(default_factory=list)
+    min_std: float = 1e-3
+    pointing_weight: float = 0.2
+    perception_weight: float = 0.1
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            **dict.fromkeys(("VISUAL", "ENV"), NormalizationMode.IDENTITY),
+            **dict.fromkeys(("STATE", "ACTION"), NormalizationMode.MEAN_STD),
+        }
+    )
+    optimizer_lr: float = 1e-3
+    optimizer_grad_clip_norm: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        super().__post_init__()
+        for name in ("chunk_size", "n_action_steps", "longest_instruction", "text_dim", "n_heads"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least 1.")
+        if self.n_action_steps > self.chunk_size:
+            raise ConfigError(
+                f"policy.n_action_steps is {self.n_action_steps}, but only policy.chunk_size = {self.chunk_size} "
+                "actions are predicted."
+            )
+        if min(self.hidden_dims, default=1) < 1:
+            raise ConfigError(f"policy.hidden_dims is {self.hidden_dims}; every width must be at least 1.")
+        for name in ("min_std", "pointing_weight", "perception_weight"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be 0 or positive, and finite.")
+
+    @property
+    def observation_delta_indices(self) -> list[int]:  # type: ignore[override]
+        """The first frame of the episode, and the present one."""
+        return [FIRST, 0]
+
+    @property
+    def action_delta_indices(self) -> list[int]:  # type: ignore[override]
+        """Which actions it predicts, the present frame's being 0."""
+        return list(range(self.chunk_size))
+
+    def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
+        """Check that the dataset says where objects are, and find what is to be ignored by its name.
+
+        Raises:
+            ConfigError: it does not, or there is no such name.
+        """
+        super().set_dataset_feature_metadata(features)
+        if self.ignore and not self.ignored_columns:
+            names = (features.get(OBS_STATE) or {}).get("names") or []
+            self.ignored_columns = matching_columns(self.ignore, list(names))
+
+    def validate_features(self) -> None:
+        """Keep image and state as inputs, actions and labels as outputs.
+
+        Raises:
+            ConfigError: the dataset lacks one of them.
+        """
+        known = {**(self.input_features or {}), **(self.output_features or {})}
+        super().validate_features()
+        for key in (OBS_STATE, ACTION):
+            if key not in known or len(known[key].shape) != 1:
+                raise ConfigError(f"bhd_pixels needs {key}, a vector; the dataset has {', '.join(known)}.")
+        width = int(known[OBS_STATE].shape[0])
+        if not all(0 <= column < width for column in self.ignored_columns):
+            raise ConfigError(
+                f"policy.ignored_columns is {self.ignored_columns}; {OBS_STATE} has the columns 0 to {width - 1}."
+            )
+        if self.ignore and not self.ignored_columns:
+            raise ConfigError(
+                f"policy.ignore is {self.ignore}, but nothing says which columns of {OBS_STATE} those are: make the "
+                "policy with the metadata of its dataset, or give policy.ignored_columns."
+            )
+        self.input_features = {self.image_key: known[self.image_key], OBS_STATE: known[OBS_STATE]}
+        self.output_features = {ACTION: known[ACTION], OBS_ENV_STATE: known[OBS_ENV_STATE]}
