@@ -1,0 +1,291 @@
+"""`bhd_pixels`: it looks where the instruction points, once, and needs no truth to act."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_TOKENS, OBS_STATE
+from torch import Tensor
+
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.learned.policy import load_policy
+from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy
+from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
+from bhd_lerobot.policies.pixels.modeling_pixels import PixelsPolicy
+from bhd_lerobot.tasks.pick import PickConfig, PickTask
+from tests.cases import each_case
+from tests.policies.perception.rig import FEATURES, HEIGHT, IMAGE, WIDTH, config, painted, states
+
+CHUNK = 4
+NAMES = {OBS_STATE: {"names": [f"joint.{which}" for which in (*"abcdefg", *["vel"] * 7)]}}
+
+
+def made(**options: Any) -> PixelsConfig:
+    options = {"hidden_dims": [32], "chunk_size": CHUNK, "n_action_steps": 2, **options}
+    one = config(PixelsConfig, ignored_columns=list(range(7, 14)), **options)
+    assert isinstance(one, PixelsConfig)
+    return one
+
+
+def tokens(texts: list[str], of: PixelsConfig | None = None) -> Tensor:
+    before, _ = make_pre_post_processors(of or made())
+    return before({"task": texts, OBS_STATE: torch.zeros(len(texts), 14)})[OBS_LANGUAGE_TOKENS]
+
+
+def batch(count: int = 8, **task: Any) -> dict[str, Tensor]:
+    """Return samples to learn from: the first frame, and one that shows something else."""
+    values = states(count, **task)
+    scenes = [PickTask(PickConfig(**task), 1, 25).sample(seed) for seed in range(count)]
+    first = painted(values)
+    return {
+        IMAGE: torch.stack([first, torch.rand_like(first)], dim=1),
+        OBS_ENV_STATE: torch.from_numpy(values).float().unsqueeze(1).repeat(1, 2, 1),
+        OBS_STATE: torch.randn(count, 2, 14),
+        ACTION: torch.randn(count, CHUNK, 7),
+        OBS_LANGUAGE_TOKENS: tokens([scene.instruction for scene in scenes]),
+    }
+
+
+def present(samples: dict[str, Tensor], frame: int = 0) -> dict[str, Tensor]:
+    """Return what a robot would show: one frame, and no truth."""
+    shown = {key: values[:, frame] for key, values in samples.items() if key in (IMAGE, OBS_STATE)}
+    return {**shown, OBS_LANGUAGE_TOKENS: samples[OBS_LANGUAGE_TOKENS]}
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    yield
+    torch.set_num_threads(before)
+
+
+# --- learning ---------------------------------------------------------------------------------------------------------
+
+
+def test_it_learns_to_look_at_what_is_named() -> None:
+    policy = PixelsPolicy(made(freeze=False, pointing_weight=1.0))
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), 5e-3)
+    task = {"min_objects": 2, "max_objects": 2}
+    samples = batch(10, **task)
+    other = batch(10, **task, swap=True)  # the same tables, and it is asked for the other object
+    assert torch.equal(samples[IMAGE][:, 0].sum((2, 3)), other[IMAGE][:, 0].sum((2, 3)))
+    both = {key: torch.cat([samples[key], other[key]]) for key in samples}
+    policy.train()
+    for _ in range(60):
+        loss, parts = policy.forward(both)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert set(parts) == {"perception", "pointing", "action"}
+    policy.eval()
+    for asked in (samples, other):
+        _, attention = policy._see(policy._cells(asked[IMAGE][:, 0]), asked[OBS_LANGUAGE_TOKENS])
+        rows, columns = attention.shape[1:]
+        cell = attention.flatten(1).argmax(1)
+        pixel = policy.perception._pixels[cell // columns, cell % columns]
+        table = asked[OBS_ENV_STATE][:, 0].reshape(10, 5, 16)
+        where = table[torch.arange(10), table[..., 1].argmax(1), 3:6].double().numpy()
+        apart = np.linalg.norm(policy.config.projection.pixels(where) - pixel.numpy(), axis=-1)
+        assert rows * columns > 100
+        assert np.mean(apart < 8) >= 0.9
+
+
+def test_what_is_fixed_is_neither_changed_nor_looked_at_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, samples = PixelsPolicy(made()), batch()
+    before = {name: values.clone() for name, values in policy.state_dict().items()}
+    looks: list[int] = []
+    look = policy._look
+    monkeypatch.setattr(policy, "_look", lambda image: looks.append(len(image)) or look(image))
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), 1e-2)
+    policy.train()
+    first = policy.forward(samples)[0]
+    again = policy.forward({key: values.flip(0) for key, values in samples.items()})[0]
+    assert looks == [8]
+    assert torch.allclose(first, again, atol=1e-5)
+    again.backward()
+    optimizer.step()
+    policy.eval()
+    policy.forward(samples)
+    assert looks == [8, 8], "what is held out is looked at afresh"
+    changed = {
+        name for name, values in policy.state_dict().items() if not torch.allclose(values, before[name], equal_nan=True)
+    }
+    assert not [name for name in changed if name.startswith("perception.")]
+    assert {"reader.said.weight", "named.key.weight", "others.key.weight", "actor.0.weight"} <= changed
+
+
+def test_actions_behind_the_end_do_not_count() -> None:
+    policy, samples = PixelsPolicy(made()).eval(), batch()
+    padded = torch.zeros(8, CHUNK, dtype=torch.bool)
+    padded[:, 2:] = True
+    wild = {**samples, ACTION: samples[ACTION].masked_fill(padded.unsqueeze(-1), 1e6), "action_is_pad": padded}
+    mild = {**samples, "action_is_pad": padded}
+    assert torch.equal(policy.forward(wild)[0], policy.forward(mild)[0])
+    assert policy.forward(samples)[0] != policy.forward(mild)[0]
+
+
+# --- acting -----------------------------------------------------------------------------------------------------------
+
+
+def test_it_looks_at_the_first_image_only_and_says_what_it_learned_to_say() -> None:
+    policy, samples = PixelsPolicy(made()).eval(), batch()
+    chunk = policy.predict_action_chunk(present(samples))
+    later = {**present(samples), IMAGE: torch.rand(8, 3, HEIGHT, WIDTH)}
+    assert torch.equal(policy.predict_action_chunk(later), chunk)
+    policy.reset()
+    assert not torch.equal(policy.predict_action_chunk(later), chunk)
+    # in training: the first image, and the present state
+    policy.reset()
+    policy.predict_action_chunk(present(samples))
+    wanted = policy.predict_action_chunk({**present(samples, 1), IMAGE: later[IMAGE]})
+    loss = policy.forward({**samples, ACTION: wanted})[1]
+    assert loss["action"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_chunks_are_carried_out_and_then_predicted_anew() -> None:
+    policy, samples = PixelsPolicy(made()).eval(), present(batch(2))
+    chunk = policy.predict_action_chunk(samples)
+    assert torch.equal(torch.stack([policy.select_action(samples) for _ in range(2)], 1), chunk[:, :2])
+    moved = {**samples, OBS_STATE: samples[OBS_STATE] + 1}
+    third = policy.select_action(moved)
+    assert not torch.equal(third, chunk[:, 2])
+    assert torch.equal(third, policy.predict_action_chunk(moved)[:, 0])
+
+
+def test_words_count_and_what_is_ignored_does_not() -> None:
+    policy, samples = PixelsPolicy(made()).eval(), present(batch(2))
+
+    def act(**changed: Tensor) -> Tensor:
+        policy.reset()
+        return policy.predict_action_chunk({**samples, **changed})
+
+    same = {OBS_LANGUAGE_TOKENS: tokens(["take the red cup"] * 2)}
+    upper = {OBS_LANGUAGE_TOKENS: tokens(["  Take the RED cup "] * 2)}
+    assert torch.equal(act(**same), act(**upper))
+    for other in ("take the red box", "拿起红色杯子", ""):
+        assert not torch.equal(act(**same), act(**{OBS_LANGUAGE_TOKENS: tokens([other] * 2)}))
+    fast = samples[OBS_STATE].clone()
+    fast[:, 7:] += 5
+    assert torch.equal(act(), act(**{OBS_STATE: fast}))
+    fast[:, 0] += 1
+    assert not torch.equal(act(), act(**{OBS_STATE: fast}))
+
+
+def test_the_room_behind_an_instruction_does_not_matter() -> None:
+    policy, samples = PixelsPolicy(made()).eval(), present(batch(2))
+    texts = ["take the red cup", "请抓起那个蓝色盒子"]
+    seen = [policy.see({**samples, OBS_LANGUAGE_TOKENS: tokens(texts, made(longest_instruction=n))}) for n in (40, 200)]
+    assert torch.allclose(*seen, atol=1e-6)
+
+
+# --- checkpoints ------------------------------------------------------------------------------------------------------
+
+
+def save(folder: Path, policy: Any) -> Path:
+    policy.save_pretrained(folder)
+    for pipeline in make_pre_post_processors(policy.config, dataset_stats={}):
+        pipeline.save_pretrained(folder)
+    return folder
+
+
+def test_it_begins_with_a_perception_and_needs_it_no_more_afterwards(tmp_path: Path) -> None:
+    eyes = PerceptionPolicy(config())
+    path = save(tmp_path / "eyes", eyes)
+    policy = PixelsPolicy(made(perception=str(path)))
+    for name, values in eyes.network.state_dict().items():
+        assert torch.equal(policy.perception.network.state_dict()[name], values)
+    saved = save(tmp_path / "pixels", policy)
+    for file in path.iterdir():
+        file.unlink()
+    path.rmdir()
+    again = load_policy(saved)
+    assert again.inputs == (IMAGE, OBS_STATE), "the truth is no input"
+    assert again.cameras == {IMAGE: "scene"}
+    samples = present(batch(2))
+    assert torch.equal(again.policy.predict_action_chunk(samples), policy.eval().predict_action_chunk(samples))
+    assert type(again.policy) is get_policy_class("bhd_pixels")
+
+
+@each_case(
+    ("options", "message"),
+    [
+        ({"camera_fovy": 50.0}, "whose camera_fovy is 48.0; here it is 50.0"),
+        ({"hidden": 20}, "whose hidden is 12; here it is 20"),
+    ],
+)
+def test_a_perception_of_something_else_is_refused(options: dict[str, Any], message: str, tmp_path: Path) -> None:
+    path = save(tmp_path / "eyes", PerceptionPolicy(config()))
+    with pytest.raises(ConfigError, match=message):
+        PixelsPolicy(made(perception=str(path), **options))
+
+
+def test_a_checkpoint_that_is_no_perception_is_named(tmp_path: Path) -> None:
+    path = save(tmp_path / "pixels", PixelsPolicy(made()))
+    with pytest.raises(
+        ConfigError, match=r"policy\.perception is .*, a 'bhd_pixels'; perception is a 'bhd_perception'"
+    ):
+        PixelsPolicy(made(perception=str(path)))
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+@each_case(
+    ("changed", "message"),
+    [
+        ({IMAGE: None}, "was trained with 'observation.images.scene', which is not in the batch"),
+        ({IMAGE: torch.zeros(1, 3, 60, 80)}, "bhd_pixels was trained with images of 160 x 120 px"),
+        ({OBS_STATE: None}, "was trained with 'observation.state', which is not"),
+        ({OBS_LANGUAGE_TOKENS: None}, "Run the policy's own preprocessor first"),
+    ],
+)
+def test_what_is_missing_is_named(changed: dict[str, Any], message: str) -> None:
+    shown = {key: values for key, values in {**present(batch(1)), **changed}.items() if values is not None}
+    with pytest.raises(ConfigError, match=message):
+        PixelsPolicy(made()).predict_action_chunk(shown)
+
+
+def test_an_instruction_is_needed_and_never_cut_off() -> None:
+    before, _ = make_pre_post_processors(made(longest_instruction=16))
+    with pytest.raises(ConfigError, match=r"takes 18 bytes; this bhd_pixels reads 16\. Say it shorter"):
+        before({"task": ["拿起红色杯"[:3] + "123456789"], OBS_STATE: torch.zeros(1, 14)})
+    with pytest.raises(ConfigError, match="the batch has none"):
+        before({OBS_STATE: torch.zeros(1, 14)})
+
+
+@each_case(
+    ("options", "message"),
+    [
+        ({"chunk_size": 0}, "policy.chunk_size is 0; it must be at least 1"),
+        ({"n_action_steps": 5}, "n_action_steps is 5, but only policy.chunk_size = 4"),
+        ({"hidden_dims": [0]}, "every width must be at least 1"),
+        ({"pointing_weight": -1.0}, "policy.pointing_weight is -1.0"),
+        ({"ignored_columns": [14]}, r"policy.ignored_columns is \[14\]"),
+        ({"ignored_columns": []}, "matches no number of observation.state"),
+        ({"camera": "wrist"}, "the dataset has no 'observation.images.wrist'"),
+    ],
+)
+def test_wrong_options_are_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        PixelsPolicy(config(PixelsConfig, **{"ignored_columns": [13], "chunk_size": 4, "n_action_steps": 2, **options}))
+
+
+def test_a_dataset_without_truth_or_images_is_refused() -> None:
+    with pytest.raises(ConfigError, match="learns from the true poses"):
+        made().set_dataset_feature_metadata({OBS_ENV_STATE: {"names": ["goal_x"]}})
+    found = PixelsConfig(input_features={}, output_features={}, device="cpu")
+    found.set_dataset_feature_metadata({**FEATURES, **NAMES})
+    assert found.ignored_columns == list(range(7, 14))
+    with pytest.raises(ConfigError, match="It has no images"):
+        found.validate_features()
+    found.input_features = {IMAGE: PolicyFeature(FeatureType.VISUAL, (3, HEIGHT, WIDTH))}
+    found.output_features = {OBS_ENV_STATE: PolicyFeature(FeatureType.ENV, (80,))}
+    with pytest.raises(ConfigError, match=r"bhd_pixels needs observation\.state, a vector"):
+        found.validate_features()
