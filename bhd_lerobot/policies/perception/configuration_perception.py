@@ -164,7 +164,7 @@ class PerceptionConfig(PreTrainedConfig):
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
-        """Check that the dataset says where objects are; LeRobot's `make_policy` calls it.
+        """Check that the dataset says where objects are, and keep that as output; LeRobot's `make_policy` calls it.
 
         Raises:
             ConfigError: it does not.
@@ -176,12 +176,15 @@ class PerceptionConfig(PreTrainedConfig):
                 f"{OBS_ENV_STATE}), which this dataset does not have. Record the task 'pick' in simulation, with "
                 "--robot.camera=true."
             )
+        # LeRobot takes actions as outputs, and nothing else.
+        labels = PolicyFeature(FeatureType.ENV, (len(LABELS),))
+        self.output_features = {**(self.output_features or {}), OBS_ENV_STATE: labels}
 
-    def validate_features(self) -> None:
-        """Keep the image as input and the labels as output.
+    def known_features(self) -> dict[str, PolicyFeature]:
+        """Return all features, among which the image is.
 
         Raises:
-            ConfigError: the dataset lacks one of them.
+            ConfigError: it is not.
         """
         known = {**(self.input_features or {}), **(self.output_features or {})}
         cameras = [key for key, one in known.items() if one.type == FeatureType.VISUAL]
@@ -190,6 +193,15 @@ class PerceptionConfig(PreTrainedConfig):
                 f"policy.camera is {self.camera!r}, and the dataset has no {self.image_key!r}. It has "
                 f"{', '.join(cameras) or 'no images'}. Record it with --robot.camera=true, or set --policy.camera."
             )
+        return known
+
+    def validate_features(self) -> None:
+        """Keep the image as input and the labels as output.
+
+        Raises:
+            ConfigError: the dataset lacks one of them.
+        """
+        known = self.known_features()
         if OBS_ENV_STATE not in known or tuple(known[OBS_ENV_STATE].shape) != (len(LABELS),):
             raise ConfigError(
                 f"bhd_perception learns from {OBS_ENV_STATE} of {len(LABELS)} numbers, the true poses of objects, "

@@ -106,13 +106,12 @@ class PixelsConfig(PerceptionConfig):
             self.ignored_columns = matching_columns(self.ignore, list(names))
 
     def validate_features(self) -> None:
-        """Keep image and state as inputs, actions and labels as outputs.
+        """Keep image and state as inputs, actions and, to learn from, labels as outputs.
 
         Raises:
             ConfigError: the dataset lacks one of them.
         """
-        known = {**(self.input_features or {}), **(self.output_features or {})}
-        super().validate_features()
+        known = self.known_features()
         for key in (OBS_STATE, ACTION):
             if key not in known or len(known[key].shape) != 1:
                 raise ConfigError(f"bhd_pixels needs {key}, a vector; the dataset has {', '.join(known)}.")
@@ -127,4 +126,5 @@ class PixelsConfig(PerceptionConfig):
                 "policy with the metadata of its dataset, or give policy.ignored_columns."
             )
         self.input_features = {self.image_key: known[self.image_key], OBS_STATE: known[OBS_STATE]}
-        self.output_features = {ACTION: known[ACTION], OBS_ENV_STATE: known[OBS_ENV_STATE]}
+        self.output_features = {key: known[key] for key in (ACTION, OBS_ENV_STATE) if key in known}
+        _ = self.region

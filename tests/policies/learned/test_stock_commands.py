@@ -10,6 +10,7 @@ from lerobot.datasets import LeRobotDataset
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
 from bhd_lerobot.robots.simulated_robot import connected_robots
+from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import episode_seed
 from bhd_lerobot.training import train
 from tests.policies.learned.rig import save_policy
@@ -123,12 +124,65 @@ def by_bhd_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     )
 
 
-@pytest.mark.parametrize("which", ["by_lerobot_train", "by_bhd_train"])
+@pytest.fixture(scope="module")
+def pixels_by_lerobot_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    return from_pixels(tmp_path_factory.mktemp("pixels"), "lerobot-train")
+
+
+@pytest.fixture(scope="module")
+def pixels_by_bhd_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    return from_pixels(tmp_path_factory.mktemp("pixels"), "bhd-train")
+
+
+def from_pixels(folder: Path, program: str) -> Trained:
+    """Return a UR5's `bhd_pixels`, which reads an instruction and remembers its first image."""
+    robot = arguments(robot__type="ur5", robot__camera="true", robot__camera_width=96, robot__camera_height=72)
+    of_ur5: dict[str, Any] = {"robot__type": "ur5", "robot__beams": None, "task__type": "pick", "brain__type": "pick"}
+    camera = {"robot__camera": "true", "robot__camera_width": 96, "robot__camera_height": 72}
+    run_record(
+        folder / "data", **of_ur5, **camera, dataset__episode_time_s=0.4, dataset__fps=25, dataset__num_episodes=2
+    )
+    options = arguments(
+        dataset__repo_id="test/avoid",
+        dataset__root=folder / "data",
+        dataset__use_imagenet_stats="false",
+        policy__type="bhd_pixels",
+        policy__device="cpu",
+        policy__push_to_hub="false",
+        policy__hidden_dims="[16]",
+        policy__n_action_steps=3,
+        batch_size=4,
+        steps=2,
+        save_freq=2,
+        output_dir=folder / "run",
+    )
+    if program == "bhd-train":
+        assert train.main([*options, "--threads=1"]) == 0
+    else:
+        run_stock("lerobot-train", [*options, *arguments(num_workers=0, env_eval_freq=0)])
+    instruction = PickTask(PickConfig(), 1, 25).sample(SEED).instruction
+    return Trained(
+        folder / "run" / "checkpoints" / "last" / "pretrained_model",
+        [*robot, *arguments(task__type="pick", task__duration_s=0.4)],
+        arguments(
+            env__type="bhd",
+            env__task="UR5Pick-v0",
+            env__cameras="true",
+            env__robot="{camera_width: 96, camera_height: 72}",
+            env__task_options="{duration_s: 0.4}",
+        ),
+        [*robot, *arguments(robot__scene="pick", robot__seed=SEED, task=instruction)],
+    )
+
+
+@pytest.mark.parametrize(
+    "which", ["by_lerobot_train", "by_bhd_train", "pixels_by_lerobot_train", "pixels_by_bhd_train"]
+)
 def test_a_checkpoint_does_the_same_in_all_three_programs(
     which: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     trained: Trained = request.getfixturevalue(which)
-    assert (trained.checkpoint / CONTRACT_FILE).exists() == (which == "by_bhd_train")
+    assert (trained.checkpoint / CONTRACT_FILE).exists() == which.endswith("by_bhd_train")
     ours = trace_bhd_eval(tmp_path / "bhd", [*trained.bhd_eval, f"--brain.path={trained.checkpoint}"])
     path = f"--policy.path={trained.checkpoint}"
     theirs = trace_lerobot_eval(tmp_path / "lerobot", [*trained.lerobot_eval, path])

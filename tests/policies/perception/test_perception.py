@@ -208,3 +208,11 @@ def test_images_of_another_size_and_calls_for_actions(trained: PerceptionPolicy)
         trained.forward({OBS_ENV_STATE: torch.zeros(1, 80)})
     with pytest.raises(ConfigError, match=r"gives no actions\. Use it in a brain"):
         trained.select_action({})
+
+
+def test_a_training_that_goes_on_still_knows_what_it_learns() -> None:
+    again = config()
+    PerceptionPolicy(again)
+    again.output_features = {"action": PolicyFeature(FeatureType.ACTION, (7,))}  # as LeRobot's `make_policy` leaves it
+    again.set_dataset_feature_metadata(FEATURES)
+    assert set(PerceptionPolicy(again).config.output_features or {}) == {OBS_ENV_STATE}
