@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
@@ -21,7 +22,7 @@ from bhd_lerobot.policies.perception.labels import Labels
 from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
-from tests.policies.perception.rig import HEIGHT, IMAGE, SMALL, WIDTH, config, painted, states
+from tests.policies.perception.rig import FEATURES, HEIGHT, IMAGE, SMALL, WIDTH, config, painted, states
 
 STEPS = 300
 
