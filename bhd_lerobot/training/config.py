@@ -31,6 +31,8 @@ class SelectionConfig:
         exclude_late: leave out episodes with more late frames than their recording tolerated.
         intervention_weight: how often frames in which somebody intervened are drawn, compared with others; 0 drops
             them.
+        learner_weight: how often frames are drawn that a learner drove while somebody could have intervened, compared
+            with others; 0 drops them: what is learned is what the expert did.
         expert_action: learn what the expert would have done in every frame, `expert.action`, in place of what was done.
         hold_out: of what `dataset.eval_split` is the share that is held out: `episode`, of all episodes; `instruction`,
             of each instruction's, and at least one of each, as `lerobot-train` does.
@@ -40,6 +42,7 @@ class SelectionConfig:
     min_score: float | None = None
     exclude_late: bool = False
     intervention_weight: float = 1.0
+    learner_weight: float = 1.0
     expert_action: bool = False
     hold_out: str = "episode"
 
@@ -152,6 +155,7 @@ class BhdTrainConfig(TrainPipelineConfig):
             seed=0 if self.seed is None else self.seed,
             episodes=self.dataset.episodes,
             intervention_weight=self.selection.intervention_weight,
+            learner_weight=self.selection.learner_weight,
             expert_action=self.selection.expert_action,
             eval_split=self.dataset.eval_split,
             hold_out=self.selection.hold_out,

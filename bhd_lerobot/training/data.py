@@ -115,6 +115,10 @@ def open_data(
     dataset = config.dataset
     keep = kept_features(meta, policy, config.rename_map)
     deltas = {key: times for key, times in (resolve_delta_timestamps(policy, meta) or {}).items() if key in keep}
+    for key, frames in getattr(policy, "own_delta_indices", {}).items():
+        deltas |= {
+            own: [frame / meta.fps for frame in frames] for own in deltas if config.rename_map.get(own, own) == key
+        }
     loading = config.loader_config(
         delta_timestamps=deltas or None,
         drop_n_last_frames=getattr(policy, "drop_n_last_frames", 0),

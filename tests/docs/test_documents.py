@@ -13,6 +13,7 @@ import pytest
 
 from bhd_lerobot.apps.monitor import monitor
 from bhd_lerobot.cli.data import main
+from bhd_lerobot.cli.train import algorithm_of
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
@@ -21,7 +22,8 @@ from bhd_lerobot.recording.record import record
 from bhd_lerobot.rollout.configuration import parse
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.training.arguments import parse_train
-from bhd_lerobot.training.rl.config import is_rl, parse_rl
+from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
+from bhd_lerobot.training.rl.config import parse_rl
 from tests.cases import each_case
 from tests.docs.support import ROOT, load_script
 
@@ -160,7 +162,11 @@ def parse_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def parse_training(arguments: list[str]) -> None:
     """Parse the arguments of `bhd-train`; checkpoints of earlier commands need not be there."""
-    if is_rl(arguments):
+    algorithm = algorithm_of(arguments)
+    if algorithm == "dagger":
+        read_stages(parse_aggregation(arguments))
+        return
+    if algorithm is not None:
         parse_rl(arguments)
         return
     try:

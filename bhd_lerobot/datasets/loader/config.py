@@ -24,6 +24,8 @@ class LoaderConfig:
         episodes: indices of the episodes to choose from; None means all.
         selection: which of these episodes; None means all.
         intervention_weight: how often frames with an intervention are drawn, compared with others; 0 drops them.
+        learner_weight: how often frames are drawn in which nobody intervened though somebody could have: those that a
+            learner drove; 0 drops them.
             Held-out samples are not weighted.
         expert_action: serve what the expert would have done, `expert.action`, as `action`.
         eval_split: share of the episodes that is held out, from 0 to below 1.
@@ -53,6 +55,7 @@ class LoaderConfig:
     episodes: Sequence[int] | None = None
     selection: EpisodeFilter | None = None
     intervention_weight: float = 1.0
+    learner_weight: float = 1.0
     expert_action: bool = False
     eval_split: float = 0.0
     hold_out: str = "episode"
@@ -97,8 +100,9 @@ class LoaderConfig:
                 raise ConfigError(f"{name} is {value}; it must be at least {least}.")
         if not 0 <= self.rank < self.world_size:
             raise ConfigError(f"rank is {self.rank}; it must be from 0 to world_size - 1 = {self.world_size - 1}.")
-        if not 0 <= self.intervention_weight < math.inf:
-            raise ConfigError(f"intervention_weight is {self.intervention_weight}; it must be 0 or more, and finite.")
+        for name in ("intervention_weight", "learner_weight"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ConfigError(f"{name} is {getattr(self, name)}; it must be 0 or more, and finite.")
         if not 0 <= self.eval_split < 1:
             raise ConfigError(f"eval_split is {self.eval_split}; it must be from 0 to below 1.")
         if self.hold_out not in HOLD_OUTS:

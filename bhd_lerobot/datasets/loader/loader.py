@@ -14,7 +14,7 @@ from bhd_lerobot.datasets.loader.check import check
 from bhd_lerobot.datasets.loader.config import LoaderConfig
 from bhd_lerobot.datasets.loader.gather import Batch
 from bhd_lerobot.datasets.loader.order import BatchOrder
-from bhd_lerobot.datasets.loader.selection import EpisodeFilter, intervention_weights, split_episodes
+from bhd_lerobot.datasets.loader.selection import EpisodeFilter, frame_weights, split_episodes
 from bhd_lerobot.datasets.loader.source import local_metadata
 from bhd_lerobot.datasets.loader.table import FrameTable, checked_episodes
 from bhd_lerobot.datasets.loader.table_dataset import TableDataset
@@ -34,7 +34,7 @@ __all__ = [
     "TableDataset",
     "UnsupportedDatasetError",
     "check",
-    "intervention_weights",
+    "frame_weights",
     "make_loader",
     "split_episodes",
 ]
@@ -91,7 +91,7 @@ def make_loader(
     selection, episodes = config.selection, config.episodes
     chosen = checked_episodes(meta, episodes) if selection is None else selection.select(meta, episodes)
     train, held_out = split_episodes(meta, chosen, config.eval_split, config.hold_out)
-    weights = intervention_weights(meta, train, config.intervention_weight)
+    weights = frame_weights(meta, train, intervention=config.intervention_weight, learner=config.learner_weight)
     if config.use_imagenet_stats:
         imagenet_stats(meta)
     if config.expert_action:

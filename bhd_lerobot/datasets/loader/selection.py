@@ -187,15 +187,16 @@ def _nothing_to_train_on(episodes: int, instructions: int, eval_split: float, ho
     )
 
 
-def intervention_weights(
-    meta: "LeRobotDatasetMetadata", episodes: Sequence[int] | None, weight: float
+def frame_weights(
+    meta: "LeRobotDatasetMetadata", episodes: Sequence[int] | None, *, intervention: float = 1.0, learner: float = 1.0
 ) -> Tensor | None:
-    """Return how often each sample is to be drawn, by whether somebody intervened in its frame.
+    """Return how often each sample is to be drawn, by who drove in its frame.
 
     Args:
         meta: the dataset.
         episodes: the selected episodes; None means all.
-        weight: of frames with an intervention; 0 drops them. All others have 1.
+        intervention: of frames in which somebody intervened; 0 drops them.
+        learner: of the other frames of episodes in which somebody could intervene; 0 drops them. All others have 1.
 
     Returns:
         Shape (N,), float32, in the order of the samples; None if all are drawn equally often.
@@ -203,16 +204,29 @@ def intervention_weights(
     Raises:
         DatasetError: the dataset does not say where somebody intervened.
     """
-    if weight == 1:
+    if intervention == learner == 1:
         return None
     if EVENT not in meta.features:
         raise DatasetError(
-            f"{meta.root} has no column {EVENT!r}, so it does not say where somebody intervened. Leave the weight of "
-            f"interventions at 1. It has: {', '.join(meta.features)}."
+            f"{meta.root} has no column {EVENT!r}, so it does not say where somebody intervened. Leave the weights of "
+            f"interventions and of learners at 1. It has: {', '.join(meta.features)}."
         )
-    events = FrameTable.open(meta, episodes, [EVENT]).columns[EVENT]
-    weights = torch.where(events == int(Event.INTERVENTION), torch.tensor(weight), torch.tensor(1.0))
-    return None if bool((weights == 1).all()) else weights.to(torch.float32)
+    table = FrameTable.open(meta, episodes, [EVENT])
+    events = table.columns[EVENT]
+    weights = torch.ones(len(events))
+    if learner != 1:
+        of_episode, frame = table.columns["episode_index"], table.columns["frame_index"]
+        name = f"{PREFIX}interventions"
+        stored = meta.episodes[name] if name in meta.episodes.column_names else []
+        for episode in torch.unique(of_episode).tolist() if stored else []:
+            if not stored[episode]:
+                continue  # nobody could intervene; where nobody did, there is an empty list
+            mine = of_episode == episode
+            for first, end, _ in json.loads(stored[episode]):
+                mine &= (frame < first) | (frame >= end)
+            weights[mine] = learner
+    weights[events == int(Event.INTERVENTION)] = intervention
+    return None if bool((weights == 1).all()) else weights
 
 
 def _metadata(meta: "LeRobotDatasetMetadata | StoredEpisodes", name: str, remedy: str) -> list[Any]:

@@ -31,6 +31,7 @@ class PixelsConfig(PerceptionConfig):
         n_action_steps: how many of them are carried out before it predicts again.
         longest_instruction: bytes of the longest instruction, in UTF-8.
         text_dim: numbers that an instruction becomes.
+        n_cells: cells of the image that are looked at: those in which an object is likeliest.
         n_heads: places of the image, beside the one of what is named, that actions may depend on.
         hidden_dims: widths of the layers that predict actions.
         ignore: numbers of `observation.state` that it does not look at, by name or pattern, as in ``bhd_mlp``.
@@ -46,6 +47,7 @@ class PixelsConfig(PerceptionConfig):
     n_action_steps: int = 8
     longest_instruction: int = 128
     text_dim: int = 64
+    n_cells: int = 96
     n_heads: int = 4
     hidden_dims: list[int] = field(default_factory=lambda: [512, 512, 512])
     ignore: list[str] = field(default_factory=lambda: ["*.vel"])
@@ -70,7 +72,7 @@ class PixelsConfig(PerceptionConfig):
             ConfigError: names the value and the valid ones.
         """
         super().__post_init__()
-        for name in ("chunk_size", "n_action_steps", "longest_instruction", "text_dim", "n_heads"):
+        for name in ("chunk_size", "n_action_steps", "longest_instruction", "text_dim", "n_cells", "n_heads"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least 1.")
         if self.n_action_steps > self.chunk_size:
@@ -88,6 +90,11 @@ class PixelsConfig(PerceptionConfig):
     def observation_delta_indices(self) -> list[int]:  # type: ignore[override]
         """The first frame of the episode, and the present one."""
         return [FIRST, 0]
+
+    @property
+    def own_delta_indices(self) -> dict[str, list[int]]:
+        """Of the image only the first frame, where a loader can give of each observation other frames."""
+        return {self.image_key: [FIRST]}
 
     @property
     def action_delta_indices(self) -> list[int]:  # type: ignore[override]

@@ -74,7 +74,7 @@ class PixelsPolicy(PreTrainedPolicy):
             layers += [nn.Linear(width, hidden), nn.GELU()]
             width = hidden
         self.actor = nn.Sequential(*layers, nn.Linear(width, config.chunk_size * self._action_size))
-        self._looked: dict[bytes, Tensor] = {}
+        self._looked: dict[bytes, tuple[Tensor, Tensor]] = {}
         self.reset()
 
     @classmethod
@@ -118,10 +118,11 @@ class PixelsPolicy(PreTrainedPolicy):
         """Return the loss of a preprocessed batch, and its parts for the log.
 
         Args:
-            batch: `config.image_key`, shape (batch, 2, 3, height, width), `observation.state`, shape (batch, 2, width),
-                and `observation.environment_state`, shape (batch, 2, 80), each of the episode's first frame and of the
-                present one; `observation.language.tokens`, shape (batch, bytes); `action`, shape (batch, chunk_size,
-                actions); `action_is_pad`, shape (batch, chunk_size), if any is.
+            batch: `observation.state`, shape (batch, 2, width), and `observation.environment_state`, shape (batch, 2,
+                80), both of the episode's first frame and of the present one; `config.image_key`, shape (batch, 2, 3,
+                height, width), likewise, or (batch, 3, height, width), of the first frame;
+                `observation.language.tokens`, shape (batch, bytes); `action`, shape (batch, chunk_size, actions);
+                `action_is_pad`, shape (batch, chunk_size), if any is.
         """
         config, image = self.config, self._first(batch)
         environment = batch[OBS_ENV_STATE][:, 0]
@@ -129,8 +130,9 @@ class PixelsPolicy(PreTrainedPolicy):
         if self.training and not config.freeze:
             sight = {config.image_key: image, OBS_ENV_STATE: environment}
             parts["perception"] = config.perception_weight * self.perception(sight)[0]
-        seen, attention = self._see(self._cells(image), self._tokens(batch))
-        parts["pointing"] = config.pointing_weight * self._astray(attention, environment)
+        cells, where = self._cells(image)
+        seen, attention = self._see(cells, self._tokens(batch))
+        parts["pointing"] = config.pointing_weight * self._astray(attention, where, environment)
         target = batch[ACTION]
         apart = (self._act(seen, batch[OBS_STATE][:, -1]) - target).abs()
         padding = batch.get(_PADDING)
@@ -139,14 +141,14 @@ class PixelsPolicy(PreTrainedPolicy):
         total = torch.stack(list(parts.values())).sum()
         return total, {name: float(part.detach()) for name, part in parts.items()}
 
-    def _astray(self, attention: Tensor, environment: Tensor) -> Tensor:
-        """Return how little of the attention, shape (batch, h, w), is where the named object is."""
+    def _astray(self, attention: Tensor, where: Tensor, environment: Tensor) -> Tensor:
+        """Return how little of the attention to cells, shape (batch, cells), is where the named object is."""
         table = environment.reshape(len(environment), MAX_OBJECTS, len(OBJECT_FIELDS))
         labels = Labels.of(environment)
         alone = dataclasses.replace(labels, present=labels.present & (table[..., _TARGET] > 0.5))
-        near, _ = self.perception.nearness(alone)
-        near = near / near.sum((1, 2), keepdim=True).clamp_min(1e-6)
-        return -(near * attention.clamp_min(1e-6).log()).sum((1, 2)).mean()
+        near = self.perception.nearness(alone)[0].flatten(1).gather(1, where)
+        near = near / near.sum(1, keepdim=True).clamp_min(1e-6)
+        return -(near * attention.clamp_min(1e-6).log()).sum(1).mean()
 
     # --- acting ------------------------------------------------------------------------------------------------------
 
@@ -162,7 +164,7 @@ class PixelsPolicy(PreTrainedPolicy):
             ConfigError: one of them is missing, or the images are of another size than those that it was trained on.
         """
         self.eval()
-        return self._see(self._cells(self._first(batch)), self._tokens(batch))[0]
+        return self._see(self._cells(self._first(batch))[0], self._tokens(batch))[0]
 
     @torch.no_grad()
     def act(self, seen: Tensor, batch: Mapping[str, Tensor]) -> Tensor:
@@ -208,8 +210,11 @@ class PixelsPolicy(PreTrainedPolicy):
             raise ConfigError(f"{OBS_LANGUAGE_TOKENS} is not in the batch. Run the policy's own preprocessor first.")
         return batch[OBS_LANGUAGE_TOKENS]
 
-    def _cells(self, image: Tensor) -> Tensor:
-        """Return what is known of each cell of images, shape (batch, h, w, numbers)."""
+    def _cells(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what is known of the cells of images in which an object is likeliest, and which they are.
+
+        Shapes (batch, cells, numbers) and (batch, cells).
+        """
         if not (self.training and self.config.freeze):
             return self._look(image)
         # In a training the same first images come again and again.
@@ -217,13 +222,17 @@ class PixelsPolicy(PreTrainedPolicy):
         new = {key: row for row, key in enumerate(keys) if key not in self._looked}
         if new:
             with torch.no_grad():
-                self._looked.update(zip(new, self._look(image[list(new.values())]), strict=True))
-        return torch.stack([self._looked[key] for key in keys])
+                cells, where = self._look(image[list(new.values())])
+            self._looked.update(zip(new, zip(cells, where, strict=True), strict=True))
+        found = [self._looked[key] for key in keys]
+        return torch.stack([cells for cells, _ in found]), torch.stack([where for _, where in found])
 
-    def _look(self, image: Tensor) -> Tensor:
+    def _look(self, image: Tensor) -> tuple[Tensor, Tensor]:
         features, answers = self.perception.look(image)
+        presence = answers["presence"].flatten(1)
+        where = presence.topk(min(self.config.n_cells, presence.shape[1]), dim=1).indices
         place = (self.perception.places(answers) - self._middle) / self._extent
-        return torch.cat(
+        every = torch.cat(
             [
                 place,
                 answers["presence"].sigmoid().unsqueeze(-1),
@@ -235,12 +244,11 @@ class PixelsPolicy(PreTrainedPolicy):
                 features.movedim(1, -1),
             ],
             dim=-1,
-        )
+        ).flatten(1, 2)
+        return every.gather(1, where.unsqueeze(-1).expand(-1, -1, every.shape[-1])), where
 
     def _see(self, cells: Tensor, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what actions depend on, shape (batch, numbers), and where the named is, shape (batch, h, w)."""
-        rows, columns = cells.shape[1:3]
-        cells = cells.flatten(1, 2)
+        """Return what actions depend on, shape (batch, numbers), and where the named is, shape (batch, cells)."""
         bias = cells[..., 3].clamp_min(1e-4).log()  # where nothing is, nothing is meant
         said = self.reader(tokens)
         attention = self.named(said, cells, bias)
@@ -248,7 +256,7 @@ class PixelsPolicy(PreTrainedPolicy):
         about = torch.cat([cells, cells[..., :3] - named[:, None, :3]], dim=-1)
         around = self.others(torch.cat([said, named], dim=-1), about, bias)
         further = torch.einsum("bhn,bnc->bhc", around, self.value(about))
-        return torch.cat([named, further.flatten(1)], dim=-1), attention[:, 0].unflatten(1, (rows, columns))
+        return torch.cat([named, further.flatten(1)], dim=-1), attention[:, 0]
 
     def _act(self, seen: Tensor, state: Tensor) -> Tensor:
         values = torch.cat([state[:, self._columns], seen], dim=-1)

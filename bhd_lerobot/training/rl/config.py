@@ -298,22 +298,6 @@ class RlConfig:
                 raise ConfigError(f"reward.events.{event} is {number}; it must be a finite number.")
 
 
-def is_rl(arguments: Sequence[str]) -> bool:
-    """Return whether a command line of `bhd-train` asks for reinforcement learning: `algorithm` is set in it.
-
-    What is wrong with the command line is left to the parser that reads it next.
-    """
-    try:
-        overrides = configuration.read_overrides(arguments)
-        if "algorithm" in overrides:
-            return True
-        path = overrides.get(configuration.CONFIG_PATH)
-        file = None if path is None else _config_file(Path(str(path)))
-        return file is not None and file.suffix != ".json" and "algorithm" in configuration.read_file(file)
-    except ConfigError:
-        return False
-
-
 def parse_rl(arguments: Sequence[str]) -> RlConfig:
     """Return what a command line asks for.
 
@@ -325,11 +309,12 @@ def parse_rl(arguments: Sequence[str]) -> RlConfig:
     """
     prefix = f"--{configuration.CONFIG_PATH}="
     found = [
-        f"{prefix}{_config_file(Path(argument.removeprefix(prefix)))}" if argument.startswith(prefix) else argument
+        f"{prefix}{config_file(Path(argument.removeprefix(prefix)))}" if argument.startswith(prefix) else argument
         for argument in arguments
     ]
     return configuration.parse(RlConfig, found)
 
 
-def _config_file(path: Path) -> Path:
+def config_file(path: Path) -> Path:
+    """Return a configuration file, or that of a run's folder."""
     return path / CONFIG_NAME if path.is_dir() else path

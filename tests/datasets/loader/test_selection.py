@@ -19,7 +19,7 @@ from bhd_lerobot.datasets.loader.loader import (
     MemoryBudgetError,
     TableDataset,
     check,
-    intervention_weights,
+    frame_weights,
     make_loader,
     split_episodes,
 )
@@ -145,16 +145,16 @@ def test_a_split_that_leaves_nothing(plain: Path) -> None:
 def test_interventions_are_weighted_or_dropped(plain: Path, foreign: Path) -> None:
     meta = open_metadata(plain)
     place = sum(support.length(episode) for episode in (0, 1)) + 1
-    weights = intervention_weights(meta, None, 3.0)
+    weights = frame_weights(meta, None, intervention=3.0)
     assert weights is not None
     assert weights.tolist() == [3.0 if i == place else 1.0 for i in range(meta.total_frames)]
-    assert intervention_weights(meta, None, 1.0) is None
-    assert intervention_weights(meta, [0, 1], 0.0) is None  # nobody intervened there
+    assert frame_weights(meta, None) is None
+    assert frame_weights(meta, [0, 1], intervention=0.0) is None  # nobody intervened there
     loader = make_loader("t/t", LoaderConfig(batch_size=8, intervention_weight=0.0), root=plain).train
     drawn = torch.cat([batch["index"] for batch in loader])
     assert sorted(drawn.tolist()) == [i for i in range(meta.total_frames) if i != place]
     with pytest.raises(DatasetError, match="no column 'event'"):
-        intervention_weights(open_metadata(foreign), None, 0.0)
+        frame_weights(open_metadata(foreign), None, intervention=0.0)
 
 
 def test_selected_and_split_episodes_reach_the_loaders(plain: Path) -> None:

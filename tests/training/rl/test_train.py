@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-import yaml
 from lerobot.configs import FeatureType, PolicyFeature
 from rich.console import Console
 
@@ -25,7 +24,7 @@ from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
 from bhd_lerobot.training import checkpoint as checkpoints
 from bhd_lerobot.training.rl import checkpoint
 from bhd_lerobot.training.rl import train as module
-from bhd_lerobot.training.rl.config import RlConfig, is_rl, parse_rl
+from bhd_lerobot.training.rl.config import RlConfig, parse_rl
 from bhd_lerobot.training.rl.environment import RlVecEnv
 from bhd_lerobot.training.rl.features import in_units
 from bhd_lerobot.training.rl.learner import make_learner
@@ -328,16 +327,6 @@ def test_a_folder_that_exists_is_not_overwritten_and_one_without_a_run_not_resum
         run(tmp_path, resume="true")
     with pytest.raises(ConfigError, match="no run to resume"):
         run(tmp_path / "missing", resume="true")
-
-
-def test_a_command_line_with_an_algorithm_asks_for_reinforcement_learning(tmp_path: Path) -> None:
-    assert is_rl(["--algorithm=ppo"])
-    assert is_rl(["--config_path=configs/train/ppo_turtlebot3.yaml", "--steps=5"])
-    assert not is_rl(["--dataset.repo_id=a/b", "--policy.type=bhd_mlp"])
-    assert not is_rl([f"--config_path={tmp_path / 'missing.yaml'}"])
-    other = tmp_path / "bc.yaml"
-    other.write_text(yaml.safe_dump({"dataset": {"repo_id": "a/b"}}))
-    assert not is_rl([f"--config_path={other}"])
 
 
 @pytest.mark.parametrize("name", ["ppo_turtlebot3", "ppo_ur5_reach"])

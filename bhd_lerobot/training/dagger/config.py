@@ -1,0 +1,156 @@
+"""Configuration of dataset aggregation: which programs make a round, and how many rounds there are."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.policies.dagger.brain import DaggerConfig
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.rollout import configuration
+from bhd_lerobot.training.arguments import parse_train
+
+ALGORITHM = "dagger"
+_OWN = frozenset(
+    {
+        *("dataset.root", "dataset.num_episodes", "dataset.push_to_hub", "dataset.expert_action", "brain.learner.path"),
+        *("policy.push_to_hub", "selection.expert_action", "selection.learner_weight", "resume", "output_dir", "seed"),
+        *("only", "baseline", "split", "n_episodes", "videos"),
+    }
+)
+"""Options that the rounds set themselves."""
+
+
+@dataclass
+class StageConfig:
+    """One of the programs that a round runs.
+
+    Attributes:
+        config: its configuration file.
+        options: of its command line, for example ``["--task.trail=true"]``.
+    """
+
+    config: str = ""
+    options: list[str] = field(default_factory=list)
+
+
+@dataclass
+class AggregationConfig:
+    """Dataset aggregation (S. Ross, G. Gordon and D. Bagnell, "A reduction of imitation learning", AISTATS 2011).
+
+    Round 0 learns from an expert that drives alone. In every further round the last policy drives, the expert takes
+    over where the brain ``dagger`` lets it, and a new policy learns from everything that was recorded so far. Where
+    `learner` records what the expert would have done in every frame, that is what is learned
+    (`selection.expert_action`); otherwise what the expert did, in the frames that it drove
+    (`selection.learner_weight` of 0).
+
+    Attributes:
+        algorithm: ``"dagger"``.
+        expert: a configuration of `bhd-record`, whose brain is the expert.
+        learner: a configuration of `bhd-record`, with the brain ``dagger``; its learner's path is the last policy.
+        policy: a configuration of `bhd-train`.
+        evaluation: a configuration of `bhd-eval`; of it robot and task are used, for the curve over the rounds.
+        output_dir: where everything goes; the same command goes on there with what is not done yet.
+        rounds: rounds after the first.
+        expert_episodes: that the expert drives alone.
+        episodes: that the policy of the last round drives in each further round.
+        validation_episodes: of the split `validation`, that each round's policy is judged by.
+        seed: of the training, and of the recordings: each round has its own episodes.
+    """
+
+    algorithm: str = ALGORITHM
+    expert: StageConfig = field(default_factory=StageConfig)
+    learner: StageConfig = field(default_factory=StageConfig)
+    policy: StageConfig = field(default_factory=StageConfig)
+    evaluation: StageConfig = field(default_factory=StageConfig)
+    output_dir: str = ""
+    rounds: int = 2
+    expert_episodes: int = 400
+    episodes: int = 200
+    validation_episodes: int = 200
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        if self.algorithm != ALGORITHM:
+            raise ConfigError(unknown_name("algorithm", self.algorithm, (ALGORITHM, "ppo")))
+        for name, least in (
+            *(("rounds", 0), ("expert_episodes", 1), ("episodes", 1), ("validation_episodes", 1), ("seed", 0)),
+        ):
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name} is {getattr(self, name)}; it must be at least {least}.")
+        if not self.output_dir:
+            raise ConfigError("output_dir is empty; name the folder in which the rounds are kept: --output_dir=FOLDER.")
+        for name in ("expert", "learner", "policy", "evaluation"):
+            if not getattr(self, name).config:
+                raise ConfigError(f"{name}.config is empty; name a configuration file: --{name}.config=FILE.")
+
+
+@dataclass(frozen=True)
+class Stages:
+    """What the configurations of the programs say.
+
+    Attributes:
+        expert: the type of the expert's brain.
+        has_advice: whether the expert's action is recorded in every frame.
+        steps: of a training.
+    """
+
+    expert: str
+    has_advice: bool
+    steps: int
+
+
+def read_stages(config: AggregationConfig) -> Stages:
+    """Return what the configurations say, so that what is wrong in one of them is known before the first round.
+
+    Raises:
+        ConfigError: one of them cannot be used.
+    """
+    expert = configuration.parse(RecordConfig, command(config.expert, {}))
+    learner = configuration.parse(RecordConfig, command(config.learner, {}))
+    kinds = [one.brain.get_choice_name(type(one.brain)) for one in (expert, learner)]
+    if not isinstance(learner.brain, DaggerConfig):
+        raise ConfigError(
+            f"learner.config is {config.learner.config!r}, whose brain is {kinds[1]!r}; it must be 'dagger', in which "
+            "a policy drives and an expert helps."
+        )
+    policy = parse_train(command(config.policy, {})).config
+    configuration.parse(EvalConfig, command(config.evaluation, {}))
+    return Stages(str(kinds[0]), learner.dataset.expert_action, policy.steps)
+
+
+def command(stage: StageConfig, own: Mapping[str, Any]) -> list[str]:
+    """Return the command line of a program: its file, what a round needs, and the options of the stage.
+
+    Raises:
+        ConfigError: an option of the stage is one that a round sets itself.
+    """
+    names = {option.removeprefix("--").partition("=")[0] for option in stage.options}
+    if taken := sorted(names & _OWN):
+        raise ConfigError(
+            f"The option --{taken[0]} of {stage.config!r} is set by the rounds themselves; leave it out of its options."
+        )
+    values = [f"--{name}={value}" for name, value in own.items()]
+    return [f"--{configuration.CONFIG_PATH}={stage.config}", *values, *stage.options]
+
+
+def parse_aggregation(arguments: Sequence[str]) -> AggregationConfig:
+    """Return what a command line asks for.
+
+    Raises:
+        ConfigError: an unknown key, a value of the wrong type or out of range, or a file that cannot be read.
+    """
+    return configuration.parse(AggregationConfig, arguments)
+
+
+def kept(folder: Path) -> dict[str, Any] | None:
+    """Return the configuration that a folder's rounds were made with; None if there is none."""
+    file = folder / "config.yaml"
+    return configuration.read_file(file) if file.is_file() else None

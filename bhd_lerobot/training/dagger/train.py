@@ -1,0 +1,271 @@
+"""`bhd-train` with `algorithm: dagger`: a policy drives, an expert corrects it, and it learns from that, in rounds."""
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from bhd_lerobot.datasets.edit.edits import merge
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.storage.disk import Disk
+from bhd_lerobot.errors import BhdError, ConfigError, quoted
+from bhd_lerobot.evaluation import evaluate
+from bhd_lerobot.recording import record
+from bhd_lerobot.rollout.configuration import encode, run
+from bhd_lerobot.training import train as training
+from bhd_lerobot.training.dagger.config import (
+    AggregationConfig,
+    StageConfig,
+    Stages,
+    command,
+    kept,
+    parse_aggregation,
+    read_stages,
+)
+from bhd_lerobot.training.dagger.curve import draw_curve
+
+ROUNDS, CURVE = "rounds.json", "rounds.png"
+_CONFIG, _DONE = "config.yaml", "done.json"
+_PROGRAMS: dict[str, Callable[[Sequence[str]], int]] = {
+    "bhd-record": record.main,
+    "bhd-train": training.main,
+    "bhd-eval": evaluate.main,
+}
+
+
+class _StoppedError(Exception):
+    """A program ended otherwise than well.
+
+    Attributes:
+        status: its exit status.
+    """
+
+    def __init__(self, status: int) -> None:
+        super().__init__(status)
+        self.status = status
+
+
+def train(config: AggregationConfig, console: Console | None = None) -> int:
+    """Do the rounds that are not done yet; return the exit status.
+
+    Args:
+        config: of the rounds.
+        console: where progress is shown; standard error if None.
+
+    Raises:
+        BhdError: the configuration cannot be honoured, or is another than that of the folder.
+    """
+    stages = read_stages(config)
+    folder = Path(config.output_dir).expanduser()
+    _keep_to(folder, config)
+    rounds = _Rounds(config, stages, folder, console or Console(stderr=True))
+    try:
+        for number in range(config.rounds + 1):
+            rounds.go(number)
+    except _StoppedError as stopped:
+        return stopped.status
+    rounds.conclude()
+    return 0
+
+
+def _keep_to(folder: Path, config: AggregationConfig) -> None:
+    """Note the configuration in the folder; refuse one that differs in more than how many rounds there are.
+
+    Raises:
+        ConfigError: it differs, or the folder holds something else.
+        BhdError: the folder cannot be written.
+    """
+    values, before = encode(config), kept(folder)
+    if before is None and folder.exists() and any(folder.iterdir()):
+        raise ConfigError(f"The folder {folder} holds something else. Set another --output_dir.")
+    for name in () if before is None else [name for name in values if name not in ("rounds", "output_dir")]:
+        if before is not None and before.get(name) != values[name]:
+            raise ConfigError(
+                f"The rounds in {folder} were made with {name} = {before.get(name)}, and now it is {values[name]}. Go "
+                "on with the same, or set another --output_dir."
+            )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        Disk().publish(folder / _CONFIG, yaml.safe_dump(values, sort_keys=False, allow_unicode=True).encode())
+    except OSError as error:
+        raise BhdError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
+
+
+class _Rounds:
+    def __init__(self, config: AggregationConfig, stages: Stages, folder: Path, console: Console) -> None:
+        self._config, self._stages, self._folder, self._console = config, stages, folder, console
+        self._rows: list[dict[str, Any]] = []
+        self._expert: dict[str, Any] = {}
+
+    def go(self, number: int) -> None:
+        """Do what is not done yet of a round."""
+        folder = self._folder / f"round_{number}"
+        done = self._done(folder)
+        for name, step in (("record", self._record), ("train", self._train), ("evaluate", self._evaluate)):
+            if name not in done:
+                step(number, folder)
+                done.append(name)
+                Disk().publish(folder / _DONE, json.dumps(done).encode())
+        self._rows.append(self._row(number, folder))
+        rows = {"expert": {"type": self._stages.expert, **self._expert}, "rounds": self._rows}
+        Disk().publish(self._folder / ROUNDS, (json.dumps(rows, indent=2) + "\n").encode())
+        draw_curve(self._rows, self._expert, self._folder / CURVE, str(self._folder))
+
+    def conclude(self) -> None:
+        """Show the rounds, and how to judge the last policy."""
+        table = Table(title=None, box=None, pad_edge=False)
+        for column in ("round", "episodes", "expert drove", "success, 95 %", "score, 95 %"):
+            table.add_column(column)
+        for row in self._rows:
+            share = "all" if row["expert_share"] is None else f"{row['expert_share']:.1%}"
+            table.add_row(
+                str(row["round"]), str(row["episodes"]), share, _interval(row["success"]), _interval(row["score"])
+            )
+        table.add_row("", "", self._stages.expert, _interval(self._expert["success"]), _interval(self._expert["score"]))
+        self._console.print(table)
+        policy = self._policy(self._config.rounds)
+        evaluation = " ".join([self._config.evaluation.config, *self._config.evaluation.options])
+        self._console.print(
+            f"Policies, data and curve: {self._folder}. Judge the last policy by episodes that nobody has looked at:\n"
+            f"  bhd-eval --config_path={evaluation} --brains.policy.type=learned "
+            f"--brains.policy.path={quoted(policy)}",
+            soft_wrap=True,
+            highlight=False,
+        )
+
+    # --- steps -------------------------------------------------------------------------------------------------------
+
+    def _record(self, number: int, folder: Path) -> None:
+        config = self._config
+        stage, episodes = (config.learner, config.episodes) if number else (config.expert, config.expert_episodes)
+        own: dict[str, Any] = {
+            "dataset.root": folder / "data",
+            "dataset.num_episodes": episodes,
+            "dataset.push_to_hub": "false",
+            "seed": 1000 * config.seed + number,  # no two rounds meet the same episode
+            "resume": "true",
+            "output_dir": folder / "recording",
+        }
+        if number:
+            own["brain.learner.path"] = self._policy(number - 1)
+        elif self._stages.has_advice:
+            own["dataset.expert_action"] = "true"
+        self._run(number, "bhd-record", stage, own)
+
+    def _train(self, number: int, folder: Path) -> None:
+        run_folder = folder / "policy"
+        if (run_folder / "checkpoints" / "last").exists():
+            self._call(number, "bhd-train", ["--resume=true", f"--config_path={run_folder}"])
+            return
+        shutil.rmtree(run_folder, ignore_errors=True)
+        own: dict[str, Any] = {
+            "dataset.root": self._data(number, folder),
+            "output_dir": run_folder,
+            "seed": self._config.seed,
+            "policy.push_to_hub": "false",
+        }
+        if self._stages.has_advice:
+            own["selection.expert_action"] = "true"
+        elif number:
+            own["selection.learner_weight"] = 0
+        self._run(number, "bhd-train", self._config.policy, own)
+
+    def _data(self, number: int, folder: Path) -> Path:
+        """Return the dataset of all rounds so far."""
+        if not number:
+            return folder / "data"
+        parts = [self._folder / f"round_{one}" / "data" for one in range(number + 1)]
+        target = folder / "all"
+        # Merging is quick, and a merge that was cut short leaves nothing.
+        shutil.rmtree(target, ignore_errors=True)
+        self._say(number, f"merge {' '.join(map(str, parts))}")
+        merge(parts, target)
+        return target
+
+    def _evaluate(self, number: int, folder: Path) -> None:
+        target = folder / "evaluation"
+        shutil.rmtree(target, ignore_errors=True)
+        own: dict[str, Any] = {
+            "brains.policy.type": "learned",
+            "brains.policy.path": self._policy(number),
+            "only": "[policy]" if number else "[expert, policy]",
+            "baseline": "policy" if number else "expert",
+            "split": "validation",
+            "n_episodes": self._config.validation_episodes,
+            "videos": 0,
+            "output_dir": target,
+        }
+        if not number:
+            own["brains.expert.type"] = self._stages.expert
+        self._run(number, "bhd-eval", self._config.evaluation, own)
+
+    def _policy(self, number: int) -> Path:
+        return self._folder / f"round_{number}" / "policy"
+
+    # --- programs ----------------------------------------------------------------------------------------------------
+
+    def _run(self, number: int, program: str, stage: StageConfig, own: dict[str, Any]) -> None:
+        self._call(number, program, command(stage, own))
+
+    def _call(self, number: int, program: str, arguments: Sequence[str]) -> None:
+        self._say(number, f"{program} {' '.join(arguments)}")
+        status = _PROGRAMS[program](arguments)
+        if status:
+            self._console.print(
+                f"Round {number}: {program} ended with status {status}. What is done is kept in {self._folder}; the "
+                "same command goes on there.",
+                soft_wrap=True,
+                highlight=False,
+            )
+            raise _StoppedError(status)
+
+    def _say(self, number: int, what: str) -> None:
+        self._console.print(f"round {number}: {what}", style="bold", soft_wrap=True, highlight=False)
+
+    # --- results -----------------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def _done(folder: Path) -> list[str]:
+        folder.mkdir(exist_ok=True)
+        file = folder / _DONE
+        try:
+            return list(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else []
+        except (ValueError, TypeError) as error:
+            raise BhdError(
+                f"{file} cannot be read: {error}. Remove the folder {folder}, and its round is done anew."
+            ) from error
+
+    def _row(self, number: int, folder: Path) -> dict[str, Any]:
+        results = json.loads((folder / "evaluation" / "results.json").read_text(encoding="utf-8"))["brains"]
+        if not number:
+            self._expert = _level(results["expert"])
+        summary = dataset_info(folder / "data")
+        driven = sum(episode.metadata.get("intervened_frames") or 0 for episode in summary.episodes)
+        share = driven / summary.frames if number else None
+        before = self._rows[-1] if self._rows else {"episodes": 0, "frames": 0}
+        return {
+            "round": number,
+            "episodes": before["episodes"] + len(summary.episodes),
+            "frames": before["frames"] + summary.frames,
+            "expert_share": share,
+            **_level(results["policy"]),
+        }
+
+
+def _level(brain: dict[str, Any]) -> dict[str, Any]:
+    return {"success": brain["success"], "score": brain["means"]["score"], "outcomes": brain["outcomes"]}
+
+
+def _interval(one: dict[str, float]) -> str:
+    return f"{one['value']:.3f} ({one['low']:.3f} to {one['high']:.3f})"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Learn in rounds; return the exit status: 0, 2 after an error, 130 after Ctrl-C."""
+    interrupted = "Stopped; what is done is kept, and the same command goes on there."
+    return run(train, AggregationConfig, arguments, read=parse_aggregation, interrupted=interrupted)

@@ -1,0 +1,172 @@
+"""Aggregation in rounds: every program runs once, a stop loses nothing, and what cannot be is said before the first."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from bhd_lerobot.cli.train import algorithm_of, main
+from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.policies.learned.contract import PolicyContract
+from bhd_lerobot.training.dagger import train as dagger
+from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
+from tests.cases import each_case
+
+CONFIGS = Path("configs").absolute()
+BRIEF = ["--robot.beams=36", "--task.duration_s=2"]
+
+
+def settings(folder: Path, **changed: Any) -> Path:
+    """Write a configuration of short rounds; return the file."""
+    record = {"options": [*BRIEF, "--n_envs=2", "--preview_video=false"]}
+    values: dict[str, Any] = {
+        "algorithm": "dagger",
+        "expert": {
+            "config": str(CONFIGS / "record/turtlebot3_avoid.yaml"),
+            "options": [*record["options"], "--brain.type=gap_follower"],
+        },
+        "learner": {"config": str(CONFIGS / "record/turtlebot3_avoid_dagger.yaml"), **record},
+        "policy": {
+            "config": str(CONFIGS / "train/bc_turtlebot3_avoid.yaml"),
+            "options": ["--steps=4", "--save_freq=2", "--batch_size=8", "--eval_steps=0", "--policy.hidden_dims=[8]"],
+        },
+        "evaluation": {"config": str(CONFIGS / "eval/turtlebot3_avoid.yaml"), "options": [*BRIEF, "--n_envs=2"]},
+        "output_dir": str(folder / "run"),
+        "rounds": 1,
+        "expert_episodes": 2,
+        "episodes": 2,
+        "validation_episodes": 2,
+        **changed,
+    }
+    file = folder / "dagger.yaml"
+    file.write_text(yaml.safe_dump(values))
+    return file
+
+
+def results(folder: Path) -> Any:
+    return json.loads((folder / "run" / "rounds.json").read_text())
+
+
+def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    called: list[tuple[str, list[str]]] = []
+
+    def watched(name: str, fails: bool = False) -> Any:
+        program = PROGRAMS[name]
+
+        def run(arguments: list[str]) -> int:
+            called.append((name, arguments))
+            return 130 if fails and len([one for one, _ in called if one == name]) == 2 else program(arguments)
+
+        return run
+
+    PROGRAMS = dict(dagger._PROGRAMS)
+    argument = f"--config_path={settings(tmp_path)}"
+    # The second training is stopped before it begins.
+    monkeypatch.setattr(dagger, "_PROGRAMS", {name: watched(name, name == "bhd-train") for name in PROGRAMS})
+    assert main([argument]) == 130
+    assert [name for name, _ in called] == ["bhd-record", "bhd-train", "bhd-eval", "bhd-record", "bhd-train"]
+    assert "the same command goes on there" in " ".join(capsys.readouterr().err.split())
+    assert [row["round"] for row in results(tmp_path)["rounds"]] == [0]
+    called.clear()
+    assert main([argument]) == 0
+    assert [name for name, _ in called] == ["bhd-train", "bhd-eval"]
+    assert "--selection.expert_action=true" in called[0][1]
+
+    run = tmp_path / "run"
+    first, second = (dataset_info(run / f"round_{number}" / "data") for number in (0, 1))
+    assert [len(one.episodes) for one in (first, second)] == [2, 2]
+    assert not {one.metadata["seed"] for one in first.episodes} & {one.metadata["seed"] for one in second.episodes}
+    learned = PolicyContract.load(run / "round_1" / "policy").dataset
+    assert learned is not None
+    assert (learned["episodes"], learned["frames"]) == (4, first.frames + second.frames)
+    brain = json.loads(second.episodes[0].metadata["brain"])
+    assert brain["learner"]["path"] == str(run / "round_0" / "policy")
+
+    found = results(tmp_path)
+    assert found["expert"]["type"] == "gap_follower"
+    assert [row["episodes"] for row in found["rounds"]] == [2, 4]
+    assert [row["expert_share"] is None for row in found["rounds"]] == [True, False]
+    for one in (found["expert"], *found["rounds"]):
+        assert 0 <= one["success"]["low"] <= one["success"]["value"] <= one["success"]["high"] <= 1
+    assert (run / "rounds.png").exists()
+    report = capsys.readouterr().err
+    assert "--brains.policy.path=" in report
+
+    # Nothing is left to do; another round is; another seed would be other rounds.
+    called.clear()
+    assert main([argument]) == 0
+    assert called == []
+    assert main([argument, "--seed=1"]) == 2
+    assert "were made with seed = 0, and now it is 1" in " ".join(capsys.readouterr().err.split())
+
+
+def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called: list[list[str]] = []
+    monkeypatch.setattr(dagger, "_PROGRAMS", dict.fromkeys(dagger._PROGRAMS, lambda given: called.append(given) or 1))
+    stages = {
+        "expert": {"config": str(CONFIGS / "record/ur5_pick.yaml"), "options": []},
+        "learner": {"config": str(CONFIGS / "record/ur5_pick_dagger.yaml"), "options": []},
+        "policy": {"config": str(CONFIGS / "train/bc_ur5_pick.yaml"), "options": []},
+        "evaluation": {"config": str(CONFIGS / "eval/ur5_pick.yaml"), "options": []},
+    }
+    config = parse_aggregation([f"--config_path={settings(tmp_path, **stages)}"])
+    found = read_stages(config)
+    assert (found.expert, found.has_advice) == ("pick", False)
+    rounds = dagger._Rounds(config, found, tmp_path, dagger.Console(quiet=True))
+    monkeypatch.setattr(rounds, "_data", lambda number, folder: folder)
+    for number in (0, 1):
+        with pytest.raises(dagger._StoppedError):
+            rounds._train(number, tmp_path)
+    assert ["--selection.learner_weight=0" in one for one in called] == [False, True]
+    assert not any("expert_action" in option for one in called for option in one)
+
+
+@each_case(
+    ("changed", "message"),
+    [
+        ({"rounds": -1}, "rounds is -1; it must be at least 0"),
+        ({"output_dir": ""}, "output_dir is empty"),
+        ({"policy": {"config": "", "options": []}}, "policy.config is empty; name a configuration file"),
+        ({"policy": {"config": "missing.yaml", "options": []}}, "missing.yaml"),
+        (
+            {"learner": {"config": str(CONFIGS / "record/turtlebot3_avoid.yaml"), "options": []}},
+            "whose brain is 'avoidance'; it must be 'dagger'",
+        ),
+        (
+            {"evaluation": {"config": str(CONFIGS / "eval/turtlebot3_avoid.yaml"), "options": ["--split=train"]}},
+            "The option --split of .* is set by the rounds themselves",
+        ),
+    ],
+)
+def test_what_cannot_be_is_said_before_the_first_round(
+    changed: dict[str, Any], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([f"--config_path={settings(tmp_path, **changed)}"]) == 2
+    assert re.search(message, " ".join(capsys.readouterr().err.split()))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_with_something_else_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.txt").write_text("mine")
+    assert main([f"--config_path={settings(tmp_path)}"]) == 2
+    assert "holds something else" in " ".join(capsys.readouterr().err.split())
+    assert [one.name for one in (tmp_path / "run").iterdir()] == ["thesis.txt"]
+
+
+def test_the_algorithm_decides_which_training_is_asked_for(tmp_path: Path) -> None:
+    assert algorithm_of(["--algorithm=ppo"]) == "ppo"
+    assert algorithm_of(["--config_path=configs/train/ppo_turtlebot3.yaml", "--steps=5"]) == "ppo"
+    assert algorithm_of(["--config_path=configs/train/dagger_turtlebot3_avoid.yaml"]) == "dagger"
+    assert algorithm_of(["--dataset.repo_id=a/b", "--policy.type=bhd_mlp"]) is None
+    assert algorithm_of([f"--config_path={tmp_path / 'missing.yaml'}"]) is None
+    other = tmp_path / "bc.yaml"
+    other.write_text(yaml.safe_dump({"dataset": {"repo_id": "a/b"}}))
+    assert algorithm_of([f"--config_path={other}"]) is None
