@@ -34,6 +34,7 @@ from bhd_lerobot.tasks import avoid, navigate, pick, reach
 from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 from bhd_lerobot.training.config import BhdTrainConfig, own_fields
+from bhd_lerobot.training.dagger.config import AggregationConfig
 from bhd_lerobot.training.rl.config import RlConfig
 
 FILE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "options.md"
@@ -66,6 +67,8 @@ def reference() -> str:
         *_options(BhdTrainConfig, "", only=own_fields()),
         "## `bhd-train` with `algorithm: ppo`\n",
         *_options(RlConfig, "", choices=False),
+        "## `bhd-train` with `algorithm: dagger`\n",
+        *_options(AggregationConfig, "", choices=False),
         "## Teleoperator `bhd_brain`\n",
         "For the stock commands: `--teleop.type=bhd_brain`. The brain is chosen by `--teleop.brain.type`; its options "
         "are those of `brain.*` above.\n",

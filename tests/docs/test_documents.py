@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import bhd_lerobot.plugin  # noqa: F401  registers our policies
 from bhd_lerobot.apps.monitor import monitor
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.cli.train import algorithm_of
