@@ -29,6 +29,7 @@ _TARGET = OBJECT_FIELDS.index("target")
 _VALUES = 16  # numbers that each further place of the image gives
 _SAME = ("camera", "camera_position", "camera_target", "camera_fovy", "area", "object_height", "margin", "image_size")
 _SHAPE = ("channels", "hidden", "context")
+_SHARPNESS = 4  # attention is to fall off from an object's centre as this power of how near a cell is
 _THUMBNAIL = 8  # every so many pixels of an image, by which it is known again
 
 
@@ -146,7 +147,8 @@ class PixelsPolicy(PreTrainedPolicy):
         table = environment.reshape(len(environment), MAX_OBJECTS, len(OBJECT_FIELDS))
         labels = Labels.of(environment)
         alone = dataclasses.replace(labels, present=labels.present & (table[..., _TARGET] > 0.5))
-        near = self.perception.nearness(alone)[0].flatten(1).gather(1, where)
+        # Cells at the rim of an object were not taught where it is: they are not to have a say.
+        near = self.perception.nearness(alone)[0].flatten(1).gather(1, where) ** _SHARPNESS
         near = near / near.sum(1, keepdim=True).clamp_min(1e-6)
         return -(near * attention.clamp_min(1e-6).log()).sum(1).mean()
 
