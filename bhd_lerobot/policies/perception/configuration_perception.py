@@ -37,6 +37,7 @@ class PerceptionConfig(PreTrainedConfig):
         hidden: of the network where it is coarser.
         context: numbers that describe the whole image: where the camera stands, and the light.
         brightness: images are made brighter and darker by up to this share in training.
+        recolour: share of the images that have other colours in training, of which no colours are learned.
         least_presence: probability from which on something counts as an object.
         optimizer_lr: learning rate of AdamW.
         optimizer_weight_decay: of weights.
@@ -55,6 +56,7 @@ class PerceptionConfig(PreTrainedConfig):
     hidden: int = 48
     context: int = 64
     brightness: float = 0.2
+    recolour: float = 0.5
     least_presence: float = 0.3
 
     n_obs_steps: int = 1
@@ -95,7 +97,7 @@ class PerceptionConfig(PreTrainedConfig):
         ):
             if not low < getattr(self, name) < high:
                 raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be between {low:g} and {high:g}.")
-        for name in ("margin", "brightness"):
+        for name in ("margin", "brightness", "recolour"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be from 0 to below 1.")
         for name in ("channels", "hidden", "context"):

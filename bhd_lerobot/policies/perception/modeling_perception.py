@@ -120,11 +120,10 @@ class PerceptionPolicy(PreTrainedPolicy):
         """
         image = self.checked(batch)
         labels = Labels.of(batch[OBS_ENV_STATE])
+        is_true = torch.ones(len(image), dtype=torch.bool, device=image.device)
         if self.training:
             self._ratios.clear()
-            spread = self.config.brightness
-            factor = 1 + spread * (2 * torch.rand(len(image), 1, 1, 1, device=image.device) - 1)
-            image = (image * factor).clamp(0, 1)
+            image, is_true = self._varied(image)
         _, answers = self.look(image)
         if not self.training:
             self._calibrate(answers, labels)
@@ -135,6 +134,7 @@ class PerceptionPolicy(PreTrainedPolicy):
         presence = (presence * certain.abs()).sum((1, 2)).mean()
         near = heat * (heat > _NEAR)
         parts = self._errors(answers, labels.at(place))
+        parts["colour"] = parts["colour"] * is_true[:, None, None]
         means = {name: (part * near).sum() / near.sum().clamp_min(1.0) for name, part in parts.items()}
         loss = 0.1 * presence + sum(_WEIGHTS[name] * value for name, value in means.items())
         assert isinstance(loss, Tensor)
@@ -142,6 +142,25 @@ class PerceptionPolicy(PreTrainedPolicy):
         where = (self.places(answers) - labels.at(place).position)[..., :2].norm(dim=-1)
         error = float(((where * near).sum() / near.sum().clamp_min(1.0)).detach())
         return loss, {"presence": float(presence.detach()), **outputs, "error_mm": 1000 * error}
+
+    def _varied(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Return images in other light, and some in other colours; and of which the colours are true, shape (batch,).
+
+        What has other colours teaches nothing about colours, and that shape and place do not depend on them: cups are
+        found to be cups in colours in which no cup was seen.
+        """
+        config, count = self.config, len(image)
+        factor = 1 + config.brightness * (2 * torch.rand(count, 1, 1, 1, device=image.device) - 1)
+        image = (image * factor).clamp(0, 1)
+        is_true = torch.rand(count, device=image.device) >= config.recolour
+        others = (~is_true).nonzero()[:, 0]
+        if len(others):
+            # A mixture of the three channels for each of the three: new hues, or nearly none.
+            mixture = torch.rand(len(others), 3, 3, device=image.device)
+            mixture = mixture.square() / mixture.square().sum(2, keepdim=True)
+            image = image.clone()
+            image[others] = torch.einsum("bij,bjhw->bihw", mixture, image[others])
+        return image, is_true
 
     def nearness(self, labels: Labels) -> tuple[Tensor, Tensor]:
         """Return how near every cell is to an object's centre, 0 to 1, and which object's, shape (batch, h, w)."""

@@ -217,3 +217,23 @@ def test_a_training_that_goes_on_still_knows_what_it_learns() -> None:
     again.output_features = {"action": PolicyFeature(FeatureType.ACTION, (7,))}  # as LeRobot's `make_policy` leaves it
     again.set_dataset_feature_metadata(FEATURES)
     assert set(PerceptionPolicy(again).config.output_features or {}) == {OBS_ENV_STATE}
+
+
+def test_what_has_other_colours_teaches_shapes_and_places_but_no_colours() -> None:
+    policy, samples = PerceptionPolicy(config(recolour=0.999)), batch()
+    policy.train()
+    _, parts = policy.forward(samples)
+    assert parts["colour"] == 0.0
+    assert min(parts[name] for name in ("presence", "is_box", "size", "yaw")) > 0
+    image, is_true = policy._varied(samples[IMAGE])
+    assert not is_true.any()
+    assert 0 <= image.min() < image.max() <= 1
+    for one, other in zip(samples[IMAGE], image, strict=True):
+        assert not torch.allclose(one, other, atol=0.02)
+        # Where all was of one colour, it still is: nothing moves.
+        place = one == one[:, :1, :1]
+        assert torch.allclose(other[place], other[:, :1, :1].expand_as(other)[place], atol=1e-5)
+    policy.eval()
+    assert policy.forward(samples)[1]["colour"] > 0
+    half = PerceptionPolicy(config(recolour=0.5)).train()._varied(samples[IMAGE].repeat(8, 1, 1, 1))[1]
+    assert 0.3 < half.float().mean() < 0.7
