@@ -14,7 +14,7 @@ from benchmarks.results.learning import avoid, pick, reach
 from benchmarks.results.page import write_page
 from benchmarks.results.runner import REPOSITORY, FailedError, Runner
 from benchmarks.results.section import Section
-from benchmarks.results.seeing import see
+from benchmarks.results.seeing import pixels, see
 from benchmarks.results.speed import navigate, speed
 
 # Name, title, and what runs the commands and fills the section.
@@ -24,6 +24,7 @@ MEASURES = (
     ("reach", "Reach: a UR5 brings its tool to a pose", reach),
     ("pick", "Pick, from privileged state: a UR5 picks up what an instruction names", pick),
     ("see", "Pick, from a camera: a UR5 picks up what an instruction names and what it sees", see),
+    ("pixels", "Pick, from pixels: the same end to end", pixels),
     ("fine_tune", "Fine-tune: 10 episodes of a shifted world", fine_tune),
     ("navigate", "Navigate: a rule drives a TurtleBot3 to a goal", navigate),
     ("speed", "Speed", speed),

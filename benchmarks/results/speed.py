@@ -36,6 +36,7 @@ def speed(run: Runner, section: Section) -> None:
     """Loader, environments and evaluation, each beside its peers in one run."""
     for measure in (
         benchmark("loader", loader_rows, short=("--repeats=1", "--seconds=0.5", "--no-epoch")),
+        benchmark("images", images_rows, short=("--episodes=4", "--steps=20", "--turns=1")),
         benchmark("envs", envs_rows, short=("--n=4", "--repeats=1", "--seconds=0.5", "--limit=120")),
         benchmark("evaluate", evaluate_rows, short=("--episodes=4", "--n_envs=4", "--turns=1")),
     ):
@@ -66,6 +67,28 @@ def loader_rows(results: Mapping[str, Any]) -> list[Row]:
             Row(f"{what}: samples/s", speeds),
             Row(f"{what}: ours / LeRobot's better", times(one["ratio"]), f"at least {one['goal']:.0f} x", one["met"]),
         ]
+    return rows
+
+
+def images_rows(results: Mapping[str, Any]) -> list[Row]:
+    """Return the rows of `benchmarks.images`."""
+    rows = []
+    learned = results["training"]
+    for part, what in (("whole", f"a run of {learned['steps']} steps"), ("steps", "its steps alone")):
+        speeds = ", ".join(
+            f"{name} {learned[f'{part}: {name}']['median']:.1f}" for name in ("bhd-train", "lerobot-train")
+        )
+        ratio = learned[f"{part}: ratio"]
+        goal = "at least 5 x" if part == "whole" else ""
+        met = ratio["median"] >= 5 if part == "whole" else None
+        rows += [
+            Row(f"learning from images, {what}: samples per CPU second", speeds),
+            Row(f"learning from images, {what}: bhd-train / lerobot-train", times(ratio), goal, met),
+        ]
+    if "rendering" in results:
+        ratio = results["rendering"]["ratio"]
+        what = "two cameras of 96 x 96: images a second, over MuJoCo's own renderer"
+        rows.append(Row(what, times(ratio, 2), "at least 0.8 x", ratio["median"] >= 0.8))
     return rows
 
 
