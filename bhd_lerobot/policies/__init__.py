@@ -11,4 +11,5 @@ __all__ = [
     "mlp",
     "navigation",
     "perception",
+    "pixels",
 ]
