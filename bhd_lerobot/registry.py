@@ -20,6 +20,12 @@ from bhd_lerobot.policies.language.language_brain import LanguageBrain, Language
 from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
+from bhd_lerobot.policies.manipulation.servo import (
+    PickServoBrain,
+    PickServoConfig,
+    ReachServoBrain,
+    ReachServoConfig,
+)
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain, AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain, NavigatorConfig
@@ -93,8 +99,10 @@ BRAINS: dict[type[BrainConfig], Callable[[Any], Brain]] = {
     NavigatorConfig: NavigatorBrain,
     NoopConfig: NoopBrain,
     PickBrainConfig: PickBrain,
+    PickServoConfig: PickServoBrain,
     RandomConfig: RandomBrain,
     ReachBrainConfig: ReachBrain,
+    ReachServoConfig: ReachServoBrain,
 }
 """The brains, by configuration."""
 

@@ -25,7 +25,7 @@ from bhd_lerobot.policies.manipulation.skills import Plan, Skill, make_plan, sce
 
 SQUEEZE = 0.03  # [m] how far inside the object the fingers are sent: the gripper's force limit does the rest
 _MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers
-_TRAVEL = 0.22  # [m] height of the tool above the table on free motions: the finger tips stay above every object
+TRAVEL = 0.22  # [m] height of the tool above the table on free motions: the finger tips stay above every object
 _LIFTED = 0.05  # [m] an object that was lifted by less slipped out
 _POSITION = [OBJECT_FIELDS.index(axis) for axis in "xyz"]
 
@@ -246,7 +246,7 @@ class PickBrain(GoalBrain):
         work.stage = stage
         return BrainCommand(
             self.new_id(sim, stage),
-            target_pose=grasp.pose(_TRAVEL),
+            target_pose=grasp.pose(TRAVEL),
             gripper=opening,
             max_velocity=config.max_velocity,
             max_acceleration=config.max_acceleration,

@@ -12,7 +12,7 @@ from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose
 from bhd_lerobot.policies.brain import BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain, GoalBrainConfig
 
-_TARGET = tuple(f"target_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+TARGET = tuple(f"target_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 
 
 @BrainConfig.register_subclass("reach")
@@ -38,7 +38,7 @@ class ReachBrain(GoalBrain):
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the target."""
-        self._columns = find_columns(robot.environment_names, _TARGET, self.name, "environment")
+        self._columns = find_columns(robot.environment_names, TARGET, self.name, "environment")
 
     def begin_episode(self, sim: int, seed: int, instruction: str) -> None:
         """Count attempts from 0."""

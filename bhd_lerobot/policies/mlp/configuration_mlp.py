@@ -13,6 +13,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from bhd_lerobot.control.geometry.poses import quaternion_columns
 from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.policies.mlp.objects_mlp import FIELDS, object_columns
 
 ACTIVATIONS = ("relu", "tanh", "gelu", "silu", "elu")
 LOSSES = ("l1", "mse", "huber", "nll")
@@ -137,6 +138,10 @@ class MlpConfig(PreTrainedConfig):
             on twice its yaw, which a network learns badly from a quaternion.
         state_quaternions: columns of `observation.state` at which quaternions begin; found by their names.
         environment_quaternions: likewise of `observation.environment_state`.
+        sort_objects: sort the objects that a task tells of (`object_0_present`, …): what is meant first, then the nearest
+            to it. Their order in the observation is then of no account.
+        objects: where they are in `observation.environment_state`: first column, how many, how many numbers each, and
+            which of these are `present`, `target`, `x` and `y`; found by their names.
         optimizer_lr: learning rate of AdamW.
         optimizer_betas: of AdamW.
         optimizer_eps: of AdamW.
@@ -167,6 +172,8 @@ class MlpConfig(PreTrainedConfig):
     yaw_harmonics: int = 0
     state_quaternions: list[int] = field(default_factory=list)
     environment_quaternions: list[int] = field(default_factory=list)
+    sort_objects: bool = False
+    objects: list[int] = field(default_factory=list)
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -285,6 +292,9 @@ class MlpConfig(PreTrainedConfig):
             self.environment_quaternions = quaternion_columns(_names(features, OBS_ENV_STATE))
         if self.ignore and not self.ignored_columns:
             self.ignored_columns = matching_columns(self.ignore, names)
+        if self.sort_objects and not self.objects:
+            start, count, size, fields = object_columns(_names(features, OBS_ENV_STATE))
+            self.objects = [start, count, size, *fields] if count else []
         if not self.scan.is_used or self.scan.beams:
             return
         columns = [i for i, name in enumerate(names) if name.startswith("scan_") and name.endswith(".pos")]
@@ -333,6 +343,13 @@ class MlpConfig(PreTrainedConfig):
             size = kept[key].shape[0] if key in kept else 0
             if not all(0 <= column <= size - 4 for column in columns):
                 raise ConfigError(f"Quaternions at the columns {columns} do not fit into the {size} of {key}.")
+        if self.sort_objects:
+            environment = kept[OBS_ENV_STATE].shape[0] if OBS_ENV_STATE in kept else 0
+            if len(self.objects) != 7 or self.objects[0] + self.objects[1] * self.objects[2] > environment:
+                raise ConfigError(
+                    f"policy.sort_objects is true, but {OBS_ENV_STATE} of this dataset tells of no objects with "
+                    f"{', '.join(f'object_0_{one}' for one in FIELDS)}. Leave it false, or record the task 'pick'."
+                )
         if len(set(self.ignored_columns)) == width and OBS_ENV_STATE not in kept:
             raise ConfigError(f"policy.ignore is {self.ignore}, which leaves nothing to look at.")
         scan = self.scan

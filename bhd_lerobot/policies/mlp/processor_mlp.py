@@ -10,6 +10,7 @@ from torch import Tensor
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
+from bhd_lerobot.policies.mlp.objects_mlp import ObjectOrderProcessorStep
 from bhd_lerobot.policies.mlp.scan_mlp import ScanProcessorStep
 from bhd_lerobot.policies.mlp.yaw_mlp import YawProcessorStep
 
@@ -39,6 +40,11 @@ def make_bhd_mlp_pre_post_processors(
         if config.scan.start is None:
             raise ConfigError("policy.scan.start is not known yet; make the policy before its processors.")
         before.append(ScanProcessorStep(start=config.scan.start, beams=config.scan.beams))
+    if config.sort_objects:
+        if not config.objects:
+            raise ConfigError("The objects' columns are not known yet; make the policy before its processors.")
+        start, count, size, *fields = config.objects
+        before.append(ObjectOrderProcessorStep(start, count, size, tuple(fields)))
     if config.yaw_harmonics:
         if not config.quaternions:
             raise ConfigError("The quaternions' columns are not known yet; make the policy before its processors.")

@@ -1,0 +1,91 @@
+"""Objects on their way into the network: in an order of their own, whatever order they are told in."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
+from lerobot.utils.constants import OBS_ENV_STATE
+from torch import Tensor
+
+FIELDS = ("present", "target", "x", "y")
+"""What has to be told of every object, as `object_0_present` and so on."""
+
+
+@ProcessorStepRegistry.register(name="bhd_object_order_processor")
+@dataclass
+class ObjectOrderProcessorStep(ObservationProcessorStep):
+    """Sorts the objects in `observation.environment_state`: what is meant first, then the nearest to it.
+
+    A network then finds each object in the same inputs and need not learn to look for it; what stands in which row of
+    the observation tells nothing.
+
+    Attributes:
+        start: column at which the first object begins.
+        count: objects that there may be.
+        size: numbers of each.
+        fields: where `FIELDS` are among the numbers of an object.
+    """
+
+    is_elementwise: ClassVar[bool] = True
+    """What is beside it in a batch changes nothing."""
+
+    start: int = 0
+    count: int = 0
+    size: int = 0
+    fields: tuple[int, ...] = ()
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Return the observation with its objects sorted."""
+        values = observation.get(OBS_ENV_STATE)
+        if isinstance(values, Tensor):
+            end = self.start + self.count * self.size
+            rows = values[..., self.start : end].unflatten(-1, (self.count, self.size))
+            ordered = in_order(rows, self.fields).flatten(-2)
+            observation[OBS_ENV_STATE] = torch.cat([values[..., : self.start], ordered, values[..., end:]], dim=-1)
+        return observation
+
+    def get_config(self) -> dict[str, Any]:
+        """Return what the step is made from again."""
+        return {"start": self.start, "count": self.count, "size": self.size, "fields": list(self.fields)}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        """Return the features unchanged: the same numbers, in another order."""
+        return features
+
+
+def in_order(rows: Tensor, fields: tuple[int, ...] | list[int]) -> Tensor:
+    """Return objects, shape (…, count, size): what is meant first, then the nearest to it, what is not there last.
+
+    Args:
+        rows: the objects, in the same shape.
+        fields: where `FIELDS` are among the numbers of an object.
+    """
+    present, target, x, y = fields
+    is_meant = (rows[..., target] > 0.5) & (rows[..., present] > 0.5)
+    place = rows[..., [x, y]]
+    meant = (place * is_meant.unsqueeze(-1)).sum(-2, keepdim=True)
+    apart = (place - meant).square().sum(-1)
+    apart = apart.masked_fill(is_meant, -1.0).masked_fill(rows[..., present] <= 0.5, torch.inf)
+    order = apart.argsort(dim=-1, stable=True).unsqueeze(-1).expand_as(rows)
+    return rows.gather(-2, order)
+
+
+def object_columns(names: list[str]) -> tuple[int, int, int, tuple[int, ...]]:
+    """Return start, count, size and fields of the objects among the names of an environment state; zeros without any.
+
+    Args:
+        names: of all columns; those of objects are `object_K_FIELD`, K from 0, each with the same fields in a row.
+    """
+    own = [name for name in names if name.startswith("object_")]
+    first = [name.removeprefix("object_0_") for name in own if name.startswith("object_0_")]
+    if not first or len(own) % len(first) or not set(FIELDS) <= set(first):
+        return 0, 0, 0, ()
+    count, start = len(own) // len(first), names.index(own[0])
+    wanted = [f"object_{number}_{field}" for number in range(count) for field in first]
+    if names[start : start + len(wanted)] != wanted:
+        return 0, 0, 0, ()
+    return start, count, len(first), tuple(first.index(field) for field in FIELDS)
