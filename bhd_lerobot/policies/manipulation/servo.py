@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 _TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 _GRIPPER = "gripper.pos"
 _DOWN, _LEVEL, _AROUND = 0.005, 0.012, 0.02
-"""[m] The tool's axis this near to the object's goes down; this near it stays as high as it is; this near, and as low as
-it is to be, the fingers close."""
+"""[m] The tool's axis this near to the object's goes down; this near it stays as high as it is; this near, the fingers
+close if they are low enough."""
 _TURNED, _TURNED_AROUND = 0.06, 0.3  # [rad] turned from the grasp by less than this it goes down; and closes
 _GAIN = 0.5  # share of the way to the target that one frame asks for: what follows with a delay does not overshoot
 _REACHED = 0.008  # [m] above the height of the grasp, at which the fingers close

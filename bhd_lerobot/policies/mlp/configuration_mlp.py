@@ -138,8 +138,8 @@ class MlpConfig(PreTrainedConfig):
             on twice its yaw, which a network learns badly from a quaternion.
         state_quaternions: columns of `observation.state` at which quaternions begin; found by their names.
         environment_quaternions: likewise of `observation.environment_state`.
-        sort_objects: sort the objects that a task tells of (`object_0_present`, …): what is meant first, then the nearest
-            to it. Their order in the observation is then of no account.
+        sort_objects: sort the objects that a task tells of (`object_0_present`, …): what is meant first, then the
+            nearest to it. Their order in the observation is then of no account.
         objects: where they are in `observation.environment_state`: first column, how many, how many numbers each, and
             which of these are `present`, `target`, `x` and `y`; found by their names.
         optimizer_lr: learning rate of AdamW.
@@ -343,13 +343,7 @@ class MlpConfig(PreTrainedConfig):
             size = kept[key].shape[0] if key in kept else 0
             if not all(0 <= column <= size - 4 for column in columns):
                 raise ConfigError(f"Quaternions at the columns {columns} do not fit into the {size} of {key}.")
-        if self.sort_objects:
-            environment = kept[OBS_ENV_STATE].shape[0] if OBS_ENV_STATE in kept else 0
-            if len(self.objects) != 7 or self.objects[0] + self.objects[1] * self.objects[2] > environment:
-                raise ConfigError(
-                    f"policy.sort_objects is true, but {OBS_ENV_STATE} of this dataset tells of no objects with "
-                    f"{', '.join(f'object_0_{one}' for one in FIELDS)}. Leave it false, or record the task 'pick'."
-                )
+        self._check_objects(kept[OBS_ENV_STATE].shape[0] if OBS_ENV_STATE in kept else 0)
         if len(set(self.ignored_columns)) == width and OBS_ENV_STATE not in kept:
             raise ConfigError(f"policy.ignore is {self.ignore}, which leaves nothing to look at.")
         scan = self.scan
@@ -357,4 +351,14 @@ class MlpConfig(PreTrainedConfig):
             raise ConfigError(
                 f"policy.scan has start {scan.start} and beams {scan.beams}; they must lie among the {width} columns "
                 f"of {OBS_STATE}."
+            )
+
+    def _check_objects(self, width: int) -> None:
+        """Refuse to sort objects that are not among the `width` columns of the environment state."""
+        if not self.sort_objects:
+            return
+        if len(self.objects) != 3 + len(FIELDS) or self.objects[0] + self.objects[1] * self.objects[2] > width:
+            raise ConfigError(
+                f"policy.sort_objects is true, but {OBS_ENV_STATE} of this dataset tells of no objects with "
+                f"{', '.join(f'object_0_{one}' for one in FIELDS)}. Leave it false, or record the task 'pick'."
             )

@@ -17,8 +17,10 @@ from torch import Tensor, nn
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import ACTIVATIONS, MlpConfig, ScanConfig
 from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
+from bhd_lerobot.policies.mlp.objects_mlp import ObjectOrderProcessorStep, object_columns
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder
 from bhd_lerobot.policies.mlp.yaw_mlp import harmonics, yaw
+from bhd_lerobot.tasks.pick import ENVIRONMENT
 from tests.cases import each_case
 
 NAMES = ["x.vel", *(f"scan_{i:03}.pos" for i in range(8)), "theta.vel"]
@@ -440,3 +442,57 @@ def test_batches_that_it_cannot_read() -> None:
         policy.features({key: value[:, 0] for key, value in given.items()})
     with pytest.raises(ConfigError, match="nothing to sample from"):
         policy.predict_action_chunk(given, noise=torch.zeros(5, 4, 2))
+
+
+# --- objects in any order --------------------------------------------------------------------------------------------
+
+
+def told_of_objects(rows: int = 40) -> Tensor:
+    """Return environment states with one to five objects in random order, of which one is meant, shape (rows, 80)."""
+    generator = torch.Generator().manual_seed(1)
+    table = torch.randn(rows, 5, 16, generator=generator)
+    count = torch.randint(1, 6, (rows,), generator=generator)
+    table[..., 0] = (torch.arange(5) < count[:, None]).float()
+    table[..., 1] = (torch.arange(5) == (torch.rand(rows, generator=generator) * count).long()[:, None]).float()
+    return (table * table[..., :1]).flatten(1)
+
+
+def test_objects_are_sorted_whatever_order_they_are_told_in() -> None:
+    start, count, size, fields = object_columns(["other", *ENVIRONMENT, "last"])
+    step = ObjectOrderProcessorStep(start, count, size, fields)
+    told = told_of_objects()
+    extra = torch.arange(2 * len(told), dtype=torch.float32).view(len(told), 2)
+    for order in (torch.arange(5), torch.tensor([4, 2, 0, 3, 1]), torch.tensor([1, 0, 3, 4, 2])):
+        rows = told.view(-1, 5, 16)[:, order].flatten(1)
+        values = torch.cat([extra[:, :1], rows, extra[:, 1:]], dim=1)
+        done = step.observation({OBS_ENV_STATE: values})[OBS_ENV_STATE]
+        table = done[:, 1:-1].view(-1, 5, 16)
+        assert torch.equal(done[:, [0, -1]], extra)
+        assert bool((table[:, 0, 1] == 1).all())  # what is meant is the first
+        apart = (table[..., 3:5] - table[:, :1, 3:5]).norm(dim=-1).masked_fill(table[..., 0] == 0, 1e9)
+        assert bool((apart.diff(dim=1) >= 0).all())  # then the nearest, and what is not there last
+        if bool((order == torch.arange(5)).all()):
+            first = done
+        assert torch.equal(done, first)
+    history = step.observation({OBS_ENV_STATE: values.unsqueeze(1).expand(-1, 3, -1)})[OBS_ENV_STATE]
+    assert torch.equal(history[:, 2], done)
+
+
+def test_a_policy_that_sorts_objects_does_the_same_in_any_order() -> None:
+    made = config(
+        environment=80, sort_objects=True, objects=[0, 5, 16, 0, 1, 3, 4], yaw_harmonics=1, environment_quaternions=[6]
+    )
+    policy = MlpPolicy(made).eval()
+    before, _ = make_pre_post_processors(made, dataset_stats=None)
+    told = told_of_objects()
+    state = torch.randn(len(told), 10)
+    chunks = [
+        policy.predict_action_chunk(before({OBS_STATE: state, OBS_ENV_STATE: rows}))
+        for rows in (told, told.view(-1, 5, 16).flip(1).flatten(1))
+    ]
+    assert torch.equal(*chunks)
+
+
+def test_sorting_objects_that_nobody_tells_of_is_refused() -> None:
+    with pytest.raises(ConfigError, match="object_0_present"):
+        MlpPolicy(config(environment=3, sort_objects=True))

@@ -1,0 +1,164 @@
+"""The rules that say in every frame what to do, whoever brought the arm where it is."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.baselines import NoopBrain
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
+from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig
+from bhd_lerobot.policies.manipulation.servo import (
+    PickServoBrain,
+    PickServoConfig,
+    ReachServoBrain,
+    ReachServoConfig,
+    ServoConfig,
+)
+from bhd_lerobot.robots.arm_host import TOOL_NAMES
+from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.ur5_simulation import UR5Simulation
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import EpisodeSpec
+from bhd_lerobot.tasks.pick import ENVIRONMENT, PickConfig, PickTask
+from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
+from bhd_lerobot.tasks.task import Event, episode_seed
+from bhd_lerobot.tasks.variation import RandomisationConfig
+from tests.cases import each_case
+
+POSE = tuple(f"target_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+TOOL = UR5Config(action_space="tool", tool_pose=True)
+
+
+def features(environment: tuple[str, ...]) -> RobotFeatures:
+    return RobotFeatures(TOOL_NAMES, TOOL_NAMES, 25, environment)
+
+
+def tools(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Return tool poses in all directions, and openings, shape (n, 8)."""
+    place = rng.uniform((0.2, -0.4, 0.02), (0.7, 0.4, 0.4), (n, 3))
+    quaternion = Rotation.random(n, rng=rng).as_quat(scalar_first=True)
+    return np.concatenate([place, quaternion, rng.uniform(0, 0.085, (n, 1))], axis=1)
+
+
+def tables(n: int) -> np.ndarray:
+    """Return what the task tells of n tables, shape (n, 80)."""
+    task = PickTask(PickConfig(), n, 25)
+    scenes = [task.sample(seed) for seed in range(n)]
+    task.begin(np.arange(n), scenes)
+    state = task._fixed.copy()
+    for sim, scene in enumerate(scenes):
+        for place, one in enumerate(scene.objects):
+            half = one.yaw / 2
+            state[sim, place, 3:10] = one.x, one.y, one.height / 2, np.cos(half), 0, 0, np.sin(half)
+    return state.reshape(n, -1)
+
+
+def pick(config: PickServoConfig | None = None) -> PickServoBrain:
+    brain = PickServoBrain(config)
+    brain.bind(features(ENVIRONMENT))
+    return brain
+
+
+@each_case("randomised", [False, True])
+def test_it_picks(randomised: bool) -> None:
+    config = PickConfig(order="random", randomisation=RandomisationConfig(enabled=randomised))
+    simulation = UR5Simulation(TOOL, 4)
+    loop = EpisodeLoop(simulation, PickTask(config, 4, 25), PickServoBrain())
+    episodes = list(loop.run([EpisodeSpec(i, episode_seed(5, i, "train")) for i in range(8)]))
+    assert [episode.outcome.event for episode in episodes] == [Event.SUCCESS] * 8
+
+
+def test_it_reaches() -> None:
+    loop = EpisodeLoop(UR5Simulation(TOOL, 4), ReachTask(ReachConfig(), 4, 25), ReachServoBrain())
+    episodes = list(loop.run([EpisodeSpec(i, episode_seed(0, i, "train")) for i in range(4)]))
+    assert sum(episode.outcome.success for episode in episodes) >= 3  # straight ways may lead through singularities
+
+
+@each_case(("brain", "environment"), [(PickServoBrain(), ENVIRONMENT), (ReachServoBrain(), POSE)])
+def test_steps_are_short_from_wherever_the_tool_is(brain: Any, environment: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(0)
+    brain.bind(features(environment))
+    state, config = tools(200, rng), brain.config
+    told = tables(200) if environment is ENVIRONMENT else tools(200, rng)[:, :7]
+    action = brain.act(Observation(TOOL_NAMES, state, {}, told))
+    way = np.linalg.norm(action[:, :3] - state[:, :3], axis=1)
+    assert way.max() <= config.lead_m + 1e-9
+    assert np.allclose(np.linalg.norm(action[:, 3:7], axis=1), 1)
+    one, other = (Rotation.from_quat(values[:, 3:7], scalar_first=True) for values in (action, state))
+    assert (one * other.inv()).magnitude().max() <= config.lead_rad + 1e-9
+    # A network that learns quaternions as numbers needs the nearer of the two.
+    assert ((action[:, 3:7] * state[:, 3:7]).sum(axis=1) >= 0).all()
+
+
+def test_what_is_to_be_done_depends_on_nothing_but_what_is_seen() -> None:
+    rng = np.random.default_rng(1)
+    state, told = tools(60, rng), tables(60)
+    brain = pick()
+    action = brain.act(Observation(TOOL_NAMES, state, {}, told))
+    order = rng.permutation(60)
+    assert np.array_equal(brain.act(Observation(TOOL_NAMES, state[order], {}, told[order])), action[order])
+    # In which row an object is told of is of no account.
+    rows = told.reshape(60, MAX_OBJECTS, -1)[:, rng.permutation(MAX_OBJECTS)].reshape(60, -1)
+    assert np.allclose(brain.act(Observation(TOOL_NAMES, state, {}, rows)), action)
+
+
+def test_a_known_error_of_the_camera_is_taken_away() -> None:
+    error = [0.01, -0.02, 0.005]
+    state, told = tools(60, np.random.default_rng(2)), tables(60)
+    wrong = told.reshape(60, MAX_OBJECTS, -1).copy()
+    place = OBJECT_FIELDS.index("x")
+    wrong[:, :, place : place + 3] += error * (wrong[:, :, :1] > 0)
+    right = pick().act(Observation(TOOL_NAMES, state, {}, told))
+    config = PickServoConfig(camera_error_m=error)
+    seen = pick(config).act(Observation(TOOL_NAMES, state, {}, wrong.reshape(60, -1)))
+    # The turn of the wrist follows from where the object seems to be.
+    assert np.allclose(seen[:, :3], right[:, :3], atol=1e-6)
+
+
+def test_without_an_object_or_a_target_it_stays_where_it_is() -> None:
+    state = tools(5, np.random.default_rng(3))
+    nothing = np.zeros((5, len(ENVIRONMENT)))
+    unknown = tables(5)
+    unknown.reshape(5, MAX_OBJECTS, -1)[:, 0, 3:6] = np.nan
+    for told in (nothing, unknown):
+        assert np.allclose(pick().act(Observation(TOOL_NAMES, state, {}, told)), state)
+    reach = ReachServoBrain()
+    reach.bind(features(POSE))
+    for told in (np.zeros((5, 7)), np.full((5, 7), np.nan)):
+        assert np.allclose(reach.act(Observation(TOOL_NAMES, state, {}, told)), state)
+
+
+def test_as_an_expert_it_says_in_every_frame_what_it_would_do() -> None:
+    brain = DaggerBrain(DaggerConfig(learner=None, expert=None, collision_s=None, stall_s=None), NoopBrain(), pick())  # type: ignore[arg-type]
+    brain.bind(features(ENVIRONMENT))
+    brain.reset(np.arange(3), [1, 2, 3], 3)
+    assert brain.gives_advice
+    state, told = tools(3, np.random.default_rng(4)), tables(3)
+    seen = Observation(TOOL_NAMES, state, {}, told)
+    driven = brain.act(seen)
+    assert np.allclose(driven, state)  # the learner drives
+    assert np.array_equal(brain.advice(), pick().act(seen))
+
+
+@each_case(
+    ("make", "message"),
+    [
+        (lambda: PickServoConfig(lead_m=0.0), "lead_m"),
+        (lambda: PickServoConfig(down_m=-1.0), "down_m"),
+        (lambda: ReachServoConfig(lead_rad=4.0), "below pi"),
+        (lambda: ServoConfig(camera_error_m=[0.0, 1.0, 0.0]), "camera_error_m"),
+    ],
+)
+def test_values_that_cannot_be_honoured_are_refused(make: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make()
+
+
+def test_a_robot_that_takes_joint_positions_is_refused() -> None:
+    joints = ("shoulder_pan.pos", "gripper.pos")
+    with pytest.raises(ConfigError, match=r"--robot\.action_space=tool --robot\.tool_pose=true"):
+        PickServoBrain().bind(RobotFeatures(joints, joints, 25, ENVIRONMENT))
