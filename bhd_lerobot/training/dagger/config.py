@@ -16,7 +16,7 @@ ALGORITHM = "dagger"
 _OWN = frozenset(
     {
         *("dataset.root", "dataset.num_episodes", "dataset.push_to_hub", "dataset.expert_action", "brain.learner.path"),
-        *("policy.push_to_hub", "selection.expert_action", "selection.learner_weight", "resume", "output_dir", "seed"),
+        *("policy.push_to_hub", "selection.expert_action", "resume", "output_dir", "seed"),
         *("only", "baseline", "split", "n_episodes", "videos"),
     }
 )
@@ -122,6 +122,13 @@ def read_stages(config: AggregationConfig) -> Stages:
             "a policy drives and an expert helps."
         )
     policy = parse_train(command(config.policy, {})).config
+    weight = "selection.learner_weight"
+    if not learner.dataset.expert_action and weight in _names(config.policy):
+        raise ConfigError(
+            f"The option --{weight} of {config.policy.config!r} weighs frames in which {config.learner.config!r} does not "
+            "record what the expert would have done (dataset.expert_action is false): they are not learned from. Leave "
+            "it out of its options."
+        )
     configuration.parse(EvalConfig, command(config.evaluation, {}))
     return Stages(str(kinds[0]), learner.dataset.expert_action, policy.steps)
 
@@ -132,13 +139,17 @@ def command(stage: StageConfig, own: Mapping[str, Any]) -> list[str]:
     Raises:
         ConfigError: an option of the stage is one that a round sets itself.
     """
-    names = {option.removeprefix("--").partition("=")[0] for option in stage.options}
-    if taken := sorted(names & _OWN):
+    if taken := sorted(_names(stage) & _OWN):
         raise ConfigError(
             f"The option --{taken[0]} of {stage.config!r} is set by the rounds themselves; leave it out of its options."
         )
     values = [f"--{name}={value}" for name, value in own.items()]
     return [f"--{configuration.CONFIG_PATH}={stage.config}", *values, *stage.options]
+
+
+def _names(stage: StageConfig) -> set[str]:
+    """Return the names of a stage's options."""
+    return {option.removeprefix("--").partition("=")[0] for option in stage.options}
 
 
 def parse_aggregation(arguments: Sequence[str]) -> AggregationConfig:

@@ -143,6 +143,16 @@ def test_of_an_expert_that_gives_goals_only_what_it_did_is_learned(
             {"evaluation": {"config": str(CONFIGS / "eval/turtlebot3_avoid.yaml"), "options": ["--split=train"]}},
             "The option --split of .* is set by the rounds themselves",
         ),
+        (
+            {
+                "learner": {"config": str(CONFIGS / "record/ur5_pick_dagger.yaml"), "options": []},
+                "policy": {
+                    "config": str(CONFIGS / "train/bc_ur5_pick.yaml"),
+                    "options": ["--selection.learner_weight=2"],
+                },
+            },
+            "--selection.learner_weight of .* they are not learned from",
+        ),
     ],
 )
 def test_what_cannot_be_is_said_before_the_first_round(
