@@ -10,8 +10,9 @@ from pathlib import Path
 
 from benchmarks.results.adaptation import fine_tune
 from benchmarks.results.aggregation import aggregate
-from benchmarks.results.learning import avoid, pick, reach
+from benchmarks.results.learning import avoid, reach
 from benchmarks.results.page import write_page
+from benchmarks.results.picking import pick
 from benchmarks.results.runner import REPOSITORY, FailedError, Runner
 from benchmarks.results.section import Section
 from benchmarks.results.seeing import pixels, see

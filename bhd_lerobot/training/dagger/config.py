@@ -125,9 +125,9 @@ def read_stages(config: AggregationConfig) -> Stages:
     weight = "selection.learner_weight"
     if not learner.dataset.expert_action and weight in _names(config.policy):
         raise ConfigError(
-            f"The option --{weight} of {config.policy.config!r} weighs frames in which {config.learner.config!r} does not "
-            "record what the expert would have done (dataset.expert_action is false): they are not learned from. Leave "
-            "it out of its options."
+            f"The option --{weight} of {config.policy.config!r} weighs frames in which {config.learner.config!r} does "
+            "not record what the expert would have done (dataset.expert_action is false): they are not learned from. "
+            "Leave it out of its options."
         )
     configuration.parse(EvalConfig, command(config.evaluation, {}))
     return Stages(str(kinds[0]), learner.dataset.expert_action, policy.steps)
