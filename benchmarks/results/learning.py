@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.results.runner import FailedError, Runner
-from benchmarks.results.section import Row, Section, mean, rate
+from benchmarks.results.section import Row, Section, mean, over_seeds, rate
 from bhd_lerobot.evaluation.statistics import mean_difference, ratio_of_means
 
 EPISODES = 500
@@ -207,3 +207,9 @@ def success_row(results: Any, name: str, goal: float | None = None) -> Row:
     met = None if goal is None else brain["success"]["value"] >= goal
     what = f"{name}: success in {brain['episodes']}"
     return Row(what, rate(brain["success"], brain["outcomes"]), "" if goal is None else f"at least {goal:.0%}", met)
+
+
+def seeds_row(results: Any, names: Sequence[str], what: str = "all seeds") -> Row:
+    """Return the row of the mean success of policies that differ in their training seeds only."""
+    rates = [float(results["brains"][name]["success"]["value"]) for name in names]
+    return Row(f"{what}: mean success, interval over {len(names)} trainings", over_seeds(rates))

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from benchmarks.results.learning import TOOL, evaluate, success_row
+from benchmarks.results.learning import TOOL, evaluate, seeds_row, success_row
 from benchmarks.results.runner import Runner
 from benchmarks.results.section import Row, Section
 
@@ -40,14 +40,13 @@ def pick(run: Runner, section: Section) -> None:
     for seed in SEEDS:
         row, low = success_row(results, f"seed_{seed}"), results["brains"][f"seed_{seed}"]["success"]["low"]
         section.rows.append(Row(row.what, row.value, f"lower end at least {_GOAL:.0%}", low >= _GOAL))
-    rates = [results["brains"][f"seed_{seed}"]["success"]["value"] for seed in SEEDS]
+    section.rows.append(seeds_row(results, [f"seed_{seed}" for seed in SEEDS]))
     section.rows.append(Row("time from nothing to the first seed's policy", f"{seconds[0]:.0f} s"))
     section.remarks.append(
         f"Privileged state: all of them read where the objects are from the simulator, in any order, and a flag that "
-        f"says which is meant; none has seen an image or read a word. {len(SEEDS)} seeds of recording and training; "
-        f"success from {min(rates):.1%} to {max(rates):.1%}. `clone` learned from episodes of `pick_servo` alone. In "
-        f"{last} further rounds the last policy drove, and the rule said in every frame what it would do. A `fault` is a "
-        "stop by the cerebellum, of which the report gives the reason."
+        f"says which is meant; none has seen an image or read a word. {len(SEEDS)} seeds of recording and training. "
+        f"`clone` learned from episodes of `pick_servo` alone. In {last} further rounds the last policy drove, and the "
+        "rule said in every frame what it would do. A `fault` is a stop by the cerebellum; the report gives its reason."
     )
 
 

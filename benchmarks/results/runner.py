@@ -1,6 +1,7 @@
 """Runs the commands that results come from, each once, and remembers what they were and how long they took."""
 
 import json
+import resource
 import shlex
 import subprocess
 import sys
@@ -33,11 +34,13 @@ class Ran:
         command: as a person would type it, in the repository.
         seconds: how long it took [s].
         status: its exit status.
+        cpu_seconds: processor time, of all its processes and threads together [s].
     """
 
     command: str
     seconds: float
     status: int
+    cpu_seconds: float = 0.0
 
 
 class Runner:
@@ -85,12 +88,12 @@ class Runner:
                 return kept
         log = note.with_suffix(".log")
         print(f"== {command}\n   log: {log}", flush=True)
-        started = time.perf_counter()
+        started, used = time.perf_counter(), _cpu_seconds()
         with log.open("w", encoding="utf-8") as file:
             done = subprocess.run(
                 _executable(arguments), cwd=REPOSITORY, stdout=file, stderr=subprocess.STDOUT, check=False
             )
-        ran = Ran(command, time.perf_counter() - started, done.returncode)
+        ran = Ran(command, time.perf_counter() - started, done.returncode, _cpu_seconds() - used)
         if done.returncode not in allowed:
             tail = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-15:])
             raise FailedError(f"{command}\nended with status {done.returncode}. The end of {log}:\n{tail}")
@@ -102,6 +105,12 @@ class Runner:
     def read(self, *parts: str) -> Any:
         """Return what a JSON file in the folder holds."""
         return json.loads((REPOSITORY / self.path(*parts)).read_text(encoding="utf-8"))
+
+
+def _cpu_seconds() -> float:
+    """Return the processor time of all processes that were started here and have ended [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _executable(arguments: Sequence[str]) -> list[str]:

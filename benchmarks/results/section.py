@@ -1,9 +1,10 @@
 """What a section of the results consists of: commands, numbers with their goals, and an image or two."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from benchmarks.results.runner import Ran
+from bhd_lerobot.evaluation import statistics
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,10 @@ class Section:
         lines += [
             "",
             "```bash",
-            *(f"{command.command}   # {command.seconds:.0f} s" for command in self.commands),
+            *(
+                f"{command.command}   # {command.seconds:.0f} s, {command.cpu_seconds:.0f} s of processor time"
+                for command in self.commands
+            ),
             "```",
             "",
         ]
@@ -65,6 +69,13 @@ def rate(estimate: Mapping[str, float | None], outcomes: Mapping[str, int]) -> s
     text = f"{estimate['value']:.1%} ({estimate['low']:.1%} to {estimate['high']:.1%})"
     causes = ", ".join(f"{count} {cause}" for cause, count in outcomes.items() if cause != "success")
     return f"{text}; {causes}" if causes else text
+
+
+def over_seeds(rates: Sequence[float]) -> str:
+    """Return the mean success of policies from several training seeds, with Student's 95 % interval over the seeds."""
+    one = statistics.mean(rates, within=(0.0, 1.0))
+    low, high = max(0.0, one.low), min(1.0, one.high)
+    return f"{one.value:.1%} ({low:.1%} to {high:.1%}); {', '.join(f'{rate:.1%}' for rate in rates)}"
 
 
 def mean(estimate: Mapping[str, float], sign: str = "") -> str:

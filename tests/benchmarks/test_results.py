@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from benchmarks.results.adaptation import recovered
 from benchmarks.results.learning import values
 from benchmarks.results.page import write_page
 from benchmarks.results.runner import FailedError, Runner
-from benchmarks.results.section import Row, Section
+from benchmarks.results.section import Row, Section, over_seeds
 from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
 
 RATIO = {"median": 12.3, "low": 11.0, "high": 14.0, "turns": 3}
@@ -94,6 +95,13 @@ def test_evaluate_and_navigate_rows_carry_goals_and_numbers() -> None:
     rows = navigate_rows(navigated)
     assert [row.met for row in rows] == [True, False, True]
     assert rows[0].value == "99.0% (98.0% to 99.5%); 5 collision"
+
+
+def test_the_interval_over_seeds_is_not_that_over_episodes() -> None:
+    assert over_seeds([0.9, 0.9, 0.9]).startswith("90.0%")
+    low, high = (float(one) for one in re.findall(r"([\d.]+)%", over_seeds([0.90, 0.94, 0.98]))[1:3])
+    assert low < 90
+    assert 98 < high <= 100  # three seeds say little
 
 
 # --- fine-tuning ------------------------------------------------------------------------------------------------------
