@@ -9,11 +9,12 @@ from typing import Any
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from bhd_lerobot.control.geometry.poses import quaternion_columns
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.policies.mlp.objects_mlp import FIELDS, object_columns
+from bhd_lerobot.policies.mlp.objects_mlp import FIELDS, TOOL, object_columns
+from bhd_lerobot.policies.mlp.residual_mlp import position_columns
 
 ACTIVATIONS = ("relu", "tanh", "gelu", "silu", "elu")
 LOSSES = ("l1", "mse", "huber", "nll")
@@ -100,6 +101,27 @@ def matching_columns(patterns: Sequence[str], names: Sequence[str]) -> list[int]
     return [i for i, name in enumerate(names) if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
 
 
+def check_residual(config: Any, width: int) -> None:
+    """Refuse `residual` where no action is a position that is observed.
+
+    Args:
+        config: with `residual`, `residual_columns` and `action_feature`.
+        width: numbers of `observation.state`.
+
+    Raises:
+        ConfigError: it cannot be honoured.
+    """
+    if not config.residual:
+        return
+    columns, actions = config.residual_columns, int(config.action_feature.shape[0])
+    if len(columns) != actions or max(columns, default=-1) < 0 or max(columns) >= width:
+        raise ConfigError(
+            f"policy.residual is true, and policy.residual_columns is {columns}: of none of the {actions} actions is it "
+            f"known that {OBS_STATE} has the same position (….pos). Leave it false; for tool poses set "
+            "--robot.tool_pose=true when recording."
+        )
+
+
 @PreTrainedConfig.register_subclass("bhd_mlp")
 @dataclass
 class MlpConfig(PreTrainedConfig):
@@ -138,10 +160,16 @@ class MlpConfig(PreTrainedConfig):
             on twice its yaw, which a network learns badly from a quaternion.
         state_quaternions: columns of `observation.state` at which quaternions begin; found by their names.
         environment_quaternions: likewise of `observation.environment_state`.
+        residual: predict by how much an action differs from where the robot is, for actions that are positions which
+            are also observed, such as joint positions and tool poses.
+        residual_columns: of each action the column of `observation.state` that has its name, -1 for none; found by
+            their names.
         sort_objects: sort the objects that a task tells of (`object_0_present`, …): what is meant first, then the
-            nearest to it. Their order in the observation is then of no account.
+            nearest to it. Their order in the observation is then of no account. Where the robot observes its tool pose,
+            it also sees where what is meant is from there.
         objects: where they are in `observation.environment_state`: first column, how many, how many numbers each, and
-            which of these are `present`, `target`, `x` and `y`; found by their names.
+            which of these are `present`, `target` and the pose; found by their names.
+        tool_columns: of the tool pose in `observation.state`; found by their names.
         optimizer_lr: learning rate of AdamW.
         optimizer_betas: of AdamW.
         optimizer_eps: of AdamW.
@@ -172,8 +200,11 @@ class MlpConfig(PreTrainedConfig):
     yaw_harmonics: int = 0
     state_quaternions: list[int] = field(default_factory=list)
     environment_quaternions: list[int] = field(default_factory=list)
+    residual: bool = False
+    residual_columns: list[int] = field(default_factory=list)
     sort_objects: bool = False
     objects: list[int] = field(default_factory=list)
+    tool_columns: list[int] = field(default_factory=list)
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -292,9 +323,13 @@ class MlpConfig(PreTrainedConfig):
             self.environment_quaternions = quaternion_columns(_names(features, OBS_ENV_STATE))
         if self.ignore and not self.ignored_columns:
             self.ignored_columns = matching_columns(self.ignore, names)
+        if self.residual and not self.residual_columns:
+            self.residual_columns = position_columns(_names(features, ACTION), names)
         if self.sort_objects and not self.objects:
             start, count, size, fields = object_columns(_names(features, OBS_ENV_STATE))
             self.objects = [start, count, size, *fields] if count else []
+            if set(TOOL) <= set(names):
+                self.tool_columns = [names.index(name) for name in TOOL]
         if not self.scan.is_used or self.scan.beams:
             return
         columns = [i for i, name in enumerate(names) if name.startswith("scan_") and name.endswith(".pos")]
@@ -343,6 +378,7 @@ class MlpConfig(PreTrainedConfig):
             size = kept[key].shape[0] if key in kept else 0
             if not all(0 <= column <= size - 4 for column in columns):
                 raise ConfigError(f"Quaternions at the columns {columns} do not fit into the {size} of {key}.")
+        check_residual(self, width)
         self._check_objects(kept[OBS_ENV_STATE].shape[0] if OBS_ENV_STATE in kept else 0)
         if len(set(self.ignored_columns)) == width and OBS_ENV_STATE not in kept:
             raise ConfigError(f"policy.ignore is {self.ignore}, which leaves nothing to look at.")

@@ -12,6 +12,8 @@ from torch.nn import functional
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
+from bhd_lerobot.policies.mlp.objects_mlp import OBS_RELATIVE, relative_features, relative_size
+from bhd_lerobot.policies.mlp.residual_mlp import Residual
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder, other_columns, transformed
 from bhd_lerobot.policies.mlp.yaw_mlp import OBS_YAW, harmonics
 
@@ -27,6 +29,7 @@ _PADDING = "action_is_pad"
 _HINTS = {
     OBS_SCAN: " Run the policy's own preprocessor first.",
     OBS_YAW: " Run the policy's own preprocessor first.",
+    OBS_RELATIVE: " Run the policy's own preprocessor first.",
     OBS_ENV_STATE: " It comes from a task; a robot's own sensors, and so lerobot-rollout, lack it. Run this policy in "
     "bhd-eval or lerobot-eval, or train one on the sensors alone: "
     "--policy.input_features='{observation.state: {type: STATE, shape: [WIDTH]}}'.",
@@ -41,8 +44,7 @@ class MlpPolicy(PreTrainedPolicy):
 
     Args:
         config: its shape and its features.
-        kwargs: what LeRobot passes to every policy (dataset statistics and metadata); the processors normalise, so
-            nothing of it is needed.
+        kwargs: what LeRobot passes to every policy; of it `dataset_stats` are used, for `config.residual`.
     """
 
     config_class = MlpConfig
@@ -67,8 +69,13 @@ class MlpPolicy(PreTrainedPolicy):
         self.scan_encoder = ScanEncoder(scan, steps, activation) if scan.is_used and scan.channels else None
         self._beams = 0 if not scan.is_used else self.scan_encoder.size if self.scan_encoder else steps * scan.beams
         yaws = 2 * config.yaw_harmonics * config.quaternions
-        self.feature_size = steps * (len(columns) + environment_size + yaws) + self._beams
+        self._is_relative = config.sort_objects and bool(config.tool_columns)
+        relative = relative_size(config.yaw_harmonics) if self._is_relative else 0
+        self.feature_size = steps * (len(columns) + environment_size + yaws + relative) + self._beams
         self.net = nn.Sequential(*_perceptron(config, self.feature_size, config.chunk_size * self._action_size))
+        self.residual: Residual | None = None
+        if config.residual:
+            self.residual = Residual(config.residual_columns, kwargs.get("dataset_stats"), config.min_std)
         self.log_std: nn.Parameter | None = None
         if config.gaussian:
             shape = (config.chunk_size, self._action_size)
@@ -95,7 +102,7 @@ class MlpPolicy(PreTrainedPolicy):
 
         Returns:
             shape (batch, feature_size): of each observation, oldest first, the state without beams, the environment
-            state, and cosines and sines of yaws; then the beams.
+            state, cosines and sines of yaws, and where what is meant is from the tool; then the beams.
         """
         config = self.config
         rows = {key: self._history(batch, key) for key in self._keys}
@@ -110,6 +117,8 @@ class MlpPolicy(PreTrainedPolicy):
             parts.append(rows[OBS_ENV_STATE])
         if config.yaw_harmonics:
             parts.append(harmonics(self._history(batch, OBS_YAW), config.yaw_harmonics))
+        if self._is_relative:
+            parts.append(relative_features(self._history(batch, OBS_RELATIVE), config.yaw_harmonics))
         numbers = self._clipped(torch.cat(parts, dim=-1)).flatten(1)
         if scan is None:
             return numbers
@@ -180,7 +189,7 @@ class MlpPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], noise: Tensor | None = None, **_: Any) -> Tensor:
         """Return the next action, normalised, shape (batch, actions); look again when the last chunk is used up."""
-        for key in (*self._keys, OBS_SCAN, OBS_YAW):
+        for key in (*self._keys, OBS_SCAN, OBS_YAW, OBS_RELATIVE):
             if key not in batch:
                 continue
             seen = self._seen.setdefault(key, deque(maxlen=self.config.history))
@@ -194,7 +203,8 @@ class MlpPolicy(PreTrainedPolicy):
         return self._planned.popleft()
 
     def _chunk(self, batch: dict[str, Tensor]) -> Tensor:
-        return self.net(self.features(batch)).unflatten(-1, (self.config.chunk_size, self._action_size))
+        chunk: Tensor = self.net(self.features(batch)).unflatten(-1, (self.config.chunk_size, self._action_size))
+        return chunk if self.residual is None else chunk + self.residual(self._history(batch, OBS_STATE)[:, -1])
 
     def _history(self, batch: dict[str, Tensor], key: str) -> Tensor:
         """Return an input, shape (batch, n_obs_steps, width)."""

@@ -1,4 +1,4 @@
-"""Objects on their way into the network: in an order of their own, whatever order they are told in."""
+"""Objects on their way into the network: in an order of their own, and where what is meant is from the tool."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -6,11 +6,21 @@ from typing import Any, ClassVar
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
-from lerobot.utils.constants import OBS_ENV_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-FIELDS = ("present", "target", "x", "y")
+from bhd_lerobot.policies.mlp.yaw_mlp import harmonics, yaw
+
+FIELDS = ("present", "target", "x", "y", "z", "qw", "qx", "qy", "qz")
 """What has to be told of every object, as `object_0_present` and so on."""
+
+TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+"""Where the tool is, in `observation.state`."""
+
+OBS_RELATIVE = "observation.bhd_relative"
+"""Key of where what is meant is from the tool: x, y, z in the base frame [m], and its yaw from the tool's [rad]."""
+
+_SCALES = (0.1, 0.02, 0.005)  # [m] within which distances are told apart
 
 
 @ProcessorStepRegistry.register(name="bhd_object_order_processor")
@@ -19,13 +29,14 @@ class ObjectOrderProcessorStep(ObservationProcessorStep):
     """Sorts the objects in `observation.environment_state`: what is meant first, then the nearest to it.
 
     A network then finds each object in the same inputs and need not learn to look for it; what stands in which row of
-    the observation tells nothing.
+    the observation tells nothing. Where the tool is observed, `OBS_RELATIVE` is added.
 
     Attributes:
         start: column at which the first object begins.
         count: objects that there may be.
         size: numbers of each.
         fields: where `FIELDS` are among the numbers of an object.
+        tool: columns of `observation.state` that have `TOOL`; nothing if it is not observed.
     """
 
     is_elementwise: ClassVar[bool] = True
@@ -35,6 +46,7 @@ class ObjectOrderProcessorStep(ObservationProcessorStep):
     count: int = 0
     size: int = 0
     fields: tuple[int, ...] = ()
+    tool: tuple[int, ...] = ()
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Return the observation with its objects sorted."""
@@ -44,11 +56,21 @@ class ObjectOrderProcessorStep(ObservationProcessorStep):
             rows = values[..., self.start : end].unflatten(-1, (self.count, self.size))
             ordered = in_order(rows, self.fields).flatten(-2)
             observation[OBS_ENV_STATE] = torch.cat([values[..., : self.start], ordered, values[..., end:]], dim=-1)
+            state = observation.get(OBS_STATE)
+            if self.tool and isinstance(state, Tensor):
+                meant = ordered[..., : self.size][..., list(self.fields[2:])]
+                observation[OBS_RELATIVE] = _relative(state[..., list(self.tool)], meant)
         return observation
 
     def get_config(self) -> dict[str, Any]:
         """Return what the step is made from again."""
-        return {"start": self.start, "count": self.count, "size": self.size, "fields": list(self.fields)}
+        return {
+            "start": self.start,
+            "count": self.count,
+            "size": self.size,
+            "fields": list(self.fields),
+            "tool": list(self.tool),
+        }
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -64,7 +86,7 @@ def in_order(rows: Tensor, fields: tuple[int, ...] | list[int]) -> Tensor:
         rows: the objects, in the same shape.
         fields: where `FIELDS` are among the numbers of an object.
     """
-    present, target, x, y = fields
+    present, target, x, y, *_ = fields
     is_meant = (rows[..., target] > 0.5) & (rows[..., present] > 0.5)
     place = rows[..., [x, y]]
     meant = (place * is_meant.unsqueeze(-1)).sum(-2, keepdim=True)
@@ -72,6 +94,31 @@ def in_order(rows: Tensor, fields: tuple[int, ...] | list[int]) -> Tensor:
     apart = apart.masked_fill(is_meant, -1.0).masked_fill(rows[..., present] <= 0.5, torch.inf)
     order = apart.argsort(dim=-1, stable=True).unsqueeze(-1).expand_as(rows)
     return rows.gather(-2, order)
+
+
+def _relative(tool: Tensor, item: Tensor) -> Tensor:
+    """Return where objects are from tools, shape (…, 4), of poses, shape (…, 7)."""
+    turned = yaw(item[..., 3:]) - yaw(tool[..., 3:])
+    return torch.cat([item[..., :3] - tool[..., :3], turned.unsqueeze(-1)], dim=-1)
+
+
+def relative_size(count: int) -> int:
+    """Return how many numbers `relative_features` makes, with `count` harmonics."""
+    return 3 * len(_SCALES) + 2 * count
+
+
+def relative_features(values: Tensor, count: int) -> Tensor:
+    """Return what a network sees of `OBS_RELATIVE`, shape (…, `relative_size`).
+
+    Metres and millimetres at once: each coordinate at several scales, beyond which it counts as far away; and
+    harmonics of the yaw.
+
+    Args:
+        values: shape (…, 4).
+        count: harmonics of the yaw.
+    """
+    places = [torch.tanh(values[..., :3] / scale) for scale in _SCALES]
+    return torch.cat([*places, harmonics(values[..., 3:], count)], dim=-1)
 
 
 def object_columns(names: list[str]) -> tuple[int, int, int, tuple[int, ...]]:

@@ -44,7 +44,7 @@ def make_bhd_mlp_pre_post_processors(
         if not config.objects:
             raise ConfigError("The objects' columns are not known yet; make the policy before its processors.")
         start, count, size, *fields = config.objects
-        before.append(ObjectOrderProcessorStep(start, count, size, tuple(fields)))
+        before.append(ObjectOrderProcessorStep(start, count, size, tuple(fields), tuple(config.tool_columns)))
     if config.yaw_harmonics:
         if not config.quaternions:
             raise ConfigError("The quaternions' columns are not known yet; make the policy before its processors.")

@@ -8,7 +8,8 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.mlp.configuration_mlp import matching_columns
+from bhd_lerobot.policies.mlp.configuration_mlp import check_residual, matching_columns
+from bhd_lerobot.policies.mlp.residual_mlp import position_columns
 from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
 
 FIRST = -100_000
@@ -36,6 +37,8 @@ class PixelsConfig(PerceptionConfig):
         hidden_dims: widths of the layers that predict actions.
         ignore: numbers of `observation.state` that it does not look at, by name or pattern, as in ``bhd_mlp``.
         ignored_columns: their columns; found by their names.
+        residual: predict by how much an action differs from where the robot is, as in ``bhd_mlp``.
+        residual_columns: of each action the column of `observation.state` that has its name; found by their names.
         min_std: least standard deviation that a number of the state or an action is divided by, in its own unit.
         pointing_weight: of the loss of where it looks: at what the instruction names.
         perception_weight: of the loss of ``bhd_perception``, where its weights are learned as well.
@@ -52,6 +55,8 @@ class PixelsConfig(PerceptionConfig):
     hidden_dims: list[int] = field(default_factory=lambda: [512, 512, 512])
     ignore: list[str] = field(default_factory=lambda: ["*.vel"])
     ignored_columns: list[int] = field(default_factory=list)
+    residual: bool = True
+    residual_columns: list[int] = field(default_factory=list)
     min_std: float = 1e-3
     pointing_weight: float = 0.2
     perception_weight: float = 0.1
@@ -111,6 +116,9 @@ class PixelsConfig(PerceptionConfig):
         if self.ignore and not self.ignored_columns:
             names = (features.get(OBS_STATE) or {}).get("names") or []
             self.ignored_columns = matching_columns(self.ignore, list(names))
+        if self.residual and not self.residual_columns:
+            names, actions = ((features.get(key) or {}).get("names") or [] for key in (OBS_STATE, ACTION))
+            self.residual_columns = position_columns(list(actions), list(names))
 
     def validate_features(self) -> None:
         """Keep image and state as inputs, actions and, to learn from, labels as outputs.
@@ -132,6 +140,7 @@ class PixelsConfig(PerceptionConfig):
                 f"policy.ignore is {self.ignore}, but nothing says which columns of {OBS_STATE} those are: make the "
                 "policy with the metadata of its dataset, or give policy.ignored_columns."
             )
+        check_residual(self, width)
         self.input_features = {self.image_key: known[self.image_key], OBS_STATE: known[OBS_STATE]}
         self.output_features = {key: known[key] for key in (ACTION, OBS_ENV_STATE) if key in known}
         _ = self.region

@@ -20,6 +20,7 @@ from torch.nn import functional
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint
+from bhd_lerobot.policies.mlp.residual_mlp import Residual
 from bhd_lerobot.policies.perception.labels import Labels
 from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
@@ -39,7 +40,7 @@ class PixelsPolicy(PreTrainedPolicy):
     Args:
         config: its shape and its features.
         initialise: begin with the weights of `config.perception`; not where a checkpoint's own follow.
-        kwargs: what LeRobot passes to every policy; nothing of it is needed.
+        kwargs: what LeRobot passes to every policy; of it `dataset_stats` are used, for `config.residual`.
 
     Raises:
         ConfigError: `config.perception` is no checkpoint of a ``bhd_perception`` that looks at the same images.
@@ -75,6 +76,9 @@ class PixelsPolicy(PreTrainedPolicy):
             layers += [nn.Linear(width, hidden), nn.GELU()]
             width = hidden
         self.actor = nn.Sequential(*layers, nn.Linear(width, config.chunk_size * self._action_size))
+        self.residual: Residual | None = None
+        if config.residual:
+            self.residual = Residual(config.residual_columns, kwargs.get("dataset_stats"), config.min_std)
         self._looked: dict[bytes, tuple[Tensor, Tensor]] = {}
         self.reset()
 
@@ -262,7 +266,8 @@ class PixelsPolicy(PreTrainedPolicy):
 
     def _act(self, seen: Tensor, state: Tensor) -> Tensor:
         values = torch.cat([state[:, self._columns], seen], dim=-1)
-        return self.actor(values).unflatten(-1, (self.config.chunk_size, self._action_size))
+        chunk: Tensor = self.actor(values).unflatten(-1, (self.config.chunk_size, self._action_size))
+        return chunk if self.residual is None else chunk + self.residual(state)
 
 
 class _Reader(nn.Module):

@@ -480,7 +480,11 @@ def test_objects_are_sorted_whatever_order_they_are_told_in() -> None:
 
 def test_a_policy_that_sorts_objects_does_the_same_in_any_order() -> None:
     made = config(
-        environment=80, sort_objects=True, objects=[0, 5, 16, 0, 1, 3, 4], yaw_harmonics=1, environment_quaternions=[6]
+        environment=80,
+        sort_objects=True,
+        objects=[0, 5, 16, 0, 1, *range(3, 10)],
+        yaw_harmonics=1,
+        environment_quaternions=[6],
     )
     policy = MlpPolicy(made).eval()
     before, _ = make_pre_post_processors(made, dataset_stats=None)
