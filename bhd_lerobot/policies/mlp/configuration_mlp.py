@@ -116,9 +116,8 @@ def check_residual(config: Any, width: int) -> None:
     columns, actions = config.residual_columns, int(config.action_feature.shape[0])
     if len(columns) != actions or max(columns, default=-1) < 0 or max(columns) >= width:
         raise ConfigError(
-            f"policy.residual is true, and policy.residual_columns is {columns}: of none of the {actions} actions is it "
-            f"known that {OBS_STATE} has the same position (….pos). Leave it false; for tool poses set "
-            "--robot.tool_pose=true when recording."
+            f"policy.residual is true, and policy.residual_columns is {columns}: no action is known to be a position "
+            f"(….pos) that {OBS_STATE} has, too. Leave it false; for tool poses set --robot.tool_pose=true when recording."
         )
 
 

@@ -9,6 +9,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import check_residual, matching_columns
+from bhd_lerobot.policies.mlp.objects_mlp import TOOL
 from bhd_lerobot.policies.mlp.residual_mlp import position_columns
 from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
 
@@ -39,6 +40,8 @@ class PixelsConfig(PerceptionConfig):
         ignored_columns: their columns; found by their names.
         residual: predict by how much an action differs from where the robot is, as in ``bhd_mlp``.
         residual_columns: of each action the column of `observation.state` that has its name; found by their names.
+        tool_columns: of the tool pose in `observation.state`, if it is observed: then actions also depend on where what
+            is named is from there; found by their names.
         min_std: least standard deviation that a number of the state or an action is divided by, in its own unit.
         pointing_weight: of the loss of where it looks: at what the instruction names.
         perception_weight: of the loss of ``bhd_perception``, where its weights are learned as well.
@@ -55,8 +58,9 @@ class PixelsConfig(PerceptionConfig):
     hidden_dims: list[int] = field(default_factory=lambda: [512, 512, 512])
     ignore: list[str] = field(default_factory=lambda: ["*.vel"])
     ignored_columns: list[int] = field(default_factory=list)
-    residual: bool = True
+    residual: bool = False
     residual_columns: list[int] = field(default_factory=list)
+    tool_columns: list[int] = field(default_factory=list)
     min_std: float = 1e-3
     pointing_weight: float = 0.2
     perception_weight: float = 0.1
@@ -113,12 +117,13 @@ class PixelsConfig(PerceptionConfig):
             ConfigError: it does not, or there is no such name.
         """
         super().set_dataset_feature_metadata(features)
+        names, actions = (list((features.get(key) or {}).get("names") or []) for key in (OBS_STATE, ACTION))
         if self.ignore and not self.ignored_columns:
-            names = (features.get(OBS_STATE) or {}).get("names") or []
-            self.ignored_columns = matching_columns(self.ignore, list(names))
+            self.ignored_columns = matching_columns(self.ignore, names)
         if self.residual and not self.residual_columns:
-            names, actions = ((features.get(key) or {}).get("names") or [] for key in (OBS_STATE, ACTION))
-            self.residual_columns = position_columns(list(actions), list(names))
+            self.residual_columns = position_columns(actions, names)
+        if not self.tool_columns and set(TOOL) <= set(names):
+            self.tool_columns = [names.index(name) for name in TOOL]
 
     def validate_features(self) -> None:
         """Keep image and state as inputs, actions and, to learn from, labels as outputs.

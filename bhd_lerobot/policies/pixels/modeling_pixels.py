@@ -17,10 +17,12 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_TOKENS, 
 from torch import Tensor, nn
 from torch.nn import functional
 
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
+from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint
+from bhd_lerobot.policies.mlp.objects_mlp import relative_features, relative_size
 from bhd_lerobot.policies.mlp.residual_mlp import Residual
+from bhd_lerobot.policies.mlp.yaw_mlp import yaw
 from bhd_lerobot.policies.perception.labels import Labels
 from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
@@ -63,6 +65,8 @@ class PixelsPolicy(PreTrainedPolicy):
         left, bottom, right, top = config.area
         middle = [(left + right) / 2, (bottom + top) / 2, config.object_height / 2]
         self.register_buffer("_middle", torch.tensor(middle), persistent=False)
+        self._state_mean: Tensor
+        self._state_std: Tensor
         self.register_buffer("_extent", torch.tensor([(right - left) / 2, (top - bottom) / 2, 0.05]), persistent=False)
         self._action_size = int(config.output_features[ACTION].shape[0])  # type: ignore[index]
         cell = config.channels + self.perception.answer_size
@@ -70,11 +74,18 @@ class PixelsPolicy(PreTrainedPolicy):
         self.named = _Attention(config.text_dim, cell, 1)
         self.others = _Attention(config.text_dim + cell, cell + 3, config.n_heads)
         self.value = nn.Linear(cell + 3, _VALUES)
+        # Of the state before it was normalised; of a checkpoint, with its weights.
+        known = (kwargs.get("dataset_stats") or {}).get(OBS_STATE)
+        for name, empty in (("mean", torch.zeros(state)), ("std", torch.ones(state))):
+            value = empty if known is None else torch.as_tensor(known[name], dtype=torch.float32)
+            self.register_buffer(f"_state_{name}", value.clamp(min=config.min_std) if name == "std" else value)
         width = len(columns) + cell + config.n_heads * _VALUES
+        width += relative_size(1) if config.tool_columns else 0
         layers: list[nn.Module] = []
         for hidden in config.hidden_dims:
             layers += [nn.Linear(width, hidden), nn.GELU()]
             width = hidden
+        self._yaw = 6 + len(COLOURS) + 3  # where `_look` puts the yaw
         self.actor = nn.Sequential(*layers, nn.Linear(width, config.chunk_size * self._action_size))
         self.residual: Residual | None = None
         if config.residual:
@@ -266,6 +277,13 @@ class PixelsPolicy(PreTrainedPolicy):
 
     def _act(self, seen: Tensor, state: Tensor) -> Tensor:
         values = torch.cat([state[:, self._columns], seen], dim=-1)
+        if self.config.tool_columns:
+            tool = (state * self._state_std + self._state_mean)[:, self.config.tool_columns]
+            place = seen[:, :3] * self._extent + self._middle
+            # Where the two are, and by how much what is named is turned; it is told by twice its yaw.
+            turned = torch.atan2(seen[:, self._yaw + 1], seen[:, self._yaw]) / 2 - yaw(tool[:, 3:])
+            relative = torch.cat([place - tool[:, :3], 2 * turned.unsqueeze(-1)], dim=-1)
+            values = torch.cat([values, relative_features(relative, 1)], dim=-1)
         chunk: Tensor = self.actor(values).unflatten(-1, (self.config.chunk_size, self._action_size))
         return chunk if self.residual is None else chunk + self.residual(state)
 
