@@ -117,7 +117,7 @@ def check_residual(config: Any, width: int) -> None:
     if len(columns) != actions or max(columns, default=-1) < 0 or max(columns) >= width:
         raise ConfigError(
             f"policy.residual is true, and policy.residual_columns is {columns}: no action is known to be a position "
-            f"(….pos) that {OBS_STATE} has, too. Leave it false; for tool poses set --robot.tool_pose=true when recording."
+            f"(….pos) that {OBS_STATE} has, too. Leave it false; for tool poses record with --robot.tool_pose=true."
         )
 
 
