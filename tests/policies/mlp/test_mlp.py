@@ -17,7 +17,14 @@ from torch import Tensor, nn
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import ACTIVATIONS, MlpConfig, ScanConfig
 from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
-from bhd_lerobot.policies.mlp.objects_mlp import ObjectOrderProcessorStep, object_columns
+from bhd_lerobot.policies.mlp.objects_mlp import (
+    OBS_RELATIVE,
+    ObjectOrderProcessorStep,
+    object_columns,
+    relative_features,
+    relative_size,
+)
+from bhd_lerobot.policies.mlp.residual_mlp import position_columns
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder
 from bhd_lerobot.policies.mlp.yaw_mlp import harmonics, yaw
 from bhd_lerobot.tasks.pick import ENVIRONMENT
@@ -500,3 +507,53 @@ def test_a_policy_that_sorts_objects_does_the_same_in_any_order() -> None:
 def test_sorting_objects_that_nobody_tells_of_is_refused() -> None:
     with pytest.raises(ConfigError, match="object_0_present"):
         MlpPolicy(config(environment=3, sort_objects=True))
+
+
+# --- changes of positions --------------------------------------------------------------------------------------------
+
+STATS = {
+    OBS_STATE: {"mean": torch.linspace(-1, 1, 10), "std": torch.linspace(0.1, 2, 10)},
+    ACTION: {"mean": torch.tensor([0.3, -0.2]), "std": torch.tensor([0.5, 1e-9])},
+}
+
+
+def test_a_residual_policy_that_says_nothing_stays_where_it_is() -> None:
+    made = config(residual=True, residual_columns=[3, -1])
+    policy = MlpPolicy(made, dataset_stats=STATS)
+    for parameter in policy.net.parameters():
+        nn.init.zeros_(parameter)
+    before, after = make_pre_post_processors(made, dataset_stats=STATS)
+    state = torch.randn(20, 10, generator=torch.Generator().manual_seed(0))
+    chunk = after(policy.predict_action_chunk(before({OBS_STATE: state, OBS_ENV_STATE: torch.zeros(20, 3)})))
+    assert torch.allclose(chunk[..., 0], state[:, 3:4].expand(-1, 4), atol=1e-5)  # in the robot's units
+    assert torch.allclose(chunk[..., 1], STATS[ACTION]["mean"][1].expand(20, 4))  # that which is not observed
+    # What it begins at is in the checkpoint: another policy does the same without any statistics.
+    again = MlpPolicy(made)
+    again.load_state_dict(policy.state_dict())
+    values = before({OBS_STATE: state, OBS_ENV_STATE: torch.zeros(20, 3)})
+    assert torch.equal(again.predict_action_chunk(values), policy.predict_action_chunk(values))
+
+
+def test_positions_are_found_by_their_names_and_speeds_are_none() -> None:
+    assert position_columns(["a.pos", "b.pos", "c.vel"], ["c.vel", "b.pos", "x.pos"]) == [-1, 1, -1]
+    with pytest.raises(ConfigError, match=r"--robot\.tool_pose=true"):
+        MlpPolicy(config(residual=True, residual_columns=[-1, -1]))
+
+
+def test_where_what_is_meant_is_from_the_tool_does_not_depend_on_where_both_are() -> None:
+    start, count, size, fields = object_columns(list(ENVIRONMENT))
+    step = ObjectOrderProcessorStep(start, count, size, fields, tuple(range(7)))
+    generator = torch.Generator().manual_seed(2)
+    told = told_of_objects().view(-1, 5, 16)
+    quaternion = torch.from_numpy(Rotation.random(40, rng=np.random.default_rng(0)).as_quat(scalar_first=True)).float()
+    tool = torch.cat([torch.randn(40, 3, generator=generator), quaternion], dim=1)
+    seen = step.observation({OBS_STATE: tool, OBS_ENV_STATE: told.flatten(1)})[OBS_RELATIVE]
+    shift = torch.tensor([0.3, -0.2, 0.1])
+    moved = told.clone()
+    moved[..., 3:6] += shift
+    tool = torch.cat([tool[:, :3] + shift, tool[:, 3:]], dim=1)
+    again = step.observation({OBS_STATE: tool, OBS_ENV_STATE: moved.flatten(1)})[OBS_RELATIVE]
+    assert torch.allclose(seen, again, atol=1e-5)
+    features = relative_features(seen, 2)
+    assert features.shape == (40, relative_size(2))
+    assert float(features.abs().max()) <= 1  # however far away
