@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.cnn.processor_cnn import OdometryProcessorStep
 from bhd_lerobot.policies.learned.policy import LoadedPolicy, torch_device
 from bhd_lerobot.policies.mlp.scan_mlp import ScanProcessorStep
 from bhd_lerobot.policies.mlp.yaw_mlp import YawProcessorStep
@@ -40,7 +41,9 @@ _ELEMENTWISE = (
     ScanProcessorStep,
     YawProcessorStep,
     InstructionProcessorStep,
+    OdometryProcessorStep,
 )
+_PERCEPTRONS = ("bhd_mlp", "bhd_cnn")
 _SMALL = 2_000_000  # parameters; below, a second thread costs more than it does
 _BLOCK, _BLOCK_LARGE = 64, 8
 
@@ -79,13 +82,13 @@ def make_inference(loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: 
     if threads is None and sum(p.numel() for p in loaded.policy.parameters()) < _SMALL:
         threads = 1
     is_plain = all(isinstance(step, _ELEMENTWISE) for step in (*loaded.before.steps, *loaded.after.steps))
-    if is_plain and loaded.kind in ("bhd_mlp", "bhd_pixels", "act", "diffusion"):
+    if is_plain and loaded.kind in (*_PERCEPTRONS, "bhd_pixels", "act", "diffusion"):
         return BatchedInference(loaded, sample=sample, exact=exact, threads=threads)
     return StockInference(loaded, threads=threads)
 
 
 class BatchedInference:
-    """One forward pass for all simulations that need one: `bhd_mlp`, `bhd_pixels`, ACT and Diffusion.
+    """One forward pass for all simulations that need one: `bhd_mlp`, `bhd_cnn`, `bhd_pixels`, ACT and Diffusion.
 
     The policy keeps nothing between two calls: histories and chunks belong to the caller, the averages of ACT's
     temporal ensembling, what `bhd_pixels` saw first and the random numbers to each simulation.
@@ -104,7 +107,7 @@ class BatchedInference:
     def __init__(self, loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: int | None) -> None:
         self.loaded, self._exact, self._threads = loaded, exact, threads
         config, self._kind = loaded.config, loaded.kind
-        self._sample = self._kind == "bhd_mlp" and (sample or config.sample)
+        self._sample = self._kind in _PERCEPTRONS and (sample or config.sample)
         self.steps = int(config.n_action_steps)
         self.looks_once = self._kind == "bhd_pixels"
         self.frames = (0,) if self.looks_once else tuple(config.observation_delta_indices or (0,))
@@ -156,7 +159,7 @@ class BatchedInference:
         policy = self.loaded.policy
         if self._kind == "diffusion":
             return self._diffuse(sims, batch)
-        if self._kind == "bhd_mlp":
+        if self._kind in _PERCEPTRONS:
             if not self._sample:
                 return policy.predict_action_chunk(batch)
             return policy.predict_action_chunk(batch, noise=self._noise(sims, self.loaded.config.chunk_size))

@@ -23,9 +23,10 @@ from lerobot.utils.device_utils import is_torch_device_available
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.plugins import load_plugins
+from bhd_lerobot.policies.cnn import configuration_cnn  # noqa: F401 - these four register our own
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import CONFIG_FILE, camera_name
-from bhd_lerobot.policies.mlp import configuration_mlp  # noqa: F401 - these three register our own
+from bhd_lerobot.policies.mlp import configuration_mlp  # noqa: F401
 from bhd_lerobot.policies.perception import configuration_perception  # noqa: F401
 from bhd_lerobot.policies.pixels import configuration_pixels  # noqa: F401
 
