@@ -27,6 +27,14 @@ PREFIXES = ("lerobot_robot_", "lerobot_camera_", "lerobot_teleoperator_", "lerob
 BODIES: dict[str, Callable[[], MobileBase | Arm]] = {"turtlebot3": turtlebot3_burger, "ur5": ur5}
 """What makes the body of a robot with the options that it has by default, by the robot's type."""
 
+POLICIES = {
+    "bhd_cnn": "bhd_lerobot.policies.cnn.processor_cnn",
+    "bhd_mlp": "bhd_lerobot.policies.mlp.processor_mlp",
+    "bhd_perception": "bhd_lerobot.policies.perception.processor_perception",
+    "bhd_pixels": "bhd_lerobot.policies.pixels.processor_pixels",
+}
+"""The modules that register this package's own types of policies, with their steps of processing."""
+
 _OPTION = "discover_packages_path"
 # This distribution, for LeRobot's commands. Ours register what they need; our environments take seconds to import.
 _OURS = "lerobot_robot_bhd"

@@ -50,6 +50,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "policies.navigation": ("bodies", "policies"),
     "policies.manipulation": (*_TASKS, "policies"),
     "policies.perception": ("bodies", "policies.learned", "policies.manipulation"),
+    "policies.pixels": ("bodies", "policies.learned", "policies.mlp", "policies.perception"),
     "policies.language": (*_TASKS, "policies", "policies.manipulation", "policies.perception"),
     "policies.dagger": (*_TASKS, "policies", "policies.manipulation", "policies.navigation"),
     "datasets.storage": (),
@@ -88,6 +89,10 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("registry", "rollout", "hub"),
     ),
     "training.rl": ("registry", "plugin", "tasks", "envs", "policies.*", "datasets.format", "rollout", "training"),
+    "training.dagger": (
+        *("policies", "policies.dagger", "datasets.format", "datasets.storage", "datasets.edit"),
+        *("rollout", "recording", "evaluation", "training"),
+    ),
     "apps.view": (
         "plugins",
         "tasks",

@@ -4,6 +4,7 @@ __all__ = [
     "baselines",
     "blanked",
     "brain",
+    "cnn",
     "dagger",
     "language",
     "learned",
@@ -11,4 +12,5 @@ __all__ = [
     "mlp",
     "navigation",
     "perception",
+    "pixels",
 ]

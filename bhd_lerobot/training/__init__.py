@@ -4,6 +4,7 @@ __all__ = [
     "arguments",
     "checkpoint",
     "config",
+    "dagger",
     "data",
     "env",
     "log",

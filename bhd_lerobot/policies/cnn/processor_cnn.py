@@ -1,7 +1,7 @@
 """What happens before and after `bhd_cnn`, in LeRobot's own steps and one more."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import PolicyAction
@@ -28,6 +28,9 @@ class OdometryProcessorStep(ObservationProcessorStep):
         odometry: columns of `observation.state`.
         ranges: likewise.
     """
+
+    is_elementwise: ClassVar[bool] = True
+    """What is beside it in a batch changes nothing."""
 
     odometry: list[int] = field(default_factory=list)
     ranges: list[int] = field(default_factory=list)

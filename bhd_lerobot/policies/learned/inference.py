@@ -21,27 +21,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.cnn.processor_cnn import OdometryProcessorStep
 from bhd_lerobot.policies.learned.policy import LoadedPolicy, torch_device
-from bhd_lerobot.policies.mlp.scan_mlp import ScanProcessorStep
-from bhd_lerobot.policies.mlp.yaw_mlp import YawProcessorStep
-from bhd_lerobot.policies.pixels.processor_pixels import InstructionProcessorStep
 
 type Rows = dict[str, NDArray]
 """Observations of some simulations: by key, shape (simulations, frames, …), oldest first; images uint8 (…, h, w, 3).
 Images are missing where they are not looked at."""
 
-# Steps that treat every number by itself, so that a batch, a history or a chunk may go through them in one piece.
+# Steps that treat every number by itself, so that a batch, a history or a chunk may go through them in one piece; those
+# of this package say so themselves.
 _ELEMENTWISE = (
     RenameObservationsProcessorStep,
     AddBatchDimensionProcessorStep,
     DeviceProcessorStep,
     NormalizerProcessorStep,
     UnnormalizerProcessorStep,
-    ScanProcessorStep,
-    YawProcessorStep,
-    InstructionProcessorStep,
-    OdometryProcessorStep,
 )
 _PERCEPTRONS = ("bhd_mlp", "bhd_cnn")
 _SMALL = 2_000_000  # parameters; below, a second thread costs more than it does
@@ -81,7 +74,8 @@ def make_inference(loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: 
         raise ConfigError("brain.sample is true, but this policy has no distribution (bhd_mlp with gaussian=true has).")
     if threads is None and sum(p.numel() for p in loaded.policy.parameters()) < _SMALL:
         threads = 1
-    is_plain = all(isinstance(step, _ELEMENTWISE) for step in (*loaded.before.steps, *loaded.after.steps))
+    steps = (*loaded.before.steps, *loaded.after.steps)
+    is_plain = all(isinstance(step, _ELEMENTWISE) or getattr(step, "is_elementwise", False) for step in steps)
     if is_plain and loaded.kind in (*_PERCEPTRONS, "bhd_pixels", "act", "diffusion"):
         return BatchedInference(loaded, sample=sample, exact=exact, threads=threads)
     return StockInference(loaded, threads=threads)

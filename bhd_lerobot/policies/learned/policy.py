@@ -1,6 +1,7 @@
 """A trained policy and its processors, loaded as they were saved, whatever LeRobot policy it is."""
 
 import contextlib
+import importlib
 import io
 import json
 from dataclasses import dataclass
@@ -22,13 +23,9 @@ from lerobot.utils.constants import (
 from lerobot.utils.device_utils import is_torch_device_available
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.plugins import load_plugins
-from bhd_lerobot.policies.cnn import configuration_cnn  # noqa: F401 - these four register our own
+from bhd_lerobot.plugins import POLICIES, load_plugins
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import CONFIG_FILE, camera_name
-from bhd_lerobot.policies.mlp import configuration_mlp  # noqa: F401
-from bhd_lerobot.policies.perception import configuration_perception  # noqa: F401
-from bhd_lerobot.policies.pixels import configuration_pixels  # noqa: F401
 
 
 @dataclass(frozen=True)
@@ -156,7 +153,9 @@ def _config(folder: Path, device: str) -> Any:
         kind = values["type"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{file} cannot be read ({error!r}). Copy the checkpoint again.") from error
-    if kind not in PreTrainedConfig.get_known_choices():
+    if kind in POLICIES:
+        importlib.import_module(POLICIES[kind])
+    elif kind not in PreTrainedConfig.get_known_choices():
         load_plugins()
     if kind not in PreTrainedConfig.get_known_choices():
         known = ", ".join(sorted(PreTrainedConfig.get_known_choices()))

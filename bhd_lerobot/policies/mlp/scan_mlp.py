@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
@@ -25,6 +25,9 @@ class ScanProcessorStep(ObservationProcessorStep):
         start: column of the first beam in `observation.state`.
         beams: how many there are.
     """
+
+    is_elementwise: ClassVar[bool] = True
+    """What is beside it in a batch changes nothing."""
 
     start: int = 0
     beams: int = 0

@@ -1,7 +1,7 @@
 """Orientations on their way into the network: as sines and cosines of multiples of the yaw, past the normalisation."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
@@ -22,6 +22,9 @@ class YawProcessorStep(ObservationProcessorStep):
         state: columns of `observation.state` at which a quaternion wxyz begins.
         environment: likewise of `observation.environment_state`.
     """
+
+    is_elementwise: ClassVar[bool] = True
+    """What is beside it in a batch changes nothing."""
 
     state: list[int] = field(default_factory=list)
     environment: list[int] = field(default_factory=list)

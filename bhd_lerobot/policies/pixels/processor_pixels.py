@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
@@ -25,6 +25,9 @@ class InstructionProcessorStep(ObservationProcessorStep):
     Attributes:
         length: bytes of the longest instruction, in UTF-8.
     """
+
+    is_elementwise: ClassVar[bool] = True
+    """What is beside it in a batch changes nothing."""
 
     length: int = 128
 
