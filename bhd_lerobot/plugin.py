@@ -2,10 +2,11 @@
 
 import bhd_lerobot.registry  # noqa: F401  registers the robots
 from bhd_lerobot.envs.config_env import BhdEnvConfig
+from bhd_lerobot.policies.cnn.configuration_cnn import CnnConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 
 # Importing a configuration registers its type with LeRobot's choice registries.
-__all__ = ["BhdBrainConfig", "BhdEnvConfig", "MlpConfig", "PerceptionConfig", "PixelsConfig"]
+__all__ = ["BhdBrainConfig", "BhdEnvConfig", "CnnConfig", "MlpConfig", "PerceptionConfig", "PixelsConfig"]

@@ -28,6 +28,7 @@ BODIES: dict[str, Callable[[], MobileBase | Arm]] = {"turtlebot3": turtlebot3_bu
 """What makes the body of a robot with the options that it has by default, by the robot's type."""
 
 POLICIES = {
+    "bhd_cnn": "bhd_lerobot.policies.cnn.processor_cnn",
     "bhd_mlp": "bhd_lerobot.policies.mlp.processor_mlp",
     "bhd_perception": "bhd_lerobot.policies.perception.processor_perception",
     "bhd_pixels": "bhd_lerobot.policies.pixels.processor_pixels",

@@ -45,6 +45,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "rollout.configuration"),
     "policies": _TASKS,
     "policies.mlp": ("control.geometry",),
+    "policies.cnn": ("bodies", "policies", "policies.mlp"),
     "policies.learned": ("__version__", "plugins", "control", "datasets.storage", "policies", "policies.mlp"),
     "policies.navigation": ("bodies", "policies"),
     "policies.manipulation": (*_TASKS, "policies"),

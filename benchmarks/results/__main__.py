@@ -10,6 +10,7 @@ from pathlib import Path
 
 from benchmarks.results.adaptation import fine_tune
 from benchmarks.results.aggregation import aggregate
+from benchmarks.results.camera_drive import camera_drive
 from benchmarks.results.learning import avoid, reach
 from benchmarks.results.page import write_page
 from benchmarks.results.picking import pick
@@ -22,6 +23,11 @@ from benchmarks.results.speed import navigate, speed
 MEASURES = (
     ("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),
     ("aggregate", "Avoid, by aggregation: the rule corrects its clone", aggregate),
+    (
+        "camera_drive",
+        "Avoid, from the front camera: a rule that reads the lidar corrects it",
+        camera_drive,
+    ),
     ("reach", "Reach: a UR5 brings its tool to a pose", reach),
     ("pick", "Pick, from privileged state: a UR5 picks up what an instruction names", pick),
     ("see", "Pick, from a camera: a UR5 picks up what an instruction names and what it sees", see),

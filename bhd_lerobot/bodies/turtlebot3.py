@@ -32,6 +32,8 @@ WHEEL_SEPARATION = 0.160  # [m], [urdf]
 MAX_LINEAR = 0.22  # [m/s], [manual]
 MAX_ANGULAR = 2.84  # [rad/s], [manual]
 LIDAR_BEAMS = 360  # [lds]
+RANGE_MIN, RANGE_MAX = 0.12, 3.5  # [m], [lds]
+SCANNER_AHEAD = -0.032  # [m] of the wheel axis, [urdf]
 # [N m s/rad], an estimate: the base follows its wheels' command with a time constant of 11 ms, which is
 # (mass * radius^2 / 2 + inertia of a wheel and its rotor) / gain. A stiffer servo is faster than a physics step of 5
 # ms: the tyres' forces are then computed for a torque that the step does not deliver, and the robot rears up when it
@@ -88,11 +90,11 @@ def turtlebot3_burger(
         lidar=LidarSpec(
             site="lidar",
             beams=LIDAR_BEAMS,
-            range_min=0.12,
-            range_max=3.5,
+            range_min=RANGE_MIN,
+            range_max=RANGE_MAX,
             rate_hz=5,
             noise_std=lidar_noise_std,
-            ahead=-0.032,
+            ahead=SCANNER_AHEAD,
         ),
         cameras={"front": CameraSpec("front", camera_width, camera_height)},
         radius=0.124,  # the rear corners of the hull; the outer rims of the tyres are at 0.095 m

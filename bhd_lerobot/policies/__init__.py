@@ -4,6 +4,7 @@ __all__ = [
     "baselines",
     "blanked",
     "brain",
+    "cnn",
     "dagger",
     "language",
     "learned",

@@ -7,34 +7,39 @@ import pytest
 import yaml
 from lerobot.policies.factory import make_policy
 
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_robot
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.rollout import configuration
 from bhd_lerobot.training.arguments import parse_train
+from bhd_lerobot.training.dagger.config import command, parse_aggregation, read_stages
 from tests.training.support import MLP, make_dataset, options, run_train
 
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "train"
-CONFIGS = sorted(one for one in FOLDER.glob("*.yaml") if one.name.startswith(("bc_", "act_", "diffusion_", "smolvla_")))
+KINDS = ("bc_", "act_", "cnn_", "diffusion_", "smolvla_")
+CONFIGS = sorted(one for one in FOLDER.glob("*.yaml") if one.name.startswith(KINDS))
 
 
 def described(name: str) -> dict[str, dict]:
     """Return the features of the robot's datasets."""
-    config = TurtleBot3Config(beams=36) if "turtlebot3" in name else UR5Config(tool_pose=True)
+    config = TurtleBot3Config(beams=36, odometry="cnn" in name) if "turtlebot3" in name else UR5Config(tool_pose=True)
     robot = make_robot(config)
     state, action = list(robot.observation_names), list(robot.action_names)
     vectors = {"observation.state": state, "observation.environment_state": ["goal_x", "goal_y"], "action": action}
     if "avoid" in name:
         del vectors["observation.environment_state"]
     features = {key: {"dtype": "float32", "shape": (len(one),), "names": one} for key, one in vectors.items()}
-    if "camera" in name or "smolvla" in name:
+    if "camera" in name or "smolvla" in name or "cnn" in name:
         names = ["height", "width", "channels"]
-        for camera in ("scene", "wrist"):
+        for camera in ("front",) if "turtlebot3" in name else ("scene", "wrist"):
             features[f"observation.images.{camera}"] = {"dtype": "video", "shape": (240, 320, 3), "names": names}
     return features
 
 
 def test_there_are_configurations() -> None:
-    assert len(CONFIGS) == 9
+    assert len(CONFIGS) == 10
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
@@ -54,6 +59,20 @@ def test_a_configuration_is_valid_and_its_policy_can_be_built(path: Path, tmp_pa
     if "cameras" in path.stem:
         assert "observation.environment_state" not in policy.config.input_features  # it would tell what is to be seen
     assert sum(one.numel() for one in policy.parameters()) > 1000
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("dagger_*.yaml")), ids=lambda path: path.stem)
+def test_the_stages_of_aggregation_fit_together(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(FOLDER.parents[1])
+    config = parse_aggregation([f"--config_path={path}"])
+    stages = read_stages(config)
+    assert stages.has_advice
+    robots, tasks = set(), set()
+    for stage, kind in ((config.expert, RecordConfig), (config.learner, RecordConfig), (config.evaluation, EvalConfig)):
+        parsed = configuration.parse(kind, command(stage, {}))
+        robots.add(str(parsed.robot))
+        tasks.add(str(parsed.task))
+    assert len(robots) == len(tasks) == 1
 
 
 def test_no_configuration_for_a_cpu_counts_on_a_second_processor() -> None:

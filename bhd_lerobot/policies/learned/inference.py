@@ -36,6 +36,7 @@ _ELEMENTWISE = (
     NormalizerProcessorStep,
     UnnormalizerProcessorStep,
 )
+_PERCEPTRONS = ("bhd_mlp", "bhd_cnn")
 _SMALL = 2_000_000  # parameters; below, a second thread costs more than it does
 _BLOCK, _BLOCK_LARGE = 64, 8
 
@@ -75,13 +76,13 @@ def make_inference(loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: 
         threads = 1
     steps = (*loaded.before.steps, *loaded.after.steps)
     is_plain = all(isinstance(step, _ELEMENTWISE) or getattr(step, "is_elementwise", False) for step in steps)
-    if is_plain and loaded.kind in ("bhd_mlp", "bhd_pixels", "act", "diffusion"):
+    if is_plain and loaded.kind in (*_PERCEPTRONS, "bhd_pixels", "act", "diffusion"):
         return BatchedInference(loaded, sample=sample, exact=exact, threads=threads)
     return StockInference(loaded, threads=threads)
 
 
 class BatchedInference:
-    """One forward pass for all simulations that need one: `bhd_mlp`, `bhd_pixels`, ACT and Diffusion.
+    """One forward pass for all simulations that need one: `bhd_mlp`, `bhd_cnn`, `bhd_pixels`, ACT and Diffusion.
 
     The policy keeps nothing between two calls: histories and chunks belong to the caller, the averages of ACT's
     temporal ensembling, what `bhd_pixels` saw first and the random numbers to each simulation.
@@ -100,7 +101,7 @@ class BatchedInference:
     def __init__(self, loaded: LoadedPolicy, *, sample: bool, exact: bool, threads: int | None) -> None:
         self.loaded, self._exact, self._threads = loaded, exact, threads
         config, self._kind = loaded.config, loaded.kind
-        self._sample = self._kind == "bhd_mlp" and (sample or config.sample)
+        self._sample = self._kind in _PERCEPTRONS and (sample or config.sample)
         self.steps = int(config.n_action_steps)
         self.looks_once = self._kind == "bhd_pixels"
         self.frames = (0,) if self.looks_once else tuple(config.observation_delta_indices or (0,))
@@ -152,7 +153,7 @@ class BatchedInference:
         policy = self.loaded.policy
         if self._kind == "diffusion":
             return self._diffuse(sims, batch)
-        if self._kind == "bhd_mlp":
+        if self._kind in _PERCEPTRONS:
             if not self._sample:
                 return policy.predict_action_chunk(batch)
             return policy.predict_action_chunk(batch, noise=self._noise(sims, self.loaded.config.chunk_size))

@@ -263,6 +263,16 @@ class MlpConfig(PreTrainedConfig):
         self.scan.check()
 
     @property
+    def image_key(self) -> str | None:
+        """Key of the image that it looks at; nothing, because it reads numbers."""
+        return None
+
+    @property
+    def sight_size(self) -> int:
+        """How many inputs of the perceptron are made of images."""
+        return 0
+
+    @property
     def quaternions(self) -> int:
         """How many quaternions there are among the inputs, as far as is known."""
         return len(self.state_quaternions) + len(self.environment_quaternions)
@@ -347,15 +357,15 @@ class MlpConfig(PreTrainedConfig):
             ConfigError: there is no input or no action, or the beams lie outside the state.
         """
         known: dict[str, PolicyFeature] = self.input_features or {}
-        kept = {key: feature for key, feature in known.items() if key in (OBS_STATE, OBS_ENV_STATE)}
+        kept = {key: feature for key, feature in known.items() if key in (OBS_STATE, OBS_ENV_STATE, self.image_key)}
         self.input_features = kept
         if not kept:
-            raise ConfigError(f"bhd_mlp reads {OBS_STATE} and {OBS_ENV_STATE}; the dataset has neither.")
+            raise ConfigError(f"{self.type} reads {OBS_STATE} and {OBS_ENV_STATE}; the dataset has neither.")
         if self.action_feature is None:
-            raise ConfigError("bhd_mlp needs an action to predict; the dataset has none.")
+            raise ConfigError(f"{self.type} needs an action to predict; the dataset has none.")
         for key, feature in {**kept, **(self.output_features or {})}.items():
             if feature.type != FeatureType.VISUAL and len(feature.shape) != 1:
-                raise ConfigError(f"bhd_mlp reads and writes vectors; {key} has the shape {tuple(feature.shape)}.")
+                raise ConfigError(f"{self.type} reads and writes vectors; {key} has the shape {tuple(feature.shape)}.")
         state = self.robot_state_feature
         width = state.shape[0] if state else 0
         if self.ignore and not self.ignored_columns:
@@ -379,7 +389,7 @@ class MlpConfig(PreTrainedConfig):
                 raise ConfigError(f"Quaternions at the columns {columns} do not fit into the {size} of {key}.")
         check_residual(self, width)
         self._check_objects(kept[OBS_ENV_STATE].shape[0] if OBS_ENV_STATE in kept else 0)
-        if len(set(self.ignored_columns)) == width and OBS_ENV_STATE not in kept:
+        if len(set(self.ignored_columns)) == width and OBS_ENV_STATE not in kept and not self.sight_size:
             raise ConfigError(f"policy.ignore is {self.ignore}, which leaves nothing to look at.")
         scan = self.scan
         if scan.is_used and (not scan.beams or scan.start is None or scan.start + scan.beams > width):

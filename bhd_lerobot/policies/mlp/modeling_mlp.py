@@ -26,10 +26,8 @@ ACTIVATION_LAYERS: dict[str, type[nn.Module]] = {
 }
 _LOG_STD = (-5.0, 2.0)  # a standard deviation that goes to 0 makes the loss go to minus infinity
 _PADDING = "action_is_pad"
+_PREPROCESSED = " Run the policy's own preprocessor first."
 _HINTS = {
-    OBS_SCAN: " Run the policy's own preprocessor first.",
-    OBS_YAW: " Run the policy's own preprocessor first.",
-    OBS_RELATIVE: " Run the policy's own preprocessor first.",
     OBS_ENV_STATE: " It comes from a task; a robot's own sensors, and so lerobot-rollout, lack it. Run this policy in "
     "bhd-eval or lerobot-eval, or train one on the sensors alone: "
     "--policy.input_features='{observation.state: {type: STATE, shape: [WIDTH]}}'.",
@@ -61,6 +59,7 @@ class MlpPolicy(PreTrainedPolicy):
         state_size = int(state.shape[0]) if state else 0
         environment_size = int(environment.shape[0]) if environment else 0
         self._keys = [key for key, width in ((OBS_STATE, state_size), (OBS_ENV_STATE, environment_size)) if width]
+        self._kept_keys = [*self._keys, OBS_SCAN, OBS_YAW, OBS_RELATIVE]  # of which a history is kept
         scan, steps = config.scan, config.n_obs_steps
         columns = other_columns(state_size, scan.start or 0, scan.beams if scan.is_used else 0, config.ignored_columns)
         # Not part of the checkpoint: the configuration says it.
@@ -71,7 +70,9 @@ class MlpPolicy(PreTrainedPolicy):
         yaws = 2 * config.yaw_harmonics * config.quaternions
         self._is_relative = config.sort_objects and bool(config.tool_columns)
         relative = relative_size(config.yaw_harmonics) if self._is_relative else 0
-        self.feature_size = steps * (len(columns) + environment_size + yaws + relative) + self._beams
+        self.feature_size = (
+            steps * (len(columns) + environment_size + yaws + relative) + self._beams + config.sight_size
+        )
         self.net = nn.Sequential(*_perceptron(config, self.feature_size, config.chunk_size * self._action_size))
         self.residual: Residual | None = None
         if config.residual:
@@ -150,9 +151,12 @@ class MlpPolicy(PreTrainedPolicy):
                 (batch, chunk_size), if any is.
             reduction: ``"mean"``, or ``"none"`` for one loss a row, shape (batch,).
         """
+        return self._compared(self._chunk(self.features(batch), batch), batch, reduction)
+
+    def _compared(self, mean: Tensor, batch: dict[str, Tensor], reduction: str) -> tuple[Tensor, dict[str, float]]:
+        """Return what `forward` returns, given the chunks that were predicted, shape (batch, chunk_size, actions)."""
         target = batch[ACTION]
         target = target.unsqueeze(1) if target.ndim == 2 else target
-        mean = self._chunk(batch)
         loss = self._loss(mean, target)
         padding = batch.get(_PADDING)
         valid = torch.ones_like(loss[..., :1]) if padding is None else (~padding).unsqueeze(-1).to(loss.dtype)
@@ -177,7 +181,7 @@ class MlpPolicy(PreTrainedPolicy):
             ConfigError: noise for a policy that is not Gaussian.
         """
         self.eval()
-        mean = self._chunk(batch)
+        mean = self._chunk(self.features(batch), batch)
         if noise is None and self.config.sample:
             noise = torch.randn_like(mean)
         if noise is None:
@@ -189,7 +193,7 @@ class MlpPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], noise: Tensor | None = None, **_: Any) -> Tensor:
         """Return the next action, normalised, shape (batch, actions); look again when the last chunk is used up."""
-        for key in (*self._keys, OBS_SCAN, OBS_YAW, OBS_RELATIVE):
+        for key in self._kept_keys:
             if key not in batch:
                 continue
             seen = self._seen.setdefault(key, deque(maxlen=self.config.history))
@@ -202,15 +206,16 @@ class MlpPolicy(PreTrainedPolicy):
             self._planned.extend(chunk[:, : self.config.n_action_steps].transpose(0, 1))
         return self._planned.popleft()
 
-    def _chunk(self, batch: dict[str, Tensor]) -> Tensor:
-        chunk: Tensor = self.net(self.features(batch)).unflatten(-1, (self.config.chunk_size, self._action_size))
+    def _chunk(self, features: Tensor, batch: dict[str, Tensor]) -> Tensor:
+        chunk: Tensor = self.net(features).unflatten(-1, (self.config.chunk_size, self._action_size))
         return chunk if self.residual is None else chunk + self.residual(self._history(batch, OBS_STATE)[:, -1])
 
     def _history(self, batch: dict[str, Tensor], key: str) -> Tensor:
         """Return an input, shape (batch, n_obs_steps, width)."""
         values = batch.get(key)
         if values is None:
-            raise ConfigError(f"bhd_mlp was trained with {key!r}, which is not in the batch.{_HINTS.get(key, '')}")
+            hint = _HINTS.get(key, "" if key in self._keys else _PREPROCESSED)
+            raise ConfigError(f"{self.name} was trained with {key!r}, which is not in the batch.{hint}")
         values = values.unsqueeze(1) if values.ndim == 2 else values
         if values.shape[1] != self.config.n_obs_steps:
             raise ConfigError(

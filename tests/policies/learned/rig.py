@@ -13,6 +13,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from numpy.typing import NDArray
 
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
+from bhd_lerobot.policies.cnn.configuration_cnn import CnnConfig
 from bhd_lerobot.policies.learned.brain import LearnedBrain, LearnedBrainConfig
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
@@ -64,6 +65,15 @@ KINDS: dict[str, tuple[type, dict[str, Any]]] = {
     "diffusion": (DiffusionConfig, _SMALL_DIFFUSION),
     "diffusion_ddim": (DiffusionConfig, {**_SMALL_DIFFUSION, "noise_scheduler_type": "DDIM"}),
     "diffusion_image": (DiffusionConfig, _SMALL_DIFFUSION),
+    # Any three numbers are odometry.
+    "cnn_image": (
+        CnnConfig,
+        {
+            **_MLP,
+            **{"n_obs_steps": 3, "obs_stride": 2, "channels": [4, 6], "image_dim": 16, "ignored_columns": [0, 1]},
+            **{"range_columns": [5, 2, 3], "range_angles": [-0.5, 0.0, 0.5], "odometry_columns": [6, 7, 8]},
+        },
+    ),
     "pixels_image": (PixelsConfig, {"hidden_dims": [32], "chunk_size": 6, "n_action_steps": 3, "camera": "front"}),
 }
 INSTRUCTION = "drive"
@@ -87,7 +97,7 @@ def save_policy(folder: Path, kind: str = "mlp", **overrides: Any) -> Path:
         outputs["observation.environment_state"] = PolicyFeature(FeatureType.ENV, (len(LABELS),))
         options["ignored_columns"] = [0, 1]
     config: Any = config_class(device="cpu", input_features=inputs, output_features=outputs, **options)
-    if isinstance(config, MlpConfig):
+    if isinstance(config, MlpConfig) and kind != "cnn_image":
         config.set_dataset_feature_metadata({"observation.state": {"names": list(STATE)}})
     torch.manual_seed(7)
     policy = get_policy_class(config.type)(config)

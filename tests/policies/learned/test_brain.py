@@ -54,7 +54,7 @@ def test_alone_its_actions_are_those_of_lerobot_to_the_bit(checkpoints: dict[str
         assert len(np.unique(actions, axis=0)) == FRAMES  # something was there to compare
 
 
-@pytest.mark.parametrize("kind", ["mlp_history", "act_average", "diffusion", "mlp_sample", "pixels_image"])
+@pytest.mark.parametrize("kind", ["mlp_history", "act_average", "diffusion", "mlp_sample", "pixels_image", "cnn_image"])
 def test_any_policy_runs_as_copies_with_the_actions_of_lerobot(checkpoints: dict[str, Path], kind: str) -> None:
     brain, stock = make_brain(checkpoints[kind]), Stock(checkpoints[kind])
     brain.inference = StockInference(brain.loaded, threads=None)

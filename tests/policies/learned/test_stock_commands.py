@@ -175,8 +175,60 @@ def from_pixels(folder: Path, program: str) -> Trained:
     )
 
 
+@pytest.fixture(scope="module")
+def cnn_by_lerobot_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    return from_front_camera(tmp_path_factory.mktemp("cnn"), "lerobot-train")
+
+
+@pytest.fixture(scope="module")
+def cnn_by_bhd_train(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    return from_front_camera(tmp_path_factory.mktemp("cnn"), "bhd-train")
+
+
+def from_front_camera(folder: Path, program: str) -> Trained:
+    """Return a TurtleBot3's `bhd_cnn`, which remembers images and odometry."""
+    body = {"robot__odometry": "true", "robot__camera": "true", "robot__camera_width": 64, "robot__camera_height": 48}
+    robot = arguments(robot__type="turtlebot3", robot__beams=BEAMS, **body)
+    run_record(folder / "data", robot__beams=BEAMS, **body, dataset__episode_time_s=1.0, dataset__num_episodes=2)
+    options = arguments(
+        dataset__repo_id="test/avoid",
+        dataset__root=folder / "data",
+        dataset__use_imagenet_stats="false",
+        policy__type="bhd_cnn",
+        policy__device="cpu",
+        policy__push_to_hub="false",
+        policy__hidden_dims="[16]",
+        policy__n_obs_steps=3,
+        policy__obs_stride=2,
+        batch_size=4,
+        steps=2,
+        save_freq=2,
+        output_dir=folder / "run",
+    )
+    if program == "bhd-train":
+        assert train.main([*options, "--threads=1"]) == 0
+    else:
+        run_stock("lerobot-train", [*options, *arguments(num_workers=0, env_eval_freq=0)])
+    return Trained(
+        folder / "run" / "checkpoints" / "last" / "pretrained_model",
+        [*robot, *arguments(task__type="avoid", task__duration_s=1.0)],
+        arguments(
+            env__type="bhd",
+            env__task="TurtleBot3Avoid-v0",
+            env__cameras="true",
+            env__robot=f"{{beams: {BEAMS}, odometry: true, camera_width: 64, camera_height: 48}}",
+            env__task_options="{duration_s: 1.0}",
+        ),
+        [*robot, *arguments(robot__arena="random", robot__seed=SEED)],
+    )
+
+
 @pytest.mark.parametrize(
-    "which", ["by_lerobot_train", "by_bhd_train", "pixels_by_lerobot_train", "pixels_by_bhd_train"]
+    "which",
+    [
+        *("by_lerobot_train", "by_bhd_train", "pixels_by_lerobot_train", "pixels_by_bhd_train"),
+        *("cnn_by_lerobot_train", "cnn_by_bhd_train"),
+    ],
 )
 def test_a_checkpoint_does_the_same_in_all_three_programs(
     which: str, request: pytest.FixtureRequest, tmp_path: Path

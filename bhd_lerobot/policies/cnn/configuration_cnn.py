@@ -1,0 +1,162 @@
+"""Configuration of `bhd_cnn`: a base's camera and odometry in, a chunk of actions out."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+
+from bhd_lerobot.bodies.turtlebot3 import RANGE_MAX, RANGE_MIN, SCANNER_AHEAD
+from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.brain import find_scan
+from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
+
+ODOMETRY = ("x.pos", "y.pos", "theta.pos")
+_LEAST_SIZE = 16  # [px]
+_SPACING_DEG = 2.0  # between two directions in which ranges are learned, at least
+
+
+@PreTrainedConfig.register_subclass("bhd_cnn")
+@dataclass
+class CnnConfig(MlpConfig):
+    """Configuration of the policy type ``bhd_cnn``.
+
+    It is a ``bhd_mlp``, whose options it has, that looks at images in place of a range finder. To act it needs the
+    camera and the wheels' odometry. The beams of a range finder are needed to learn, never to act: of every image the
+    network also says how far away things are in the directions that it shows. Of the last `n_obs_steps` images it
+    keeps this in mind, so that it knows about things that the camera does not show any more.
+
+    Attributes:
+        camera: name of the camera that it looks through.
+        field_of_view: ranges are learned in directions up to half of this to either side [deg]; what the camera sees.
+        range_minimum: nearer things count as being at this range [m].
+        range_maximum: farther things count as being at this range [m].
+        scanner_ahead: where the range finder is, ahead of the point that the robot turns about [m].
+        channels: of the convolutions, each of which halves the image's width and height.
+        image_dim: numbers that an image becomes.
+        sectors: directions around the robot for each of which it keeps in mind the nearest thing.
+        range_weight: of the loss of the ranges, beside that of the actions.
+        range_columns: columns of `observation.state` that are the ranges to learn; found by their names.
+        range_angles: their directions [rad], counter-clockwise from straight ahead.
+        odometry_columns: columns that are the odometry, x [m], y [m] and yaw [rad]; found by their names.
+    """
+
+    n_obs_steps: int = 8
+    obs_stride: int = 5
+    chunk_size: int = 1
+    ignore: list[str] = field(default_factory=lambda: ["*.vel"])
+
+    camera: str = "front"
+    field_of_view: float = 60.0
+    range_minimum: float = RANGE_MIN
+    range_maximum: float = RANGE_MAX
+    scanner_ahead: float = SCANNER_AHEAD
+    channels: list[int] = field(default_factory=lambda: [12, 24, 32])
+    image_dim: int = 128
+    sectors: int = 36
+    range_weight: float = 1.0
+    range_columns: list[int] = field(default_factory=list)
+    range_angles: list[float] = field(default_factory=list)
+    odometry_columns: list[int] = field(default_factory=list)
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            **dict.fromkeys(("STATE", "ENV", "ACTION"), NormalizationMode.MEAN_STD),
+        }
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot be honoured.
+
+        Raises:
+            ConfigError: names the value and the valid ones.
+        """
+        super().__post_init__()
+        for name in ("image_dim", "sectors"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"policy.{name} is {getattr(self, name)}; it must be at least 1.")
+        if not self.channels or min(self.channels) < 1:
+            raise ConfigError(f"policy.channels is {self.channels}; it must name at least one width, of at least 1.")
+        if not 0 < self.field_of_view <= 360:
+            raise ConfigError(f"policy.field_of_view is {self.field_of_view}; it must be in (0, 360] [deg].")
+        if not 0 < self.range_minimum < self.range_maximum < math.inf:
+            raise ConfigError(
+                f"policy.range_minimum is {self.range_minimum} and policy.range_maximum is {self.range_maximum}; the "
+                "first must be positive and below the second [m]."
+            )
+        if not 0 <= self.range_weight < math.inf:
+            raise ConfigError(f"policy.range_weight is {self.range_weight}; it must be 0 or positive, and finite.")
+        if self.scan.is_used:
+            raise ConfigError("bhd_cnn does not read a range finder; leave policy.scan out, or train a bhd_mlp.")
+
+    @property
+    def image_key(self) -> str:
+        """The image's key in datasets and batches."""
+        return f"{OBS_IMAGES}.{self.camera}"
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height of the image [px]."""
+        _, height, width = (self.input_features or {})[self.image_key].shape
+        return int(width), int(height)
+
+    @property
+    def sight_size(self) -> int:
+        """How many inputs of the perceptron are made of images: of the present one, and of all that is kept in mind."""
+        return self.image_dim + self.sectors
+
+    def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
+        """Find odometry and ranges by their names, and read neither as numbers; LeRobot's `make_policy` calls it.
+
+        Raises:
+            ConfigError: the dataset lacks one of them.
+        """
+        names = list((features.get(OBS_STATE) or {}).get("names") or [])
+        if missing := [name for name in ODOMETRY if name not in names]:
+            raise ConfigError(
+                f"bhd_cnn keeps in mind where things are by the robot's odometry, and {OBS_STATE} of this dataset has "
+                f"no {missing[0]!r}. Record it with --robot.odometry=true."
+            )
+        beams, angles = find_scan(names, self.type)
+        super().set_dataset_feature_metadata(features)
+        if self.range_columns:
+            return
+        self.odometry_columns = [names.index(name) for name in ODOMETRY]
+        every = max(1, round(_SPACING_DEG * len(angles) / 360))
+        seen = [i for i in range(0, len(angles), every) if abs(math.degrees(angles[i])) <= self.field_of_view / 2]
+        seen.sort(key=lambda beam: float(angles[beam]))
+        self.range_columns = [beams.start + beam for beam in seen]
+        self.range_angles = [float(angles[beam]) for beam in seen]
+        unread = {*self.ignored_columns, *self.odometry_columns, *range(beams.start, beams.stop)}
+        self.ignored_columns = sorted(unread)
+
+    def validate_features(self) -> None:
+        """Keep the inputs that it reads, and refuse what it cannot be built for.
+
+        Raises:
+            ConfigError: image, odometry, ranges or action are missing.
+        """
+        known = self.input_features or {}
+        cameras = [key for key, one in known.items() if one.type == FeatureType.VISUAL]
+        if self.image_key not in cameras:
+            raise ConfigError(
+                f"policy.camera is {self.camera!r}, and the dataset has no {self.image_key!r}. It has "
+                f"{', '.join(cameras) or 'no images'}. Record it with --robot.camera=true, or set --policy.camera."
+            )
+        super().validate_features()
+        if min(self.image_size) < _LEAST_SIZE:
+            width, height = self.image_size
+            raise ConfigError(
+                f"The images of {self.image_key!r} are {width} x {height} px; bhd_cnn needs at least {_LEAST_SIZE} x "
+                f"{_LEAST_SIZE}."
+            )
+        size = self.robot_state_feature.shape[0] if self.robot_state_feature else 0
+        columns = [*self.range_columns, *self.odometry_columns]
+        if not self.range_columns or len(self.odometry_columns) != len(ODOMETRY) or max(columns) >= size:
+            raise ConfigError(
+                f"bhd_cnn does not know which columns of {OBS_STATE} are ranges and odometry: make the policy with the "
+                "metadata of its dataset."
+            )
