@@ -11,6 +11,7 @@ from pathlib import Path
 from benchmarks.results.adaptation import fine_tune
 from benchmarks.results.aggregation import aggregate
 from benchmarks.results.learning import avoid, pick, reach
+from benchmarks.results.monitored import monitored
 from benchmarks.results.page import write_page
 from benchmarks.results.runner import REPOSITORY, FailedError, Runner
 from benchmarks.results.section import Section
@@ -21,6 +22,7 @@ from benchmarks.results.speed import navigate, speed
 MEASURES = (
     ("avoid", "Avoid: a TurtleBot3 roams without touching anything", avoid),
     ("aggregate", "Avoid, by aggregation: the rule corrects its clone", aggregate),
+    ("monitored", "Avoid, by aggregation and then PPO, with the collision monitor", monitored),
     ("reach", "Reach: a UR5 brings its tool to a pose", reach),
     ("pick", "Pick, from privileged state: a UR5 picks up what an instruction names", pick),
     ("see", "Pick, from a camera: a UR5 picks up what an instruction names and what it sees", see),
