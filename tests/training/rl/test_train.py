@@ -342,6 +342,8 @@ def test_a_checkpoint_of_another_robot_is_refused(finished: RlResult, tmp_path: 
         run(tmp_path / "run", start_from=finished.checkpoint, **config)
     with pytest.raises(ConfigError, match="trained on other observation features"):
         run(tmp_path / "beams", start_from=finished.checkpoint, robot__beams=72)
+    with pytest.raises(ConfigError, match="sees 2 observations already"):
+        run(tmp_path / "history", start_from=finished.checkpoint, see_history=True)
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(tmp_path: Path) -> None:
