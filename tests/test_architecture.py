@@ -88,7 +88,9 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("plugin", "tasks", "robots.host", "envs", "policies.*", *_DATASETS, "datasets.loader", "datasets.remote"),
         *("registry", "rollout", "hub"),
     ),
-    "training.rl": ("registry", "plugin", "tasks", "envs", "policies.*", "datasets.format", "rollout", "training"),
+    "training.rl": (
+        *("registry", "plugin", "control", "tasks", "envs", "policies.*", "datasets.format", "rollout", "training"),
+    ),
     "training.dagger": (
         *("policies", "policies.dagger", "datasets.format", "datasets.storage", "datasets.edit"),
         *("rollout", "recording", "evaluation", "training"),

@@ -12,6 +12,7 @@ from benchmarks.results.adaptation import fine_tune
 from benchmarks.results.aggregation import aggregate
 from benchmarks.results.camera_drive import camera_drive
 from benchmarks.results.learning import avoid, reach
+from benchmarks.results.monitored import monitored
 from benchmarks.results.page import write_page
 from benchmarks.results.picking import pick
 from benchmarks.results.runner import REPOSITORY, FailedError, Runner
@@ -28,6 +29,7 @@ MEASURES = (
         "Avoid, from the front camera: a rule that reads the lidar corrects it",
         camera_drive,
     ),
+    ("monitored", "Avoid, by aggregation and then PPO, with the collision monitor", monitored),
     ("reach", "Reach: a UR5 brings its tool to a pose", reach),
     ("pick", "Pick, from privileged state: a UR5 picks up what an instruction names", pick),
     ("see", "Pick, from a camera: a UR5 picks up what an instruction names and what it sees", see),

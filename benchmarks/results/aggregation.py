@@ -19,14 +19,9 @@ _SUCCESS_GOAL, _SCORE_GOAL = 0.985, 0.97
 
 def aggregate(run: Runner, section: Section) -> None:
     """Clone a rule, let the clone drive and the rule say what it would do, and learn from both, in rounds."""
-    config, last = "configs/train/dagger_turtlebot3_avoid.yaml", 1 if run.is_short else ROUNDS
-    seconds = []
-    for seed in SEEDS:
-        command = ["bhd-train", f"--config_path={config}", f"--seed={seed}", f"--output_dir={run.path(_folder(seed))}"]
-        options = _SHORT if run.is_short else (f"--rounds={ROUNDS}",)
-        seconds.append(run.run(f"aggregate_train_{seed}", [*command, *options]).seconds)
+    made = {seed: aggregated(run, seed) for seed in SEEDS}
     brains = {"clone": f"{_folder(0)}/round_0/policy"}
-    brains |= {f"seed_{seed}": f"{_folder(seed)}/round_{last}/policy" for seed in SEEDS}
+    brains |= {f"seed_{seed}": policy for seed, (policy, _) in made.items()}
     results = evaluate(
         run,
         "aggregate_eval",
@@ -49,13 +44,22 @@ def aggregate(run: Runner, section: Section) -> None:
         what = f"{name} / gap_follower: mean score, paired"
         section.rows.append(Row(what, mean(asdict(ratio)), f"at least {_SCORE_GOAL}", ratio.value >= _SCORE_GOAL))
     rates = [results["brains"][f"seed_{seed}"]["success"]["value"] for seed in SEEDS]
-    section.rows.append(Row("time from nothing to the first seed's policy", f"{seconds[0]:.0f} s"))
+    section.rows.append(Row("time from nothing to the first seed's policy", f"{made[0][1]:.0f} s"))
     section.remarks.append(
         f"{len(SEEDS)} seeds of recording and training; success from {min(rates):.1%} to {max(rates):.1%}. `clone` "
-        f"learned from episodes of `gap_follower` alone. In {last} further rounds the last policy drove, the rule took "
+        f"learned from episodes of `gap_follower` alone. In the further rounds the last policy drove, the rule took "
         "over before collisions and said in every frame what it would do; the others learned that, from all episodes "
         "so far."
     )
+
+
+def aggregated(run: Runner, seed: int) -> tuple[str, float]:
+    """Clone a rule by aggregation, and return the folder of the policy and how long that took [s]."""
+    config = "configs/train/dagger_turtlebot3_avoid.yaml"
+    command = ["bhd-train", f"--config_path={config}", f"--seed={seed}", f"--output_dir={run.path(_folder(seed))}"]
+    options = _SHORT if run.is_short else (f"--rounds={ROUNDS}",)
+    seconds = run.run(f"aggregate_train_{seed}", [*command, *options]).seconds
+    return f"{_folder(seed)}/round_{1 if run.is_short else ROUNDS}/policy", seconds
 
 
 def _folder(seed: int) -> str:

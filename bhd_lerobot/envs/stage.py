@@ -69,6 +69,7 @@ class Stage:
         frames: longest duration of an episode [frames].
         seeds: seed of the episode that each simulation is in, shape (n,).
         scenes: its scene, by simulation.
+        limits: `Limit` flags of the last frame, shape (n,).
 
     Args:
         robot: the robot's configuration.
@@ -83,6 +84,7 @@ class Stage:
         self.task = make_task(task, n, robot.fps, self.simulation.body)
         self.frames = max(1, round(self.task.duration_s * robot.fps))
         self.seeds = np.zeros(n, np.int64)
+        self.limits: NDArray[np.int64] = np.zeros(n, np.int64)
         self.scenes: list[Any] = [None] * n
         self._truth: Any = None
         self._eyes: Camera | None = None
@@ -100,6 +102,7 @@ class Stage:
         self.simulation.reset(ids, scenes, seeds)
         self.task.begin(ids, scenes)
         self.seeds[ids] = seeds
+        self.limits[ids] = 0
         for sim, scene in zip(ids.tolist(), scenes, strict=True):
             self.scenes[sim] = scene
         self._truth = None
@@ -141,7 +144,7 @@ class Stage:
         """
         simulation = self.simulation
         report = simulation.step(actions)
-        self._truth = simulation.truth(report)
+        self._truth, self.limits = simulation.truth(report), report.limits.copy()
         reward, event = self.task.judge(self._truth, simulation.running)
         event = add_faults(event, report.mode, simulation.running)
         truncated = event == Event.TIMEOUT

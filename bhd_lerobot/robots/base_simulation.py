@@ -20,6 +20,10 @@ from bhd_lerobot.tasks.task import BaseTruth
 if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
     from bhd_lerobot.robots.config import MobileBaseConfig
 
+_ANGLES = np.radians(np.arange(0.0, 360.0, 10.0))
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(len(_ANGLES))], axis=1)
+"""Unit vectors, counter-clockwise from ahead, in which a privileged state measures, shape (36, 3)."""
+
 
 class BaseSimulation(BaseHost, Simulation):
     """n simulated bases.
@@ -41,6 +45,7 @@ class BaseSimulation(BaseHost, Simulation):
             raise AssertionError(f"{body.name} has no lidar; the configuration has checked that.")
         world = World(body, n, physics_hz=config.physics_hz, threads=threads)
         self.lidar = Lidar(world, body.lidar, config.beams)
+        self._radius, self._fastest = body.radius, np.asarray(body.limits.velocity)
         super().__init__(
             config,
             SimulatedPlant(world),
@@ -60,6 +65,15 @@ class BaseSimulation(BaseHost, Simulation):
     def truth(self, report: FrameReport | None = None) -> BaseTruth:
         """Return where the bases are, and whether they touched the scene since the start of the last frame."""
         return BaseTruth(self.world.base_pose, self._touched.copy())
+
+    def privileged_state(self) -> NDArray[np.float64]:
+        """Return how near the scene is now, without noise and delay, and the twists that are commanded, shape (n, 38).
+
+        The first are the radius over the distance from the lidar in `_DIRECTIONS`, at most 1.
+        """
+        distance, _ = self.world.rays(self.lidar.spec.site, _DIRECTIONS)
+        near = self._radius / np.maximum(distance, self._radius)
+        return np.concatenate([near, self._controller.command / self._fastest], axis=1)
 
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pose of the base in recorded states, shape (frames, 7)."""

@@ -18,6 +18,7 @@ TRAIL = tuple(f"trail_{bearing:g}deg_{distance:g}m" for bearing in _BEARINGS_DEG
 """Places around the robot, bearing counter-clockwise from its front [deg] and distance [m]: 1 in a cell that it has
 visited in this episode, 0 in any other."""
 
+_TINY = 1e-9
 _TRAIL_XY = np.stack([f(np.radians(_BEARINGS_DEG))[:, None] * _DISTANCES_M for f in (np.cos, np.sin)]).reshape(2, -1)
 
 
@@ -102,6 +103,21 @@ class AvoidTask(BaseTask):
         points = np.stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left], axis=-1)
         cell, inside = self._cells(points)
         return (self._visited[self._sims[:, None], cell] & inside).astype(np.float64)
+
+    def privileged_state(self) -> NDArray[np.float64]:
+        """Return how far a robot is from being stuck, the score so far, and the path that success needs, shape (n, 3).
+
+        The first and the last are paths as a share of what they must be, up to 2 and 1.
+        """
+        config, visited = self.config, self._visited.sum(axis=1)
+        paths = [
+            np.clip(path / max(least, _TINY), 0.0, most)
+            for path, least, most in (
+                (self._path.recent, config.stuck_path_m, 2.0),
+                (self._path.total, config.min_path_m, 1.0),
+            )
+        ]
+        return np.stack([*paths, visited / np.maximum(self._free.sum(axis=1), 1)], axis=1)
 
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[Arena]) -> None:
         """Start episodes: the robot stands at each arena's start."""

@@ -57,6 +57,10 @@ class OperatorTask:
         success = event == Event.SUCCESS
         return Outcome(success, event, float(success))
 
+    def privileged_state(self) -> NDArray[np.float64]:
+        """Return what the task itself returns."""
+        return self._task.privileged_state()
+
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the task, and that a person judges it."""
         return {**self._task.parameters(), "judged_by": "operator"}

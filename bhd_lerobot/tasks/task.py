@@ -181,6 +181,12 @@ class Task(Protocol):
     def environment_state(self, truth: Any) -> NDArray[np.float64]:
         """Return what the task reports to the brain now, shape (n, len(environment_names))."""
 
+    def privileged_state(self) -> NDArray[np.float64]:
+        """Return what decides an outcome and no brain is told, numbers around 1, shape (n, any); for a critic.
+
+        How much time is left is not among it: an episode whose time is over is truncated, and its value goes on.
+        """
+
     def judge(self, truth: Any, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the reward and the `Event` of the frame that just ended, each of shape (n,).
 
@@ -235,6 +241,10 @@ class ConfiguredTask:
         """Report nothing to the brain, shape (n, 0)."""
         return np.zeros((len(self._sims), 0))
 
+    def privileged_state(self) -> NDArray[np.float64]:
+        """Return nothing, shape (n, 0)."""
+        return np.zeros((len(self._sims), 0))
+
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the task."""
         return {"type": self.name, **asdict(self.config)}
@@ -262,6 +272,7 @@ class PathLengths:
 
     Attributes:
         total: in all [m], shape (n,).
+        recent: in the last `window` frames [m], shape (n,).
 
     Args:
         n: number of robots.
@@ -269,12 +280,12 @@ class PathLengths:
     """
 
     def __init__(self, n: int, window: int) -> None:
-        self.total = np.zeros(n)
+        self.total, self.recent = np.zeros(n), np.zeros(n)
         self._history = np.zeros((window, n))  # totals of the last frames, a ring
 
     def begin(self, ids: NDArray[np.intp]) -> None:
         """Start episodes in some simulations."""
-        self.total[ids] = 0.0
+        self.total[ids] = self.recent[ids] = 0.0
         self._history[:, ids] = 0.0
 
     def add(self, step: NDArray[np.float64], frame: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -286,6 +297,6 @@ class PathLengths:
         """
         self.total += step
         at = frame % len(self._history), np.arange(len(step))
-        recent = self.total - self._history[at]  # the ring's oldest entry: the path one window ago
+        self.recent = self.total - self._history[at]  # the ring's oldest entry: the path one window ago
         self._history[at] = self.total
-        return recent
+        return self.recent

@@ -15,10 +15,12 @@ from benchmarks.envs import BARE, OURS, TooLateError, summary, time_limit
 from benchmarks.results.__main__ import MEASURES
 from benchmarks.results.adaptation import recovered
 from benchmarks.results.learning import values
+from benchmarks.results.monitored import rows as monitored_rows
 from benchmarks.results.page import write_page
 from benchmarks.results.runner import FailedError, Runner
 from benchmarks.results.section import Row, Section, over_seeds
 from benchmarks.results.speed import envs_rows, evaluate_rows, loader_rows, navigate_rows
+from tests.cases import each_case
 
 RATIO = {"median": 12.3, "low": 11.0, "high": 14.0, "turns": 3}
 
@@ -139,6 +141,29 @@ def test_outcomes_are_in_the_order_of_the_episodes() -> None:
     rows = [("a", 1, True), ("b", 0, True), ("a", 0, False)]
     results = {"episodes": [{"brain": name, "episode": number, "success": good} for name, number, good in rows]}
     assert values(results, "a", "success") == [False, True]
+
+
+@each_case(
+    ("failures", "score", "met"),
+    [(5, 0.2, [True, True, True]), (6, 0.19, [False, False, True]), (0, 0.18, [True, False, False])],
+)
+def test_what_ppo_made_of_a_clone_is_compared_with_that_and_with_the_rule(
+    failures: int, score: float, met: list[bool]
+) -> None:
+    def results(scores: dict[str, float], failed: int = 0) -> dict[str, Any]:
+        episodes = [
+            {"brain": name, "episode": i, "score": value + 0.01 * (-1) ** i}
+            for name, value in scores.items()
+            for i in range(10)
+        ]
+        rate = {"value": 0.9, "low": 0.8, "high": 1.0}
+        brain = {"episodes": 10, "successes": 10 - failed, "success": rate, "outcomes": {"success": 10 - failed}}
+        return {"episodes": episodes, "brains": dict.fromkeys(scores, brain)}
+
+    alone = results({"avoidance": 0.126, "clone_7": 0.2})
+    rows = monitored_rows(alone, results({"clone_7": 0.15, "ppo_7": score}, failures), (7,))
+    assert [row.met for row in rows] == [None, None, *met]
+    assert rows[2].value == str(failures)
 
 
 # --- page and runner --------------------------------------------------------------------------------------------------

@@ -129,17 +129,19 @@ class MlpPolicy(PreTrainedPolicy):
         return torch.cat([numbers, beams], dim=-1)
 
     def features_in(self, other: "MlpPolicy") -> list[int]:
-        """Return where this policy's features are among those of another, which ignores fewer columns or none.
+        """Return where this policy's features are among those of another, which sees more.
 
-        Both are to have the same configuration but for `ignored_columns`.
+        Both are to have the same configuration, but the other may ignore fewer columns and may see more observations,
+        of which the last are this policy's.
         """
         own, others = self._columns.tolist(), other._columns.tolist()
         steps, beams = self.config.n_obs_steps, self._beams
         rest = (self.feature_size - beams) // steps - len(own)  # environment state and yaws, the same in both
         of_step = [*(others.index(column) for column in own), *range(len(others), len(others) + rest)]
         width = len(others) + rest
-        numbers = [step * width + place for step in range(steps) for place in of_step]
-        return numbers + list(range(steps * width, steps * width + beams))
+        first = other.config.n_obs_steps - steps
+        numbers = [step * width + place for step in range(first, first + steps) for place in of_step]
+        return numbers + list(range(other.feature_size - beams, other.feature_size))
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a preprocessed batch, and its parts for the log.

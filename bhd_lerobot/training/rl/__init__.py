@@ -1,3 +1,14 @@
 """Reinforcement learning."""
 
-__all__ = ["checkpoint", "config", "environment", "features", "learner", "log", "parts", "train", "validation"]
+__all__ = [
+    "checkpoint",
+    "config",
+    "environment",
+    "features",
+    "learner",
+    "log",
+    "parts",
+    "privileged",
+    "train",
+    "validation",
+]

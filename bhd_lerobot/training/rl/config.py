@@ -37,6 +37,8 @@ _LEAST = {
     "validation.freq": 1,
     "validation.n_episodes": 1,
     "validation.n_envs": 1,
+    "validation.confirm": 0,
+    "validation.candidates": 1,
     "validation.seed": 0,
     "critic_warmup": 0,
     "seed": 0,
@@ -74,10 +76,10 @@ class RlEnvConfig:
 
 @dataclass
 class RlPolicyConfig:
-    """The actor, a `bhd_mlp`; with `start_from` the checkpoint decides, and all of this but `critic_dims` is ignored.
+    """Actor and critic. The actor is a `bhd_mlp`; with `start_from` the checkpoint says which.
 
     Attributes:
-        n_obs_steps: observations that it looks at.
+        n_obs_steps: observations that it looks at; a checkpoint's actor with `see_history` only.
         obs_stride: frames from each of them to the next.
         hidden_dims: widths of the hidden layers.
         activation: one of bhd_mlp's.
@@ -85,6 +87,9 @@ class RlPolicyConfig:
         feature_clip: normalised inputs beyond ± this count as this; nothing turns it off.
         scan: how a range finder's beams become inputs.
         critic_dims: widths of the critic's hidden layers.
+        privileged_critic: let the critic see more than the actor, which is all that a robot has: of a base how near the
+            scene is, without noise and delay, and what is commanded; how near `avoid` is to calling it stuck, and its
+            score so far; whether the collision monitor intervenes.
     """
 
     n_obs_steps: int = 1
@@ -95,6 +100,7 @@ class RlPolicyConfig:
     feature_clip: float | None = 10.0
     scan: ScanConfig = field(default_factory=ScanConfig)
     critic_dims: list[int] = field(default_factory=lambda: [256, 256])
+    privileged_critic: bool = False
 
     def actor(self) -> MlpConfig:
         """Return the configuration of an actor that begins from nothing.
@@ -133,7 +139,7 @@ class PpoConfig:
         vf_coef: weight of the critic's loss.
         max_grad_norm: largest norm of the gradient.
         lr: learning rate of Adam.
-        lr_schedule: ``"linear"``: to 0 over the training; ``"constant"``.
+        lr_schedule: ``"linear"``: to 0 over `steps`, whatever time they take; ``"constant"``.
         target_kl: an update ends when the policy has changed by 1.5 times this; nothing turns it off.
         log_std_init: logarithm of the exploration noise, in normalised actions; the checkpoint's own, or 0, if nothing.
     """
@@ -180,12 +186,18 @@ class RewardConfig:
 class ValidationConfig:
     """Episodes that judge the policy on the way. They are neither those of the training nor any held-out ones.
 
+    The best checkpoint is chosen among all that were saved, the policy that the run started with included. It is the
+    one that was best on the way; or, as the best of many is best by chance, too, the best of a few on further episodes,
+    which those few drive at the end.
+
     Attributes:
         freq: environment steps between two validations.
         n_episodes: how many episodes.
         n_envs: how many run side by side.
         seed: run seed of these episodes, of the split `train`; another than the training's.
-        select: what makes a checkpoint the best: ``"score"``, ``"success"`` or ``"return"``.
+        select: what makes a checkpoint the best: ``"score"``, ``"success"`` or ``"return"``; of equals, the score.
+        confirm: further episodes that decide at the end between the best candidates; none if 0.
+        candidates: how many checkpoints drive them, those that were best on the way; the start does besides.
         rule: a brain whose level is drawn beside the curve; also what normalisation is estimated from. None if nothing.
     """
 
@@ -194,6 +206,8 @@ class ValidationConfig:
     n_envs: int = 64
     seed: int = 777_001
     select: str = "score"
+    confirm: int = 0
+    candidates: int = 2
     rule: BrainConfig | None = None
 
 
@@ -211,10 +225,13 @@ class RlConfig:
         reward: what the learner gets.
         validation: how it is judged on the way.
         steps: environment steps, all environments together.
-        max_minutes: end after this time [min], validation included; nothing: after `steps` only.
+        max_minutes: end after this time [min] even if `steps` are not done, but for the last validation; nothing: after
+            `steps` only.
         start_from: a checkpoint of a `bhd_mlp`, whose weights become the actor; of a chunk, the first action counts.
         see_ignored: let the actor see what the checkpoint ignores (`policy.ignore`); it begins as if it did not. A
             clone must not see its own speed, because it would repeat it; who learns from what comes of it may.
+        see_history: let the actor see `policy.n_obs_steps` observations, `policy.obs_stride` frames apart, where the
+            checkpoint sees the last one; it begins as if it saw that only.
         critic_warmup: environment steps in which only the critic learns.
         output_dir: folder of the run; a new one in `outputs/train` if nothing.
         resume: go on with the run in `output_dir`.
@@ -234,6 +251,7 @@ class RlConfig:
     max_minutes: float | None = None
     start_from: str | None = None
     see_ignored: bool = False
+    see_history: bool = False
     critic_warmup: int = 0
     output_dir: str | None = None
     resume: bool = False
@@ -261,6 +279,10 @@ class RlConfig:
                 raise ConfigError(f"critic_warmup is {self.critic_warmup}; it needs --start_from, a checkpoint.")
             if self.see_ignored:
                 raise ConfigError("see_ignored is true; it needs --start_from, a checkpoint that ignores something.")
+            if self.see_history:
+                raise ConfigError("see_history is true; it needs --start_from, a checkpoint that sees one observation.")
+        if self.see_history and self.policy.n_obs_steps < 2:
+            raise ConfigError("see_history is true; it needs --policy.n_obs_steps of 2 or more.")
         if self.policy.scan.channels and self.policy.scan.transform == "none":
             raise ConfigError("policy.scan.channels needs policy.scan.transform: inverse or log.")
         if self.resume and self.output_dir is None:

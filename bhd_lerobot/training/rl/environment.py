@@ -17,6 +17,7 @@ from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.training.rl.config import RewardConfig
 from bhd_lerobot.training.rl.features import FeatureStack, in_units, rows_of
 from bhd_lerobot.training.rl.parts import RlParts
+from bhd_lerobot.training.rl.privileged import privileged_state
 
 Array = NDArray[np.float64]
 
@@ -88,6 +89,9 @@ def pose_potential(tool: Array, target: Array, per_m: float, per_rad: float) -> 
 class RlVecEnv(VecEnv):
     """n simulations as stable-baselines3's `VecEnv`: feature vectors in, normalised actions out.
 
+    A vector is what the actor sees, `stack.size` numbers, and behind that, if it is privileged, what only the critic
+    sees.
+
     An episode that ended begins anew in the same step. Its last observation is in `infos[i]["terminal_observation"]`,
     and `infos[i]["TimeLimit.truncated"]` says whether only its time was over, so that the learner adds the value of
     what would have come. `infos[i]["episode"]` holds the task's own return `r`, not the learner's, and the length `l`;
@@ -103,19 +107,23 @@ class RlVecEnv(VecEnv):
         parts: the policy, whose inputs and outputs these are.
         reward: how the learner's reward is made.
         gamma: discount of a frame.
+        privileged: whether the critic sees more than the actor: `privileged_state`.
     """
 
-    def __init__(self, env: BhdVectorEnv, parts: RlParts, reward: RewardConfig, gamma: float) -> None:
+    def __init__(
+        self, env: BhdVectorEnv, parts: RlParts, reward: RewardConfig, gamma: float, *, privileged: bool = False
+    ) -> None:
         if env.autoreset_mode.value != "Disabled":
             raise ConfigError(f"autoreset_mode is {env.autoreset_mode.value}; the adapter needs Disabled.")
         self.env = env
         self.stack = FeatureStack(parts.front, parts.before, env.num_envs)
         self.shaping = Shaping(reward, gamma, env.num_envs)
-        self._after = parts.after
+        self._after, self._privileged = parts.after, privileged
+        width = self.stack.size + (privileged_state(env.stage).shape[1] if privileged else 0)
         size = env.single_action_space.shape[0]  # type: ignore[index]
         super().__init__(
             env.num_envs,
-            spaces.Box(-np.inf, np.inf, (self.stack.size,), np.float32),
+            spaces.Box(-np.inf, np.inf, (width,), np.float32),
             spaces.Box(-_UNBOUNDED, _UNBOUNDED, (size,), np.float32),
         )
         self._all = np.arange(env.num_envs)
@@ -128,7 +136,7 @@ class RlVecEnv(VecEnv):
         """Begin the next episode everywhere; return vectors, shape (n, size)."""
         observation, _ = self.env.reset()
         self._begin(self._all, observation)
-        return self.stack.features()
+        return self._vectors()
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Take normalised actions, shape (n, a)."""
@@ -152,12 +160,16 @@ class RlVecEnv(VecEnv):
             self._finish(ended, truncated, info, infos)
             observation, _ = self.env.reset(options={"reset_mask": done})
             self._begin(ended, observation)
-        return self.stack.features(), shaped, done, infos
+        return self._vectors(), shaped, done, infos
+
+    def _vectors(self) -> NDArray[np.float32]:
+        features = self.stack.features()
+        return np.hstack([features, privileged_state(self.env.stage)]) if self._privileged else features
 
     def _finish(
         self, ended: NDArray[np.intp], truncated: NDArray[np.bool_], info: dict[str, Any], infos: list[dict[str, Any]]
     ) -> None:
-        last = self.stack.features(ended)
+        last = self._vectors()[ended]
         for row, sim in enumerate(ended.tolist()):
             infos[sim] = {
                 "terminal_observation": last[row],

@@ -40,10 +40,12 @@ class ActorHead(nn.Module):
 
     Args:
         policy: the `bhd_mlp`; its modules are shared, not copied.
+        size: how many numbers of a vector it sees, the first ones.
     """
 
-    def __init__(self, policy: MlpPolicy) -> None:
+    def __init__(self, policy: MlpPolicy, size: int) -> None:
         super().__init__()
+        self._size = size
         scan, steps = policy.config.scan, policy.config.n_obs_steps
         self.encoder = policy.scan_encoder
         self.hidden = nn.Sequential(*list(policy.net)[:-1])
@@ -51,7 +53,8 @@ class ActorHead(nn.Module):
         self._shape = (steps, scan.beams)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return the hidden layer, shape (n, width), of vectors, shape (n, size)."""
+        """Return the hidden layer, shape (n, width), of vectors, shape (n, size or more)."""
+        features = features[:, : self._size]
         if self.encoder is not None:
             numbers, scan = features[:, : -self._beams], features[:, -self._beams :]
             features = torch.cat([numbers, self.encoder(scan.unflatten(1, self._shape))], dim=-1)
@@ -63,13 +66,14 @@ class Networks(nn.Module):
 
     Args:
         policy: the actor.
-        size: width of a feature vector.
+        actor_size: how many numbers of a vector the actor sees, the first ones.
+        size: width of a vector, all of which the critic sees.
         critic_dims: widths of the critic's hidden layers.
     """
 
-    def __init__(self, policy: MlpPolicy, size: int, critic_dims: list[int]) -> None:
+    def __init__(self, policy: MlpPolicy, actor_size: int, size: int, critic_dims: list[int]) -> None:
         super().__init__()
-        self.policy_net = ActorHead(policy)
+        self.policy_net = ActorHead(policy, actor_size)
         self.latent_dim_pi = int(policy.net[-1].in_features)  # type: ignore[arg-type]
         layers: list[nn.Module] = []
         width = size
@@ -99,10 +103,11 @@ class MlpActorCritic(ActorCriticPolicy):
         actor: the `bhd_mlp`, which shares its parameters with this.
 
     Args:
-        observation_space: vectors of a `FeatureStack`.
+        observation_space: vectors of an `RlVecEnv`.
         action_space: normalised actions.
         lr_schedule: of the learning rate.
         actor: the `bhd_mlp`, with a chunk of one action.
+        actor_size: how many numbers of a vector it sees, the first ones.
         critic_dims: widths of the critic's hidden layers.
         fresh: initialise the actor's linear layers; otherwise they stay as they are.
         kwargs: what stable-baselines3 passes besides.
@@ -115,12 +120,13 @@ class MlpActorCritic(ActorCriticPolicy):
         lr_schedule: Any,
         *,
         actor: MlpPolicy,
+        actor_size: int,
         critic_dims: list[int],
         fresh: bool,
         **kwargs: Any,
     ) -> None:
         # nn.Module wants to be initialised before it gets modules, and SB3 builds the networks while it does so.
-        self._ingredients: tuple[MlpPolicy, list[int], bool] = (actor, critic_dims, fresh)
+        self._ingredients: tuple[MlpPolicy, int, list[int], bool] = (actor, actor_size, critic_dims, fresh)
         super().__init__(observation_space, action_space, lr_schedule, ortho_init=False, **kwargs)
 
     @property
@@ -133,12 +139,12 @@ class MlpActorCritic(ActorCriticPolicy):
         return [*self.mlp_extractor.policy_net.parameters(), *self.action_net.parameters(), self.log_std]
 
     def _build_mlp_extractor(self) -> None:
-        actor, critic_dims, _ = self._ingredients
-        self.mlp_extractor = Networks(actor, self.features_dim, critic_dims)  # type: ignore[assignment]
+        actor, actor_size, critic_dims, _ = self._ingredients
+        self.mlp_extractor = Networks(actor, actor_size, self.features_dim, critic_dims)  # type: ignore[assignment]
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
-        actor, _, fresh = self._ingredients
+        actor, *_, fresh = self._ingredients
         self.action_net = actor.net[-1]
         parts: list[tuple[nn.Module, float]] = [(self.mlp_extractor.value_net, 2**0.5), (self.value_net, 1.0)]
         if fresh:
@@ -158,19 +164,14 @@ class WarmedUpPPO(PPO):
     Args:
         args: see `stable_baselines3.PPO`.
         critic_warmup: environment steps in which the actor is frozen.
-        done: share of the run that is done after an environment step, from 0 to 1.
         kwargs: see `stable_baselines3.PPO`.
     """
 
     policy: MlpActorCritic
 
-    def __init__(self, *args: Any, critic_warmup: int, done: Callable[[int], float], **kwargs: Any) -> None:
+    def __init__(self, *args: Any, critic_warmup: int, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._warmup, self._done = critic_warmup, done
-
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        # Stable-baselines3 counts steps; here the time may be up first.
-        self._current_progress_remaining = 1 - self._done(num_timesteps)
+        self._warmup = critic_warmup
 
     def train(self) -> None:
         """Learn from the samples that were gathered."""
@@ -180,14 +181,13 @@ class WarmedUpPPO(PPO):
         super().train()
 
 
-def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv, done: Callable[[int], float]) -> WarmedUpPPO:
+def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv) -> WarmedUpPPO:
     """Return PPO on an actor.
 
     Args:
         config: of the run.
         parts: the actor and what belongs to it.
         env: the environments.
-        done: how much of the run is done after a step, from 0 to 1.
     """
     options = asdict(config.ppo)
     lr, schedule, log_std = (options.pop(name) for name in ("lr", "lr_schedule", "log_std_init"))
@@ -198,18 +198,18 @@ def make_learner(config: RlConfig, parts: RlParts, env: RlVecEnv, done: Callable
     learner = WarmedUpPPO(
         MlpActorCritic,
         env,
-        learning_rate=lr if schedule == "constant" else lambda remaining: lr * remaining,
+        learning_rate=lr if schedule == "constant" else lambda remaining: lr * max(0.0, remaining),
         **options,
         seed=config.seed,
         device="cpu",
         policy_kwargs={
             "actor": parts.actor,
+            "actor_size": env.stack.size,
             "critic_dims": list(config.policy.critic_dims),
             "fresh": parts.fresh,
             "log_std_init": log_std,
         },
         critic_warmup=config.critic_warmup,
-        done=done,
     )
     learner.set_logger(Logger(None, []))
     return learner

@@ -77,7 +77,8 @@ def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] 
         versions=versions(),
     )
     if config.start_from is not None:
-        return _from_checkpoint(config.start_from, contract, see_ignored=config.see_ignored)
+        steps = (config.policy.n_obs_steps, config.policy.obs_stride) if config.see_history else None
+        return _from_checkpoint(config.start_from, contract, see_ignored=config.see_ignored, steps=steps)
     if config.resume:
         # With the normalisation that the run began with.
         return _from_checkpoint(str(config.output_dir), contract)
@@ -96,7 +97,9 @@ def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] 
     return RlParts(MlpPolicy(mlp), _front(mlp), before, after, contract, fresh=True)
 
 
-def _from_checkpoint(path: str, contract: PolicyContract, *, see_ignored: bool = False) -> RlParts:
+def _from_checkpoint(
+    path: str, contract: PolicyContract, *, see_ignored: bool = False, steps: tuple[int, int] | None = None
+) -> RlParts:
     folder = find_checkpoint(path)
     loaded = load_policy(folder)
     who = f"The policy {path!r}"
@@ -122,7 +125,12 @@ def _from_checkpoint(path: str, contract: PolicyContract, *, see_ignored: bool =
         raise ConfigError(f"{who} has policy.scan.channels without a transform; train it with inverse or log ranges.")
     if see_ignored and not loaded.config.ignored_columns:
         raise ConfigError(f"see_ignored is true, and {who[0].lower()}{who[1:]} ignores nothing. Leave it out.")
-    actor = single_action(seeing_all(loaded.policy) if see_ignored else loaded.policy)
+    if steps is not None and loaded.config.n_obs_steps > 1:
+        raise ConfigError(
+            f"see_history is true, and {who[0].lower()}{who[1:]} sees {loaded.config.n_obs_steps} observations "
+            "already. Leave it out."
+        )
+    actor = single_action(seeing_more(loaded.policy, ignored=see_ignored, steps=steps))
     known = dataclasses.replace(contract, dataset=trained.dataset)
     return RlParts(actor, _front(actor.config), loaded.before, loaded.after, known, fresh=False)
 
@@ -154,15 +162,29 @@ def single_action(policy: MlpPolicy) -> MlpPolicy:
     return actor
 
 
-def seeing_all(policy: MlpPolicy) -> MlpPolicy:
-    """Return a policy that does the same, and that sees what the other ignores: the weights of that are 0."""
-    config = dataclasses.replace(policy.config, ignore=[], ignored_columns=[])
+def seeing_more(policy: MlpPolicy, *, ignored: bool = False, steps: tuple[int, int] | None = None) -> MlpPolicy:
+    """Return a policy that does the same, and that sees more: the weights of that are 0.
+
+    Args:
+        policy: a policy; with `steps`, one that sees one observation.
+        ignored: see what the other ignores.
+        steps: how many observations to see, and frames from each to the next; as many as before if None.
+    """
+    values: dict[str, Any] = {"ignore": [], "ignored_columns": []} if ignored else {}
+    if steps is not None:
+        values |= {"n_obs_steps": steps[0], "obs_stride": steps[1]}
+    config = dataclasses.replace(policy.config, **values)
     config.scan = copy.deepcopy(policy.config.scan)
     wider = MlpPolicy(config)
     state = dict(policy.state_dict())
     old = state["net.0.weight"]
     state["net.0.weight"] = old.new_zeros(old.shape[0], wider.feature_size)
     state["net.0.weight"][:, policy.features_in(wider)] = old
+    if policy.scan_encoder is not None:  # scans are its input channels, the present one the last
+        name = "scan_encoder.layers.0.weight"
+        kernels = torch.zeros_like(wider.state_dict()[name])
+        kernels[:, -state[name].shape[1] :] = state[name]
+        state[name] = kernels
     wider.load_state_dict(state)
     return wider
 

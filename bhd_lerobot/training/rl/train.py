@@ -29,6 +29,9 @@ from bhd_lerobot.training.rl.log import PLOT_NAME, SHOWN, Row, draw_curve
 from bhd_lerobot.training.rl.parts import make_parts
 from bhd_lerobot.training.rl.validation import Level, Validation, level
 
+_ON_THE_WAY, _AT_THE_END = ("val", "step"), ("confirmed", "candidate")
+"""Of the rows of `metrics.jsonl` that judge a checkpoint: prefix of their levels, and key of the checkpoint's step."""
+
 
 @dataclass
 class RlResult:
@@ -170,8 +173,9 @@ class _Run:
             from bhd_lerobot.training.rl.learner import make_learner
 
             self._env, self._parts = env, make_parts(config, env, episodes)
-            adapter = RlVecEnv(env, self._parts, config.reward, config.ppo.gamma)
-            self._learn(make_learner(config, self._parts, adapter, self._done))
+            privileged = config.policy.privileged_critic
+            adapter = RlVecEnv(env, self._parts, config.reward, config.ppo.gamma, privileged=privileged)
+            self._learn(make_learner(config, self._parts, adapter))
         return result
 
     def _done(self, step: int) -> float:
@@ -215,6 +219,7 @@ class _Run:
                 self._judge(learner, {"step": result.step, "minutes": self._minutes()})
             elif self._saved != result.step:
                 self._save(learner)
+            self._confirm()
             self._draw()
         self._print_summary()
 
@@ -257,15 +262,43 @@ class _Run:
         self._result.checkpoint, self._saved = folder, self._result.step
         return folder
 
-    def _best_row(self) -> Row | None:
-        """Return the row of the best validation, the latest of equals; None if there was none."""
-        key = f"val_{self._config.validation.select}"
-        judged = [row for row in self._result.rows if row.get(key) is not None]
-        return max(judged, key=lambda row: (row[key], row["step"]), default=None)
+    def _confirm(self) -> None:
+        """Let the best checkpoints, and the one that the run started from, drive the episodes that decide."""
+        config, result = self._config.validation, self._result
+        if not config.confirm:
+            return
+        steps = {row["step"] for row in self._ranked(_ON_THE_WAY)[: config.candidates]}
+        if self._config.start_from is not None:
+            steps.add(0)
+        levels = {}
+        for step in sorted(steps - {row["candidate"] for row in self._ranked(_AT_THE_END)}):
+            policy = checkpoints.folder_of(result.output_dir, step) / PRETRAINED_MODEL_DIR
+            levels[step] = self._validation.checkpoint(policy, self._stop.__bool__, further=True)
+            if self._stop:
+                return  # what not all have driven decides nothing
+        for step, found in levels.items():
+            if found is not None:
+                now = {"step": result.step, "minutes": self._minutes(), "candidate": step}
+                self._log({**now, **found.row(_AT_THE_END[0])})
+        self._point_to_best()
+
+    def _ranked(self, kind: tuple[str, str]) -> list[Row]:
+        """Return the rows that judge a checkpoint, the best first, the latest of equals."""
+        prefix, step = kind
+        keys = [f"{prefix}_{self._config.validation.select}", f"{prefix}_score", step]
+        judged = [row for row in self._result.rows if row.get(keys[0]) is not None]
+        return sorted(judged, key=lambda row: [row[key] for key in keys], reverse=True)
+
+    def _best(self) -> tuple[int, str, Row] | None:
+        """Return the step of the best checkpoint, and the row that says so with the prefix of its keys."""
+        for prefix, step in (_AT_THE_END, _ON_THE_WAY):
+            if ranked := self._ranked((prefix, step)):
+                return int(ranked[0][step]), prefix, ranked[0]
+        return None
 
     def _point_to_best(self) -> None:
-        best = self._best_row()
-        folder = None if best is None else checkpoints.folder_of(self._result.output_dir, best["step"])
+        best = self._best()
+        folder = None if best is None else checkpoints.folder_of(self._result.output_dir, best[0])
         if folder is not None and folder.is_dir():
             self._result.best = folder
             point(folder, checkpoints.BEST)
@@ -273,7 +306,8 @@ class _Run:
     def _log(self, row: Row) -> None:
         self._metrics.append(row)
         self._progress.advance(self._done(self._result.step))
-        prefix = f"step {row['step']:,}  {row['minutes']:.1f} min" if "val_score" in row else ""
+        judged = row.get("candidate", row["step"] if "val_score" in row else None)
+        prefix = "" if judged is None else f"step {judged:,}  {row['minutes']:.1f} min"
         self._progress.log(prefix, format_numbers(row, SHOWN))
 
     def _draw(self) -> None:
@@ -288,9 +322,10 @@ class _Run:
         lines.append(f"{result.step:,} environment steps in {self._minutes():.1f} min")
         if result.rule is not None:
             lines.append(f"rule on the validation episodes: {_text(result.rule.row())}")
-        best = self._best_row()
+        best = self._best()
         if best is not None and result.best is not None:
-            lines.append(f"best, after {best['step']:,} steps: {_text(best)}")
+            step, prefix, row = best
+            lines.append(f"best, after {step:,} steps: {_text(row, prefix)}")
             lines.append(f"best checkpoint: {result.best / PRETRAINED_MODEL_DIR}")
         lines.append(f"curve: {result.output_dir / PLOT_NAME}")
         if self._stop:
@@ -301,8 +336,9 @@ class _Run:
         self._console.print(escape("\n".join(lines)), soft_wrap=True, highlight=False)
 
 
-def _text(row: Row) -> str:
-    return f"score {row['val_score']:.4f}, success {row['val_success']:.3f}, return {row['val_return']:.4f}"
+def _text(row: Row, prefix: str = "val") -> str:
+    score, success, total = (row[f"{prefix}_{key}"] for key in ("score", "success", "return"))
+    return f"score {score:.4f}, success {success:.3f}, return {total:.4f}"
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -34,13 +34,13 @@ class Level:
     reward: float
     failures: dict[str, float]
 
-    def row(self) -> dict[str, Any]:
+    def row(self, prefix: str = "val") -> dict[str, Any]:
         """Return it as part of a row of `metrics.jsonl`."""
         return {
-            "val_score": self.score,
-            "val_success": self.success,
-            "val_return": self.reward,
-            **{f"val_{cause}": share for cause, share in self.failures.items()},
+            f"{prefix}_score": self.score,
+            f"{prefix}_success": self.success,
+            f"{prefix}_return": self.reward,
+            **{f"{prefix}_{cause}": share for cause, share in self.failures.items()},
         }
 
 
@@ -56,16 +56,21 @@ class Validation:
         self._n = min(own.n_envs, own.n_episodes)
         self._simulation = make_simulation(config.robot, self._n, config.env.threads)
         self._task_config, self._fps = config.task, self._simulation.rates.fps
-        self._specs = [EpisodeSpec(i, episode_seed(own.seed, i, "train")) for i in range(own.n_episodes)]
+        every = own.n_episodes + own.confirm
+        specs = [EpisodeSpec(i, episode_seed(own.seed, i, "train")) for i in range(every)]
+        self._specs, self._further = specs[: own.n_episodes], specs[own.n_episodes :]
 
-    def run(self, brain: Any, stop: Callable[[], bool] = lambda: False) -> list[Episode]:
-        """Return the episodes of a brain, given by its configuration."""
+    def run(self, brain: Any, stop: Callable[[], bool] = lambda: False, *, further: bool = False) -> list[Episode]:
+        """Return the episodes of a brain, given by its configuration; with `further`, those that confirm."""
         task = make_task(self._task_config, self._n, self._fps, self._simulation.body)
-        return list(EpisodeLoop(self._simulation, task, make_brain(brain)).run(self._specs, stop))
+        specs = self._further if further else self._specs
+        return list(EpisodeLoop(self._simulation, task, make_brain(brain)).run(specs, stop))
 
-    def checkpoint(self, folder: Any, stop: Callable[[], bool] = lambda: False) -> Level | None:
+    def checkpoint(
+        self, folder: Any, stop: Callable[[], bool] = lambda: False, *, further: bool = False
+    ) -> Level | None:
         """Return how good the policy in a folder is; None if a stop came first."""
-        return level(self.run(LearnedBrainConfig(path=str(folder)), stop))
+        return level(self.run(LearnedBrainConfig(path=str(folder)), stop, further=further))
 
     def close(self) -> None:
         """Free the simulations."""

@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,25 +20,23 @@ from bhd_lerobot.training.rl.parts import RlParts, make_parts
 N = 3
 
 
-def configuration(duration_s: int = 1) -> RlConfig:
-    return parse_rl(
-        [
-            "--algorithm=ppo",
-            "--robot.type=turtlebot3",
-            "--robot.beams=36",
-            "--task.type=avoid",
-            f"--task.duration_s={duration_s}",
-            "--task.min_path_m=0",
-            f"--env.n_envs={N}",
-            "--env.threads=1",
-            "--policy.n_obs_steps=3",
-            "--policy.obs_stride=2",
-            "--policy.hidden_dims=[8]",
-            "--policy.critic_dims=[8]",
-            "--ppo.n_steps=12",
-            "--ppo.batch_size=12",
-        ]
-    )
+def options(duration_s: int = 1) -> list[str]:
+    return [
+        "--algorithm=ppo",
+        "--robot.type=turtlebot3",
+        "--robot.beams=36",
+        "--task.type=avoid",
+        f"--task.duration_s={duration_s}",
+        "--task.min_path_m=0",
+        f"--env.n_envs={N}",
+        "--env.threads=1",
+        "--policy.n_obs_steps=3",
+        "--policy.obs_stride=2",
+        "--policy.hidden_dims=[8]",
+        "--policy.critic_dims=[8]",
+        "--ppo.n_steps=12",
+        "--ppo.batch_size=12",
+    ]
 
 
 def environment(config: RlConfig) -> BhdVectorEnv:
@@ -48,7 +47,7 @@ def environment(config: RlConfig) -> BhdVectorEnv:
 
 class Rig:
     def __init__(self, duration_s: int = 1, reward: RewardConfig | None = None) -> None:
-        self.config = configuration(duration_s)
+        self.config = parse_rl(options(duration_s))
         self.env = environment(self.config)
         self.parts: RlParts = make_parts(self.config, self.env)
         self.adapter = RlVecEnv(self.env, self.parts, reward or self.config.reward, self.config.ppo.gamma)
@@ -151,7 +150,7 @@ def test_what_is_reported_is_the_tasks_own_return_whatever_the_learner_gets() ->
 def test_the_learner_adds_the_value_of_what_would_have_come_to_truncated_episodes_only(
     rig: Rig, truncated: bool, factor: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    learner = make_learner(rig.config, rig.parts, rig.adapter, lambda step: 0.0)
+    learner = make_learner(rig.config, rig.parts, rig.adapter)
     with torch.no_grad():
         learner.policy.value_net.weight.zero_()
         learner.policy.value_net.bias.fill_(5.0)
@@ -194,6 +193,41 @@ def test_the_potential_is_zero_at_the_target_and_falls_with_distance_and_angle()
     turned[0, 3:] = np.cos(0.2), np.sin(0.2), 0.0, 0.0
     assert pose_potential(moved, target, 2.0, 0.5) == pytest.approx(-0.2)
     assert pose_potential(turned, target, 2.0, 0.5) == pytest.approx(-0.2)
+
+
+def test_the_critic_sees_more_than_the_actor_and_the_actor_what_it_saw_before() -> None:
+    config = parse_rl([*options(1), "--robot.lidar_noise_std=0", "--robot.collision_monitor=true"])
+    env = environment(config)
+    parts = make_parts(config, env)
+    adapter = RlVecEnv(env, parts, config.reward, 0.99, privileged=True)
+    seen, size = adapter.reset(), adapter.stack.size
+    np.testing.assert_array_equal(seen[:, :size], adapter.stack.features())
+    assert size == parts.actor.feature_size
+    # The scan was taken where the robots stand: of 36 beams each is one of the directions.
+    simulation: Any = env.stage.simulation
+    near = simulation.body.radius / simulation.lidar.ranges
+    np.testing.assert_allclose(seen[:, size : size + 36], np.minimum(near, 1.0), atol=0.02)
+    learner = make_learner(config, parts, adapter)
+    other = seen.copy()
+    other[:, size:] += 0.5
+    for name, is_same in (("forward_actor", True), ("forward_critic", False)):
+        both = [getattr(learner.policy.mlp_extractor, name)(torch.from_numpy(rows)) for rows in (seen, other)]
+        assert torch.equal(*both) is is_same
+    adapter.close()
+
+
+def test_the_critic_is_told_when_the_monitor_keeps_the_robot_from_an_obstacle() -> None:
+    config = parse_rl([*options(60), "--robot.collision_monitor=true"])
+    env = environment(config)
+    adapter = RlVecEnv(env, make_parts(config, env), config.reward, 0.99, privileged=True)
+    adapter.reset()
+    flags = []
+    for _ in range(150):  # they drive straight on until they stand before something
+        adapter.step_async(np.tile(np.float32([1.0, 0.0]), (N, 1)))
+        flags.append(adapter.step_wait()[0][:, -1])
+    adapter.close()
+    assert not flags[0].any()
+    assert np.any(flags, axis=0).all()
 
 
 def test_the_adapter_refuses_an_environment_that_begins_anew_by_itself(rig: Rig) -> None:

@@ -13,7 +13,7 @@ from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN
 from bhd_lerobot.policies.mlp.yaw_mlp import OBS_YAW
 from bhd_lerobot.training.rl.config import parse_rl
-from bhd_lerobot.training.rl.parts import seeing_all
+from bhd_lerobot.training.rl.parts import seeing_more
 
 WIDTH, BEAMS, TASK = 14, 8, 9  # two numbers, the beams, four more numbers; the environment state
 IGNORED = [0, 11, 13]
@@ -60,7 +60,7 @@ def batch(one: MlpPolicy, seed: int = 0) -> dict[str, Tensor]:
 @pytest.mark.parametrize("case", CASES)
 def test_it_does_the_same_at_first_whatever_the_ignored_numbers_are(case: str) -> None:
     narrow = policy(**CASES[case])
-    wide = seeing_all(narrow)
+    wide = seeing_more(narrow, ignored=True)
     assert (wide.config.ignore, wide.config.ignored_columns) == ([], [])
     assert narrow.config.ignored_columns == IGNORED  # the checkpoint's own is left alone
     for seed in range(3):
@@ -72,7 +72,7 @@ def test_it_does_the_same_at_first_whatever_the_ignored_numbers_are(case: str) -
 
 @pytest.mark.parametrize("case", CASES)
 def test_it_can_learn_from_what_was_ignored(case: str) -> None:
-    wide = seeing_all(policy(**CASES[case]))
+    wide = seeing_more(policy(**CASES[case]), ignored=True)
     rows = batch(wide)
     wide.train()
     wide._chunk(rows).square().sum().backward()
@@ -82,6 +82,29 @@ def test_it_can_learn_from_what_was_ignored(case: str) -> None:
     assert (gradient[:, unused].abs().sum(dim=0) > 0).all()
 
 
+@pytest.mark.parametrize("case", CASES)
+def test_it_can_see_what_was_before_and_does_the_same_at_first(case: str) -> None:
+    narrow = policy(**{**CASES[case], "n_obs_steps": 1, "obs_stride": 1})
+    wide = seeing_more(narrow, ignored=True, steps=(3, 2))
+    assert (wide.config.n_obs_steps, wide.config.obs_stride, wide.config.history) == (3, 2, 5)
+    last, every = batch(narrow), batch(wide)
+    for key, rows in every.items():
+        rows[:, -1:] = last[key]
+    torch.testing.assert_close(
+        wide.predict_action_chunk(every), narrow.predict_action_chunk(last), rtol=1e-5, atol=1e-6
+    )
+    wide.train()
+    wide._chunk(every).square().sum().backward()
+    first = wide.net[0].weight if wide.scan_encoder is None else wide.scan_encoder.layers[0].weight
+    unused = (first == 0).all(dim=0)
+    assert unused.any()
+    assert (first.grad[:, unused].abs().sum(dim=0) > 0).all()
+
+
 def test_seeing_what_is_ignored_needs_a_checkpoint() -> None:
     with pytest.raises(ConfigError, match="see_ignored is true; it needs --start_from"):
         parse_rl(["--config_path=configs/train/ppo_turtlebot3.yaml", "--see_ignored=true"])
+    with pytest.raises(ConfigError, match="see_history is true; it needs --start_from"):
+        parse_rl(["--config_path=configs/train/ppo_turtlebot3.yaml", "--see_history=true"])
+    with pytest.raises(ConfigError, match=r"see_history is true; it needs --policy\.n_obs_steps"):
+        parse_rl(["--config_path=configs/train/ppo_ur5_reach.yaml", "--see_history=true", "--start_from=x"])

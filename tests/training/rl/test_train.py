@@ -31,6 +31,7 @@ from bhd_lerobot.training.rl.learner import make_learner
 from bhd_lerobot.training.rl.log import draw_curve
 from bhd_lerobot.training.rl.parts import make_parts, single_action
 from bhd_lerobot.training.rl.train import RlResult, main, train
+from bhd_lerobot.training.rl.validation import Level, Validation
 from tests.forks import Fork
 
 # How much the network's rows may differ when they are computed beside others, in m/s and rad/s.
@@ -189,14 +190,18 @@ def test_a_run_that_is_killed_while_it_saves_goes_on_from_the_last_complete_chec
     assert [row["step"] for row in rows(folder) if "val_score" in row] == [0, 64, 96]
 
 
-@pytest.mark.parametrize("channels", [[], [4]])
-def test_the_exported_policy_does_what_the_learners_actor_does(tmp_path: Path, channels: list[int]) -> None:
+@pytest.mark.parametrize(("channels", "privileged"), [([], False), ([4], True)])
+def test_the_exported_policy_does_what_the_learners_actor_does(
+    tmp_path: Path, channels: list[int], privileged: bool
+) -> None:
     config = parse_rl(options(**{"policy.scan.channels": channels, "policy__layer_norm": "true"}))
     env = BhdVectorEnv(4, config.environment, config.robot, config.task, autoreset_mode="Disabled", threads=1)
     parts = make_parts(config, env)
-    adapter = RlVecEnv(env, parts, config.reward, 0.99)
+    adapter = RlVecEnv(env, parts, config.reward, 0.99, privileged=privileged)
     stack = adapter.stack
-    learner = make_learner(config, parts, adapter, lambda step: 0.0)
+    hidden = np.zeros((4, adapter.observation_space.shape[0] - stack.size), np.float32)  # type: ignore[index]
+    assert (hidden.size > 0) is privileged
+    learner = make_learner(config, parts, adapter)
     learner.learn(64, log_interval=2**60)
     assert any(len(p) and p.grad is not None for p in parts.actor.net.parameters())
     checkpoint.export(tmp_path, parts, learner.policy.log_std)
@@ -208,7 +213,7 @@ def test_the_exported_policy_does_what_the_learners_actor_does(tmp_path: Path, c
             stack.restart(np.arange(4), state)
         else:
             stack.push(state)
-        mean, _ = learner.predict(stack.features(), deterministic=True)
+        mean, _ = learner.predict(np.hstack([stack.features(), hidden]), deterministic=True)
         wanted.append(in_units(parts.after, mean))
     env.close()
     np.testing.assert_allclose(actions(tmp_path, states), wanted, rtol=0, atol=TOLERANCE)
@@ -220,7 +225,7 @@ def test_a_checkpoint_that_is_exported_without_training_does_the_same(finished: 
     env = BhdVectorEnv(4, config.environment, config.robot, config.task, autoreset_mode="Disabled", threads=1)
     parts = make_parts(config, env)
     adapter = RlVecEnv(env, parts, config.reward, 0.99)
-    learner = make_learner(config, parts, adapter, lambda step: 0.0)
+    learner = make_learner(config, parts, adapter)
     checkpoint.export(tmp_path, parts, learner.policy.log_std)
     env.close()
     states = np.random.default_rng(0).uniform(0.1, 3.0, (5, 4, 38)).astype(np.float32)
@@ -231,6 +236,44 @@ def test_the_actor_is_frozen_while_the_critic_warms_up(finished: RlResult, tmp_p
     frozen = run(tmp_path / "frozen", start_from=finished.checkpoint, critic_warmup=96)
     assert frozen.checkpoint is not None
     assert weights(frozen.checkpoint) == weights(frozen.output_dir / "checkpoints" / "000000000")
+
+
+def test_the_learning_rate_follows_the_steps_and_never_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module._Run, "_minutes", lambda _: 0.9)
+    result = run(tmp_path / "run", max_minutes=1, steps=90)  # the last update is after 96
+    found = {row["step"]: row["lr"] for row in rows(result.output_dir) if "lr" in row}
+    assert found == {step: pytest.approx(3e-4 * max(0.0, 1 - step / 90)) for step in (32, 64, 96)}
+
+
+def test_the_best_checkpoint_is_the_one_of_most_successes_and_the_start_is_among_the_candidates(
+    finished: RlResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    levels = {  # success and score on the way; on the episodes that confirm
+        0: ((0.8, 0.2), (1.0, 0.2)),
+        32: ((0.9, 0.3), (1.0, 0.9)),
+        64: ((1.0, 0.1), (1.0, 0.1)),
+        96: ((1.0, 0.3), (0.9, 0.3)),
+    }
+    driven = []
+
+    def checkpoint_of(self: Validation, folder: Path, stop: Any, *, further: bool = False) -> Level:
+        step = int(folder.parent.name)
+        driven.append((step, further))
+        success, score = levels[step][further]
+        return Level(2, score, success, score, {})
+
+    monkeypatch.setattr(Validation, "checkpoint", checkpoint_of)
+    wanted = {"validation__freq": 32, "validation__select": "success", "start_from": finished.checkpoint}
+    for confirm, best in ((0, 96), (2, 0)):
+        result = run(tmp_path / str(confirm), validation__confirm=confirm, **wanted)
+        assert result.best == result.output_dir / "checkpoints" / f"{best:09d}"
+    assert [step for step, further in driven if further] == [0, 64, 96]
+    again = [f"--config_path={tmp_path / '2'}", "--resume=true", "--steps=97"]
+    levels[128] = ((1.0, 0.4), (1.0, 0.25))
+    assert train(parse_rl(again), Console(file=io.StringIO())).best == tmp_path / "2/checkpoints/000000128"
+    assert [step for step, further in driven if further] == [0, 64, 96, 128]
 
 
 def test_ctrl_c_saves_and_prints_the_resume_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
@@ -268,6 +311,8 @@ WRONG: list[tuple[dict[str, object], str]] = [
     ({"reward__events": "{colision: -1}"}, "Did you mean 'collision'"),
     ({"reward__potential": "pose"}, "only a task with a target pose"),
     ({"algorithm": "sac"}, "Valid: ppo"),
+    ({"validation__confirm": -1}, "validation.confirm is -1"),
+    ({"validation__candidates": 0}, "validation.candidates is 0"),
     ({"validation__seed": 0}, "judged on the episodes"),
     ({"critic_warmup": 10}, "needs --start_from"),
     ({"robot__type": "ur5", "robot__beams": None}, "this task is for turtlebot3"),
@@ -297,6 +342,8 @@ def test_a_checkpoint_of_another_robot_is_refused(finished: RlResult, tmp_path: 
         run(tmp_path / "run", start_from=finished.checkpoint, **config)
     with pytest.raises(ConfigError, match="trained on other observation features"):
         run(tmp_path / "beams", start_from=finished.checkpoint, robot__beams=72)
+    with pytest.raises(ConfigError, match="sees 2 observations already"):
+        run(tmp_path / "history", start_from=finished.checkpoint, see_history=True)
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(tmp_path: Path) -> None:
@@ -329,9 +376,9 @@ def test_a_folder_that_exists_is_not_overwritten_and_one_without_a_run_not_resum
         run(tmp_path / "missing", resume="true")
 
 
-@pytest.mark.parametrize("name", ["ppo_turtlebot3", "ppo_ur5_reach"])
+@pytest.mark.parametrize("name", ["ppo_turtlebot3", "ppo_turtlebot3_monitor", "ppo_ur5_reach"])
 def test_the_shipped_configurations_are_valid(name: str) -> None:
-    config: RlConfig = parse_rl([f"--config_path=configs/train/{name}.yaml"])
+    config: RlConfig = parse_rl([f"--config_path=configs/train/{name}.yaml", "--start_from=x"])
     assert config.max_minutes is not None
     assert config.max_minutes <= 20
 
