@@ -10,8 +10,8 @@ to take the core from the inference.
 The weights are not trained, unless checkpoints are named. What a network costs does not depend on its weights, but what
 becomes of its answers does: the threshold of the untrained perception is set so that it finds five objects, as many as
 there can be. Lateness of ticks, ticks later than 0.1 ms, missed ticks, frames a second and the brain's processor time
-per frame are printed, lateness with its ratio to that of `noop` in the same round. Exits with 1 if a goal is missed, with
-2 if nothing could be measured.
+per frame are printed, lateness with its ratio to that of `noop` in the same round. Exits with 1 if a goal is missed,
+with 2 if nothing could be measured.
 """
 
 import argparse
