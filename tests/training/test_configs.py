@@ -26,15 +26,15 @@ def described(name: str) -> dict[str, dict]:
     if "avoid" in name:
         del vectors["observation.environment_state"]
     features = {key: {"dtype": "float32", "shape": (len(one),), "names": one} for key, one in vectors.items()}
-    if "camera" in name or "smolvla" in name:
-        names = ["height", "width", "channels"]
+    if any(one in name for one in ("camera", "pixels", "smolvla")):
+        names, shape = ["height", "width", "channels"], (120, 160, 3) if "pixels" in name else (240, 320, 3)
         for camera in ("scene", "wrist"):
-            features[f"observation.images.{camera}"] = {"dtype": "video", "shape": (240, 320, 3), "names": names}
+            features[f"observation.images.{camera}"] = {"dtype": "video", "shape": shape, "names": names}
     return features
 
 
 def test_there_are_configurations() -> None:
-    assert len(CONFIGS) == 9
+    assert len(CONFIGS) == 11
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
@@ -51,7 +51,7 @@ def test_a_configuration_is_valid_and_its_policy_can_be_built(path: Path, tmp_pa
         return  # building it loads a model from the Hub
     meta = SimpleNamespace(features=described(path.stem), stats={}, fps=25)
     policy = make_policy(config.policy, ds_meta=meta)
-    if "cameras" in path.stem:
+    if "cameras" in path.stem or "pixels" in path.stem:
         assert "observation.environment_state" not in policy.config.input_features  # it would tell what is to be seen
     assert sum(one.numel() for one in policy.parameters()) > 1000
 

@@ -241,7 +241,7 @@ class PerceptionPolicy(PreTrainedPolicy):
                     f"Of the objects on these tables {len(places)} were seen; to find where the camera stands, "
                     f"{_LEAST_SEEN} are needed. Record more tables, or train without --fine_tune_camera."
                 )
-            view = fit_view(config.view, config.image_size, places, pixels)
+            view = fit_view(before, config.image_size, places, pixels)
             config.camera_position, config.camera_target = list(view.position), list(view.target)
             config.camera_roll = view.roll
             self._aim()

@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from bhd_lerobot.policies.perception.modeling_perception import Detections
 
 _SCALE = 2.0  # [px] residuals that are larger count less than their square: what was taken for another object
+_MOVE = 0.1  # [m] and [rad] by which a camera may easily be moved; it counts as much as a residual of 1 px
+_COLOUR = 0.2  # of the image's width: as much counts that an object has another colour
 
 
 def matched(found: "list[Detections]", labels: Labels, camera: Projection) -> tuple[NDArray[np.float64], ...]:
     """Return where objects are, shape (k, 3) [m], and where they were seen, shape (k, 2) [px].
 
-    What was found belongs to the nearest object of its colour in the image, if there is one.
+    What was found belongs to the object that is nearest in the image and likeliest in colour.
 
     Args:
         found: in each image.
@@ -35,11 +37,9 @@ def matched(found: "list[Detections]", labels: Labels, camera: Projection) -> tu
             continue
         at = camera.pixels(seen.position.cpu().double().numpy())
         apart = np.linalg.norm(at[:, None] - camera.pixels(true)[None], axis=-1)
-        apart[seen.colour.argmax(-1).cpu().numpy()[:, None] != colours] = math.inf
-        nearest = apart.argmin(axis=1)
-        known = np.isfinite(apart.min(axis=1))
-        places.append(true[nearest[known]])
-        pixels.append(at[known])
+        apart += _COLOUR * camera.width * (1 - seen.colour.cpu().numpy()[:, colours])
+        places.append(true[apart.argmin(axis=1)])
+        pixels.append(at)
     if not places:
         return np.zeros((0, 3)), np.zeros((0, 2))
     return np.concatenate(places), np.concatenate(pixels)
@@ -51,7 +51,7 @@ def fit_view(
     """Return the view that shows points where they were seen, by robust least squares; six numbers are found.
 
     Args:
-        view: where to begin; its field of view, and how far its target is, stay.
+        view: from which it was moved; the field of view, and how far the target is, stay.
         size: of the images [px].
         places: of the points, shape (k, 3) [m].
         pixels: where they were seen, shape (k, 2) [px].
@@ -68,7 +68,7 @@ def fit_view(
         return CameraView(tuple(position), target, view.fovy, roll)
 
     def residuals(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        seen = Projection(made(values), *size).pixels(places) - pixels
-        return np.asarray(seen.ravel())
+        astray = Projection(made(values), *size).pixels(places) - pixels
+        return np.concatenate([astray.ravel(), (values - start) / _MOVE])
 
     return made(least_squares(residuals, start, loss="soft_l1", f_scale=_SCALE, x_scale="jac").x)
